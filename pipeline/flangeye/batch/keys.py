@@ -1,0 +1,86 @@
+"""Whether a session is still the one that was run: a hash of everything that decides its result.
+
+It is made at every start for every session, so large files are not read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from flangeye import types as t
+from flangeye.batch.software import Software
+from flangeye.recipe import Recipe
+from flangeye.result import sha256
+from flangeye.stage import Chosen, Params
+
+SMALL = 65_536
+"""Files up to so many bytes are told apart by content, larger ones by size and time of change."""
+
+
+class Fingerprints:
+    """Fingerprints of files and folders, each looked at once."""
+
+    def __init__(self) -> None:
+        self._known: dict[Path, str] = {}
+
+    def of(self, path: Path) -> str:
+        """Return a hash of a file, or of every file below a folder; large files are not read.
+
+        A path that is not there has a fingerprint too: its session will say what is wrong.
+        """
+        if path not in self._known:
+            self._known[path] = _fingerprint(path)
+        return self._known[path]
+
+    def of_recipe(self, recipe: Recipe) -> list[str]:
+        """Return path and fingerprint of every file or folder that a step's parameters name."""
+        paths = {path.absolute() for step in recipe.steps for path in _paths(step.params)}
+        return [f"{path} {self.of(path)}" for path in sorted(paths)]
+
+
+def session_key(
+    recipe: Recipe, archive: Path | None, software: Software, prints: Fingerprints
+) -> str:
+    """Return the hash of a recipe, the files it names, its input and what computes."""
+    # The resolved recipe has only the names of the models that the header's files describe.
+    models = [value for kind, value in recipe.context.items() if kind not in (t.Box, t.Seed)]
+    files = prints.of_recipe(recipe)
+    given = [str(archive), prints.of(archive)] if archive else []
+    return sha256(json.dumps([recipe.resolved(), repr(models), files, given, software]))
+
+
+def _fingerprint(path: Path) -> str:
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.relative_to(path)}\0{_state(file)}\n".encode(errors="replace"))
+    return digest.hexdigest()
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, Chosen):
+        yield from _paths(value.params)
+    elif isinstance(value, Params):
+        for _, inner in value:
+            yield from _paths(inner)
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from _paths(inner)
+    elif isinstance(value, dict):
+        yield from _paths(list(value.values()))
+
+
+def _state(file: Path) -> str:
+    try:
+        stat = file.stat()
+        if stat.st_size <= SMALL:
+            return hashlib.sha256(file.read_bytes()).hexdigest()
+        return f"{stat.st_size} {stat.st_mtime_ns}"
+    except OSError as error:
+        return type(error).__name__

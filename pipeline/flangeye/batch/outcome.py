@@ -1,0 +1,119 @@
+"""What became of one session: a row of the tables, the variants' columns aside."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from flangeye.result import Result
+
+Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
+STATUSES: tuple[Status, ...] = ("verified", "unverified", "refused", "failed", "crashed")
+ACCEPTED = ("verified", "unverified")
+FINISHED = ("verified", "unverified", "refused")
+
+MARKER = "session.json"
+"""Written last into a session's folder: it is whole, and need not be run again."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one session; SI units.
+
+    Attributes:
+        status: How it ended; ``failed`` is a foreseen mistake such as an unreadable archive,
+            ``crashed`` one that is not, or the death of its worker.
+        reason: Why, unless the calibration was accepted.
+        used: Captures used.
+        captures: Captures seen.
+        holdout_rms_m: Error on poses that took no part in the estimate.
+        holdout_median_m: The same, its median.
+        holdout_p95_m: The same, 95 % are below.
+        predicted_rms_m: Error to expect over the workspace.
+        predicted_p95_m: The same, 95 % are below.
+        true_rms_m: True error over the workspace, in simulation.
+        true_centre_m: True error at its centre.
+        true_rotation_rad: True error of the rotation.
+        seconds: What the session took on its worker.
+        report: Report of the session, from the batch's folder.
+    """
+
+    status: Status
+    reason: str | None = None
+    used: int | None = None
+    captures: int | None = None
+    holdout_rms_m: float | None = None
+    holdout_median_m: float | None = None
+    holdout_p95_m: float | None = None
+    predicted_rms_m: float | None = None
+    predicted_p95_m: float | None = None
+    true_rms_m: float | None = None
+    true_centre_m: float | None = None
+    true_rotation_rad: float | None = None
+    seconds: float = 0.0
+    report: str | None = None
+
+
+@dataclass
+class Batch:
+    """What a batch came to.
+
+    Attributes:
+        out: Its folder.
+        outcomes: Session id -> what became of it.
+        known: How many of them had finished at an earlier start.
+    """
+
+    out: Path
+    outcomes: dict[str, Outcome]
+    known: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every session gave a calibration."""
+        return all(outcome.status in ACCEPTED for outcome in self.outcomes.values())
+
+
+def outcome_of(result: Result) -> Outcome:
+    """Return the headline figures of a result."""
+    holdout, workspace, truth = result.holdout, result.workspace, result.truth
+    return Outcome(
+        status=result.status,  # type: ignore[arg-type]
+        reason=result.refused,
+        used=sum(o.used for o in result.observations),
+        captures=len(result.observations),
+        holdout_rms_m=holdout.rms if holdout else None,
+        holdout_median_m=holdout.median if holdout else None,
+        holdout_p95_m=holdout.p95 if holdout else None,
+        predicted_rms_m=workspace.predicted_rms if workspace else None,
+        predicted_p95_m=workspace.predicted_p95 if workspace else None,
+        true_rms_m=truth.rms_over_workspace if truth else None,
+        true_centre_m=truth.error_at_centroid if truth else None,
+        true_rotation_rad=truth.rotation_error if truth else None,
+    )
+
+
+def mark_finished(folder: Path, key: str, outcome: Outcome) -> None:
+    """Leave the outcome in a session's folder, whole or not at all."""
+    draft = folder / f"{MARKER}.part"
+    draft.write_text(json.dumps({"key": key, **asdict(outcome)}, indent=2) + "\n", encoding="utf-8")
+    draft.replace(folder / MARKER)
+
+
+def finished_outcome(folder: Path, key: str, report: bool) -> Outcome | None:
+    """Return what :func:`mark_finished` left; None when the session has to run.
+
+    Args:
+        folder: The session's folder.
+        key: The session's key; anything else there is of another session.
+        report: Whether a report is wanted.
+    """
+    try:
+        data = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        if data.pop("key") != key or (report and not data["report"]):
+            return None
+        return Outcome(**data)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return None  # not there, or not ours

@@ -1,0 +1,43 @@
+"""What a person asks of ``flangeye batch``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from flangeye.errors import FlangeyeError
+
+SEED = "seed"
+
+
+class BatchError(FlangeyeError):
+    """The batch cannot start; nothing has run."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for.
+
+    Attributes:
+        recipe: File, or name of a shipped recipe.
+        archives: Recordings to run on; none for recipes that simulate.
+        overrides: ``PATH=VALUE``, the same in every session.
+        grid: ``PATH=a,b,c``: every combination is run.
+        repeat: How many seeds, counted up from the recipe's; None for the recipe's alone.
+        vary: What ``repeat`` counts up; only ``seed`` can be.
+        workers: Worker processes on this machine; None for one per core.
+        scheduler: Address of a running dask scheduler, instead of workers here.
+        out: Folder of the batch; None for ``batches/<recipe>``.
+        report: Make each session's ``report.html``.
+    """
+
+    recipe: str
+    archives: tuple[Path, ...] = ()
+    overrides: tuple[str, ...] = ()
+    grid: tuple[str, ...] = ()
+    repeat: int | None = None
+    vary: str = SEED
+    workers: int | None = None
+    scheduler: str | None = None
+    out: Path | None = None
+    report: bool = True

@@ -1,0 +1,337 @@
+"""The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
+
+Modules are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from flangeye.errors import FlangeyeError
+
+if TYPE_CHECKING:
+    from flangeye.recipe import Recipe
+    from flangeye.registry import Registry
+    from flangeye.replay import Replay
+    from flangeye.result import Result
+    from flangeye.runfolder import RunFolder
+    from flangeye.types import ArchivePath
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Hand-eye calibration from the robot's own flange, driven by YAML recipes.\n\n"
+    "Start with: flangeye run ur5_phoxi-m_simulated\n\n"
+    "Exit codes: 0 done, 1 the calibration was refused, 2 bad input.",
+)
+
+RecipeName = Annotated[str, typer.Argument(help="A recipe file, or the name of a shipped recipe.")]
+Overrides = Annotated[
+    Optional[list[str]],  # noqa: UP045  typer reads the annotation at run time
+    typer.Option(
+        "--set", metavar="PATH=VALUE", help="Override one value: steps.2.inlier='0.2 mm'."
+    ),
+]
+LogFile = Annotated[Path, typer.Argument(help="The run.mcap of a run.")]
+
+
+def main() -> None:
+    """Run the command line; every foreseen mistake is one line and an exit code."""
+    try:
+        app()
+    except FlangeyeError as error:
+        _fail(error)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+def _fail(error: FlangeyeError) -> None:
+    if os.environ.get("FLANGEYE_DEBUG"):
+        traceback.print_exception(error)
+    for line in str(error).splitlines():
+        sys.stderr.write(f"error: {line}\n")
+    sys.exit(error.exit_code)
+
+
+@app.command()
+def run(
+    recipe: RecipeName,
+    archive: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Recordings to run on, for recipes that start with acquire.archive."),
+    ] = None,
+    overrides: Overrides = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for the run's files; default runs/<time>_<recipe>."),
+    ] = None,
+    source: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."
+        ),
+    ] = None,
+    at: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
+    ] = None,
+) -> None:
+    """Run a recipe: a calibration, its log and its report."""
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.registry import load_registry
+    from flangeye.runfolder import RunFolder
+    from flangeye.types import ArchivePath
+
+    registry = load_registry()
+    checked = load_recipe(find_recipe(recipe), registry, overrides or ())
+    replay = _replay(checked, source, at)
+    folder = RunFolder.create(checked.name, out)
+    result = _record(checked, registry, folder, ArchivePath(archive), replay)
+    if result.status == "refused":
+        raise typer.Exit(1)
+
+
+def _replay(recipe: Recipe, source: Path | None, at: str | None) -> Replay | None:
+    from flangeye.errors import StageError
+    from flangeye.replay import replay_from
+    from flangeye.runlog import read_run
+
+    if (source is None) != (at is None):
+        raise StageError("--from and --at go together: --from run.mcap --at solve.svd")
+    if source is None or at is None:
+        return None
+    return replay_from(read_run(source), recipe, at)
+
+
+def _record(
+    recipe: Recipe,
+    registry: Registry,
+    folder: RunFolder,
+    archive: ArchivePath,
+    replay: Replay | None,
+) -> Result:
+    """Run with a log and a progress bar, and say what came of it."""
+    from rich.console import Console
+
+    from flangeye.session import record_run
+    from flangeye.terminal import ProgressBar, print_result
+
+    try:
+        with ProgressBar(Console(stderr=True)) as progress:
+            registry.hooks.register(progress)
+            result = record_run(recipe, registry, folder, archive, replay)
+    except FlangeyeError:
+        if folder.log.exists():
+            sys.stderr.write(f"what was gathered is in {folder.log}\n")
+        raise
+    print_result(Console(), result)
+    typer.echo(f"\n{folder.path}/: report.html  calibration.yaml  result.json  run.mcap")
+    return result
+
+
+@app.command()
+def batch(  # noqa: PLR0913  one argument an option
+    recipe: RecipeName,
+    archives: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Argument(help="Recordings, a session each; none for recipes that simulate."),
+    ] = None,
+    overrides: Overrides = None,
+    grid: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--set-grid", metavar="PATH=A,B,C", help="Run with each value; may be repeated."
+        ),
+    ] = None,
+    repeat: Annotated[Optional[int], typer.Option(min=1, help="Run with so many seeds.")] = None,  # noqa: UP045
+    vary: Annotated[str, typer.Option(help="What --repeat counts up.")] = "seed",
+    workers: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, help="Processes on this machine; default one for each core."),
+    ] = None,
+    scheduler: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="tcp://HOST:PORT", help="A running dask scheduler to use instead."),
+    ] = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for everything; default batches/<recipe>."),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Make each session's report.html.")
+    ] = True,
+) -> None:
+    """Run a recipe over archives, values and seeds, and compare the sessions.
+
+    Finished sessions are not run again. Exit codes: 0 every session gave a calibration, 1 one
+    was refused, failed or crashed, 2 nothing could start.
+    """
+    from rich.console import Console
+
+    from flangeye.batch import Request, run_batch, summary_text
+    from flangeye.registry import load_registry
+
+    request = Request(
+        recipe, tuple(archives or ()), tuple(overrides or ()), tuple(grid or ()), repeat, vary,
+        workers, scheduler, out, report,
+    )  # fmt: skip
+    try:
+        done = run_batch(request, load_registry(), Console(stderr=True))
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped; the same command goes on from here\n")
+        raise typer.Exit(130) from None
+    typer.echo(summary_text(done))
+    if not done.accepted:
+        raise typer.Exit(1)
+
+
+@app.command()
+def check(recipe: RecipeName, overrides: Overrides = None) -> None:
+    """Check a recipe without running it: every mistake, with its line."""
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.registry import load_registry
+
+    path = find_recipe(recipe)
+    checked = load_recipe(path, load_registry(), overrides or ())
+    typer.echo(f"{path}: ok, {len(checked.steps)} steps")
+
+
+@app.command()
+def recipes() -> None:
+    """List the shipped recipes."""
+    from flangeye.recipe import recipe_names
+    from flangeye.yamlfile import read_yaml
+
+    names = recipe_names()
+    width = max(map(len, names), default=0)
+    for name, path in names.items():
+        typer.echo(f"{name:{width}}  {read_yaml(path).data.get('title', '')}")
+
+
+@app.command()
+def stages(
+    name: Annotated[str | None, typer.Argument(help="A stage or part, for its parameters.")] = None,
+) -> None:
+    """List stages and parts; with NAME its parameters, units, defaults and meaning."""
+    from flangeye.catalogue_text import describe_all, describe_one
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    typer.echo(describe_one(registry, name) if name else describe_all(registry))
+
+
+@app.command()
+def plugins() -> None:
+    """List the installed plugins, what each offers, and those that could not be loaded."""
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    for plugin, version in registry.versions().items():
+        offers = sorted(n for n, owner in registry.owners.items() if owner == plugin)
+        typer.echo(f"{plugin} {version}: {', '.join(offers) or 'no stages or parts'}")
+    for plugin, error in registry.broken.items():
+        typer.echo(f"{plugin}: could not be loaded: {type(error).__name__}: {error}")
+
+
+@app.command()
+def schema(
+    result: Annotated[bool, typer.Option("--result", help="The schema of result.json.")] = False,
+    out: Annotated[Optional[Path], typer.Option(help="File to write instead of printing.")] = None,  # noqa: UP045
+) -> None:
+    """Print the JSON Schema of recipes, for editors that check YAML while you type."""
+    import json
+
+    from flangeye.registry import load_registry
+    from flangeye.result import Result
+    from flangeye.schema import header_line, recipe_schema
+
+    document = Result.model_json_schema() if result else recipe_schema(load_registry())
+    text = json.dumps(document, indent=2, ensure_ascii=False)
+    if out is None:
+        typer.echo(text)
+    else:
+        out.write_text(text + "\n", encoding="utf-8")
+    if not result:
+        typer.echo(f"first line of your recipe: {header_line(out)}", err=True)
+
+
+@app.command()
+def show(log: LogFile) -> None:
+    """Say what happened in a run, step by step; also for a run that was killed."""
+    from rich.console import Console
+
+    from flangeye.runlog import read_run
+    from flangeye.terminal import print_log
+
+    print_log(Console(), read_run(log))
+
+
+@app.command()
+def report(
+    log: LogFile,
+    out: Annotated[Path | None, typer.Option(help="Default: report.html beside the log.")] = None,
+) -> None:
+    """Make the HTML report of a run from its log alone."""
+    from flangeye.report import write_report
+    from flangeye.runlog import read_run
+
+    path = out or log.parent / "report.html"
+    write_report(read_run(log), path)
+    typer.echo(path)
+
+
+@app.command()
+def loopback(
+    robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    faults: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--fault",
+            metavar="NAME[=DURATION][@WHEN]",
+            help="Let something go wrong, for example 'freeze=3 s@moving'.",
+        ),
+    ] = None,
+    floor: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Height of a surface to touch, for example '100 mm'."),
+    ] = None,
+    joints: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Where the arm starts, for example '0 -90 90 -90 -90 0 deg'."),
+    ] = None,
+    seed: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(help="Give the arm errors of its joints' zeros, drawn with this seed."),
+    ] = None,
+) -> None:
+    """Be a robot's controller on loopback, for its own driver to connect to."""
+    from flangeye.catalogue import load_model
+    from flangeye.loopback import LoopbackOptions, find_loopback, read_height, read_joints
+    from flangeye.registry import load_registry
+
+    model = load_model("robots", robot)
+    offered = [each for some in load_registry().hooks.hook.flangeye_loopbacks() for each in some]
+    options = LoopbackOptions(
+        robot=model,
+        host=host,
+        joints=read_joints(joints) if joints is not None else None,
+        floor=read_height(floor) if floor is not None else None,
+        faults=tuple(faults or ()),
+        seed=seed,
+    )
+    find_loopback(offered, model).serve(options)
+
+
+if __name__ == "__main__":
+    main()

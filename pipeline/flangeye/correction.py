@@ -1,0 +1,79 @@
+"""Where the flange is, when the arm's own report of it is known to be wrong. Arrays only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.kinematics import Arm
+from flangeye.types import ArmCorrection
+
+Floats = NDArray[np.float64]
+
+REACHED = 1e-9
+"""Joint angles belong to a pose when they reach it this closely [rad, m]."""
+STEPS, LONGEST_STEP = 200, 0.2
+"""Newton steps at most, and the most that a joint moves in each [rad]."""
+
+
+def corrected_flange(
+    base_T_flange: Floats,
+    joints: Floats | None,
+    correction: ArmCorrection | None,
+    arm: Arm | None,
+) -> Floats:
+    """Return the (4, 4) pose of the seen circle, from the pose the arm reports.
+
+    Args:
+        base_T_flange: (4, 4) as reported.
+        joints: (n,) as reported [rad], or None.
+        correction: What is wrong with the arm, if anything.
+        arm: Its kinematics; needed when joint offsets are corrected.
+
+    Raises:
+        ValueError: Joint offsets are to be corrected without kinematics, or the pose is out of
+            the arm's reach.
+    """
+    if correction is None:
+        return base_T_flange
+    pose = np.array(base_T_flange)
+    if correction.joint_offsets is not None:
+        if arm is None or correction.joints is None:
+            raise ValueError("joint offsets need the arm's kinematics and a configuration")
+        angles = follow(arm, pose, correction.joints) if joints is None else joints
+        moved = arm.flange(angles + correction.joint_offsets)
+        pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved
+    pose[:3, 3] += pose[:3, :3] @ correction.tool_offset
+    return pose
+
+
+def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
+    """Return the joint angles (..., n) that reach (..., 4, 4) poses on the branch of ``near``.
+
+    Newton's method in small steps: a configuration leads to its own branch.
+
+    Args:
+        arm: The kinematics.
+        base_T_flange: (..., 4, 4) poses.
+        near: (n,) joint angles to start from [rad].
+
+    Raises:
+        ValueError: It does not get to every pose.
+    """
+    joints = np.broadcast_to(near, (*base_T_flange.shape[:-2], arm.n)).astype(np.float64)
+    for _ in range(STEPS):
+        twist = _twist(base_T_flange, arm.flange(joints))
+        if np.abs(twist).max() < REACHED:
+            return joints
+        step = (np.linalg.pinv(arm.jacobian(joints), rcond=1e-6) @ twist[..., None])[..., 0]
+        longest = np.abs(step).max(axis=-1, keepdims=True)
+        joints = joints + step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
+    raise ValueError("no joint angles near the given ones reach the pose")
+
+
+def _twist(wanted: Floats, reached: Floats) -> Floats:
+    """Return (..., 6) that leads from one pose to another, exact when they are near."""
+    turn = wanted[..., :3, :3] @ np.swapaxes(reached[..., :3, :3], -1, -2)
+    skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
+    axis = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    return np.concatenate([axis, wanted[..., :3, 3] - reached[..., :3, 3]], axis=-1)

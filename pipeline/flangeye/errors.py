@@ -1,0 +1,31 @@
+"""The ways a run ends early, and the exit code each one has.
+
+A message says where, what is wrong, what is allowed and what to do; the command line prints
+it as it is, without a traceback.
+"""
+
+
+class FlangeyeError(Exception):
+    """Anything the user can be told in one line; ``exit_code`` is the process's."""
+
+    exit_code = 2
+
+
+class RecipeError(FlangeyeError):
+    """A recipe is wrong; one ``file:line: path: message`` a line, every mistake at once."""
+
+
+class StageError(FlangeyeError):
+    """A step cannot do its work at all with the input it was given."""
+
+
+class CalibrationRefused(FlangeyeError):
+    """The input was sound, but no answer can be trusted: the reason, and what is missing."""
+
+    exit_code = 1
+
+
+class RunStopped(FlangeyeError):
+    """The person stopped the run (Ctrl-C)."""
+
+    exit_code = 130

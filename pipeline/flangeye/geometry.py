@@ -1,0 +1,163 @@
+"""Rigid-body and least-squares geometry shared by more than one kind of plugin. Arrays only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def hat(v: Floats) -> Floats:
+    """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_exp(phi: Floats) -> Floats:
+    """Return the rotation of a rotation vector, (3,) [rad] -> (3, 3) (Rodrigues)."""
+    angle = float(np.linalg.norm(phi))
+    k = hat(np.asarray(phi, dtype=np.float64))
+    # sin(x)/x and (1 - cos(x))/x^2 without cancellation near zero.
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def rotation_log(rotation: Floats) -> Floats:
+    """Return the rotation vector (3,) [rad] of a (3, 3) rotation, its length at most pi."""
+    q = quaternion_from_rotation(rotation)
+    xyz, w = q[:3], q[3]
+    length = float(np.linalg.norm(xyz))
+    if length < 1e-12:
+        return 2.0 * xyz
+    return np.asarray(xyz / length * 2.0 * np.arctan2(length, w))
+
+
+def quaternion_from_rotation(rotation: Floats) -> Floats:
+    """Return the unit quaternion (4,) xyzw, w >= 0, of a (3, 3) rotation (Bar-Itzhack 2000).
+
+    The dominant eigenvector of a symmetric matrix: stable at every angle, and the nearest
+    rotation where the matrix is not quite orthonormal.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rotation, dtype=np.float64)
+    k = np.array(
+        [
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    q = np.linalg.eigh(k)[1][:, -1]
+    return np.asarray(q if q[3] >= 0 else -q)
+
+
+def rotation_from_quaternion(xyzw: Floats) -> Floats:
+    """Return the (3, 3) rotation of a quaternion (4,) xyzw; it is normalised first."""
+    q = np.asarray(xyzw, dtype=np.float64)
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """Return the (3, 3) rotation Rz(yaw) Ry(pitch) Rx(roll), angles [rad] (URDF, ROS)."""
+    cr, cp, cy = np.cos([roll, pitch, yaw])
+    sr, sp, sy = np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rpy_from_rotation(rotation: Floats) -> Floats:
+    """Return (roll, pitch, yaw) [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
+
+
+def rigid(rotation: Floats, translation: Floats) -> Floats:
+    """Return the (4, 4) matrix of a (3, 3) rotation and a (3,) translation [m]."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, translation
+    return out
+
+
+def basis_of_plane(normal: Floats) -> Floats:
+    """Return (3, 3) whose rows are two in-plane axes and the unit normal, right-handed."""
+    n = np.asarray(normal, dtype=np.float64) / np.linalg.norm(normal)
+    helper = np.eye(3)[np.argmin(np.abs(n))]
+    u = np.cross(helper, n)
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(n, u), n])
+
+
+def kabsch(source: Floats, target: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:
+    """Return R (3, 3), t (3,) minimising sum w |R source + t - target|^2, for (N, 3) points.
+
+    Umeyama (1991) with scale one: the paper's equations (8) to (10), with the sign taken from
+    det(U) det(V), which also holds for coplanar points, where det of the covariance is zero.
+    """
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    mean_s, mean_t = w @ source, w @ target
+    cross = (target - mean_t).T @ (w[:, None] * (source - mean_s))
+    u, _, vt = np.linalg.svd(cross)
+    sign = np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
+    rotation = u @ sign @ vt
+    return rotation, mean_t - rotation @ mean_s
+
+
+def adjoint_shift(offset: Floats) -> Floats:
+    """Return the (6, 6) map of a perturbation (phi, tau) to another reference point.
+
+    With ``tau`` taken about p, ``adjoint_shift(q - p) @ (phi, tau)`` is taken about q:
+    ``tau_q = tau_p + phi x (q - p)``.
+    """
+    out = np.eye(6)
+    out[3:, :3] = -hat(offset)
+    return out
+
+
+def covariance_at(covariance: Floats, about: Floats, points: Floats) -> Floats:
+    """Return the (N, 3, 3) covariance of mapped points from a transform's (6, 6) covariance.
+
+    Args:
+        covariance: Order (rotation, translation), left perturbation, translation about ``about``.
+        about: (3,) reference point [m].
+        points: (N, 3) in the parent frame [m].
+    """
+    jacobian = np.zeros((len(points), 3, 6))
+    jacobian[:, :, :3] = -hat(np.asarray(points) - about)
+    jacobian[:, :, 3:] = np.eye(3)
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
+
+
+def kabsch_covariance(target: Floats, sigma: float) -> Floats:
+    """Return the (6, 6) covariance of :func:`kabsch`, translation about the targets' centroid.
+
+    Every coordinate of every pair carries independent noise of ``sigma`` [m], on either side.
+    Rotation and translation are then independent, and this is the Cramér-Rao bound
+    (Fitzpatrick, West & Maurer 1998).
+
+    Raises:
+        numpy.linalg.LinAlgError: The targets lie on a line: a rotation is not determined.
+    """
+    levers = hat(target - target.mean(axis=0))
+    out = np.zeros((6, 6))
+    out[:3, :3] = sigma**2 * np.linalg.inv(np.einsum("nki,nkj->ij", levers, levers))
+    out[3:, 3:] = sigma**2 / len(target) * np.eye(3)
+    return out

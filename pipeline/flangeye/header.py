@@ -1,0 +1,79 @@
+"""The sections of a recipe above its steps, as people write them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from flangeye.units import Length
+
+
+class Section(BaseModel):
+    """Base of a recipe's sections."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
+
+
+class RobotSection(Section):
+    """Which arm."""
+
+    model: str = Field(description="A model of data/robots, or a .yaml file of your own.")
+
+
+class ScannerSection(Section):
+    """Which scanner."""
+
+    model: str = Field(description="A model of data/scanners, or a .yaml file of your own.")
+
+
+class SphereSection(Section):
+    """A calibration sphere that the flange carries."""
+
+    diameter: Length = Field(gt=0)
+    centre: tuple[Length, Length, Length] = Field(
+        description="Where its centre is in the flange frame: origin in the face, z outwards."
+    )
+
+
+class FeatureSection(Section):
+    """Which circle to look for; by default the flange the robot's file names."""
+
+    standard: str | None = Field(
+        None, description="Designation such as ISO 9409-1-50-4-M6, or a .yaml file of your own."
+    )
+    wrist_circle: Length | None = Field(
+        None, description="Diameter of the wrist's outer circle, for scanners too coarse for a rim."
+    )
+    sphere: SphereSection | None = Field(
+        None, description="A calibration sphere on the flange, to be looked for in its place."
+    )
+
+
+class WorkspaceSection(Section):
+    """Where the work is, in the robot's base; errors are reported over this box."""
+
+    centre: tuple[Length, Length, Length]
+    size: tuple[Length, Length, Length]
+
+
+class LogSection(Section):
+    """What goes into run.mcap besides the results, which always do."""
+
+    clouds: Literal["preview", "full"] = Field(
+        "preview", description="Raw scans: thinned for viewing, or whole, to segment again later."
+    )
+
+
+class Header(Section):
+    """A recipe, its steps not yet checked."""
+
+    title: str = Field(description="One line for people.")
+    description: str = Field("", description="More lines for people.")
+    robot: RobotSection | None = None
+    scanner: ScannerSection | None = None
+    feature: FeatureSection = FeatureSection()
+    workspace: WorkspaceSection | None = None
+    seed: int = Field(0, ge=0, description="The only source of randomness.")
+    log: LogSection = LogSection()
+    steps: list[Any] = Field(min_length=1, description="Stages in order, each with parameters.")

@@ -1,0 +1,254 @@
+"""Read a recipe: YAML in, checked steps out, every mistake at once with its line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from flangeye import types as t
+from flangeye.catalogue import (
+    Flange,
+    FlangeStandard,
+    RobotModel,
+    ScannerModel,
+    Sphere,
+    flange_of,
+    load_model,
+    load_standard,
+    read_model,
+    wrist_circle_of,
+)
+from flangeye.errors import RecipeError
+from flangeye.explain import sentence
+from flangeye.header import FeatureSection, Header
+from flangeye.overrides import apply_override
+from flangeye.registry import PluginNotFoundError, Registry
+from flangeye.shipped import shipped
+from flangeye.stage import Params, Part, Stage
+from flangeye.steps import SECTIONS, Step, StepOrder
+from flangeye.yamlfile import Document, parse_yaml, read_yaml
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe that was checked whole and can run.
+
+    Attributes:
+        name: File name without its suffix.
+        header: The sections, as written.
+        steps: The checked steps.
+        context: What stages may ask for by type: robot, scanner, flange, sphere, workspace, seed.
+        text: The recipe as the person wrote it.
+    """
+
+    name: str
+    header: Header
+    steps: tuple[Step, ...]
+    context: dict[type, Any]
+    text: str
+
+    def resolved(self) -> str:
+        """Return the recipe as YAML with every default and override written out."""
+        data = self.header.model_dump(mode="json", exclude_none=True)
+        data["steps"] = [
+            {step.stage.name: step.params.model_dump(mode="json", exclude_none=True)}
+            if step.params
+            else step.stage.name
+            for step in self.steps
+        ]
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def recipe_names() -> dict[str, Path]:
+    """Return the shipped recipes: name -> path, sorted."""
+    root = shipped("recipes")
+    found = {str(p.relative_to(root).with_suffix("")): p for p in root.rglob("*.yaml")}
+    return dict(sorted(found.items()))
+
+
+def find_recipe(name: str) -> Path:
+    """Return the path of a recipe given as a path or as a shipped name.
+
+    Raises:
+        RecipeError: Neither exists; names the nearest shipped recipes.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    known = recipe_names()
+    if name in known:
+        return known[name]
+    if path.suffix in (".yaml", ".yml") or path.is_dir():
+        raise RecipeError(f"{name}: no such recipe file")
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(near)}?" if near else "'flangeye recipes' lists them"
+    raise RecipeError(f"no recipe '{name}'; {hint}")
+
+
+def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
+    """Read and check a recipe without running it.
+
+    Args:
+        path: The YAML file.
+        registry: The plugins on offer.
+        overrides: ``steps.2.inlier=0.2 mm`` and the like, validated as if written in the file.
+
+    Raises:
+        RecipeError: Names every mistake found, not only the first.
+    """
+    document = read_yaml(path)
+    return _Checker(document, registry, path.parent).check(path.stem, path.read_text(), overrides)
+
+
+def parse_recipe(text: str, name: str, registry: Registry) -> Recipe:
+    """Check a recipe given as text, as a log holds it; see :func:`load_recipe`."""
+    return _Checker(parse_yaml(text, name), registry, Path()).check(name, text, ())
+
+
+class _Checker:
+    """Collects every mistake of one recipe; also the context of its validation."""
+
+    def __init__(self, document: Document, registry: Registry, folder: Path) -> None:
+        self.folder = folder
+        self._document = document
+        self._registry = registry
+        self._overridden: list[tuple[Hashable, ...]] = []
+        self._mistakes: list[str] = []
+
+    def part(self, name: str) -> Part:
+        """Return a part by name; parameters that choose parts ask here."""
+        return self._registry.part(name)
+
+    def check(self, name: str, text: str, overrides: Sequence[str]) -> Recipe:
+        data = self._document.data
+        if not isinstance(data, dict):
+            raise RecipeError(
+                f"{self._document.name}:1: a recipe is a mapping with 'title' and 'steps'"
+            )
+        self._overridden = [apply_override(data, override) for override in overrides]
+        header = self._header(data)
+        context = self._context(header) if header else dict.fromkeys(SECTIONS)
+        entries = data.get("steps")
+        steps = self._steps(entries if isinstance(entries, list) else [], context)
+        if self._mistakes or header is None:
+            raise RecipeError("\n".join(self._mistakes))
+        return Recipe(name, header, tuple(steps), context, text)
+
+    def complain(self, keys: Sequence[Hashable], message: str) -> None:
+        """Note one mistake at a path of keys."""
+        overridden = any(tuple(keys[: len(path)]) == path for path in self._overridden)
+        source = "--set " if overridden else f"{self._document.name}:{self._document.line(keys)}: "
+        self._mistakes.append(f"{source}{'.'.join(map(str, keys))}: {message}")
+
+    def _header(self, data: dict[Hashable, Any]) -> Header | None:
+        try:
+            return Header.model_validate(data)
+        except ValidationError as error:
+            self._explain((), error, Header)
+            return None
+
+    def _context(self, header: Header) -> dict[type, Any]:
+        context: dict[type, Any] = {t.Seed: header.seed}
+        if header.workspace:
+            context[t.Box] = t.Box(header.workspace.centre, header.workspace.size)  # type: ignore[arg-type]
+        if sphere := header.feature.sphere:
+            context[Sphere] = Sphere(radius=sphere.diameter / 2, centre_in_flange=sphere.centre)
+        for kind, cls, section in (
+            ("robots", RobotModel, header.robot),
+            ("scanners", ScannerModel, header.scanner),
+        ):
+            try:
+                if section:
+                    context[cls] = load_model(kind, section.model, self.folder)  # type: ignore[arg-type]
+            except RecipeError as error:
+                self.complain((kind[:-1], "model"), str(error))
+        try:
+            if RobotModel in context:
+                context[Flange] = self._flange(header.feature, context[RobotModel])
+        except RecipeError as error:
+            self.complain(("feature",), str(error))
+        return context
+
+    def _flange(self, feature: FeatureSection, robot: RobotModel) -> Flange:
+        if feature.standard and feature.wrist_circle:
+            raise RecipeError("give either a standard or a wrist_circle, not both")
+        if feature.sphere and feature.wrist_circle:
+            raise RecipeError("give either a sphere or a wrist_circle, not both")
+        if feature.wrist_circle:
+            return wrist_circle_of(robot, feature.wrist_circle)
+        designation = feature.standard or robot.flange.standard
+        if designation.endswith((".yaml", ".yml")):
+            return flange_of(robot, read_model(self.folder / designation, FlangeStandard))
+        return flange_of(robot, load_standard(designation))
+
+    def _steps(self, entries: list[Any], context: dict[type, Any]) -> list[Step]:
+        order = StepOrder(self.complain, context)
+        steps = []
+        for index, entry in enumerate(entries):
+            named = self._named(index, entry)
+            if named is None:
+                continue
+            name, raw = named
+            stage = self._stage(index, name)
+            order.visit(index, name, stage)
+            params = self._params(index, stage, raw) if stage else None
+            if stage and (params or stage.params is None):
+                steps.append(Step(index, stage, params))
+        order.finish()
+        return steps
+
+    def _named(self, index: int, entry: Any) -> tuple[str, Any] | None:
+        if isinstance(entry, str):
+            return entry, {}
+        if isinstance(entry, dict) and len(entry) == 1:
+            ((name, raw),) = entry.items()
+            return name, {} if raw is None else raw
+        self.complain(
+            ("steps", index), "a step is a stage's name, or one mapping {name: parameters}"
+        )
+        return None
+
+    def _stage(self, index: int, name: str) -> Stage | None:
+        try:
+            return self._registry.stage(name)
+        except PluginNotFoundError as error:
+            self.complain(("steps", index), str(error))
+            return None
+
+    def _params(self, index: int, stage: Stage, raw: Any) -> Params | None:
+        at = ("steps", index, stage.name)
+        if stage.params is None:
+            if raw:
+                self.complain(at, f"{stage.name} takes no parameters")
+            return None
+        if not isinstance(raw, dict):
+            self.complain(at, "parameters are a mapping, for example {inlier: 0.2 mm}")
+            return None
+        try:
+            return stage.params.model_validate(raw, context=self)
+        except ValidationError as error:
+            self._explain(at, error, stage.params)
+            return None
+
+    def _explain(
+        self, at: tuple[Hashable, ...], error: ValidationError, model: type[BaseModel]
+    ) -> None:
+        for details in error.errors():
+            keys = (*at, *details["loc"])
+            self.complain(keys, sentence(details, model, self._given(keys, details["input"])))
+
+    def _given(self, keys: Sequence[Hashable], parsed: Any) -> Any:
+        """Return what the person wrote at ``keys``, before any of it was converted."""
+        node = self._document.data
+        for key in keys:
+            try:
+                node = node[key]
+            except (KeyError, IndexError, TypeError):
+                return parsed
+        return node

@@ -1,0 +1,229 @@
+"""Write a run to MCAP as it happens; a hook implementation, so no stage can forget to log.
+
+Channels (``N.stage`` is a step's label, such as ``2.fit.rim``):
+
+============================  ==========================  ======================================
+topic                         schema                      content
+============================  ==========================  ======================================
+/source                       flangeye.Source (JSON)      where captures come from, and notes
+/capture                      flangeye.Capture (JSON)     id, pose, joints, time, role, grid shape
+/capture/cloud                foxglove.PointCloud         the scan: thinned, or whole
+/pose                         foxglove.PoseInFrame        the flange as the controller reports it
+/tf                           foxglove.FrameTransform     base -> flange, base -> camera
+/step/N.stage                 flangeye.<type> (JSON)      what the step gave, lossless
+/step/N.stage/cloud           foxglove.PointCloud         the points of that value, lossless
+/scene                        foxglove.SceneUpdate        fitted circles
+/rejection                    flangeye.Rejection (JSON)   a capture set aside, and why
+/capture/finished             flangeye.Finished (JSON)    nothing more will come of this capture
+/log                          foxglove.Log                the same for people
+============================  ==========================  ======================================
+
+JSON messages of steps are ``{"capture": id or null, "seconds": s, "value": …}``. Attachments:
+``recipe.yaml``, ``recipe.resolved.yaml`` and, when the run ended, ``result.json``. Every message
+is a chunk of its own and is handed to the operating system at once: a killed run loses nothing
+that was finished.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from flangeye import __version__, foxglove
+from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.hookspecs import hookimpl
+
+PREVIEW_POINTS = 40_000
+
+_ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
+
+
+class LogWriteError(FlangeyeError):
+    """The log cannot be written any further, for example because the disk is full."""
+
+
+def adapter(cls: Any) -> TypeAdapter[Any]:
+    """Return the (cached) JSON reader and writer of a type."""
+    if cls not in _ADAPTERS:
+        _ADAPTERS[cls] = TypeAdapter(cls)
+    return _ADAPTERS[cls]
+
+
+def clouds_of(value: Any) -> dict[str, t.PointCloud]:
+    """Return the point clouds held directly by a flowing value, by field name."""
+    if not dataclasses.is_dataclass(value):
+        return {}
+    held = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return {name: v for name, v in held.items() if isinstance(v, t.PointCloud)}
+
+
+class Recorder:
+    """Writes one run to one MCAP file."""
+
+    def __init__(self, path: Path, recipe: dict[str, str], full_clouds: bool) -> None:
+        """Create the file.
+
+        Args:
+            path: File to create.
+            recipe: Attachment name -> YAML text.
+            full_clouds: Log raw scans whole instead of thinned.
+
+        Raises:
+            LogWriteError: The file cannot be written.
+        """
+        from mcap.writer import CompressionType, Writer
+
+        self._path = path
+        self._full = full_clouds
+        self._channels: dict[str, int] = {}
+        try:
+            self._file = path.open("wb")
+            # One message, one chunk: what was written survives the death of the process.
+            self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.ZSTD)
+            self._writer.start(profile="", library=f"flangeye {__version__}")
+            for name, text in recipe.items():
+                self._attach(name, "application/yaml", text.encode())
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    @hookimpl
+    def flangeye_run_started(self, source: t.Source, total: int | None) -> None:
+        """Log where the captures come from."""
+        self._json("/source", "Source", {"total": total, **_plain(source)})
+        for note in source.notes:
+            self._log(note, foxglove.INFO)
+
+    @hookimpl
+    def flangeye_captured(self, step: str, capture: t.Capture, seconds: float) -> None:
+        """Log the scan and the pose."""
+        cloud, now = capture.cloud, time.time_ns()
+        xyz = cloud.xyz.reshape(-1, 3) if self._full else _thinned(cloud)
+        meta = _plain(capture) | {
+            "shape": list(cloud.xyz.shape),
+            "full": self._full,
+            "step": step,
+            "seconds": seconds,
+        }
+        self._json("/capture", "Capture", meta)
+        self._proto("/capture/cloud", foxglove.point_cloud(cloud, xyz, now))
+        self._proto("/pose", foxglove.pose_in_frame(capture.base_T_flange, now))
+        self._proto("/tf", foxglove.frame_transform(capture.base_T_flange, now))
+
+    @hookimpl
+    def flangeye_stage_finished(
+        self, step: str, capture: str | None, value: Any, seconds: float
+    ) -> None:
+        """Log what a step gave, and a mirror of it for viewers."""
+        topic = f"/step/{step}"
+        for name, cloud in clouds_of(value).items():
+            xyz = cloud.xyz.reshape(-1, 3)
+            self._proto(f"{topic}/{name}", foxglove.point_cloud(cloud, xyz, time.time_ns()))
+        payload = {"capture": capture, "seconds": seconds, "value": _plain(value)}
+        self._json(topic, type(value).__name__, payload)
+        self._mirror(capture, value)
+
+    @hookimpl
+    def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:
+        """Log a capture that was set aside."""
+        self._json("/rejection", "Rejection", _plain(rejection))
+        self._log(
+            f"{rejection.id} set aside by {rejection.stage}: {rejection.reason}", foxglove.WARNING
+        )
+
+    @hookimpl
+    def flangeye_capture_finished(self, capture: str) -> None:
+        """Mark that nothing more will come of a capture."""
+        self._json("/capture/finished", "Finished", {"capture": capture})
+
+    @hookimpl
+    def flangeye_run_finished(self, result: dict[str, Any]) -> None:
+        """Attach the result and close the file."""
+        try:
+            self._attach("result.json", "application/json", dump_result(result).encode())
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self.close()
+
+    def close(self) -> None:
+        """Close the file as it is; a log without its end can still be read."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _mirror(self, capture: str | None, value: Any) -> None:
+        now = time.time_ns()
+        if isinstance(value, t.CircleFeature) and capture is not None:
+            self._proto("/scene", foxglove.circle_scene(capture, value, now))
+        if isinstance(value, t.HandEye):
+            self._proto("/tf", foxglove.frame_transform(value.base_T_camera.transform, now))
+        if isinstance(value, t.Verification):
+            level = foxglove.INFO if value.passed else foxglove.WARNING
+            self._log(value.reason, level)
+
+    def _log(self, line: str, level: int) -> None:
+        self._proto("/log", foxglove.log(line, level, time.time_ns()))
+
+    def _json(self, topic: str, schema: str, payload: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            described = json.dumps({"title": f"flangeye.{schema}", "type": "object"}).encode()
+            schema_id = self._writer.register_schema(f"flangeye.{schema}", "jsonschema", described)
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
+        self._add(topic, json.dumps(payload, allow_nan=False).encode())
+
+    def _proto(self, topic: str, message: Any) -> None:
+        from mcap_protobuf.schema import register_schema
+
+        if topic not in self._channels:
+            schema_id = register_schema(self._writer, type(message))
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
+        self._add(topic, message.SerializeToString())
+
+    def _add(self, topic: str, data: bytes) -> None:
+        now = time.time_ns()
+        try:
+            self._writer.add_message(self._channels[topic], now, data, now)
+            self._file.flush()
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _attach(self, name: str, media_type: str, data: bytes) -> None:
+        now = time.time_ns()
+        self._writer.add_attachment(now, now, name, media_type, data)
+        self._file.flush()
+
+    def _unwritable(self, error: OSError) -> LogWriteError:
+        return LogWriteError(
+            f"{self._path}: cannot be written: {error.strerror or error}; what was written so far "
+            "can be read with 'flangeye show'"
+        )
+
+
+def dump_result(result: dict[str, Any]) -> str:
+    """Return the text of ``result.json``."""
+    return json.dumps(result, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """Return a flowing value as plain JSON data, its clouds left out."""
+    return adapter(type(value)).dump_python(value, mode="json", exclude=set(clouds_of(value)))
+
+
+def _thinned(cloud: t.PointCloud) -> NDArray[np.float32]:
+    """Return at most :data:`PREVIEW_POINTS` finite points, spread evenly."""
+    flat = cloud.xyz.reshape(-1, 3)
+    if cloud.organised:
+        step = max(1, int(np.ceil(np.sqrt(len(flat) / PREVIEW_POINTS))))
+        flat = cloud.xyz[::step, ::step].reshape(-1, 3)
+    else:
+        flat = flat[:: max(1, len(flat) // PREVIEW_POINTS)]
+    return flat[np.isfinite(flat).all(axis=1)]

@@ -1,0 +1,97 @@
+"""Run from a log: what the steps before a given one gave is read back instead of done again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.recipe import Recipe
+from flangeye.runlog import RunLog
+from flangeye.stage import KINDS
+
+_ORDER = list(KINDS)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A log, and where in the recipe to start.
+
+    Attributes:
+        log: The log.
+        at: Index of the first step to do again.
+        kind: Kind of that step.
+    """
+
+    log: RunLog
+    at: int
+    kind: str
+
+    @property
+    def source(self) -> t.Source:
+        """Where the logged captures came from."""
+        return self.log.source or t.Source(fingerprint="")
+
+    def stream(self) -> t.Captures | t.Observations:
+        """Return what the log gives to the step ``at``.
+
+        Raises:
+            StageError: The log does not hold it.
+        """
+        if self.kind == "acquire":
+            raise StageError("--at the acquire step: that is the whole recipe; leave out --from")
+        if self.kind == "segment":
+            return self._scans()
+        if self.kind == "fit":
+            captures = [capture for capture, _ in self.log.flange_clouds()]
+            return t.Captures(captures, self.source, len(captures))
+        observations = self.log.observations()
+        return t.Observations(observations, self.source, len(observations))
+
+    def _scans(self) -> t.Captures:
+        if not self.log.has_full_clouds:
+            raise StageError(
+                f"{self.log.path}: holds thinned scans only, which cannot be segmented again; "
+                "start --at a later step, or record with log: {clouds: full}"
+            )
+        return t.Captures(self.log.captures(), self.source, len(self.log.poses))
+
+    def segmented(self) -> dict[str, t.FlangeCloud] | None:
+        """Return the segmented flanges by capture, when segmenting is not done again."""
+        if self.kind != "fit":
+            return None
+        return {capture.id: flange for capture, flange in self.log.flange_clouds()}
+
+    def views(self) -> t.Views:
+        """Return the verification views, when they are not segmented again."""
+        again = self.kind in ("segment", "fit")
+        return t.Views() if again else self.log.views()
+
+    def rejections(self) -> list[t.Rejection]:
+        """Return the captures that were set aside by the steps that are not done again."""
+        earlier = _ORDER[: _ORDER.index(self.kind)]
+        return [r for r in self.log.rejections if r.stage.partition(".")[0] in earlier]
+
+    def calibration(self, stage: str) -> t.HandEye:
+        """Return what ``stage`` gave.
+
+        Raises:
+            StageError: The run ended before.
+        """
+        found = self.log.calibration(stage)
+        if found is None:
+            raise StageError(f"{self.log.path}: ended before {stage}; use --at {stage}")
+        return found
+
+
+def replay_from(log: RunLog, recipe: Recipe, at: str) -> Replay:
+    """Return the replay that starts at the step ``at``: its index, its name or its label.
+
+    Raises:
+        StageError: There is no such step; names those there are.
+    """
+    for step in recipe.steps:
+        if at in (str(step.index), step.stage.name, step.label):
+            return Replay(log, step.index, step.stage.kind)
+    known = ", ".join(step.stage.name for step in recipe.steps)
+    raise StageError(f"--at {at}: the recipe has no such step; its steps are {known}")

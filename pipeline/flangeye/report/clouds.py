@@ -1,0 +1,147 @@
+"""The segmented flange and the fitted circle of a few telling captures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.foxglove import circle_lines
+from flangeye.geometry import basis_of_plane
+from flangeye.report.facts import Facts
+from flangeye.report.plot import (
+    CIRCLE,
+    DIVERGING,
+    Floats,
+    Trace,
+    figure3d,
+    lines,
+    packed,
+    scatter3d,
+    thinned,
+)
+from flangeye.report.units import millimetres, percent
+
+CLOUD_POINTS = 4_000
+"""Points of one panel; three panels and the cell together stay below 20,000."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One capture's cloud and fit.
+
+    Attributes:
+        id: Of the capture.
+        why: Why this one is shown.
+        facts: Name and value, for the caption.
+        figure: For plotly, in the circle's own axes.
+    """
+
+    id: str
+    why: str
+    facts: list[tuple[str, str]]
+    figure: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One capture's cloud in the axes of its circle: z along the normal, (N, 3) [m]."""
+
+    id: str
+    xyz: Floats
+    circle: t.CircleFeature
+
+    @property
+    def plane_rms(self) -> float:
+        """Root mean square distance of the points from the fitted plane [m]."""
+        return float(np.sqrt(np.mean(self.xyz[:, 2] ** 2)))
+
+
+def cloud_panels(facts: Facts) -> list[Panel]:
+    """Return the captures with the smallest, the median and the largest error."""
+    fits = fits_of(facts)
+    residuals = facts.residuals
+    name = "residual" if residuals else "distance from the plane"
+    if residuals:
+        fits = [fit for fit in fits if fit.id in residuals]
+    ranked = sorted(fits, key=lambda fit: residuals.get(fit.id, fit.plane_rms))
+    chosen = _telling(ranked, name)
+    if not chosen:
+        return []
+    limit = _colour_limit([fit for fit, _ in chosen])
+    return [_panel(fit, why, limit, facts) for fit, why in chosen]
+
+
+def _colour_limit(fits: list[Fit]) -> float:
+    """Return the distance [m] at the ends of the common colours.
+
+    The median of the panels: one fit that is far off shows as plain colour and leaves the
+    others readable.
+    """
+    extremes = [float(np.quantile(np.abs(fit.xyz[:, 2]), 0.98)) for fit in fits]
+    return max(float(np.median(extremes)), 1e-5)
+
+
+def fits_of(facts: Facts) -> list[Fit]:
+    """Return every capture that has both a flange cloud and a circle with a normal."""
+    log = facts.log
+    flanges = {e.capture: e.value for e in log.of_kind("segment")}
+    fits = []
+    for entry in log.of_kind("fit"):
+        flange, circle = flanges.get(entry.capture), entry.value
+        if isinstance(flange, t.FlangeCloud) and isinstance(circle, t.CircleFeature):
+            if circle.normal is None or len(flange.cloud.xyz) == 0:
+                continue
+            axes = basis_of_plane(circle.normal)
+            xyz = (flange.cloud.xyz.astype(np.float64) - circle.centre) @ axes.T
+            fits.append(Fit(str(entry.capture), xyz, circle))
+    return fits
+
+
+def _telling(ranked: list[Fit], name: str) -> list[tuple[Fit, str]]:
+    if not ranked:
+        return []
+    places = {0: f"smallest {name}", len(ranked) // 2: f"median {name}"}
+    places[len(ranked) - 1] = f"largest {name}" if len(ranked) > 1 else "the only capture"
+    return [(ranked[place], why) for place, why in sorted(places.items())]
+
+
+def _panel(fit: Fit, why: str, limit: float, facts: Facts) -> Panel:
+    shown = thinned(fit.xyz, CLOUD_POINTS)
+    figure = figure3d([_cloud(shown, limit), *_fitted(fit)], eye=(1.1, -1.3, 1.3))
+    figure["layout"]["showlegend"] = False
+    figure["layout"]["scene"]["domain"] = {"y": [0.2, 1.0]}  # room for the colour bar
+    return Panel(fit.id, why, _caption(fit, len(shown), facts), figure)
+
+
+def _cloud(xyz: Floats, limit: float) -> Trace:
+    bar = {
+        "orientation": "h", "thickness": 8, "len": 0.8, "y": 0, "yanchor": "bottom",
+        "title": {"text": "distance from the plane [mm]", "side": "bottom", "font": {"size": 12}},
+        "tickfont": {"size": 11},
+    }  # fmt: skip
+    marker = {
+        "size": 1.8, "color": packed(xyz[:, 2] * 1e3), "colorscale": DIVERGING,
+        "cmin": -limit * 1e3, "cmax": limit * 1e3, "colorbar": bar,
+    }  # fmt: skip
+    return scatter3d(xyz, "markers", marker=marker, name="flange")
+
+
+def _fitted(fit: Fit) -> list[Trace]:
+    axes = basis_of_plane(fit.circle.normal)  # type: ignore[arg-type]
+    drawn = [(line - fit.circle.centre) @ axes.T for line in circle_lines(fit.circle)]
+    return [lines(drawn, CIRCLE, 5, name="fitted circles and normal")]
+
+
+def _caption(fit: Fit, shown: int, facts: Facts) -> list[tuple[str, str]]:
+    observation = next((o for o in facts.measured if o.id == fit.id), None)
+    rows = []
+    if fit.id in facts.residuals:
+        used = "used" if observation and observation.used else "not used"
+        rows.append(("Residual", f"{millimetres(facts.residuals[fit.id])} mm ({used})"))
+    rows.append(("Points", f"{len(fit.xyz):,} ({shown:,} shown)".replace(",", "\u202f")))
+    rows.append(("From the plane", f"{millimetres(fit.plane_rms)} mm rms"))
+    rows += [(f"Radius, {name}", f"{millimetres(x)} mm") for name, x in fit.circle.radii.items()]
+    return [*rows, ("Rim seen", percent(fit.circle.arc_coverage))]

@@ -1,0 +1,160 @@
+"""What a log lets us say, in the shape of ``result.json``, whether or not the run came to its end.
+
+A finished run brings its own result. For a run that was killed the same document is put together
+from what was logged, with the same functions, so that everything after this has one case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flangeye import result as r
+from flangeye import types as t
+from flangeye.runlog import RunLog
+from flangeye.units import parse_quantity
+from flangeye.yamlfile import parse_yaml
+
+INCOMPLETE = "incomplete"
+UNSOLVED = "the run ended before the solver"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """One run, finished or not.
+
+    Attributes:
+        log: What was logged.
+        result: The run's own result, or what the log allows to say.
+        recipe: The resolved recipe, or an empty text.
+    """
+
+    log: RunLog
+    result: r.Result
+    recipe: str
+
+    @property
+    def estimate(self) -> tuple[str, r.TransformResult] | None:
+        """Name and value of the transform that was estimated, if the solver came so far."""
+        return next(iter(self.result.transforms.items()), None)
+
+    @property
+    def base_T_camera(self) -> t.Array | None:
+        """(4, 4) the camera's pose in the base, where that is what was estimated."""
+        found = self.result.transforms.get("base_T_camera")
+        return None if found is None else np.array(found.matrix)
+
+    @property
+    def measured(self) -> list[r.ObservationResult]:
+        """Poses whose circle was fitted, in the order in which they were captured."""
+        order = {capture: i for i, capture in enumerate(self.log.poses)}
+        fitted = [o for o in self.result.observations if o.centre_in_camera is not None]
+        return sorted(fitted, key=lambda o: order.get(o.id, len(order)))
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Residual by pose [m]; empty without an estimate, where they mean nothing."""
+        if self.estimate is None:
+            return {}
+        return {o.id: o.residual for o in self.measured if o.residual is not None}
+
+    @property
+    def set_aside(self) -> list[r.ObservationResult]:
+        """Captures that some stage or the solver decided not to use."""
+        return [
+            o
+            for o in self.result.observations
+            if not o.used and (o.centre_in_camera is None or self.estimate is not None)
+        ]
+
+
+def facts_of(log: RunLog) -> Facts:
+    """Return what ``log`` lets us say."""
+    attached = log.attachments.get("recipe.resolved.yaml", log.attachments.get("recipe.yaml", b""))
+    recipe = attached.decode("utf-8", "replace")
+    raw = log.result
+    result = _so_far(log, recipe) if raw is None else r.Result.model_validate(raw)
+    return Facts(log, result, recipe)
+
+
+def _so_far(log: RunLog, recipe: str) -> r.Result:
+    """Return the result a killed run would have had, as far as it came."""
+    source = log.source or t.Source(fingerprint="")
+    calibration = log.calibration()
+    pairs = calibration.pairs if calibration else _unsolved(log.observations())
+    header = parse_yaml(recipe, "recipe").data if recipe else {}
+    box = r.workspace_of(source, _box(header), pairs)
+    verifications = {e.step: e.value for e in log.of_kind("verify")}
+    return r.Result(
+        title=str(header.get("title", log.path.name)),
+        status=INCOMPLETE,
+        method=calibration.method if calibration else None,
+        transforms=r.transforms_result(calibration),
+        observations=r.observations_result(pairs, log.rejections),
+        workspace=r.workspace_result(calibration, box) if calibration and box else None,
+        holdout=r.holdout_result(verifications),
+        verifications={step: _verification(found) for step, found in verifications.items()},
+        truth=_truth(source, calibration, box),
+        timing=_timing(log),
+        provenance=_provenance(source, calibration, header, recipe),
+    )
+
+
+def _unsolved(observations: Sequence[t.Observation]) -> list[t.Pair]:
+    return [t.Pair(o, np.zeros(3), used=False, reason=UNSOLVED) for o in observations]
+
+
+def _box(header: dict[str, Any]) -> t.Box | None:
+    """Return the box of the recipe's ``workspace`` section."""
+    section = header.get("workspace")
+    if not section:
+        return None
+    centre, size = ([parse_quantity(x, "length") for x in section[k]] for k in ("centre", "size"))
+    return t.Box(np.array(centre), np.array(size))
+
+
+def _verification(found: t.Verification) -> r.VerificationResult:
+    return r.VerificationResult(
+        passed=found.passed,
+        reason=found.reason,
+        figures=dict(found.figures),
+        errors=dict(found.errors),
+    )
+
+
+def _truth(
+    source: t.Source, calibration: t.HandEye | None, box: t.Box | None
+) -> r.TruthResult | None:
+    if source.truth is None or calibration is None or box is None:
+        return None
+    return r.truth_result(calibration.base_T_camera.transform, source.truth.base_T_camera, box)
+
+
+def _timing(log: RunLog) -> dict[str, r.StageTiming]:
+    spent: dict[str, list[float]] = {}
+    for meta in log.poses.values():
+        spent.setdefault(meta["step"], []).append(meta["seconds"])
+    for entry in log.entries:
+        spent.setdefault(entry.step, []).append(entry.seconds)
+    return {
+        step: r.StageTiming(seconds=sum(each), calls=len(each))
+        for step, each in sorted(spent.items())
+    }
+
+
+def _provenance(
+    source: t.Source, calibration: t.HandEye | None, header: dict[str, Any], recipe: str
+) -> r.Provenance:
+    notes = [*source.notes, *(calibration.notes if calibration else ())]
+    return r.Provenance(
+        versions={},  # the machine that reports need not be the one that ran
+        plugins={},
+        recipe="",
+        recipe_hash=r.sha256(recipe),
+        input_hash=source.fingerprint,
+        seed=int(header.get("seed", 0)),
+        notes=notes,
+    )

@@ -1,0 +1,31 @@
+"""SI numbers as people read them in a report: millimetres, degrees, seconds."""
+
+from __future__ import annotations
+
+import math
+
+
+def millimetres(metres: float) -> str:
+    """Return a length [m] in mm without its unit: to a micrometre where that says something."""
+    value = metres * 1e3
+    decimals = 3 if abs(value) < 10 else 2 if abs(value) < 100 else 1
+    return f"{value:z.{decimals}f}"
+
+
+def degrees(radians: float) -> str:
+    """Return an angle [rad] in degrees without its unit, to four decimals."""
+    return f"{math.degrees(radians):z.4f}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time [s] with the unit that suits it."""
+    if seconds >= 120:
+        return f"{seconds / 60:.1f} min"
+    if seconds >= 1:
+        return f"{seconds:.2f} s"
+    return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-6 else "0 ms"
+
+
+def percent(share: float) -> str:
+    """Return a share in whole percent."""
+    return f"{share:.0%}"

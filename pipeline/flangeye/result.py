@@ -1,0 +1,280 @@
+"""``result.json``: the public contract of a run. SI units and radians throughout.
+
+The models below are its definition; ``flangeye schema --result`` prints them as JSON Schema. Runs
+of the same recipe, input and seed give the same document bit for bit, ``timing`` aside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from flangeye import __version__
+from flangeye import types as t
+from flangeye.geometry import covariance_at, rotation_log
+
+Vector = list[float]
+Matrix = list[list[float]]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+class TransformResult(_Part):
+    """An estimated transform."""
+
+    matrix: Matrix = Field(description="4x4, maps child coordinates to parent coordinates.")
+    covariance: Matrix = Field(
+        description="6x6, order (rotation [rad], translation [m]), of a left perturbation in the "
+        "parent frame, the translation taken at `about`."
+    )
+    about: Vector = Field(description="Point in the parent frame [m].")
+
+
+class ObservationResult(_Part):
+    """One capture and what became of it; measured values are null when it was set aside early."""
+
+    id: str
+    centre_in_camera: Vector | None = None
+    normal_in_camera: Vector | None = None
+    radii: dict[str, float] | None = None
+    covariance: Matrix | None = Field(None, description="3x3, of the centre [m^2].")
+    arc_coverage: float | None = Field(None, description="Share of the rim that was seen.")
+    clocking: float | None = Field(None, description="Angle of the hole pattern [rad], if seen.")
+    tcp_in_base: Vector | None = None
+    residual: float | None = Field(None, description="Distance of mapped centre and TCP [m].")
+    residual_in_base: Vector | None = Field(None, description="Mapped centre minus TCP [m].")
+    used: bool
+    reason: str | None = Field(None, description="Why it was not used.")
+
+
+class HoldoutResult(_Part):
+    """Errors on poses that took no part in the estimate."""
+
+    folds: int
+    rms: float
+    median: float
+    p95: float
+    figures: dict[str, float] = Field(description="Everything else verify.holdout reports.")
+
+
+class VerificationResult(_Part):
+    """One verify step."""
+
+    passed: bool
+    reason: str
+    figures: dict[str, float]
+    errors: dict[str, float] = Field(description="Per pose, by observation id [m].")
+
+
+class WorkspaceResult(_Part):
+    """Where errors are reported, and the error to expect there."""
+
+    centre: Vector
+    size: Vector
+    predicted_rms: float = Field(description="Root mean square over the box, from the covariance.")
+    predicted_p95: float = Field(description="95 % of the errors over the box are below [m].")
+
+
+class TruthResult(_Part):
+    """Simulation only: what the calibration is really worth."""
+
+    base_T_camera: Matrix
+    error_at_centroid: float = Field(description="At the workspace's centre [m].")
+    rms_over_workspace: float = Field(description="Over the workspace box [m].")
+    rotation_error: float = Field(description="[rad]")
+
+
+class CorrectionResult(_Part):
+    """What is wrong with where the arm says its flange is, estimated with the transforms."""
+
+    tool_offset: Vector = Field(description="The circle's centre in the flange frame [m].")
+    joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
+
+
+class StageTiming(_Part):
+    """What one step took, the steps it pulled from excluded."""
+
+    seconds: float
+    calls: int
+
+
+class Provenance(_Part):
+    """What made this result."""
+
+    versions: dict[str, str]
+    plugins: dict[str, str]
+    recipe: str
+    recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
+    input_hash: str = Field(description="Of everything the captures are made from.")
+    seed: int
+    notes: list[str] = Field(description="What the source and the solver want people to know.")
+
+
+class Result(_Part):
+    """The whole document."""
+
+    format: int = Field(1, description="Version of this contract.")
+    title: str
+    status: str = Field(description="verified, unverified (no verify step) or refused.")
+    refused: str | None = Field(None, description="Why.")
+    method: str | None = Field(None, description="The solve step.")
+    transforms: dict[str, TransformResult]
+    correction: CorrectionResult | None = Field(
+        None, description="The transforms hold for the arm so corrected; null: as it reports."
+    )
+    observations: list[ObservationResult]
+    workspace: WorkspaceResult | None = None
+    holdout: HoldoutResult | None = None
+    verifications: dict[str, VerificationResult]
+    truth: TruthResult | None = None
+    timing: dict[str, StageTiming]
+    provenance: Provenance
+
+
+def transforms_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
+    """Return the section ``transforms``."""
+    if calibration is None:
+        return {}
+    estimate = calibration.base_T_camera
+    return {
+        estimate.transform.name: TransformResult(
+            matrix=estimate.transform.matrix.tolist(),
+            covariance=estimate.covariance.tolist(),
+            about=estimate.about.tolist(),
+        )
+    }
+
+
+def correction_result(calibration: t.HandEye | None) -> CorrectionResult | None:
+    """Return the section ``correction``."""
+    correction = calibration.correction if calibration else None
+    if correction is None:
+        return None
+    offsets = correction.joint_offsets
+    return CorrectionResult(
+        tool_offset=correction.tool_offset.tolist(),
+        joint_offsets=None if offsets is None else offsets.tolist(),
+    )
+
+
+def observations_result(
+    pairs: Sequence[t.Pair], rejections: Sequence[t.Rejection]
+) -> list[ObservationResult]:
+    """Return the section ``observations``: every capture, those set aside early included."""
+    early = [
+        ObservationResult(id=r.id, used=False, reason=f"{r.stage}: {r.reason}") for r in rejections
+    ]
+    return sorted([*map(_observation, pairs), *early], key=lambda o: o.id)
+
+
+def _observation(pair: t.Pair) -> ObservationResult:
+    circle = pair.observation.circle
+    return ObservationResult(
+        id=pair.observation.id,
+        centre_in_camera=circle.centre.tolist(),
+        normal_in_camera=None if circle.normal is None else circle.normal.tolist(),
+        radii=dict(circle.radii),
+        covariance=circle.covariance.tolist(),
+        arc_coverage=circle.arc_coverage,
+        clocking=circle.clocking,
+        tcp_in_base=pair.observation.tcp_in_base.tolist(),
+        residual=float(np.linalg.norm(pair.residual)),
+        residual_in_base=pair.residual.tolist(),
+        used=pair.used,
+        reason=pair.reason,
+    )
+
+
+def workspace_result(calibration: t.HandEye, box: t.Box) -> WorkspaceResult:
+    """Return the error to expect over ``box``, from the estimate's covariance alone."""
+    estimate = calibration.base_T_camera
+    covariances = covariance_at(estimate.covariance, estimate.about, box.grid())
+    return WorkspaceResult(
+        centre=box.centre.tolist(),
+        size=box.size.tolist(),
+        predicted_rms=float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean())),
+        predicted_p95=_p95_of_gaussians(covariances),
+    )
+
+
+def _p95_of_gaussians(covariances: t.Array, draws: int = 400) -> float:
+    """Return the 95th percentile of |x| over zero-mean Gaussians (N, 3, 3), by fixed draws."""
+    unit = np.random.default_rng(0).standard_normal((draws, 3))
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+    return float(np.quantile(np.linalg.norm(roots @ unit.T, axis=1), 0.95))
+
+
+def truth_result(estimate: t.Transform, truth: t.Transform, box: t.Box) -> TruthResult:
+    """Return how far the estimate maps points of the workspace from where they are."""
+    error = estimate.matrix @ truth.inverse().matrix
+
+    def displacement(points: Any) -> Any:
+        return np.linalg.norm(points @ error[:3, :3].T + error[:3, 3] - points, axis=-1)
+
+    return TruthResult(
+        base_T_camera=truth.matrix.tolist(),
+        error_at_centroid=float(displacement(box.centre)),
+        rms_over_workspace=float(np.sqrt((displacement(box.grid()) ** 2).mean())),
+        rotation_error=float(np.linalg.norm(rotation_log(error[:3, :3]))),
+    )
+
+
+def holdout_result(verifications: Mapping[str, t.Verification]) -> HoldoutResult | None:
+    """Return the section ``holdout`` from the step that computed one."""
+    wanted = {"folds", "rms", "median", "p95"}
+    for verification in verifications.values():
+        figures = dict(verification.figures)
+        if wanted <= figures.keys():
+            core = {name: figures.pop(name) for name in wanted}
+            return HoldoutResult(
+                folds=int(core["folds"]), rms=core["rms"], median=core["median"], p95=core["p95"],
+                figures=figures,
+            )  # fmt: skip
+    return None
+
+
+def verifications_result(found: Mapping[str, t.Verification]) -> dict[str, VerificationResult]:
+    """Return the section ``verifications``."""
+    return {
+        step: VerificationResult(
+            passed=v.passed, reason=v.reason, figures=dict(v.figures), errors=dict(v.errors)
+        )
+        for step, v in found.items()
+    }
+
+
+def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair]) -> t.Box | None:
+    """Return the recipe's box, or the source's, or the box around the flange's centres."""
+    if given or source.workspace:
+        return given or source.workspace
+    if not pairs:
+        return None
+    centres = np.array([pair.observation.tcp_in_base for pair in pairs])
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    return t.Box((low + high) / 2, high - low)
+
+
+def sha256(text: str) -> str:
+    """Return the hash of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def library_versions() -> dict[str, str]:
+    """Return the versions of everything that computes."""
+    names = ("numpy", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "pydantic", "mcap")
+    found = {"flangeye": __version__, "python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

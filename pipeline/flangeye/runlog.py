@@ -1,0 +1,241 @@
+"""Read a run's MCAP back, finished or killed half way: for people, and to run again.
+
+Read from front to back with the streaming reader: a file without its end is read as far as its
+last whole message, and there is one way for both.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye import foxglove
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.record import adapter
+
+_TYPES: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        t.FlangeCloud, t.CircleFeature, t.HandEye, t.VerifiedHandEye, t.Verification, t.Observation,
+        t.Seam, t.WeldReport,
+    )
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One value a step gave.
+
+    Attributes:
+        step: Its label, such as ``2.fit.rim``.
+        capture: The capture's id, for steps that run once per capture.
+        seconds: What it took.
+        type: Name of the value's type.
+        value: The value, or plain data when its type is not ours.
+    """
+
+    step: str
+    capture: str | None
+    seconds: float
+    type: str
+    value: Any
+
+    @property
+    def stage(self) -> str:
+        """Name of the stage, such as ``fit.rim``."""
+        return self.step.partition(".")[2]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the stage, such as ``fit``."""
+        return self.stage.partition(".")[0]
+
+
+@dataclass
+class RunLog:
+    """What a log holds, its raw clouds aside (see :meth:`captures`).
+
+    Attributes:
+        path: The file.
+        complete: Whether the run came to its end.
+        attachments: Name -> bytes: the recipe, the result.
+        source: Where the captures came from; None when the run died before.
+        total: How many captures were expected, when known.
+        poses: Capture id -> its metadata, in order of arrival.
+        entries: Every value, in order.
+        rejections: Captures set aside.
+        finished: Ids of the captures that went through.
+        messages: Log lines for people.
+    """
+
+    path: Path
+    complete: bool = False
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    source: t.Source | None = None
+    total: int | None = None
+    poses: dict[str, dict[str, Any]] = field(default_factory=dict)
+    entries: list[Entry] = field(default_factory=list)
+    rejections: list[t.Rejection] = field(default_factory=list)
+    finished: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """The content of ``result.json``, when the run came to its end."""
+        raw = self.attachments.get("result.json")
+        return None if raw is None else json.loads(raw)
+
+    def of_kind(self, kind: str) -> list[Entry]:
+        """Return the values of every step of one kind, in order."""
+        return [entry for entry in self.entries if entry.kind == kind]
+
+    def observations(self) -> list[t.Observation]:
+        """Return one observation for each circle that was fitted, in order."""
+        given = [e.value for e in self.of_kind("acquire") if isinstance(e.value, t.Observation)]
+        fitted = [
+            t.Observation(str(e.capture), e.value, *self._pose(str(e.capture)))
+            for e in self.of_kind("fit")
+            if e.capture in self.poses
+        ]
+        return given + fitted
+
+    def flange_clouds(self) -> Iterator[tuple[t.Capture, t.FlangeCloud]]:
+        """Yield each segmented flange with its capture, whose own cloud is the flange's."""
+        for entry in self.of_kind("segment"):
+            yield self._capture(str(entry.capture), entry.value.cloud), entry.value
+
+    def views(self) -> t.Views:
+        """Return the verification views."""
+        return t.Views(
+            t.VerificationView(capture.id, flange, capture.base_T_flange)
+            for capture, flange in self.flange_clouds()
+            if capture.role == "verification"
+        )
+
+    def calibration(self, stage: str | None = None) -> t.HandEye | None:
+        """Return what ``stage`` gave, or the last calibration of any, if it came so far."""
+        given = [e.value for e in self.entries if isinstance(e.value, t.HandEye)]
+        if stage is not None:
+            given = [e.value for e in self.entries if e.stage == stage]
+        return given[-1] if given else None
+
+    def captures(self) -> Iterator[t.Capture]:
+        """Yield the captures with the clouds that were logged, thinned or whole."""
+        meta: dict[str, Any] = {}
+        for topic, _, data in _messages(self.path):
+            if topic == "/capture":
+                meta = json.loads(data)
+            elif topic == "/capture/cloud":
+                xyz = _decode_cloud(data)
+                if meta["full"]:
+                    xyz = xyz.reshape(meta["shape"])
+                yield self._capture(meta["id"], t.PointCloud(t.CAMERA, xyz))
+
+    @property
+    def has_full_clouds(self) -> bool:
+        """Whether the raw scans were logged whole."""
+        return bool(self.poses) and all(meta["full"] for meta in self.poses.values())
+
+    def _pose(self, capture: str) -> tuple[t.Transform, Any]:
+        meta = self.poses[capture]
+        pose = adapter(t.Transform).validate_python(meta["base_T_flange"])
+        return pose, None if meta["joints"] is None else np.array(meta["joints"])
+
+    def _capture(self, capture: str, cloud: t.PointCloud) -> t.Capture:
+        meta = self.poses[capture]
+        pose, joints = self._pose(capture)
+        return t.Capture(capture, cloud, pose, joints, meta["time_ns"], meta["role"])
+
+
+def read_run(path: Path) -> RunLog:
+    """Read a log, as far as it goes.
+
+    Raises:
+        StageError: The file is missing, empty, or not an MCAP file of ours.
+    """
+    log = RunLog(path)
+    clouds: dict[str, t.PointCloud] = {}
+    for topic, schema, data in _messages(path, log):
+        if schema == "foxglove.PointCloud" and topic.startswith("/step/"):
+            clouds[topic] = t.PointCloud(t.CAMERA, _decode_cloud(data))
+        elif topic == "/log":
+            log.messages.append(_decode_log(data))
+        elif schema.startswith("flangeye."):
+            _take(log, topic, schema.removeprefix("flangeye."), json.loads(data), clouds)
+    if log.source is None and not log.attachments:
+        raise StageError(f"{path}: is an MCAP file, but not a log of flangeye")
+    return log
+
+
+def _take(
+    log: RunLog, topic: str, schema: str, data: dict[str, Any], clouds: dict[str, t.PointCloud]
+) -> None:
+    if topic == "/source":
+        log.total = data.pop("total")
+        log.source = adapter(t.Source).validate_python(data)
+    elif topic == "/capture":
+        log.poses[data["id"]] = data
+    elif topic == "/capture/finished":
+        log.finished.append(data["capture"])
+    elif topic == "/rejection":
+        log.rejections.append(t.Rejection(**data))
+    elif topic.startswith("/step/"):
+        value = _decode_value(topic, schema, data["value"], clouds)
+        step = topic.removeprefix("/step/")
+        log.entries.append(Entry(step, data["capture"], data["seconds"], schema, value))
+
+
+def _decode_value(topic: str, schema: str, data: Any, clouds: dict[str, t.PointCloud]) -> Any:
+    cls = _TYPES.get(schema)
+    if cls is None:
+        return data
+    held = {
+        f.name: clouds[f"{topic}/{f.name}"] for f in fields(cls) if f"{topic}/{f.name}" in clouds
+    }
+    return adapter(cls).validate_python({**data, **held})
+
+
+def _decode_cloud(data: bytes) -> Any:
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+    return foxglove.points_of(PointCloud.FromString(data))
+
+
+def _decode_log(data: bytes) -> str:
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+
+    return str(Log.FromString(data).message)
+
+
+def _messages(path: Path, log: RunLog | None = None) -> Iterator[tuple[str, str, bytes]]:
+    """Yield (topic, schema name, data) until the end or the first damage; fill ``log``."""
+    from mcap.records import Attachment, Channel, Footer, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            for record in StreamReader(file, validate_crcs=True, record_size_limit=size).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = (record.topic, schemas.get(record.schema_id, ""))
+                elif isinstance(record, Message):
+                    yield (*channels[record.channel_id], record.data)
+                elif log is not None and isinstance(record, Attachment):
+                    log.attachments[record.name] = record.data
+                elif log is not None and isinstance(record, Footer):
+                    log.complete = True
+    except OSError as error:
+        raise StageError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except Exception as error:  # damaged bytes can break the parser in any way
+        if not channels:
+            raise StageError(f"{path}: is not an MCAP file") from error

@@ -1,0 +1,235 @@
+"""Run a checked recipe: lazily, one capture at a time.
+
+The solver pulls observations; each pull acquires one capture and takes it through the
+per-capture steps. When the solver stops pulling, nothing more is acquired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from types import NoneType
+from typing import Any, get_args
+
+import pluggy
+
+from flangeye import types as t
+from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
+from flangeye.outcome import Outcome, result_of
+from flangeye.recipe import Recipe
+from flangeye.registry import Registry
+from flangeye.replay import Replay
+from flangeye.result import Result
+from flangeye.steps import Step
+from flangeye.stopwatch import Stopwatch
+
+
+class Runner:
+    """One run of one recipe."""
+
+    def __init__(self, recipe: Recipe, registry: Registry, archive: t.ArchivePath) -> None:
+        self._recipe = recipe
+        self._registry = registry
+        self._hooks: pluggy.HookRelay = registry.hooks.hook
+        self._values: dict[Any, Any] = {
+            t.Box: None, t.ArchivePath: archive, t.Views: t.Views(), **recipe.context
+        }  # fmt: skip
+        self._watch = Stopwatch()
+        self._outcome = Outcome(t.Source(fingerprint=""))
+        self._segmented: dict[str, t.FlangeCloud] | None = None
+        self._refined: list[Step] = []
+
+    @property
+    def accepted(self) -> int:
+        """How many captures have become observations so far."""
+        return len(self._outcome.seen)
+
+    def run(self, replay: Replay | None = None) -> Result:
+        """Run the recipe and return its result.
+
+        Raises:
+            StageError: A step cannot do its work with the input it was given.
+        """
+        try:
+            self._observe(replay)
+            self._solve(replay)
+            self._refine(replay)
+            self._verify()
+            self._weld()
+        except CalibrationRefused as error:
+            self._outcome.refused = str(error)
+        result = result_of(self._outcome, self._recipe, self._registry, self._watch)
+        self._hooks.flangeye_run_finished(result=result.model_dump(mode="json"))
+        return result
+
+    # --- acquire, segment, fit: one capture at a time ------------------------------------------
+
+    def _observe(self, replay: Replay | None) -> None:
+        """Set up the stream of observations; nothing is acquired yet."""
+        stream = replay.stream() if replay else self._call(self._steps("acquire")[0])
+        if replay:
+            self._segmented = replay.segmented()
+            self._values[t.Views] = replay.views()
+            self._outcome.rejections = replay.rejections()
+        self._outcome.source = stream.source
+        self._values[t.Box] = self._values[t.Box] or stream.source.workspace
+        self._hooks.flangeye_run_started(source=stream.source, total=stream.total)
+        observations = (
+            self._logged(stream) if isinstance(stream, t.Observations) else self._fitted(stream)
+        )
+        solvable = t.Observations(observations, stream.source, stream.total)
+        self._outcome.seen = solvable.seen
+        self._values[t.Observations] = solvable
+
+    def _logged(self, stream: t.Observations) -> Iterator[t.Observation]:
+        """Log observations that came ready made: one by one, as if they had been fitted."""
+        step = self._steps("acquire")[0]
+        for observation in stream:
+            self._finished(step, observation.id, observation, 0.0)
+            self._hooks.flangeye_capture_finished(capture=observation.id)
+            yield observation
+
+    def _fitted(self, stream: t.Captures) -> Iterator[t.Observation]:
+        label = self._steps("acquire")[0].label
+        captures = iter(stream)
+        while True:
+            before = self._watch.seconds.get(label, 0.0)
+            with self._watch.timing(label):
+                capture = next(captures, None)
+            if capture is None:
+                return
+            seconds = self._watch.seconds[label] - before
+            self._hooks.flangeye_captured(step=label, capture=capture, seconds=seconds)
+            observation = self._through(capture)
+            self._hooks.flangeye_capture_finished(capture=capture.id)
+            if observation is not None:
+                yield observation
+
+    def _through(self, capture: t.Capture) -> t.Observation | None:
+        """Take one capture through segment and fit; None when set aside or kept for verifying."""
+        flange = self._segment(capture)
+        if flange is None:
+            return None
+        if capture.role == "verification":
+            view = t.VerificationView(capture.id, flange, capture.base_T_flange)
+            self._values[t.Views].append(view)
+            return None
+        circle = self._per_capture("fit", capture.id, {t.FlangeCloud: flange})
+        if circle is None:
+            return None
+        return t.Observation(capture.id, circle, capture.base_T_flange, capture.joints)
+
+    def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
+        if self._segmented is not None:
+            flange = self._segmented[capture.id]
+            self._finished(self._steps("segment")[0], capture.id, flange, 0.0)
+            return flange
+        found: t.FlangeCloud | None = self._per_capture("segment", capture.id, {t.Capture: capture})
+        return found
+
+    def _per_capture(self, kind: str, capture: str, given: Mapping[Any, Any]) -> Any:
+        step = self._steps(kind)[0]
+        value = self._call(step, capture, given)
+        if isinstance(value, t.Rejected):
+            rejection = t.Rejection(capture, step.stage.name, value.reason)
+            self._outcome.rejections.append(rejection)
+            self._hooks.flangeye_capture_rejected(rejection=rejection)
+            return None
+        return value
+
+    # --- solve, verify, weld: once -------------------------------------------------------------
+
+    def _solve(self, replay: Replay | None) -> None:
+        step = self._steps("solve")[0]
+        if replay and replay.at > step.index:
+            list(self._values[t.Observations])  # log them again: the new log stands by itself
+        self._calibrate(step, replay)
+        self._values[t.Solver] = self._solve_subset
+
+    def _refine(self, replay: Replay | None) -> None:
+        for step in self._steps("refine"):
+            self._calibrate(step, replay)
+            self._refined.append(step)
+
+    def _calibrate(self, step: Step, replay: Replay | None) -> None:
+        """Do a step that gives a calibration, or read it back from the log."""
+        if replay and replay.at > step.index:
+            calibration = replay.calibration(step.stage.name)
+            self._finished(step, None, calibration, 0.0)
+        else:
+            calibration = self._call(step)
+        self._values[t.HandEye] = self._outcome.calibration = calibration
+
+    def _solve_subset(self, observations: Sequence[t.Observation]) -> t.HandEye:
+        """Solve a subset, and refine it as far as the calibration has been refined."""
+        subset = t.Observations(observations, self._outcome.source, len(observations))
+        given: dict[Any, Any] = {t.Observations: subset}
+        for step in (self._steps("solve")[0], *self._refined):
+            given[t.HandEye] = step.stage.function(**self._arguments(step, given))
+        calibration: t.HandEye = given[t.HandEye]
+        return calibration
+
+    def _verify(self) -> None:
+        for step in self._steps("verify"):
+            self._outcome.verifications[step.label] = self._call(step)
+        failed = [v.reason for v in self._outcome.verifications.values() if not v.passed]
+        if failed:
+            raise CalibrationRefused("; ".join(failed))
+        calibration = self._outcome.calibration
+        if self._outcome.verifications and calibration is not None:
+            values = {f.name: getattr(calibration, f.name) for f in fields(t.HandEye)}
+            verified = t.VerifiedHandEye(**values, verifications=self._outcome.verifications)
+            self._values[t.VerifiedHandEye] = self._outcome.calibration = verified
+
+    def _weld(self) -> None:
+        for kind, gives in (("seam", t.Seam), ("weld", t.WeldReport)):
+            for step in self._steps(kind):
+                self._values[gives] = self._call(step)
+
+    # --- one call --------------------------------------------------------------------------------
+
+    def _steps(self, kind: str) -> list[Step]:
+        return [step for step in self._recipe.steps if step.stage.kind == kind]
+
+    def _call(
+        self, step: Step, capture: str | None = None, given: Mapping[Any, Any] | None = None
+    ) -> Any:
+        before = self._watch.seconds.get(step.label, 0.0)
+        with self._watch.timing(step.label):
+            value = _guarded(step, self._arguments(step, given or {}))
+        if not isinstance(value, t.Stream):
+            seconds = self._watch.seconds[step.label] - before
+            if not isinstance(value, t.Rejected):
+                self._finished(step, capture, value, seconds)
+        return value
+
+    def _arguments(self, step: Step, given: Mapping[Any, Any]) -> dict[str, Any]:
+        values = {**self._values, **given}
+        arguments = {name: values.get(_bare(need)) for name, need in step.stage.needs.items()}
+        if step.params is not None:
+            arguments["params"] = step.params
+        return arguments
+
+    def _finished(self, step: Step, capture: str | None, value: Any, seconds: float) -> None:
+        self._hooks.flangeye_stage_finished(
+            step=step.label, capture=capture, value=value, seconds=seconds
+        )
+
+
+def _guarded(step: Step, arguments: dict[str, Any]) -> Any:
+    """Call a stage; a mistake inside a plugin becomes one line that names it."""
+    try:
+        return step.stage.function(**arguments)
+    except (FlangeyeError, MemoryError):
+        raise
+    except Exception as error:
+        raise StageError(
+            f"{step.label}: failed with {type(error).__name__}: {error}; this is a mistake in the "
+            "plugin (FLANGEYE_DEBUG=1 shows where)"
+        ) from error
+
+
+def _bare(need: Any) -> Any:
+    """Return X of ``X | None``."""
+    alternatives = [a for a in get_args(need) if a is not NoneType]
+    return alternatives[0] if NoneType in get_args(need) else need

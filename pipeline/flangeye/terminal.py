@@ -1,0 +1,177 @@
+"""What people see in the terminal: progress while a run goes on, and its result."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+
+from flangeye.geometry import rpy_from_rotation
+from flangeye.hookspecs import hookimpl
+from flangeye.result import Result
+from flangeye.types import Rejection, Source
+
+if TYPE_CHECKING:
+    from flangeye.runlog import RunLog
+
+
+class ProgressBar:
+    """Shows captures as they go through; a hook implementation like any other."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("captures", total=None)
+
+    @hookimpl
+    def flangeye_run_started(self, source: Source, total: int | None) -> None:
+        """Start the bar and tell what the source reports."""
+        for note in source.notes:
+            self._console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        self._progress.update(self._task, total=total)
+        self._progress.start()
+
+    @hookimpl
+    def flangeye_capture_rejected(self, rejection: Rejection) -> None:
+        """Say what was set aside, and why."""
+        line = f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}"
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    @hookimpl
+    def flangeye_capture_finished(self, capture: str) -> None:
+        """Move the bar."""
+        self._progress.advance(self._task)
+
+    @hookimpl
+    def flangeye_stage_finished(
+        self, step: str, capture: str | None, value: Any, seconds: float
+    ) -> None:
+        """Name the steps that run once, after the captures."""
+        if capture is None:
+            self._progress.update(self._task, description=step.partition(".")[2])
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        self._progress.stop()
+
+
+def print_result(console: Console, result: Result) -> None:
+    """Print the matrix, how far it can be trusted, and how that is known."""
+    used = sum(o.used for o in result.observations)
+    lines = [result.title, f"{result.status}: {used} of {len(result.observations)} captures used"]
+    for name, estimate in result.transforms.items():
+        lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]
+        lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
+        lines += ["", *_uncertainty(estimate.matrix, np.array(estimate.covariance))]
+    lines += _errors(result)
+    if result.refused:
+        lines += ["", f"refused: {result.refused}"]
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def _uncertainty(matrix: Any, covariance: Any) -> list[str]:
+    std = np.sqrt(np.diag(covariance))
+    rpy = np.degrees(rpy_from_rotation(np.array(matrix)[:3, :3]))
+    return [
+        f"  roll, pitch, yaw   {rpy[0]:.4f}, {rpy[1]:.4f}, {rpy[2]:.4f} deg",
+        "  one sigma          "
+        + ", ".join(f"{x:.4f}" for x in np.degrees(std[:3]))
+        + " deg about base x, y, z; "
+        + ", ".join(f"{x * 1e3:.3f}" for x in std[3:])
+        + " mm at the work",
+    ]
+
+
+def _errors(result: Result) -> list[str]:
+    lines = []
+    if result.workspace:
+        w = result.workspace
+        size = " x ".join(f"{x * 1e3:.0f}" for x in w.size)
+        lines.append(
+            f"  predicted error    {_mm(w.predicted_rms)} rms, 95 % below {_mm(w.predicted_p95)} "
+            f"over the workspace ({size} mm)"
+        )
+    if result.holdout:
+        h = result.holdout
+        lines.append(
+            f"  held-out error     {_mm(h.rms)} rms, {_mm(h.median)} median, "
+            f"95 % below {_mm(h.p95)} ({h.folds} folds over poses)"
+        )
+    if result.truth:
+        t = result.truth
+        lines.append(
+            f"  true error         {_mm(t.rms_over_workspace)} rms over the workspace, "
+            f"{_mm(t.error_at_centroid)} at its centre, {np.degrees(t.rotation_error):.4f} deg"
+        )
+    return lines
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.3f} mm"
+
+
+def print_log(console: Console, log: RunLog) -> None:
+    """Print what happened in a run, step by step."""
+    from rich.table import Table
+
+    state = (
+        "complete" if log.complete else "incomplete: the run ended early; shown as far as it goes"
+    )
+    expected = f" of {log.total}" if log.total else ""
+    _say(console, f"{log.path}: {state}")
+    _say(console, f"{len(log.poses)}{expected} captures arrived, {len(log.finished)} went through")
+    for note in log.source.notes if log.source else ():
+        _say(console, f"note: {note}")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("step", "values", "seconds", "set aside"):
+        table.add_column(column, justify="left" if column == "step" else "right")
+    set_aside = Counter(r.stage for r in log.rejections)
+    for step, poses in _by_acquire_step(log).items():
+        seconds = sum(pose["seconds"] for pose in poses)
+        table.add_row(step, str(len(poses)), f"{seconds:.2f}", "0")
+    for step in dict.fromkeys(entry.step for entry in log.entries):
+        entries = [entry for entry in log.entries if entry.step == step]
+        seconds = sum(entry.seconds for entry in entries)
+        aside = set_aside[entries[0].stage]
+        table.add_row(step, str(len(entries)), f"{seconds:.2f}", str(aside))
+    console.print(table)
+    for rejection in log.rejections:
+        _say(console, f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}")
+    if log.finished and not log.complete:
+        last = [e for e in log.entries if e.capture == log.finished[-1]]
+        after = f", last step {last[-1].step}" if last else ""
+        _say(console, f"last finished capture: {log.finished[-1]}{after}")
+    if log.result:
+        print_result(console, Result.model_validate(log.result))
+
+
+def _by_acquire_step(log: RunLog) -> dict[str, list[dict[str, Any]]]:
+    steps: dict[str, list[dict[str, Any]]] = {}
+    for pose in log.poses.values():
+        steps.setdefault(pose["step"], []).append(pose)
+    return steps
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, markup=False, highlight=False, soft_wrap=True)

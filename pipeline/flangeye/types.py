@@ -1,0 +1,522 @@
+"""The values that flow between stages, and the conventions they follow.
+
+* SI units and radians; time in nanoseconds since the epoch.
+* ``parent_T_child`` maps coordinates in ``child`` to coordinates in ``parent``; points carry the
+  name of the frame they are given in. Frames: ``base`` (robot base), ``flange`` (ISO 9409-1: origin
+  at the centre of the flange's face, z outwards), ``camera`` (scanner, z along the view).
+* Quaternions are xyzw. Covariances of a transform are 6x6, in the order (rotation, translation),
+  of a left perturbation in the parent frame, and say about which point the translation is taken:
+  ``x' = about + Exp(phi) (x - about) + tau``.
+* Everything is frozen, arrays are read-only, and shapes and finiteness are checked here and
+  nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, NewType, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import core_schema
+
+BASE, FLANGE, CAMERA = "base", "flange", "camera"
+
+
+class _AsNestedLists:
+    """Lets pydantic read and write a float64 array as nested JSON lists, bit for bit."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, _handler: Any) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            lambda value: np.asarray(value, dtype=np.float64),
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda a: a.tolist()),
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, _schema: Any, _handler: Any) -> dict[str, Any]:
+        return {"type": "array"}
+
+
+Array = Annotated[NDArray[np.float64], _AsNestedLists]
+FloatArray = NDArray[np.float32] | NDArray[np.float64]
+
+
+class FrameMismatchError(ValueError):
+    """Two values that meet are not expressed in the same frame."""
+
+
+def _frozen(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    """Return a read-only float64 copy of ``value``; refuse another shape or non-finite entries."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} holds values that are not finite")
+    array.setflags(write=False)
+    return array
+
+
+def _freeze(instance: Any, **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        what = f"{type(instance).__name__}.{name}"
+        object.__setattr__(instance, name, _frozen(getattr(instance, name), shape, what))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points in one frame, unorganised (N, 3) or organised (H, W, 3); a missing point is NaN.
+
+    Single precision: at one metre it resolves 0.06 um, a thousandth of the best scanner's noise.
+
+    Attributes:
+        frame: Frame the points are expressed in.
+        xyz: (N, 3) or (H, W, 3) positions [m], float32.
+    """
+
+    frame: str
+    xyz: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        xyz = np.asarray(self.xyz, dtype=np.float32)
+        if xyz.ndim not in (2, 3) or xyz.shape[-1] != 3:
+            raise ValueError(f"a cloud is (N, 3) or (H, W, 3), not {xyz.shape}")
+        view = xyz.view()
+        view.setflags(write=False)
+        object.__setattr__(self, "xyz", view)
+
+    @property
+    def organised(self) -> bool:
+        """Whether neighbours in the array are neighbours in the scanner's image."""
+        return self.xyz.ndim == 3
+
+    def points(self) -> NDArray[np.float32]:
+        """Return the (M, 3) points that are finite."""
+        flat = self.xyz.reshape(-1, 3)
+        return flat[np.isfinite(flat).all(axis=1)]
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, _handler: Any) -> core_schema.CoreSchema:
+        # Points never travel as JSON: the log writes them as foxglove.PointCloud.
+        return core_schema.is_instance_schema(cls)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, _schema: Any, _handler: Any) -> dict[str, Any]:
+        return {"description": "On the channel named like this one with /cloud added."}
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Rigid transform ``parent_T_child``.
+
+    Attributes:
+        parent: Frame the result is expressed in.
+        child: Frame the input is expressed in.
+        matrix: (4, 4) homogeneous matrix, translation in [m].
+    """
+
+    parent: str
+    child: str
+    matrix: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, matrix=(4, 4))
+        rotation = self.matrix[:3, :3]
+        orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        if not orthonormal or np.linalg.det(rotation) < 0 or tuple(self.matrix[3]) != (0, 0, 0, 1):
+            raise ValueError(f"{self.name} is not a rigid transform")
+
+    @property
+    def name(self) -> str:
+        """``parent_T_child``."""
+        return f"{self.parent}_T_{self.child}"
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) rotation ``parent_R_child``."""
+        return self.matrix[:3, :3]
+
+    @property
+    def translation(self) -> NDArray[np.float64]:
+        """(3,) origin of ``child`` in ``parent`` [m]."""
+        return self.matrix[:3, 3]
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Return ``parent_T_other``; refuse frames that do not meet."""
+        self._require(self.child, other.parent)
+        return Transform(self.parent, other.child, self.matrix @ other.matrix)
+
+    def apply(self, xyz: FloatArray) -> NDArray[np.float64]:
+        """Map (..., 3) coordinates in ``child`` to coordinates in ``parent``."""
+        return np.asarray(xyz, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def apply_cloud(self, cloud: PointCloud) -> PointCloud:
+        """Return the cloud expressed in ``parent``; refuse a cloud in another frame."""
+        self._require(self.child, cloud.frame)
+        return PointCloud(self.parent, self.apply(cloud.xyz).astype(np.float32))
+
+    def inverse(self) -> Transform:
+        """Return ``child_T_parent``."""
+        inverted = np.eye(4)
+        inverted[:3, :3] = self.rotation.T
+        inverted[:3, 3] = -self.rotation.T @ self.translation
+        return Transform(self.child, self.parent, inverted)
+
+    def _require(self, expected: str, got: str) -> None:
+        if expected != got:
+            raise FrameMismatchError(f"{self.name} acts on frame '{expected}', not on '{got}'")
+
+
+@dataclass(frozen=True, eq=False)
+class TransformEstimate:
+    """A transform that was estimated, with what is known of its error.
+
+    Attributes:
+        transform: The estimate.
+        covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in the
+            parent frame.
+        about: (3,) point in the parent frame at which the translation part is taken [m].
+    """
+
+    transform: Transform
+    covariance: Array
+    about: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, covariance=(6, 6), about=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An axis-aligned box in the robot's base: where the work is.
+
+    Attributes:
+        centre: (3,) [m].
+        size: (3,) full edge lengths [m].
+    """
+
+    centre: Array
+    size: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, centre=(3,), size=(3,))
+
+    def grid(self, n: int = 5) -> NDArray[np.float64]:
+        """Return (n^3, 3) points spread evenly over the box, its faces included."""
+        ticks = np.linspace(-0.5, 0.5, n)
+        unit = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.asarray(self.centre + unit * self.size)
+
+
+Role = Literal["calibration", "verification"]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One look at the flange: where the robot says it stood, and what the scanner saw.
+
+    Attributes:
+        id: Unique within a run.
+        cloud: The scan, in ``camera``.
+        base_T_flange: Pose read from the controller.
+        joints: (n,) joint angles [rad], when known.
+        time_ns: When the exposure ended.
+        role: ``verification`` captures are kept from every solver.
+    """
+
+    id: str
+    cloud: PointCloud
+    base_T_flange: Transform
+    joints: Array | None = None
+    time_ns: int = 0
+    role: Role = "calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class FlangeCloud:
+    """The part of one scan that is the flange's face and rim.
+
+    Attributes:
+        cloud: (N, 3) points in ``camera``, all finite.
+        centre: (3,) rough centre of the disc in ``camera`` [m]; a start for fitting.
+        normal: (3,) rough unit normal in ``camera``, towards the scanner.
+    """
+
+    cloud: PointCloud
+    centre: Array
+    normal: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, centre=(3,), normal=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class CircleFeature:
+    """A circle fitted to the flange, or a sphere fitted to one mounted on it, in ``camera``.
+
+    Attributes:
+        centre: (3,) [m].
+        normal: (3,) unit normal of the face, towards the scanner; None where only centres exist.
+        radii: Fitted radii by name, for example ``{"rim": .., "bore": ..}`` [m].
+        covariance: (3, 3) of the centre [m^2].
+        normal_covariance: (3, 3) of the normal, singular along it; None with the normal.
+        arc_coverage: Share of the rim's circumference that was seen, 0 to 1; 0 if not known.
+        clocking: Angle of the hole pattern about the normal [rad], or None when not visible.
+        centre_in_flange: (3,) where the arm carries that centre, in ``flange`` [m]: its origin,
+            unless a target is mounted on it.
+    """
+
+    centre: Array
+    normal: Array | None
+    radii: Mapping[str, float]
+    covariance: Array
+    normal_covariance: Array | None
+    arc_coverage: float
+    clocking: float | None = None
+    centre_in_flange: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        _freeze(self, centre=(3,), covariance=(3, 3), centre_in_flange=(3,))
+        if self.normal is not None or self.normal_covariance is not None:
+            _freeze(self, normal=(3,), normal_covariance=(3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """What a per-capture stage returns instead of a value: the capture is set aside, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Rejection:
+    """A capture that was set aside: which, by which stage, and why."""
+
+    id: str
+    stage: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A fitted circle and the robot pose it belongs to: one equation for the solver."""
+
+    id: str
+    circle: CircleFeature
+    base_T_flange: Transform
+    joints: Array | None = None
+
+    @property
+    def tcp_in_base(self) -> NDArray[np.float64]:
+        """(3,) the circle's centre as the controller reports it [m]."""
+        return self.base_T_flange.apply(self.circle.centre_in_flange)
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationView:
+    """A segmented flange kept from the solver, for verifiers that compare whole clouds."""
+
+    id: str
+    flange: FlangeCloud
+    base_T_flange: Transform
+
+
+T = TypeVar("T")
+
+
+class Stream(Generic[T]):
+    """Values pulled one at a time, of which those already pulled are kept.
+
+    A solver that has reached its target simply stops iterating: nothing more is acquired.
+
+    Attributes:
+        source: What is known of where the values come from.
+        total: How many there will be, when known.
+        seen: The values pulled so far.
+    """
+
+    def __init__(self, items: Iterable[T], source: Source, total: int | None = None) -> None:
+        self._items = iter(items)
+        self.source = source
+        self.total = total
+        self.seen: list[T] = []
+
+    def __iter__(self) -> Iterator[T]:
+        yield from list(self.seen)
+        for item in self._items:
+            self.seen.append(item)
+            yield item
+
+
+class Captures(Stream[Capture]):
+    """What an ``acquire`` stage gives. Captures are large, so those pulled are not kept."""
+
+    def __iter__(self) -> Iterator[Capture]:
+        return self._items
+
+
+class Observations(Stream[Observation]):
+    """What a ``solve`` stage takes; an ``acquire`` stage may give it where no clouds exist."""
+
+
+class Views(list[VerificationView]):
+    """The verification views seen so far; they come before the first observation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated cell knows and no real one does. No stage can ask for it."""
+
+    base_T_camera: Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Where captures come from.
+
+    Attributes:
+        fingerprint: Hash of everything the captures are made from.
+        notes: What the person should be told: what was skipped, detected, converted.
+        workspace: Where the work is; the box of the flange's centres when not given.
+        truth: Simulation only.
+    """
+
+    fingerprint: str
+    notes: Sequence[str] = ()
+    workspace: Box | None = None
+    truth: Truth | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """One observation after solving.
+
+    Attributes:
+        observation: What went in.
+        residual: (3,) measured centre, mapped to ``base``, minus the TCP (corrected, where the
+            solver corrects the arm) [m].
+        used: Whether it took part in the estimate.
+        reason: Why it did not.
+    """
+
+    observation: Observation
+    residual: Array
+    used: bool = True
+    reason: str | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self, residual=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class ArmCorrection:
+    """What a solver found wrong with where the arm says its flange is.
+
+    Attributes:
+        tool_offset: (3,) the seen circle's centre in ``flange`` [m].
+        joint_offsets: (n,) to add to the joint angles [rad], or None.
+        joints: (n,) a configuration of the arm on the branch that it was in [rad], from which
+            the angles of a pose without any are found; with ``joint_offsets``.
+    """
+
+    tool_offset: Array
+    joint_offsets: Array | None = None
+    joints: Array | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self, tool_offset=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """A calibration that nobody has verified yet.
+
+    Attributes:
+        base_T_camera: The camera's pose in the robot's base.
+        pairs: Every observation the solver pulled.
+        method: Stage that solved it.
+        notes: What the solver wants the person to know.
+        correction: What it found wrong with the arm; the pose holds with it.
+    """
+
+    base_T_camera: TransformEstimate
+    pairs: tuple[Pair, ...]
+    method: str
+    notes: tuple[str, ...] = ()
+    correction: ArmCorrection | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """How far a candidate calibration is off, and where that matters.
+
+    Attributes:
+        motion: (4, 4) in ``camera``; takes what was measured onto what was predicted.
+        at: (3,) where the work is, in ``camera`` [m].
+        base_R_camera: (3, 3) of the candidate, to express the error in ``base``.
+    """
+
+    motion: Array
+    at: Array
+    base_R_camera: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, motion=(4, 4), at=(3,), base_R_camera=(3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """What a ``verify`` stage found.
+
+    Attributes:
+        passed: Whether the calibration may be used.
+        reason: One line: the figure and the limit it was held against.
+        figures: Named results in SI units.
+        errors: Per-pose errors on poses that took no part [m], by observation id.
+    """
+
+    passed: bool
+    reason: str
+    figures: Mapping[str, float]
+    errors: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class VerifiedHandEye(HandEye):
+    """A calibration that passed every verification; only the runner makes one."""
+
+    verifications: Mapping[str, Verification] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """A weld seam.
+
+    Attributes:
+        points_in_base: (N, 3) along the seam [m].
+    """
+
+    points_in_base: Array
+
+
+@dataclass(frozen=True, eq=False)
+class WeldReport:
+    """What the torch did."""
+
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ArchivePath:
+    """What ``--archive`` named on the command line, if anything."""
+
+    path: Path | None = None
+
+
+Seed = NewType("Seed", int)
+"""The recipe's seed: the only source of randomness a stage may use."""
+
+Solver = Callable[[Sequence[Observation]], HandEye]
+"""Solves a subset of the observations again, with the recipe's own solve and refine steps."""

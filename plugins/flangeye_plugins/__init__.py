@@ -1,0 +1,81 @@
+"""The built-in plugins, offered to the engine through the same door as a vendor's."""
+
+from collections.abc import Iterable
+
+from flangeye import hookimpl
+from flangeye.stage import Part, Stage
+from flangeye_plugins.acquisition.archive import acquire_archive
+from flangeye_plugins.acquisition.centres import acquire_centres
+from flangeye_plugins.acquisition.plans import grid
+from flangeye_plugins.acquisition.simulated import acquire_simulated
+from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.fitting.ransac import fit_ransac_circle
+from flangeye_plugins.fitting.rim import fit_rim
+from flangeye_plugins.fitting.sphere import fit_sphere
+from flangeye_plugins.readers.ancorasir import ancorasir
+from flangeye_plugins.readers.auto import auto
+from flangeye_plugins.readers.folder import folder
+from flangeye_plugins.refining.compensate import refine_compensate
+from flangeye_plugins.segmentation.flange import segment_flange
+from flangeye_plugins.segmentation.sphere import segment_sphere
+from flangeye_plugins.solving.iterative import solve_iterative
+from flangeye_plugins.solving.robust import solve_robust
+from flangeye_plugins.solving.svd import solve_svd
+from flangeye_plugins.studies.by_iteration import verify_by_iteration
+from flangeye_plugins.studies.icp_as_in_paper import (
+    error_icp_as_in_paper,
+    verify_icp_as_in_paper,
+)
+from flangeye_plugins.studies.oracle import error_oracle
+from flangeye_plugins.studies.points import acquire_points
+from flangeye_plugins.studies.published import acquire_published_centres
+from flangeye_plugins.studies.realisations import verify_realisations
+from flangeye_plugins.studies.stored_results import verify_stored_results
+from flangeye_plugins.verification.errors import error_holdout, error_icp
+from flangeye_plugins.verification.holdout import verify_holdout
+from flangeye_plugins.verification.icp import verify_icp
+
+
+@hookimpl
+def flangeye_stages() -> Iterable[Stage]:
+    """Offer the built-in stages."""
+    return (
+        acquire_simulated,
+        acquire_archive,
+        acquire_centres,
+        segment_flange,
+        fit_rim,
+        fit_ransac_circle,
+        segment_sphere,
+        fit_sphere,
+        solve_robust,
+        solve_svd,
+        solve_iterative,
+        refine_compensate,
+        verify_holdout,
+        verify_icp,
+        acquire_points,
+        acquire_published_centres,
+        verify_realisations,
+        verify_icp_as_in_paper,
+        verify_by_iteration,
+        verify_stored_results,
+    )
+
+
+@hookimpl
+def flangeye_parts() -> Iterable[Part]:
+    """Offer the built-in parts."""
+    return (
+        ancorasir,
+        auto,
+        folder,
+        grid,
+        cost_translation,
+        cost_axes,
+        cost_work_radius,
+        error_icp,
+        error_holdout,
+        error_oracle,
+        error_icp_as_in_paper,
+    )

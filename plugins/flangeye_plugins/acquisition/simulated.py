@@ -1,0 +1,251 @@
+"""``acquire.simulated``: captures from a cell whose truth is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from flangeye.catalogue import (
+    Flange,
+    RobotModel,
+    ScannerModel,
+    Sphere,
+    flange_of,
+    load_standard,
+)
+from flangeye.errors import StageError
+from flangeye.geometry import rigid, rotation_from_rpy
+from flangeye.stage import Choose, Chosen, Params, stage
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    Box,
+    Capture,
+    Captures,
+    PointCloud,
+    Role,
+    Seed,
+    Source,
+    Transform,
+    Truth,
+)  # fmt: skip
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.acquisition.plans import Plan, Site, poses_near
+from flangeye_plugins.simulation.arm import ImperfectArm
+from flangeye_plugins.simulation.cell import Cell
+from flangeye_plugins.simulation.raycast import Body, Image, Scene
+from flangeye_plugins.simulation.reach import Reach
+from flangeye_plugins.simulation.structured_light import StructuredLight
+from flangeye_plugins.simulation.time_of_flight import TimeOfFlight
+
+Floats = NDArray[np.float64]
+
+WORKING_DISTANCE = 0.7
+"""From the scanner to the middle of the workspace, where its range allows: the paper's [m]."""
+
+EPOCH_NS = 1_704_067_200_000_000_000
+"""When simulated runs begin: 2024-01-01, 00:00 UTC."""
+
+INTERVAL_NS = 4_000_000_000
+"""From one exposure to the next."""
+
+FEWEST = 3
+"""Poses without which no camera pose can be found."""
+
+VERSION = 1
+"""Raised whenever the same parameters would give other captures."""
+
+
+class CameraPose(Params):
+    """Where the scanner stands, in ``base``."""
+
+    position: tuple[Length, Length, Length] = param(
+        ("600 mm", "-12.5 mm", "1000 mm"), description="The paper's (17): 1 m above the table."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
+    )
+
+
+class SimulatedParams(Params):
+    """Parameters of ``acquire.simulated``."""
+
+    poses: Annotated[Chosen, Choose("plan")] = param(
+        {"grid": {}}, description="Where the robot goes."
+    )
+    camera: CameraPose = Field(CameraPose(), description="The scanner's true pose.")
+    verification: int = Field(
+        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+    )
+    robot_errors: float = Field(
+        1.0, ge=0, description="Scale of the arm's joint-zero errors and of its repeatability."
+    )
+    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    resolution: float = Field(
+        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+    )
+    outliers: float = Field(
+        0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."
+    )
+
+
+@stage("acquire.simulated")
+def acquire_simulated(
+    robot: RobotModel,
+    scanner: ScannerModel,
+    flange: Flange,
+    seed: Seed,
+    params: SimulatedParams,
+    sphere: Sphere | None = None,
+) -> Captures:
+    """Scan a simulated arm that moves its flange through the scanner's view.
+
+    The reported poses are the nominal kinematics of the commanded joints; the arm that is scanned
+    has joint zeros of its own. Captures for verification come first. Each scan is made when it is
+    asked for.
+
+    Args:
+        robot: The arm.
+        scanner: What looks at it.
+        flange: What to look for; a robot that is asked for its wrist circle carries its own plate.
+        seed: Decides poses, errors and noise.
+        params: See :class:`SimulatedParams`.
+        sphere: A calibration sphere on the flange, where the recipe's feature has one.
+
+    Raises:
+        StageError: Fewer than three poses are possible.
+    """
+    plate = flange if flange.bore else flange_of(robot, load_standard(robot.flange.standard))
+    planning, checking, errors, noise = np.random.SeedSequence([VERSION, seed]).spawn(4)
+    base_T_camera = _camera_pose(params.camera)
+    reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
+    site = _site(reach, scanner, base_T_camera)
+    plan: Plan = params.poses(site, np.random.default_rng(planning))
+    _refuse_too_few(plan, reach, robot, scanner)
+    checks = _checks(plan, site, params.verification, np.random.default_rng(checking))
+    session = _Session(
+        Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera,
+        [*checks, *(pose.joints for pose in plan.poses)], len(checks), params,
+    )  # fmt: skip
+    source = Source(
+        fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
+        notes=_notes(plan, robot, scanner),
+        workspace=Box(plan.centre, plan.size),
+        truth=Truth(Transform(BASE, CAMERA, base_T_camera)),
+    )
+    return Captures(session.captures(errors, noise), source, total=len(session.joints))
+
+
+def _camera_pose(camera: CameraPose) -> Floats:
+    return rigid(rotation_from_rpy(*camera.rpy), np.asarray(camera.position))
+
+
+def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
+    distance = min(WORKING_DISTANCE, (scanner.near + scanner.far) / 2)
+    centre = base_T_camera[:3, 3] + distance * base_T_camera[:3, 2]
+    return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
+
+
+def _refuse_too_few(plan: Plan, reach: Reach, robot: RobotModel, scanner: ScannerModel) -> None:
+    if len(plan.poses) >= FEWEST:
+        return
+    why = ", ".join(f"{count} {reason}" for reason, count in reach.refused.most_common())
+    raise StageError(
+        f"acquire.simulated: {robot.model} can show its flange to {scanner.model} at "
+        f"{len(plan.poses)} of {plan.wanted} planned poses, {FEWEST} are needed ({why}); "
+        "move camera.position, or the plan's centre, or make its size or tilt smaller"
+    )
+
+
+def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[Floats]:
+    """Return joints for the captures that verify, near the middle of the workspace."""
+    found = poses_near(plan.centre, count, site, rng)
+    if len(found) < count:
+        raise StageError(
+            f"acquire.simulated: no pose for verification near the middle of the workspace "
+            f"({_mm(plan.centre)}); move the plan's centre, or set verification: 0"
+        )
+    return [pose.joints for pose in found]
+
+
+def _notes(plan: Plan, robot: RobotModel, scanner: ScannerModel) -> tuple[str, ...]:
+    left_out = plan.wanted - len(plan.poses)
+    note = f"simulated: {robot.model} before {scanner.model}, {len(plan.poses)} poses"
+    return (note + (f"; {left_out} more were planned and are not possible" if left_out else ""),)
+
+
+def _fingerprint(seed: int, *models: BaseModel | None) -> str:
+    given = [model.model_dump(mode="json") for model in models if model is not None]
+    text = json.dumps([VERSION, seed, given], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _mm(point: Floats) -> str:
+    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"
+
+
+@dataclass(frozen=True, eq=False)
+class _Session:
+    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled."""
+
+    cell: Cell
+    scanner: ScannerModel
+    base_T_camera: Floats
+    joints: list[Floats]
+    checks: int
+    params: SimulatedParams
+
+    def captures(
+        self, errors: np.random.SeedSequence, noise: np.random.SeedSequence
+    ) -> Iterator[Capture]:
+        """Make the captures, each when it is asked for."""
+        of_arm, of_scanner, of_covers, *of_captures = errors.spawn(2) + noise.spawn(
+            1 + len(self.joints)
+        )
+        arm = ImperfectArm(self.cell.robot, self.params.robot_errors, _rng(of_arm))
+        eye = self._eye(_rng(of_scanner))
+        covered = self._covered(_rng(of_covers))
+        around = self.cell.around()
+        for index, joints in enumerate(self.joints):
+            rng = _rng(of_captures[index])
+            frames, flange = arm.stand(joints, rng)
+            cover = [self.cell.board(flange)] if index in covered else []
+            xyz = eye.scan(self._before_camera(around + self.cell.arm(frames, flange) + cover), rng)
+            yield self._capture(index, xyz, arm.reported(joints))
+
+    def _eye(self, rng: np.random.Generator) -> StructuredLight | TimeOfFlight:
+        kind = StructuredLight if self.scanner.principle == "structured light" else TimeOfFlight
+        return kind(self.scanner, self.params.resolution, self.params.noise, rng)
+
+    def _covered(self, rng: np.random.Generator) -> set[int]:
+        """Draw the calibration captures in which a board hides the flange."""
+        calibration = np.arange(self.checks, len(self.joints))
+        count = round(self.params.outliers * len(calibration))
+        return set(rng.permutation(calibration)[:count].tolist())
+
+    def _before_camera(self, bodies: list[Body]) -> Scene:
+        camera_T_base = Transform(BASE, CAMERA, self.base_T_camera).inverse().matrix
+        return Scene([body.moved(camera_T_base) for body in bodies])
+
+    def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
+        role: Role = "verification" if index < self.checks else "calibration"
+        return Capture(
+            id=f"{index:04d}",
+            cloud=PointCloud(CAMERA, xyz),
+            base_T_flange=Transform(BASE, FLANGE, base_T_flange),
+            joints=self.joints[index],
+            time_ns=EPOCH_NS + (index + 1) * INTERVAL_NS,
+            role=role,
+        )
+
+
+def _rng(sequence: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.default_rng(sequence)

@@ -1,0 +1,1 @@
+"""Costs: what solve.iterative minimises."""

@@ -1,0 +1,20 @@
+"""The controllers on loopback, offered to the engine. Light: nothing is imported until one runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from flangeye import hookimpl
+from flangeye.loopback import Loopback, LoopbackOptions
+
+
+def _serve_ur(options: LoopbackOptions) -> None:
+    from flangeye_plugins.loopback.ur.server import serve
+
+    serve(options)
+
+
+@hookimpl
+def flangeye_loopbacks() -> Iterable[Loopback]:
+    """Offer a controller of Universal Robots."""
+    return (Loopback("ur", "Universal Robots", _serve_ur),)

@@ -1,0 +1,1 @@
+"""Readers: the archive layouts that ``acquire.archive`` and ``acquire.centres`` can read."""

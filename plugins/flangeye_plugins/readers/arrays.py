@@ -1,0 +1,83 @@
+"""Arrays of numbers in files, with the shape a layout says they have."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import StageError
+from flangeye.archive import Floats
+from flangeye.cloudfile import load_npy
+
+
+def read_npy(path: Path, shape: tuple[int | None, ...]) -> Floats:
+    """Return the array of a .npy file.
+
+    Args:
+        path: The file.
+        shape: What it must have; None is any length.
+
+    Raises:
+        StageError: It is missing, damaged, or of another shape.
+    """
+    return _checked(path, load_npy(path), shape)
+
+
+def read_npz(path: Path, name: str, shape: tuple[int | None, ...]) -> Floats:
+    """Return the array ``name`` of an .npz file.
+
+    Raises:
+        StageError: It is missing, damaged, or of another shape.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            array = np.asarray(arrays[name])
+    except FileNotFoundError:
+        raise StageError(f"{path}: does not exist") from None
+    except KeyError:
+        raise StageError(f"{path}: holds no array '{name}'") from None
+    except (OSError, ValueError, EOFError, TypeError, MemoryError, BadZipFile) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise StageError(f"{path}: is not a NumPy .npz file: {reason}") from None
+    return _checked(path, array, shape)
+
+
+def read_table(path: Path, width: int, rows: slice = slice(None)) -> Floats:
+    """Return the rows of ``width`` numbers of a text file, as (n, width).
+
+    Raises:
+        StageError: It is missing, or a row holds something else.
+    """
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise StageError(f"{path}: cannot be read: {error}") from None
+    numbered = [(i, line.split()) for i, line in enumerate(lines, 1) if line.strip()][rows]
+    if not numbered:
+        raise StageError(f"{path}: holds no numbers")
+    return np.array([_numbers(f"{path}:{i}", words, width) for i, words in numbered])
+
+
+def _numbers(where: str, words: list[str], width: int) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise StageError(f"{where}: {error}") from None
+    if len(values) != width or not all(map(math.isfinite, values)):
+        raise StageError(f"{where}: has {len(values)} numbers, not {width} that are finite")
+    return values
+
+
+def _checked(path: Path, array: NDArray[Any], shape: tuple[int | None, ...]) -> Floats:
+    fits = len(array.shape) == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in "fiu":
+        wanted = ", ".join("n" if want is None else str(want) for want in shape)
+        raise StageError(f"{path}: has shape {array.shape}, expected ({wanted}) numbers")
+    return array.astype(np.float64)

@@ -1,0 +1,145 @@
+"""Which pairs of centre and TCP agree on one rigid motion, when any of them may be wrong.
+
+First a scale: the motion that the better half of the pairs agrees on best (least trimmed squares)
+tells the noise. With it, truncated least squares by graduated non-convexity tells the inliers.
+Arrays only.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.geometry import kabsch
+from flangeye.statistics import chi2_quantile, f_quantile
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MOST_TRIPLES = 1000
+"""Of 1000 random triples some 200 are free of outliers when 40 % of the pairs are wrong."""
+GATE = 0.999
+"""Probability with which a good pair is kept."""
+
+
+def find_inliers(centres: Floats, tcps: Floats, finest: float) -> tuple[Mask, float]:
+    """Return which of (N, 3) centres and TCPs agree, and the noise of one coordinate [m].
+
+    Args:
+        centres: (N, 3) in ``camera`` [m].
+        tcps: (N, 3) in ``base`` [m].
+        finest: Noise to assume at least [m]; keeps exact inputs from splitting hairs.
+    """
+    if len(centres) < 4:
+        return np.ones(len(centres), dtype=bool), finest
+    half = least_trimmed_squares(centres, tcps)
+    inliers, sigma = half, finest
+    for _ in range(10):
+        sigma = max(_noise(centres, tcps, inliers), finest)
+        freedom = 3 * int(inliers.sum()) - 6
+        threshold = sigma * float(np.sqrt(3 * f_quantile(GATE, 3, freedom)))
+        found = graduated_non_convexity(centres, tcps, threshold, half)
+        if (found == inliers).all():
+            break
+        inliers = found
+    return inliers, sigma
+
+
+def least_trimmed_squares(centres: Floats, tcps: Floats) -> Mask:
+    """Return the better half of the pairs: with the smallest squared residuals among halves.
+
+    Rousseeuw & Van Driessen (2006): a start from every triple (1000 of them at most), then
+    refits to the half with the smallest residuals until it stays the same.
+    """
+    n = len(centres)
+    h = (n + 3) // 2
+    triples = _triples(n)
+    rotations, shifts = _fit_triples(centres[triples], tcps[triples])
+    errors = centres @ rotations.transpose(0, 2, 1) + shifts[:, None] - tcps
+    squares = np.sort(np.einsum("tni,tni->tn", errors, errors), axis=1)[:, :h].sum(axis=1)
+    refined = [
+        _concentrate(centres, tcps, (rotations[k], shifts[k]), h)
+        for k in np.argsort(squares, kind="stable")[:10]
+    ]
+    return min(refined, key=lambda half: half[1])[0]
+
+
+def _triples(n: int) -> NDArray[np.intp]:
+    if n * (n - 1) * (n - 2) // 6 <= MOST_TRIPLES:
+        return np.array(list(combinations(range(n), 3)))
+    order = np.random.default_rng(0).random((MOST_TRIPLES, n))
+    return np.argpartition(order, 3, axis=1)[:, :3]
+
+
+def _fit_triples(centres: Floats, tcps: Floats) -> tuple[Floats, Floats]:
+    """Return R (T, 3, 3) and t (T, 3) of T rigid fits to (T, 3, 3) triples; see ``kabsch``."""
+    mean_c, mean_b = centres.mean(axis=1), tcps.mean(axis=1)
+    cross = np.einsum("tki,tkj->tij", tcps - mean_b[:, None], centres - mean_c[:, None])
+    u, _, vt = np.linalg.svd(cross)
+    u[:, :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    rotations = u @ vt
+    return rotations, mean_b - np.einsum("tij,tj->ti", rotations, mean_c)
+
+
+def _concentrate(
+    centres: Floats, tcps: Floats, motion: tuple[Floats, Floats], h: int
+) -> tuple[Mask, float]:
+    """Refit to the ``h`` pairs with the smallest residuals until they stay the same."""
+    kept = np.zeros(len(centres), dtype=bool)
+    while True:
+        squares = _squares(centres, tcps, motion)
+        now = np.zeros_like(kept)
+        now[np.argsort(squares, kind="stable")[:h]] = True
+        if (now == kept).all():
+            return kept, float(squares[kept].sum())
+        kept = now
+        motion = kabsch(centres[kept], tcps[kept])
+
+
+def _noise(centres: Floats, tcps: Floats, kept: Mask) -> float:
+    """Return the noise of one coordinate from all pairs, by the median, fitted to some of them.
+
+    The median of all residuals stands where it would without the fit for those left out, and
+    below it for those fitted; the correction is that of a fit to all.
+    """
+    squares = _squares(centres, tcps, kabsch(centres[kept], tcps[kept]))
+    unbiased = 3 * len(squares) / (3 * len(squares) - 6)
+    return float(np.sqrt(unbiased * np.median(squares) / chi2_quantile(0.5, 3)))
+
+
+def graduated_non_convexity(centres: Floats, tcps: Floats, threshold: float, start: Mask) -> Mask:
+    """Return the inliers of truncated least squares, by graduated non-convexity.
+
+    Yang, Antonante, Tzoumas & Carlone (2020), section 3: the truncated cost is approached from
+    its convex side, the weights of a weighted Kabsch fit following in closed form.
+
+    Args:
+        centres: (N, 3) [m].
+        tcps: (N, 3) [m].
+        threshold: Residual beyond which a pair counts as an outlier [m].
+        start: Pairs to fit first.
+    """
+    limit = threshold**2
+    squares = _squares(centres, tcps, kabsch(centres[start], tcps[start]))
+    if squares.max() <= limit:
+        return np.ones(len(centres), dtype=bool)
+    mu = limit / (2 * squares.max() - limit)
+    while True:
+        weights = _truncated_weights(squares, limit, mu)
+        if (np.minimum(weights, 1 - weights) < 1e-6).all() or mu > 1e12:
+            return weights > 0.5
+        squares = _squares(centres, tcps, kabsch(centres, tcps, weights))
+        mu *= 1.4
+
+
+def _truncated_weights(squares: Floats, limit: float, mu: float) -> Floats:
+    weights = np.sqrt(limit * mu * (mu + 1) / np.maximum(squares, 1e-300)) - mu
+    weights[squares <= mu / (mu + 1) * limit] = 1.0
+    weights[squares >= (mu + 1) / mu * limit] = 0.0
+    return weights
+
+
+def _squares(centres: Floats, tcps: Floats, motion: tuple[Floats, Floats]) -> Floats:
+    return np.asarray(((centres @ motion[0].T + motion[1] - tcps) ** 2).sum(axis=1))

@@ -1,0 +1,95 @@
+"""Toy stages that driver and workers find as they find any installed plugin."""
+
+import io
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from flangeye.batch import Request, run_batch
+from flangeye.registry import load_registry
+
+ROOT = Path(__file__).parents[2]
+SITE = Path(__file__).parent / "site"
+
+RECIPE = """\
+title: Toy
+seed: 3
+steps:
+  - acquire.toy: {count: 6, noise: 0.1 mm}
+  - segment.toy
+  - fit.toy
+  - solve.work
+  - verify.toy: {max_rms: 2 mm}
+"""
+ARCHIVE_RECIPE = RECIPE.replace("acquire.toy: {count: 6, noise: 0.1 mm}", "acquire.toy_archive")
+
+
+@pytest.fixture(autouse=True)
+def toys(monkeypatch, tmp_path):
+    """Put the toy plugin on the path of this process and of those it starts."""
+    paths = [str(SITE), str(ROOT)]
+    for path in reversed(paths):
+        monkeypatch.syspath_prepend(path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def registry(toys):
+    return load_registry()
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "toy.yaml"
+    path.write_text(RECIPE)
+    return path
+
+
+@pytest.fixture
+def archive_recipe(tmp_path):
+    path = tmp_path / "replay.yaml"
+    path.write_text(ARCHIVE_RECIPE)
+    return path
+
+
+@pytest.fixture
+def archives(tmp_path):
+    """Two archives that can be read, and one that is not there."""
+    paths = [tmp_path / name for name in ("one.txt", "two.txt", "<b>none.txt")]
+    for number, path in enumerate(paths[:2]):
+        path.write_text(str(number))
+    return paths
+
+
+@pytest.fixture
+def batch(recipe, registry):
+    """Run a batch of the toy recipe in this process; return it and what was said meanwhile."""
+
+    def call(name=recipe, **wanted):
+        console = Console(file=io.StringIO(), width=200)
+        done = run_batch(Request(str(name), **{"report": False, **wanted}), registry, console)
+        return done, console.file.getvalue()
+
+    return call
+
+
+@pytest.fixture
+def flangeye(monkeypatch, capsys):
+    """Call the command line; return code, out, err."""
+    from flangeye import cli
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as exit_:
+            code = exit_.code
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call

@@ -1,0 +1,223 @@
+"""Whole batches on real dask clusters."""
+
+import csv
+import importlib.util
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flangeye.batch import cluster
+from flangeye.batch.plan import plan
+from flangeye.batch.request import BatchError, Request
+from flangeye.batch.software import software_of
+from flangeye.batch.work import STARTS, WORKER_DIED, Job
+
+SLURM = Path(cluster.__file__).with_name("slurm_cluster.py")
+
+
+def rows(folder):
+    with (folder / "sessions.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_end_is_a_row_and_costs_only_itself(batch, tmp_path):
+    """A worker that is killed, too; and the second start goes on where the first ended."""
+    grid = ("steps.3.what=die,work,refuse,fail,die once",)
+    done, said = batch(grid=grid, overrides=("steps.3.once=once",), workers=2)
+    told = [(row["steps.3.what"], row["status"]) for row in rows(done.out)]
+    assert told == [
+        ("die", "crashed"), ("work", "verified"), ("refuse", "refused"), ("fail", "failed"),
+        ("die once", "verified"),
+    ]  # fmt: skip
+    assert rows(done.out)[0]["reason"] == WORKER_DIED
+    assert not done.accepted
+    assert f"crashed {rows(done.out)[0]['session']}: {WORKER_DIED}\n" in said
+    assert done.out == Path("batches") / "toy"
+    assert not (done.out / STARTS).exists()
+
+    more = {"overrides": ("steps.3.once=once",), "workers": 1}
+    again, _ = batch(grid=("steps.3.what=work,refuse,fail",), **more)
+    assert (again.known, len(again.outcomes)) == (2, 3)
+    third, _ = batch(grid=("steps.3.what=work,refuse",), **more)
+    assert (third.known, len(rows(third.out))) == (2, 2)
+
+
+def test_archives_on_the_command_line(flangeye, archive_recipe, archives, tmp_path):
+    code, out, err = flangeye("batch", archive_recipe, *archives, "--workers", "1", "--out", "out")
+    assert code == 1
+    assert out.startswith("3 sessions: 2 verified, 1 failed\n  held-out error ")
+    assert out.endswith("out/: summary.html  sessions.csv  sessions.parquet\n")
+    assert f": {archives[2]}: no such archive\n" in err
+    page = (tmp_path / "out" / "summary.html").read_text()
+    assert "<b>" not in page
+    for row in rows(tmp_path / "out")[:2]:
+        assert (tmp_path / "out" / row["report"]).stat().st_size > 1000
+        assert f'href="{row["report"]}"' in page
+    code, out, _ = flangeye("batch", archive_recipe, *archives[:2], "--out", "out")
+    assert code == 0
+    assert out.startswith("2 sessions: 2 verified (2 of them finished earlier)\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--scheduler", "tcp://127.0.0.1:9"],
+         "error: --scheduler tcp://127.0.0.1:9: no dask scheduler answers there (OSError: Timed "
+         "out trying to connect to tcp://127.0.0.1:9 after 0.5 s); the address is what 'dask "
+         "scheduler' prints, such as tcp://host:8786"),
+        (["--scheduler", "nonsense"],
+         "error: --scheduler nonsense: no dask scheduler answers there (ValueError: missing port "
+         "number in address 'nonsense'); the address is what 'dask scheduler' prints, such as "
+         "tcp://host:8786"),
+        (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"],
+         "error: --workers starts workers here, --scheduler uses others; give one"),
+        (["--set-grid", "steps.7.x=1,2"],
+         "error: --set-grid steps.7.x: no step '7'; steps are 0 to 4"),
+        (["--out", "toy.yaml/out"], "error: toy.yaml/out: cannot be made: Not a directory"),
+    ],
+)  # fmt: skip
+def test_what_cannot_start_leaves_nothing(flangeye, recipe, tmp_path, monkeypatch, words, line):
+    assert cluster.CONNECT_SECONDS == 5
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
+    code, _, err = flangeye("batch", recipe, *words)
+    assert (code, err.splitlines()[-1]) == (2, line)
+    assert "Traceback" not in err
+    assert [path.name for path in tmp_path.iterdir()] == ["toy.yaml"]
+
+
+def test_without_the_extra_it_says_what_to_install(flangeye, recipe, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(cluster, "find_spec", lambda n: None if n == "pyarrow" else find(n))
+    code, _, err = flangeye("batch", recipe)
+    assert code == 2
+    assert err == (
+        "error: flangeye batch needs pyarrow; install with: pip install 'flangeye[batch]'\n"
+    )
+
+
+def test_the_command_line_does_not_import_dask():
+    code = (
+        "import sys; from flangeye import batch, cli; "
+        "print([m for m in ('dask', 'distributed', 'pyarrow', 'plotly') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "[]\n"
+
+
+def test_a_port_that_is_no_scheduler(batch, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(BatchError, match="no dask scheduler answers there"):
+            batch(scheduler=address)
+
+
+def test_ctrl_c_keeps_what_came_so_far(recipe, tmp_path):
+    """Sent to the whole group, as a terminal does: the workers must not answer it."""
+    command = [
+        sys.executable, "-m", "flangeye.cli", "batch", str(recipe), "--repeat", "100",
+        "--set", "steps.3.wait=100 ms", "--no-report", "--workers", "1", "--out", "out",
+    ]  # fmt: skip
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, start_new_session=True, **pipes)
+    deadline = time.monotonic() + 30
+    while len(list(tmp_path.glob("out/*/session.json"))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said.strip() == "stopped; the same command goes on from here"
+    assert 0 < len(rows(tmp_path / "out")) < 100
+    assert (tmp_path / "out" / "summary.html").exists()
+
+
+SBATCH = """\
+#!/bin/sh
+# Stands in for SLURM: starts the job's script on this machine.
+cp "$1" job.sh
+setsid sh job.sh >job.log 2>&1 &
+echo $! >job.pid
+echo "Submitted batch job 1"
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """Run the documented script with a stand-in for SLURM; give the scheduler's address."""
+    if importlib.util.find_spec("dask_jobqueue") is None:
+        pytest.skip("dask-jobqueue is not installed")
+    bin_ = tmp_path / "bin"
+    bin_.mkdir()
+    for name, text in (("sbatch", SBATCH), ("scancel", "#!/bin/sh\nkill -- -$(cat job.pid)\n")):
+        (bin_ / name).write_text(text)
+        (bin_ / name).chmod(0o755)
+    script = tmp_path / "slurm_cluster.py"
+    text = SLURM.read_text().replace("NODES = 4", "NODES = 1").replace("CORES = 16", "CORES = 2")
+    script.write_text(text.replace('"/tmp"', repr(str(tmp_path))))
+    environment = {**os.environ, "PATH": f"{bin_}{os.pathsep}{os.environ['PATH']}"}
+    process = subprocess.Popen(
+        [sys.executable, script], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    line = process.stdout.readline()
+    yield line.split()[-1]
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert process.returncode == 0
+
+
+def test_the_slurm_script_and_a_batch_on_it(slurm, batch, tmp_path):
+    done, _ = batch(scheduler=slurm, grid=("steps.3.what=work,die",))
+    assert [row["status"] for row in rows(done.out)] == ["verified", "crashed"]
+    job = (tmp_path / "job.sh").read_text()
+    for line in ("#SBATCH -p compute", "#SBATCH --cpus-per-task=2", "#SBATCH -t 04:00:00"):
+        assert line in job
+    assert re.search(r"dask_worker tcp://\S+ .*--nthreads 1 .*--nworkers 2 ", job)
+
+
+def test_two_workers_are_at_work_nearly_all_the_time(recipe, registry, tmp_path):
+    """Measured against the sessions' own time, so that a busy machine does not fail it."""
+    software = software_of(registry)
+    wanted = Request(str(recipe), repeat=26, overrides=("steps.3.wait=100 ms",))
+    sessions = plan(wanted, registry, software)
+    job = Job(tmp_path / "out", report=False, software=software)
+    (job.out / STARTS).mkdir(parents=True)
+    with cluster.local_client(2) as client:
+        assert len(list(cluster.run_all(client, job, sessions[:2]))) == 2  # imports everything
+        begun = time.perf_counter()
+        outcomes = [outcome for _, outcome in cluster.run_all(client, job, sessions[2:])]
+        took = time.perf_counter() - begun
+    assert {outcome.status for outcome in outcomes} == {"verified"}
+    worked = sum(outcome.seconds for outcome in outcomes)
+    assert worked / took > 1.8
+    assert (2 * took - worked) / 24 < 0.03
+
+
+@pytest.mark.slow
+def test_500_sessions_keep_memory_flat(recipe, registry, tmp_path):
+    import psutil
+
+    software = software_of(registry)
+    sessions = plan(Request(str(recipe), repeat=500), registry, software)
+    job = Job(tmp_path / "out", report=False, software=software)
+    (job.out / STARTS).mkdir(parents=True)
+
+    def resident():
+        return psutil.Process().memory_info().rss
+
+    with cluster.local_client(1) as client:
+        memory = []
+        for i, _ in enumerate(cluster.run_all(client, job, sessions)):
+            if i in (100, 499):
+                (worker,) = client.run(resident).values()
+                memory.append((resident(), worker))
+    for early, late in zip(*memory, strict=True):
+        assert late - early < 10e6

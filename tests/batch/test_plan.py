@@ -1,0 +1,172 @@
+"""Which sessions a batch has, and when a session is still the same."""
+
+import os
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flangeye.batch.plan import plan
+from flangeye.batch.request import BatchError, Request
+from flangeye.batch.software import Software, check_software, software_of
+from flangeye.batch.variants import split_values
+from flangeye.errors import FlangeyeError, StageError
+
+SOFTWARE = Software("1", ("toy 1.0",))
+
+
+@pytest.fixture
+def sessions(recipe, registry):
+    def call(name=recipe, software=SOFTWARE, **wanted):
+        return plan(Request(str(name), **wanted), registry, software)
+
+    return call
+
+
+def test_grid_times_seeds(sessions):
+    found = sessions(grid=("steps.2.inlier=0.2 mm,0.3 mm", "steps.0.count=5,6,7"), repeat=2)
+    assert [(*s.varied.values(), s.seed) for s in found] == [
+        (inlier, count, seed)
+        for inlier in ("0.2 mm", "0.3 mm") for count in "567" for seed in (3, 4)
+    ]  # fmt: skip
+    assert len({s.id for s in found}) == 12
+    assert found[0].overrides == ("steps.2.inlier=0.2 mm", "steps.0.count=5", "seed=3")
+
+
+def test_archives_times_values(sessions, archive_recipe, archives):
+    found = sessions(archive_recipe, archives=tuple(archives), grid=("steps.4.max_rms=1 mm,2 mm",))
+    assert [s.archive for s in found] == archives * 2
+    assert all("<" not in s.id and "/" not in s.id for s in found)
+    assert found[0].id.startswith("replay_one.txt_")
+
+
+def test_a_recipe_alone_is_one_session(sessions):
+    (session,) = sessions()
+    assert (session.varied, session.seed, session.archive) == ({}, 3, None)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({"grid": ("steps.9.x=1,2",)}, "--set-grid steps.9.x: no step '9'; steps are 0 to 4"),
+        ({"grid": ("steps.0.cuont=1,2",)},
+         "--set-grid steps.0.acquire.toy.cuont: unknown key 'cuont'; did you mean 'count'? "
+         "(allowed: count, noise, bad, verification)"),
+        ({"grid": ("steps.2.inlier=0.2 mm,3",)},
+         "--set-grid steps.2.fit.toy.inlier: '3' has no unit: a length needs one (mm, m, um, for "
+         "example '31.5 mm')"),
+        ({"overrides": ("steps.9.x=1",)}, "--set steps.9.x: no step '9'; steps are 0 to 4"),
+        ({"grid": ("seed",)}, "--set-grid seed: write PATH=a,b,c, for example "
+         "steps.2.inlier='0.2 mm,0.3 mm'"),
+        ({"grid": ("seed=1,,2",)}, "--set-grid seed=1,,2: write PATH=a,b,c, for example "
+         "steps.2.inlier='0.2 mm,0.3 mm'"),
+        ({"grid": ("seed=1", "seed=2")},
+         "--set-grid: the same path is given twice; write its values in one list"),
+        ({"grid": ("seed=1,2",), "repeat": 2},
+         "--repeat counts the seed up, and --set-grid sets it; use one of them"),
+        ({"repeat": 2, "vary": "steps.0.count"},
+         "--vary steps.0.count: only the seed can be repeated with; for other values write "
+         "--set-grid steps.0.count=a,b,c"),
+        ({"grid": ("steps.2.inlier=0.2 mm,0.0002 m",)},
+         "the same session is asked for twice: toy.yaml steps.2.inlier=0.2 mm and "
+         "toy.yaml steps.2.inlier=0.0002 m"),
+    ],
+)  # fmt: skip
+def test_what_cannot_start_is_one_line(sessions, wanted, message):
+    with pytest.raises(FlangeyeError) as caught:
+        sessions(**wanted)
+    assert str(caught.value) == message
+    assert caught.value.exit_code == 2
+
+
+def test_an_archive_for_a_recipe_that_simulates(sessions, archives):
+    with pytest.raises(BatchError) as caught:
+        sessions(archives=(archives[0],))
+    assert str(caught.value) == (
+        f"acquire.toy takes no archive, and {archives[0]} is given; leave it out"
+    )
+
+
+def test_the_same_archive_twice(sessions, archive_recipe, archives):
+    with pytest.raises(BatchError, match="asked for twice: /.*one.txt and /.*one.txt"):
+        sessions(archive_recipe, archives=(archives[0], archives[0]))
+
+
+def test_a_key_holds_all_that_decides_the_result(sessions, recipe, archive_recipe, archives):
+    def key(name=archive_recipe, archive=archives[0], **more):
+        return sessions(name, archives=(archive,), **more)[0].key
+
+    first = key()
+    assert key() == first
+    assert key(overrides=("steps.4.max_rms=2 mm",)) == first  # what it was anyway
+    assert key(overrides=("steps.4.max_rms=3 mm",)) != first
+    assert key(archive=archives[1]) != first
+    assert key(software=Software("2", ("toy 1.0",))) != first
+    assert key(software=Software("1", ("toy 1.1",))) != first
+    archive_recipe.write_text(archive_recipe.read_text() + "\n# a comment\n")
+    assert key() == first
+    archives[0].write_text("7")
+    assert key() != first
+
+
+def test_large_files_are_known_by_size_and_time(sessions, archive_recipe, tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    large, small = folder / "large.bin", folder / "small.txt"
+    large.write_bytes(bytes(70_000))
+    small.write_text("a")
+
+    def key():
+        return sessions(archive_recipe, archives=(folder,))[0].key
+
+    first = key()
+    os.utime(small, ns=(1, 1))
+    assert key() == first
+    os.utime(large, ns=(1, 1))
+    second = key()
+    assert second != first
+    small.rename(folder / "other.txt")
+    assert key() != second
+
+
+def test_files_that_the_recipe_names_count(sessions, tmp_path):
+    first = sessions(overrides=("steps.3.reads=there",))[0].key
+    (tmp_path / "there").write_text("now")
+    assert sessions(overrides=("steps.3.reads=there",))[0].key != first
+
+
+@given(st.lists(st.text("ab1. {}[]", min_size=1).filter(str.strip), min_size=1))
+def test_splitting_undoes_joining(values):
+    balanced = [v.strip() for v in values if _balanced(v)]
+    assert split_values(",".join(balanced)) == (balanced or [""])
+
+
+def _balanced(text):
+    depth = 0
+    for character in text:
+        depth += (character in "[{") - (character in "]}")
+        if depth < 0:
+            return False
+    return depth == 0
+
+
+def test_commas_inside_brackets_and_quotes_belong_to_the_value():
+    assert split_values("{a: {x: 1, y: 2}}, [1, 2] ,'c,d',\"e,'f\"") == [
+        "{a: {x: 1, y: 2}}", "[1, 2]", "'c,d'", "\"e,'f\"",
+    ]  # fmt: skip
+
+
+def test_workers_must_have_the_same_software(registry):
+    here = software_of(registry)
+    assert "toy_batch 1.0" in here.plugins
+    check_software(here, here, "host")
+    for other, told in (
+        (
+            Software("9", here.plugins),
+            f"flangeye {here.flangeye}, the batch was started with flang",
+        ),
+        (Software(here.flangeye, (*here.plugins, "zzz 1")), "plugins, the batch was started with"),
+        (Software(here.flangeye, ("aaa 1", *here.plugins[1:])), "the batch was started with aaa 1"),
+    ):
+        with pytest.raises(StageError, match=told):
+            check_software(other, here, "host")

@@ -1,0 +1,151 @@
+"""The tables and the page, from outcomes made up here."""
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from flangeye.batch.figures import drawings_of
+from flangeye.batch.outcome import Outcome
+from flangeye.batch.page import render, write_page
+from flangeye.batch.plan import Session
+from flangeye.batch.tables import table_of, write_tables
+
+EVIL = "<script>alert(1)</script>"
+
+
+def session(i, archive=None, **varied):
+    return Session(f"toy_{i:012d}", str(i), Path("/r/toy.yaml"), archive, (), varied, i)
+
+
+def outcome(rms=3e-4, **more):
+    report = more.pop("report", "toy_000000000000/report.html")
+    return Outcome("verified", None, 5, 6, rms, rms, 2 * rms, rms, 2 * rms, seconds=1.5,
+                   report=report, **more)  # fmt: skip
+
+
+@pytest.fixture
+def entries():
+    return [
+        (session(0, **{"steps.0.noise": "0.1 mm", "steps.0.count": "5"}), outcome(1e-4)),
+        (session(1, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}), outcome(2e-4)),
+        (session(2, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}),
+         Outcome("failed", f"bad, {EVIL}", seconds=0.1)),
+    ]  # fmt: skip
+
+
+def test_csv_and_parquet_hold_the_same(entries, tmp_path):
+    write_tables(table_of(entries), tmp_path)
+    with (tmp_path / "sessions.csv").open(newline="") as file:
+        read = list(csv.DictReader(file))
+    table = pq.read_table(tmp_path / "sessions.parquet")
+    rows = table.to_pylist()
+    assert len(read) == len(rows) == 3
+    for text, row in zip(read, rows, strict=True):
+        assert text == {k: "" if v is None else str(v) for k, v in row.items()}
+    assert rows[1]["holdout_rms_m"] == 2e-4
+    assert rows[2]["holdout_rms_m"] is None
+    assert rows[2]["reason"] == f"bad, {EVIL}"
+    assert table.schema.field("steps.0.noise").type == pa.string()
+    assert table.schema.field("steps.0.count").type == pa.int64()
+    assert table.schema.field("true_rms_m").type == pa.float64()
+    assert table.schema.field("archive").type == pa.string()
+
+
+def test_columns(entries):
+    assert table_of(entries).columns == (
+        "session", "recipe", "archive", "steps.0.noise", "steps.0.count", "seed", "status",
+        "reason", "used", "captures", "holdout_rms_m", "holdout_median_m", "holdout_p95_m",
+        "predicted_rms_m", "predicted_p95_m", "true_rms_m", "true_centre_m", "true_rotation_rad",
+        "seconds", "report",
+    )  # fmt: skip
+
+
+def test_quantities_stand_on_an_axis_by_their_number(entries):
+    drawings = dict(drawings_of(table_of(entries)))
+    assert set(drawings) == {"Held-out error, rms", "Predicted error, 95 %", "Time"}
+    figure = drawings["Held-out error, rms"]
+    assert figure["layout"]["xaxis"]["title"]["text"] == "step 0.noise [mm]"
+    dots = [dict(zip(t["x"], t["y"], strict=True)) for t in figure["data"]]
+    assert dots == [{0.1: pytest.approx(0.1)}, {0.2: pytest.approx(0.2)}]
+    assert [trace["name"] for trace in figure["data"]] == ["5", "6"]
+    first, second = (trace["marker"]["color"] for trace in figure["data"])
+    assert first != second
+
+
+def test_names_stand_side_by_side_and_medians_join_repetitions():
+    entries = [
+        (session(i, **{"steps.3.cost": cost}), outcome(rms * 1e-3))
+        for i, (cost, rms) in enumerate([("a", 1), ("a", 2), ("a", 4), ("b", 3), ("b", 5)])
+    ]
+    figure = dict(drawings_of(table_of(entries)))["Held-out error, rms"]
+    assert figure["layout"]["xaxis"]["type"] == "category"
+    *_, medians = figure["data"]
+    assert (medians["x"], medians["y"]) == (["a", "b"], [2.0, 4.0])
+
+
+def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries):
+    page = render(table_of(entries))
+    assert EVIL not in page
+    assert "bad, &lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert '<a href="toy_000000000000/report.html">' in page
+    own = re.sub(r"<script>.*?</script>", "", page, flags=re.S)
+    assert not re.search(r"(src|href)=\"(?!toy_)", own)
+    assert "default-src 'none'" in page
+
+
+def test_archives_are_told_apart_by_what_differs():
+    paths = [Path("/data/a/poses"), Path("/data/b/poses"), Path(f"/data/{EVIL}")]
+    page = render(table_of([(session(i, path), outcome()) for i, path in enumerate(paths)]))
+    assert '<td class="">a/poses</td>' in page
+    assert EVIL not in page
+
+
+def test_variants_are_summed_up_when_repeated(entries):
+    page = render(table_of(entries))
+    assert '<h2 id="variants">' in page
+    assert '<h2 id="variants">' not in render(table_of(entries[:2]))
+    row = re.search(r"<tr><td>0.2 mm</td><td>6</td>(.*?)</tr>", page, re.S).group(1)
+    assert re.findall(r">([^<>]*)</td>", row) == ["2", "1", "1", "0.200", "0.400", ""]
+
+
+def test_nothing_accepted_still_makes_a_page():
+    entries = [(session(0), Outcome("crashed", "no"))]
+    page = render(table_of(entries))
+    assert "1 sessions" not in page
+    assert "1 session of toy" in page
+
+
+def test_the_table_sorts_in_a_browser(entries, tmp_path):
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium on this machine: apt-get install chromium")
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    write_page(table_of(entries), tmp_path / "summary.html")
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--host-resolver-rules=MAP * ~NOTFOUND"]
+    problems = []
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=flags)
+        page = browser.new_page()
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("request", lambda r: r.url.startswith("file:") or problems.append(r.url))
+        page.goto((tmp_path / "summary.html").as_uri())
+        page.wait_for_selector("html[data-drawn='3']", timeout=30_000)
+        heading = page.locator("section").last.get_by_role("button", name="Held-out rms")
+        orders = []
+        for _ in range(2):
+            heading.click()
+            cells = page.locator("section").last.locator("tbody tr td:first-child")
+            orders.append([text[-1] for text in cells.all_inner_texts()])
+        browser.close()
+    assert problems == []
+    assert orders == [["0", "1", "2"], ["1", "0", "2"]]  # what has no figure stays last
+
+
+def test_figures_are_plain_json(entries):
+    json.dumps([figure for _, figure in drawings_of(table_of(entries))], allow_nan=False)

@@ -1,0 +1,139 @@
+"""What a worker makes of one session."""
+
+import json
+
+import pytest
+
+from flangeye.batch.outcome import MARKER, Outcome, finished_outcome
+from flangeye.batch.plan import plan
+from flangeye.batch.request import Request
+from flangeye.batch.software import software_of
+from flangeye.batch.work import STARTS, WORKER_DIED, Job, _registry, run_session
+
+
+@pytest.fixture
+def work(recipe, registry, tmp_path):
+    """Run the one session of a request here; also leaves job and session on the function."""
+    _registry.cache_clear()
+
+    def call(report=False, name=recipe, **wanted):
+        software = software_of(registry)
+        call.job = Job(tmp_path / "out", report, software)
+        (call.job.out / STARTS).mkdir(parents=True, exist_ok=True)
+        (call.session,) = plan(Request(str(name), **wanted), registry, software)
+        call.folder = call.job.out / call.session.id
+        return run_session(call.job, call.session)
+
+    yield call
+    _registry.cache_clear()
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_session_leaves_what_run_leaves(work):
+    outcome = work(report=True)
+    assert outcome.status == "verified"
+    assert (outcome.used, outcome.captures, outcome.reason) == (6, 6, None)
+    assert 0 < outcome.holdout_rms_m < 1e-3
+    assert 0 < outcome.true_rms_m < 1e-3
+    assert outcome.predicted_p95_m > outcome.predicted_rms_m > 0
+    assert outcome.seconds > 0
+    assert outcome.report == f"{work.session.id}/report.html"
+    assert names(work.folder) == [
+        "calibration.yaml", "recipe.resolved.yaml", "report.html", "result.json", "run.mcap",
+        "session.json",
+    ]  # fmt: skip
+    result = json.loads((work.folder / "result.json").read_text())
+    assert result["holdout"]["rms"] == outcome.holdout_rms_m
+    assert list((work.job.out / STARTS).iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("what", "status", "reason"),
+    [
+        ("refuse", "refused", "solve.work: refused"),
+        ("fail", "failed", "solve.work: failed"),
+        ("raise", "failed", "3.solve.work: failed with RuntimeError: no idea; this is a mistake in "
+         "the plugin (FLANGEYE_DEBUG=1 shows where)"),
+        ("exit", "crashed", "SystemExit: 3"),
+    ],
+)  # fmt: skip
+def test_what_goes_wrong_is_the_outcome(work, what, status, reason):
+    outcome = work(overrides=(f"steps.3.what={what}",))
+    assert (outcome.status, outcome.reason) == (status, reason)
+    assert (work.folder / MARKER).exists() == (status == "refused")
+    assert list((work.job.out / STARTS).iterdir()) == []
+
+
+def test_no_archive(work, archive_recipe, archives):
+    outcome = work(name=archive_recipe, archives=(archives[2],))
+    assert outcome.status == "failed"
+    assert outcome.reason == f"{archives[2]}: no such archive"
+    assert not work.folder.exists()
+
+
+def test_a_finished_session_is_taken_over(work):
+    first = work()
+    before = (work.folder / "run.mcap").stat().st_mtime_ns
+    assert work() == first
+    assert (work.folder / "run.mcap").stat().st_mtime_ns == before
+    assert work(report=True).report is not None  # it was run again for that
+
+
+def test_an_unfinished_session_is_run_again(work):
+    first = work()
+    (work.folder / MARKER).unlink()
+    (work.folder / "result.json").write_text("half")
+    again = work()
+    assert again.holdout_rms_m == first.holdout_rms_m
+    assert json.loads((work.folder / "result.json").read_text())["status"] == "verified"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"key": "other"}', "\x00", '{"key": null}'])
+def test_a_marker_that_is_not_ours_counts_for_nothing(work, text):
+    work()
+    assert finished_outcome(work.folder, work.session.key, report=False)
+    (work.folder / MARKER).write_text(text)
+    assert finished_outcome(work.folder, work.session.key, report=False) is None
+
+
+def test_a_session_that_killed_its_worker_twice_is_not_started_again(work):
+    work()
+    (work.folder / MARKER).unlink()
+    (work.job.out / STARTS / work.session.id).write_bytes(b"..")
+    outcome = run_session(work.job, work.session)
+    assert (outcome.status, outcome.reason) == ("crashed", WORKER_DIED)
+    assert WORKER_DIED == (
+        "its worker died 2 times while it ran: killed, out of memory, or a crash in native code"
+    )
+
+
+def test_a_recipe_that_changed_meanwhile(work, recipe):
+    work()
+    (work.folder / MARKER).unlink()
+    recipe.write_text(recipe.read_text().replace("2 mm", "3 mm"))
+    outcome = run_session(work.job, work.session)
+    assert outcome == Outcome(
+        "failed",
+        f"{recipe}: has changed since the batch was started; start it again",
+        seconds=outcome.seconds,
+    )
+
+
+def test_a_worker_without_the_shared_folder(work):
+    work()
+    elsewhere = Job(work.job.out / "elsewhere", report=False, software=work.job.software)
+    outcome = run_session(elsewhere, work.session)
+    assert outcome.status == "failed"
+    assert "elsewhere: not there on worker " in outcome.reason
+    assert outcome.reason.endswith("must be on a file system that all workers share")
+
+
+def test_a_folder_that_cannot_be_written(work):
+    work()
+    (work.folder / MARKER).unlink()
+    (work.folder / MARKER).with_suffix(".json.part").mkdir()
+    outcome = run_session(work.job, work.session)
+    assert outcome.status == "verified"  # what lay in the way was of an earlier start

@@ -1,0 +1,225 @@
+"""The stages and their baselines, on one simulated PhoXi M scan of 3.2 M points."""
+
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.cloudfile import read_cloud, write_cloud
+from flangeye.geometry import kabsch
+from flangeye.recipe import Recipe, find_recipe, load_recipe
+from flangeye.registry import load_registry
+from flangeye_plugins.fitting.ransac import fit_ransac_circle
+from flangeye_plugins.fitting.rim import fit_rim
+from flangeye_plugins.segmentation.flange import segment_flange
+from flangeye_plugins.solving.robust import solve_robust
+from flangeye_plugins.solving.svd import solve_svd
+
+
+class Work(NamedTuple):
+    """A call to measure.
+
+    Attributes:
+        call: The call.
+        input: What it works on, or what the baseline is.
+        points: How many points go in, where that is the measure.
+        scale: What the measured seconds are multiplied by, where only a part is run.
+    """
+
+    call: Callable[[], object]
+    input: str
+    points: int = 0
+    scale: float = 1.0
+
+
+@cache
+def recipe() -> Recipe:
+    """Return the demo."""
+    return load_recipe(find_recipe("ur5_phoxi-m_simulated"), load_registry())
+
+
+@cache
+def stages() -> dict[str, t.Capture | t.FlangeCloud]:
+    """Return one full scan and its flange."""
+    capture = next(iter(_acquire()))
+    flange = segment_flange(capture, **_asked(segment_flange))
+    return {"capture": capture, "flange": flange}
+
+
+def _acquire() -> t.Captures:
+    step = recipe().steps[0]
+    return step.stage(**_asked(step.stage), params=step.params)
+
+
+def _asked(stage) -> dict[str, object]:
+    """Return what a stage asks the recipe's header for, and default parameters."""
+    context = recipe().context
+    given = {n: context[need] for n, need in stage.needs.items() if need in context}
+    if stage.params and stage.kind != "acquire":
+        given["params"] = stage.params()
+    return given
+
+
+def acquire() -> tuple[Work, Work]:
+    """A simulated scan, beside casting its camera rays alone."""
+    import open3d as o3d
+
+    captures = iter(_acquire())
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.create_sphere(0.3))
+    rays = scene.create_rays_pinhole(47, [0, 0, 0], [0, 0, -1], [0, 1, 0], 2064, 1544)
+    return (
+        Work(lambda: next(captures), "2064 x 1544 pixels", 2064 * 1544),
+        Work(lambda: scene.cast_rays(rays), "the same rays cast at a sphere by open3d"),
+    )
+
+
+def segment() -> tuple[Work, Work]:
+    """The flange out of a full scan, beside open3d's plane of the thinned cloud."""
+    import open3d as o3d
+
+    capture = stages()["capture"]
+
+    def plane() -> None:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(capture.cloud.points()))
+        cloud.voxel_down_sample(0.001).segment_plane(0.0005, 3, 1000)
+
+    return (
+        Work(
+            lambda: segment_flange(capture, **_asked(segment_flange)),
+            "organised scan", capture.cloud.xyz.size // 3,
+        ),
+        Work(plane, "open3d voxel_down_sample and segment_plane"),
+    )  # fmt: skip
+
+
+def segment_unorganised() -> tuple[Work, Work]:
+    """The same without the scanner's image."""
+    from dataclasses import replace
+
+    capture = stages()["capture"]
+    loose = replace(capture, cloud=t.PointCloud(t.CAMERA, capture.cloud.points()))
+    return (
+        Work(
+            lambda: segment_flange(loose, **_asked(segment_flange)),
+            "unorganised scan", len(loose.cloud.xyz),
+        ),
+        segment()[1],
+    )  # fmt: skip
+
+
+def fit() -> tuple[Work, Work]:
+    """fit.rim beside the paper's 10,000 draws as fit.ransac_circle does them."""
+    flange = stages()["flange"]
+    return (
+        Work(lambda: fit_rim(flange, **_asked(fit_rim)), "flange", len(flange.cloud.xyz)),
+        Work(lambda: fit_ransac_circle(flange, **_asked(fit_ransac_circle)), "fit.ransac_circle"),
+    )
+
+
+def ransac() -> tuple[Work, Work]:
+    """The paper's fit beside a loop that draws one circle at a time, 1 % of its draws timed."""
+    flange = stages()["flange"]
+    points = flange.cloud.points().astype(float)
+    rng = np.random.default_rng(0)
+
+    def loop() -> None:
+        for _ in range(100):
+            a, b, c = points[rng.integers(0, len(points), 3)]
+            np.count_nonzero(np.abs(np.linalg.norm(points - (a + b + c) / 3, axis=1) - 0.03) < 3e-4)
+
+    return (
+        Work(
+            lambda: fit_ransac_circle(flange, **_asked(fit_ransac_circle)),
+            "flange, 10,000 draws", len(points),
+        ),
+        Work(loop, "a loop over draws in numpy", scale=100),
+    )  # fmt: skip
+
+
+def _observations(n: int = 75) -> list[t.Observation]:
+    rng = np.random.default_rng(0)
+    observations = []
+    for i in range(n):
+        pose = np.eye(4)
+        pose[:3, 3] = rng.uniform(-0.15, 0.15, 3)
+        centre = pose[:3, 3] + rng.normal(0, 1e-4, 3)
+        circle = t.CircleFeature(centre, None, {"rim": 0.03}, 1e-8 * np.eye(3), None, 1.0)
+        observations.append(t.Observation(f"{i}", circle, t.Transform(t.BASE, t.FLANGE, pose)))
+    return observations
+
+
+def _solver(stage, observations: list[t.Observation]) -> object:
+    return stage(
+        observations=t.Observations(observations, t.Source("")),
+        **_asked(stage) | {"robot": None} if "robot" in stage.needs else _asked(stage),
+    )
+
+
+def solve() -> tuple[Work, Work]:
+    """solve.svd beside the registration alone."""
+    observations = _observations()
+    camera = np.array([o.circle.centre for o in observations])
+    base = np.array([o.tcp_in_base for o in observations])
+    return (
+        Work(lambda: _solver(solve_svd, observations), "75 poses"),
+        Work(lambda: kabsch(camera, base), "one SVD of a 3 x 3 matrix"),
+    )
+
+
+def robust() -> tuple[Work, Work]:
+    """solve.robust beside solve.svd."""
+    observations = _observations()
+    return (
+        Work(lambda: _solver(solve_robust, observations), "75 poses"),
+        Work(lambda: _solver(solve_svd, observations), "solve.svd"),
+    )
+
+
+def read() -> tuple[Work, Work]:
+    """A binary PCD of a full scan beside numpy's reading of its bytes."""
+    cloud = stages()["capture"].cloud
+    path = Path(tempfile.mkdtemp()) / "scan.pcd"
+    write_cloud(path, cloud)
+    return (
+        Work(lambda: read_cloud(path, "m"), "binary PCD", cloud.xyz.size // 3),
+        Work(lambda: np.fromfile(path, np.uint8), "the bytes, by numpy"),
+    )
+
+
+def record() -> tuple[Work, Work]:
+    """A full scan into the log beside compressing its bytes."""
+    from flangeye.record import Recorder
+
+    capture, folder = stages()["capture"], Path(tempfile.mkdtemp())
+    recorder = Recorder(folder / "run.mcap", {}, full_clouds=True)
+
+    def compressed() -> None:
+        import zstandard
+
+        zstandard.compress(capture.cloud.xyz.tobytes())
+
+    return (
+        Work(
+            lambda: recorder.flangeye_captured("0.acquire", capture, 0.0),
+            "a whole scan to MCAP", capture.cloud.xyz.size // 3,
+        ),
+        Work(compressed, "zstandard on the same bytes"),
+    )  # fmt: skip
+
+
+CASES = {
+    "acquire.simulated": acquire,
+    "segment.flange": segment,
+    "segment.flange, loose": segment_unorganised,
+    "fit.rim": fit,
+    "fit.ransac_circle": ransac,
+    "solve.svd": solve,
+    "solve.robust": robust,
+    "read_cloud": read,
+    "log": record,
+}

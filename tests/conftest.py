@@ -1,0 +1,67 @@
+"""Fixtures shared by all tests."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import pluggy
+import pytest
+
+from flangeye import hookspecs
+from flangeye.registry import Registry
+from tests import toy
+
+RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
+
+
+@pytest.fixture(scope="session")
+def ancorasir() -> Path:
+    """The authors' published recordings, which are not part of the project."""
+    if not RECORDINGS.is_dir():
+        pytest.skip(f"the published recordings are not at {RECORDINGS}")
+    return RECORDINGS
+
+
+def _registry_with(*modules: tuple[str, object]) -> Registry:
+    hooks = pluggy.PluginManager(hookspecs.NAME)
+    hooks.add_hookspecs(hookspecs)
+    registry = Registry(hooks)
+    for name, module in modules:
+        registry.register(name, module)
+    return registry
+
+
+@pytest.fixture
+def toy_registry() -> Registry:
+    """A registry that offers the toy stages alone."""
+    return _registry_with(("toy", toy))
+
+
+TOY_RECIPE = """\
+title: Toy
+seed: 3
+steps:
+  - acquire.toy: {count: 6, noise: 0.1 mm}
+  - segment.toy
+  - fit.toy
+  - solve.toy
+  - verify.toy: {max_rms: 2 mm}
+"""
+
+
+@pytest.fixture
+def toy_recipe(tmp_path: Path) -> Path:
+    """A recipe of the toy stages, on disk."""
+    path = tmp_path / "toy.yaml"
+    path.write_text(TOY_RECIPE)
+    return path
+
+
+@contextmanager
+def replaced(stage, function):
+    """Let a stage call another function for a while."""
+    plain = stage.function
+    object.__setattr__(stage, "function", function)
+    try:
+        yield
+    finally:
+        object.__setattr__(stage, "function", plain)

@@ -1,0 +1,195 @@
+"""The command line as a person meets it: output, exit codes, and what stays on disk."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from flangeye import cli, registry
+from tests import toy
+from tests.conftest import replaced
+
+
+@pytest.fixture
+def flangeye(monkeypatch, toy_registry, tmp_path, capsys):
+    """Call the command line in an empty folder with the toy stages; return code, out, err."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "load_registry", lambda: toy_registry)
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as exit_:
+            code = exit_.code
+        for plugin in list(toy_registry.hooks.get_plugins()):
+            if toy_registry.hooks.get_name(plugin) != "toy":
+                toy_registry.hooks.unregister(plugin)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+def test_a_run_leaves_its_folder_and_says_the_result(flangeye, toy_recipe, tmp_path):
+    code, out, err = flangeye("run", toy_recipe, "--out", "here")
+    assert code == 0, err
+    assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [
+        "calibration.yaml", "recipe.resolved.yaml", "report.html", "result.json", "run.mcap",
+    ]  # fmt: skip
+    assert "verified: 6 of 6 captures used" in out
+    assert "true error" in out
+    result = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert result["status"] == "verified"
+    calibration = yaml.safe_load((tmp_path / "here" / "calibration.yaml").read_text())
+    assert calibration["base_T_camera"]["matrix"] == result["transforms"]["base_T_camera"]["matrix"]
+
+
+def test_by_default_the_folder_is_named_by_time_and_recipe(flangeye, toy_recipe, tmp_path):
+    assert flangeye("run", toy_recipe)[0] == 0
+    assert flangeye("run", toy_recipe)[0] == 0
+    folders = [p.name for p in (tmp_path / "runs").iterdir()]
+    assert len(folders) == 2
+    assert all("_toy" in name for name in folders)
+
+
+def test_the_resolved_recipe_runs_to_the_same_result(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--out", "a")
+    flangeye("run", tmp_path / "a" / "recipe.resolved.yaml", "--out", "b")
+    first, second = (json.loads((tmp_path / x / "result.json").read_text()) for x in "ab")
+    assert first["transforms"] == second["transforms"]
+    assert first["provenance"]["recipe_hash"] == second["provenance"]["recipe_hash"]
+
+
+def test_refused_is_exit_code_one_with_the_reason(flangeye, toy_recipe, tmp_path):
+    code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
+    assert code == 1
+    assert "refused: verify.toy: " in out
+    assert (tmp_path / "x" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["run", "nothing"], "error: no recipe 'nothing'; 'flangeye recipes' lists them"),
+        (["run", "toy.yaml", "--at", "solve.toy"],
+         "error: --from and --at go together: --from run.mcap --at solve.svd"),
+        (["run", "toy.yaml", "--from", "no.mcap", "--at", "solve.toy"],
+         "error: no.mcap: cannot be read: No such file or directory"),
+        (["run", "toy.yaml", "--set", "steps.2.inlier=3"],
+         "error: --set steps.2.fit.toy.inlier: '3' has no unit: a length needs one (mm, m, um, "
+         "for example '31.5 mm')"),
+        (["run", "toy.yaml", "--set", "steps.0.count=2"],
+         "error: solve.toy: 3 poses needed, 2 given"),
+        (["run", "toy.yaml", "--out", "."],
+         "error: .: already holds files; name a new or empty folder"),
+        (["run", "toy.yaml", "--out", "toy.yaml/x"],
+         "error: toy.yaml/x: cannot be made: Not a directory"),
+        (["show", "toy.yaml"], "error: toy.yaml: is not an MCAP file"),
+        (["report", "none.mcap"], "error: none.mcap: cannot be read: No such file or directory"),
+        (["stages", "solve.toi"], "error: no stage 'solve.toi'; did you mean solve.toy?"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_code_two(flangeye, toy_recipe, tmp_path, words, line):
+    before = sorted(p.name for p in tmp_path.iterdir())
+    code, out, err = flangeye(*words)
+    assert code == 2
+    assert err.splitlines()[-1] == line
+    assert "Traceback" not in out + err
+    kept = [n for n in sorted(p.name for p in tmp_path.iterdir()) if n != "runs"]
+    assert kept == before
+
+
+def test_from_a_log_without_the_scans(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--out", "a")
+    code, _, err = flangeye(
+        "run", toy_recipe, "--from", "a/run.mcap", "--at", "solve.toy", "--out", "b"
+    )
+    assert code == 0, err
+    first, second = (json.loads((tmp_path / x / "result.json").read_text()) for x in "ab")
+    assert first["transforms"] == second["transforms"]
+
+
+def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--set", "steps.0.bad=1", "--out", "a")
+    code, out, _ = flangeye("show", "a/run.mcap")
+    assert code == 0
+    assert "a/run.mcap: complete" in out
+    assert "set aside 000: segment.toy: no finite point" in out
+    assert "2.fit.toy" in out
+    (tmp_path / "a" / "report.html").unlink()
+    assert flangeye("report", "a/run.mcap")[0] == 0
+    assert (tmp_path / "a" / "report.html").stat().st_size > 1000
+
+
+def test_check_stages_plugins_schema(flangeye, toy_recipe, tmp_path):
+    assert flangeye("check", toy_recipe)[1] == f"{toy_recipe}: ok, 5 steps\n"
+    out = flangeye("stages")[1]
+    assert "fit: the circle's centre, with covariance\n  fit.toy" in out
+    out = flangeye("stages", "fit.toy")[1]
+    assert "  inlier: length = 0.3 mm  (> 0 in SI)\n" in out
+    assert "      Largest distance of a rim point from the circle.\n" in out
+    out = flangeye("stages", "solve.toy")[1]
+    assert "  cost: a cost = toy\n" in out
+    assert flangeye("plugins")[0] == 0
+    code, out, err = flangeye("schema")
+    assert json.loads(out)["title"] == "flangeye recipe"
+    assert err == (
+        "first line of your recipe: # yaml-language-server: $schema=recipe.schema.json\n"
+    )
+    assert json.loads(flangeye("schema", "--result")[1])["title"] == "Result"
+
+
+def test_a_folder_is_kept_once_something_was_gathered(flangeye, toy_recipe, tmp_path):
+    code, _, err = flangeye("run", toy_recipe, "--set", "steps.0.count=2", "--out", "kept")
+    assert code == 2
+    assert err.splitlines()[1] == "what was gathered is in kept/run.mcap"
+    assert flangeye("show", "kept/run.mcap")[0] == 0
+
+
+def test_help_and_stages_answer_at_once():
+    """A ratio against the bare interpreter, so that a slow machine does not fail it."""
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}
+
+    def best(*command):
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            subprocess.run([sys.executable, *command], capture_output=True, env=environment)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    heavy = best("-c", "import scipy.optimize, cv2, open3d")
+    assert best("-m", "flangeye.cli", "--help") < 0.5 * heavy
+    assert best("-m", "flangeye.cli", "stages") < 0.5 * heavy
+
+
+def test_light_commands_import_nothing_heavy():
+    code = (
+        "import sys; from flangeye import cli; from flangeye.registry import load_registry; "
+        "load_registry(); print([m for m in ('open3d', 'scipy', 'cv2', 'plotly') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "[]\n"
+
+
+def test_ctrl_c_keeps_what_was_gathered(flangeye, toy_recipe, monkeypatch):
+    plain = toy.segment.function
+
+    def stopped_at_the_fourth(capture):
+        if capture.id == "003":
+            raise KeyboardInterrupt
+        return plain(capture)
+
+    with replaced(toy.segment, stopped_at_the_fourth):
+        code, _, err = flangeye("run", toy_recipe, "--out", "a")
+    assert code == 130
+    assert err.splitlines()[-2:] == [
+        "what was gathered is in a/run.mcap", "error: stopped by Ctrl-C",
+    ]  # fmt: skip
+    assert "3 went through" in flangeye("show", "a/run.mcap")[1]

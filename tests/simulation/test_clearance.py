@@ -1,0 +1,64 @@
+"""Distances of segments, and what an arm may not touch."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flangeye.catalogue import load_model
+from flangeye.kinematics import Arm
+from flangeye_plugins.simulation.clearance import ArmVolume, segment_distance
+
+coordinates = st.lists(st.floats(-1, 1), min_size=12, max_size=12)
+
+
+@given(coordinates)
+def test_segment_distance_is_the_smallest_of_all_pairs_of_points(numbers):
+    first, second = np.array(numbers).reshape(2, 2, 3)
+    share = np.linspace(0, 1, 41)[:, None]
+    points1 = first[0] + share * (first[1] - first[0])
+    points2 = second[0] + share * (second[1] - second[0])
+    brute = np.linalg.norm(points1[:, None] - points2[None], axis=-1).min()
+    found = float(segment_distance(first, second))
+    spacing = (np.ptp(first, axis=0) + np.ptp(second, axis=0)).max() / 20
+    assert found <= brute + 1e-9
+    assert found >= brute - spacing - 1e-9
+
+
+def test_segment_distance_works_on_many_at_once():
+    first = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]]], dtype=float)
+    second = np.array([[[0.5, 1, 0], [0.5, 2, 0]], [[3, 4, 0], [3, 4, 9]]], dtype=float)
+    assert segment_distance(first, second) == pytest.approx([1.0, 5.0])
+
+
+def volume_at(robot, joints):
+    model = load_model("robots", robot)
+    volume = ArmVolume(model)
+    return volume, volume.axes(Arm(model).frames(np.array(joints, dtype=float)))
+
+
+def test_an_arm_that_points_down_is_in_the_table():
+    upright, axes = volume_at("ur5", [0, -np.pi / 2, 0, 0, 0, 0])
+    assert upright.above(axes, 0.0)
+    down, axes = volume_at("ur5", [0, 0.8, 0, 0, 0, 0])
+    assert not down.above(axes, 0.0)
+
+
+@pytest.mark.parametrize("robot", ["ur3e", "ur5", "ur5e", "ur10e", "aubo-i5"])
+def test_an_arm_that_stands_upright_touches_nothing(robot):
+    upright = [0, -np.pi / 2, 0, 0, 0, 0] if robot != "aubo-i5" else [0] * 6
+    volume, axes = volume_at(robot, upright)
+    assert volume.apart(axes)
+
+
+def test_a_folded_arm_touches_itself():
+    volume, axes = volume_at("ur5", [0, -np.pi / 2, 2.75, 0, 1.5, 0])
+    assert not volume.apart(axes)
+
+
+def test_a_line_of_sight_through_the_arm_is_not_free():
+    volume, axes = volume_at("ur5", [0, -np.pi / 2, 0, 0, 0, 0])
+    through = np.array([[[-1.0, -0.1, 0.4], [1.0, -0.1, 0.4]]])
+    beside = np.array([[[-1.0, 0.4, 0.4], [1.0, 0.4, 0.4]]])
+    assert not volume.leaves_free(axes, through, 0.03)
+    assert volume.leaves_free(axes, beside, 0.03)

@@ -1,0 +1,91 @@
+"""Every shipped recipe is checked and run."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from flangeye.recipe import load_recipe, recipe_names
+from flangeye.registry import load_registry
+from flangeye.schema import recipe_schema
+from flangeye.yamlfile import read_yaml
+
+NAMES = list(recipe_names())
+
+
+def first_step(name):
+    step = read_yaml(recipe_names()[name]).data["steps"][0]
+    return step if isinstance(step, str) else next(iter(step))
+
+
+def flangeye(*words, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "flangeye.cli", *map(str, words)],
+        cwd=cwd, capture_output=True, text=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recipe_checks_and_resolves(name):
+    registry = load_registry()
+    recipe = load_recipe(recipe_names()[name], registry)
+    assert recipe.header.title
+    assert recipe.header.description
+
+
+# Those of recipes/paper are studies; tests/studies runs them.
+CALIBRATIONS = [name for name in NAMES if not name.startswith("paper/")]
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
+    words = ["run", name, "--out", "run"]
+    if name.endswith("_archive"):
+        recordings = request.getfixturevalue("ancorasir")
+        if "ur10e_phoxi" in name and not (recordings / "data" / "ur10e").is_dir():
+            pytest.skip(f"{recordings} has no data/ur10e")
+        words += ["--archive", recordings]
+    elif name.endswith("_simulated") and "kinect" not in name:  # which is coarse enough
+        words += ["--set", "steps.0.resolution=0.3"]
+    told = flangeye(*words, cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["status"] == "verified"
+    if first_step(name) == "acquire.simulated":
+        (limit,) = [
+            step.params.max_rms
+            for step in load_recipe(recipe_names()[name], load_registry()).steps
+            if step.stage.name == "verify.holdout"
+        ]
+        assert result["truth"]["rms_over_workspace"] < limit
+
+
+def test_the_published_aubo_clouds_reach_the_target(ancorasir, tmp_path):
+    told = flangeye(
+        "run", "aubo-i5_phoxi-s_archive", "--archive", ancorasir, "--out", "run", cwd=tmp_path
+    )
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    residuals = sorted(o["residual"] for o in result["observations"])
+    rms = (sum(r * r for r in residuals) / len(residuals)) ** 0.5
+    assert told.returncode == 0
+    assert len(residuals) == 30
+    assert rms <= 0.42e-3
+    assert (residuals[14] + residuals[15]) / 2 <= 0.24e-3
+    assert result["holdout"]["rms"] <= 0.44e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_editors_accept_a_recipe_that_runs(name):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = recipe_schema(load_registry())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(read_yaml(recipe_names()[name]).data, schema)
+
+
+def test_editors_mark_a_recipe_that_does_not():
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = recipe_schema(load_registry())
+    recipe = {"title": "T", "steps": [{"fit.rim": {"inlir": "0.2 mm"}}]}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(recipe, schema)

@@ -1,0 +1,75 @@
+"""The built wheels, as a stranger installs them: ours, and a vendor's beside it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def pip(*words):
+    subprocess.run([sys.executable, "-m", "pip", "--quiet", *map(str, words)], check=True)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder holding our wheel and the vendor's, installed without the checkout."""
+    wheels, target = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
+    for project in (ROOT, ROOT / "tests" / "vendor_example"):
+        pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", wheels, project)
+    pip("install", "--no-deps", "--target", target, *wheels.glob("*.whl"))
+    return target
+
+
+@pytest.fixture
+def flangeye(installed, tmp_path):
+    """Run the installed command in an empty folder."""
+
+    def call(*words):
+        environment = {**os.environ, "PYTHONPATH": str(installed)}
+        return subprocess.run(
+            [sys.executable, "-m", "flangeye.cli", *map(str, words)],
+            cwd=tmp_path, env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+
+    return call
+
+
+def test_the_wheel_carries_recipes_and_data(installed, flangeye):
+    assert (installed / "flangeye" / "_shipped" / "recipes").is_dir()
+    assert (installed / "flangeye" / "py.typed").exists()
+    told = flangeye("recipes")
+    assert "ur5_phoxi-m_simulated" in told.stdout, told.stderr
+    assert flangeye("check", "ur5_phoxi-m_simulated").stdout.startswith(str(installed))
+
+
+def test_the_wheel_runs_in_an_empty_folder(flangeye, tmp_path):
+    small = ["--set", "steps.0.resolution=0.25"]
+    told = flangeye("run", "ur5_phoxi-m_simulated", *small, "--out", "run")
+    assert told.returncode == 0, told.stderr
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["status"] == "verified"
+
+
+def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
+    assert "acme 1.0.0: fit.acme_hull" in flangeye("plugins").stdout
+    assert "tolerance: length = 1 mm" in flangeye("stages", "fit.acme_hull").stdout
+    recipe = tmp_path / "acme.yaml"
+    recipe.write_text(
+        "title: A vendor's fit\n"
+        "robot: {model: ur5}\n"
+        "scanner: {model: phoxi-m}\n"
+        "steps:\n"
+        "  - acquire.simulated: {resolution: 0.25}\n"
+        "  - segment.flange\n"
+        "  - fit.acme_hull: {tolerance: 2 mm}\n"
+        "  - solve.svd\n"
+    )
+    told = flangeye("run", recipe, "--out", "run")
+    assert told.returncode == 0, told.stderr
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["provenance"]["plugins"]["acme"] == "1.0.0"
+    assert result["status"] == "unverified"
