@@ -1,16 +1,26 @@
-"""The outputs in the README are what the commands print."""
+"""The outputs in the README are what the commands print, to the digits that travel."""
 
 import pytest
 
-from tests.readme import output_of, shown
+from tests.readme import output_of, same, shown
 
 
 def test_the_real_recordings(ancorasir):
     (command,) = [c for c in shown() if "aubo" in c]
-    assert shown()[command] == output_of(command), "python -m tests.readme renews it"
+    quoted, printed = shown()[command], output_of(command)
+    assert same(quoted, printed), f"python -m tests.readme renews it; it printed:\n{printed}"
 
 
 @pytest.mark.slow
 def test_the_demo():
     (command,) = [c for c in shown() if "simulated" in c]
-    assert shown()[command] == output_of(command), "python -m tests.readme renews it"
+    quoted, printed = shown()[command], output_of(command)
+    assert same(quoted, printed), f"python -m tests.readme renews it; it printed:\n{printed}"
+
+
+def test_a_changed_word_or_a_changed_figure_is_seen():
+    quoted = "held-out error     0.303 mm rms, 27 of 30 poses,  -148.2680 deg"
+    assert same(quoted, "held-out error     0.302 mm rms, 27 of 30 poses,  -148.2682 deg")
+    assert not same(quoted, "held-out error     0.323 mm rms, 27 of 30 poses,  -148.2680 deg")
+    assert not same(quoted, "held-out error     0.303 mm rms, 26 of 30 poses,  -148.2680 deg")
+    assert not same(quoted, "held-out error     0.303 mm p95, 27 of 30 poses,  -148.2680 deg")
