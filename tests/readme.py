@@ -42,7 +42,8 @@ def same(shown: str, printed: str) -> bool:
     words, numbers = NUMBER.split(shown), [float(n) for n in NUMBER.findall(shown)]
     others = [float(n) for n in NUMBER.findall(printed)]
     return NUMBER.split(printed) == words and all(
-        math.isclose(a, b, rel_tol=0.02, abs_tol=0.002) for a, b in zip(numbers, others, strict=True)
+        math.isclose(a, b, rel_tol=0.02, abs_tol=0.002)
+        for a, b in zip(numbers, others, strict=True)
     )
 
 

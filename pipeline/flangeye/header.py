@@ -2,29 +2,62 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from flangeye.units import Length
+from flangeye.stage import Choose, Chosen
+from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
 
 class Section(BaseModel):
     """Base of a recipe's sections."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        arbitrary_types_allowed=True,
+        defer_build=True,
+    )
+
+
+class BoxSection(Section):
+    """A box along the axes of the robot's base."""
+
+    centre: tuple[Length, Length, Length]
+    size: tuple[Length, Length, Length]
+
+
+class LimitsSection(Section):
+    """What the arm must keep to; required where a driver is named, for a real arm may be there."""
+
+    box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
+    speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Of the flange.")
+    acceleration: Acceleration = param("300 mm/s^2", gt=0, le=3.0, description="Of the flange.")
+    joint_speed: AngularSpeed = param("30 deg/s", gt=0, description="Of every joint.")
+    joints: tuple[tuple[Angle, Angle], ...] | None = Field(
+        None, description="Lower and upper angle of each joint; the model's own when not given."
+    )
 
 
 class RobotSection(Section):
-    """Which arm."""
+    """Which arm, and how to reach it."""
 
     model: str = Field(description="A model of data/robots, or a .yaml file of your own.")
+    driver: Annotated[Chosen, Choose("robot")] | None = Field(
+        None, description="How to reach the real arm, for example {ur_rtde: {host: 192.168.1.10}}."
+    )
+    limits: LimitsSection | None = Field(None, description="What the arm must keep to.")
 
 
 class ScannerSection(Section):
-    """Which scanner."""
+    """Which scanner, and how to reach it."""
 
     model: str = Field(description="A model of data/scanners, or a .yaml file of your own.")
+    driver: Annotated[Chosen, Choose("scanner")] | None = Field(
+        None, description="How to reach the real scanner, for example {watched_folder: {path: …}}."
+    )
 
 
 class SphereSection(Section):
@@ -50,11 +83,8 @@ class FeatureSection(Section):
     )
 
 
-class WorkspaceSection(Section):
+class WorkspaceSection(BoxSection):
     """Where the work is, in the robot's base; errors are reported over this box."""
-
-    centre: tuple[Length, Length, Length]
-    size: tuple[Length, Length, Length]
 
 
 class LogSection(Section):

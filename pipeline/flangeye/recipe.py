@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,18 @@ from flangeye.catalogue import (
     read_model,
     wrist_circle_of,
 )
+from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
 from flangeye.explain import sentence
-from flangeye.header import FeatureSection, Header
+from flangeye.header import FeatureSection, Header, LimitsSection
 from flangeye.overrides import apply_override
 from flangeye.registry import PluginNotFoundError, Registry
 from flangeye.shipped import shipped
 from flangeye.stage import Params, Part, Stage
 from flangeye.steps import SECTIONS, Step, StepOrder
 from flangeye.yamlfile import Document, parse_yaml, read_yaml
+
+LIMITS = "{box: {centre: [500 mm, 0 mm, 400 mm], size: [800 mm, 800 mm, 800 mm]}}"
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,7 @@ class _Checker:
 
     def _header(self, data: dict[Hashable, Any]) -> Header | None:
         try:
-            return Header.model_validate(data)
+            return Header.model_validate(data, context=self)
         except ValidationError as error:
             self._explain((), error, Header)
             return None
@@ -168,12 +172,31 @@ class _Checker:
                     context[cls] = load_model(kind, section.model, self.folder)  # type: ignore[arg-type]
             except RecipeError as error:
                 self.complain((kind[:-1], "model"), str(error))
+        self._drivers(header, context)
         try:
             if RobotModel in context:
                 context[Flange] = self._flange(header.feature, context[RobotModel])
         except RecipeError as error:
             self.complain(("feature",), str(error))
         return context
+
+    def _drivers(self, header: Header, context: dict[type, Any]) -> None:
+        """Offer the devices the header names, not yet opened, and the limits of the arm."""
+        robot, scanner = header.robot, header.scanner
+        if robot and robot.driver:
+            if robot.limits is None:
+                self.complain(
+                    ("robot",), "a robot with a driver needs limits, for example " + LIMITS
+                )
+            context[RobotDriver] = RobotDriver(
+                robot.driver.part.name, partial(robot.driver, context.get(RobotModel))
+            )
+        if robot and robot.limits:
+            context[LimitsSection] = robot.limits
+        if scanner and scanner.driver:
+            context[ScannerDriver] = ScannerDriver(
+                scanner.driver.part.name, partial(scanner.driver, context.get(ScannerModel))
+            )
 
     def _flange(self, feature: FeatureSection, robot: RobotModel) -> Flange:
         if feature.standard and feature.wrist_circle:

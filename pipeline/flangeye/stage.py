@@ -95,6 +95,9 @@ PARTS: Mapping[str, str] = {
     "plan": "the robot poses an acquisition visits",
     "cost": "what solve.iterative minimises of a pose error",
     "error": "how solve.iterative measures a candidate's pose error",
+    "robot": "an arm that acquire.live can move",
+    "scanner": "a scanner that acquire.live can trigger",
+    "sensor": "a tactile sensor that weld.tactile can read",
 }
 """The kinds of parts, which steps choose by name in their parameters."""
 

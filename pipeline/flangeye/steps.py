@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 from flangeye import types as t
 from flangeye.catalogue import Flange, RobotModel, ScannerModel, Sphere
+from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.stage import KINDS, Params, Stage
 
 Complain = Callable[[Sequence[Hashable], str], None]
@@ -19,6 +20,8 @@ SECTIONS = {
     Flange: ("robot", "{model: …}"),
     Sphere: ("feature", "{sphere: {diameter: 38.1 mm, centre: [0 mm, 0 mm, 60 mm]}}"),
     t.Seed: ("seed", "0"),
+    RobotDriver: ("robot", "{model: …, driver: {ur_rtde: {host: 192.168.1.10}}, limits: …}"),
+    ScannerDriver: ("scanner", "{model: …, driver: {watched_folder: {path: …}}}"),
 }
 """What stages may ask for of a recipe's header: the section it comes from, and an example."""
 

@@ -26,21 +26,23 @@ BASE, FLANGE, CAMERA = "base", "flange", "camera"
 
 
 class _AsNestedLists:
-    """Lets pydantic read and write a float64 array as nested JSON lists, bit for bit."""
+    """Lets pydantic read and write an array as nested JSON lists, bit for bit."""
 
-    @classmethod
-    def __get_pydantic_core_schema__(cls, _source: Any, _handler: Any) -> core_schema.CoreSchema:
+    def __init__(self, dtype: type[np.generic]) -> None:
+        self._dtype = dtype
+
+    def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
-            lambda value: np.asarray(value, dtype=np.float64),
+            lambda value: np.asarray(value, dtype=self._dtype),
             serialization=core_schema.plain_serializer_function_ser_schema(lambda a: a.tolist()),
         )
 
-    @classmethod
-    def __get_pydantic_json_schema__(cls, _schema: Any, _handler: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, _schema: Any, _handler: Any) -> dict[str, Any]:
         return {"type": "array"}
 
 
-Array = Annotated[NDArray[np.float64], _AsNestedLists]
+Array = Annotated[NDArray[np.float64], _AsNestedLists(np.float64)]
+Pixels = Annotated[NDArray[np.uint8], _AsNestedLists(np.uint8)]
 FloatArray = NDArray[np.float32] | NDArray[np.float64]
 
 
@@ -214,16 +216,43 @@ Role = Literal["calibration", "verification"]
 
 
 @dataclass(frozen=True, eq=False)
+class Image:
+    """What a calibrated camera saw.
+
+    Attributes:
+        pixels: (H, W) grey or (H, W, 3) RGB, uint8.
+        camera_matrix: (3, 3) pinhole matrix [px].
+        distortion: (k,) OpenCV's distortion coefficients; empty for an undistorted image.
+    """
+
+    pixels: Pixels
+    camera_matrix: Array
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        pixels = np.asarray(self.pixels)
+        grey_or_rgb = pixels.ndim == 2 or pixels.shape[2:] == (3,)
+        if pixels.dtype != np.uint8 or not grey_or_rgb:
+            got = f"{pixels.shape} {pixels.dtype}"
+            raise ValueError(f"an image is (H, W) or (H, W, 3) uint8, not {got}")
+        view = pixels.view()
+        view.setflags(write=False)
+        object.__setattr__(self, "pixels", view)
+        _freeze(self, camera_matrix=(3, 3), distortion=np.shape(self.distortion))
+
+
+@dataclass(frozen=True, eq=False)
 class Capture:
     """One look at the flange: where the robot says it stood, and what the scanner saw.
 
     Attributes:
         id: Unique within a run.
-        cloud: The scan, in ``camera``.
+        cloud: The scan, in ``camera``; without points where only an image was taken.
         base_T_flange: Pose read from the controller.
         joints: (n,) joint angles [rad], when known.
         time_ns: When the exposure ended.
         role: ``verification`` captures are kept from every solver.
+        image: What a camera in the scanner saw, in the same frame, if one looked.
     """
 
     id: str
@@ -232,6 +261,7 @@ class Capture:
     joints: Array | None = None
     time_ns: int = 0
     role: Role = "calibration"
+    image: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,229 @@
+"""What a robot, a scanner and a tactile sensor must do; everything vendor-specific is behind this.
+
+A driver is a part (``robot.NAME``, ``scanner.NAME``, ``sensor.NAME``): a function that takes the
+recipe's model and its own parameters and returns an open device. It imports its SDK when it is
+called and raises :class:`DeviceError` in one line where SDK, device or permission is missing.
+
+No method of a driver moves anything by itself, waits for a motion to end, or blocks for longer
+than :data:`PATIENCE`: whoever commands a motion watches it (``flangeye_plugins.motion``), so that
+every arm stops for the same reasons. SI units; a twist is (linear, angular), about the flange's
+origin, along the base's axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import StageError
+from flangeye.types import Array, Image, PointCloud, Transform
+
+Floats = NDArray[np.float64]
+
+PATIENCE = 3.0
+"""Longest time any method of a driver takes, whatever happened to the device [s]."""
+
+Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
+
+
+class DeviceError(StageError):
+    """A device cannot be opened, or is lost: which, why, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotState:
+    """One consistent sample of an arm.
+
+    Attributes:
+        base_T_flange: Pose of the flange, any tool offset of the controller taken off.
+        joints: (n,) angles [rad].
+        joint_speeds: (n,) [rad/s].
+        time_ns: When the controller sampled it, on this computer's clock.
+        mode: What the controller is able to do; anything but ready and moving is a doubt.
+        force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
+        message: What the controller says of a mode that is not ready, for people.
+    """
+
+    base_T_flange: Transform
+    joints: Array
+    joint_speeds: Array
+    time_ns: int
+    mode: Mode
+    force: Array | None = None
+    message: str = ""
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """An arm. Opened by its driver, used as a context, closed for good at the end.
+
+    Attributes:
+        name: For people: what it is and where, ``ur5e at 192.168.1.10``.
+        period: Between two of the controller's cycles [s].
+        flange_T_tool: The tool offset set in the controller; None where it cannot be read.
+    """
+
+    name: str
+    period: float
+    flange_T_tool: Transform | None
+
+    def state(self) -> RobotState:
+        """Return the newest sample; raise DeviceError when it is older than 100 ms."""
+        ...
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (n,) [rad]; speed of the fastest joint [rad/s]."""
+        ...
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange [m/s, m/s^2]."""
+        ...
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) until the next command; the arm stops if none comes in time."""
+        ...
+
+    def wait_cycle(self) -> None:
+        """Return at the start of the controller's next cycle."""
+        ...
+
+    def stop(self) -> None:
+        """Begin to brake at once, whatever is under way; does nothing on an arm that stands."""
+        ...
+
+    def close(self) -> None:
+        """Stop and let go of the controller; safe to call twice and after the device was lost."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One exposure.
+
+    Attributes:
+        cloud: In ``camera`` [m].
+        started_ns: When the exposure began, on this computer's clock.
+        ended_ns: When it ended.
+        image: What a camera in the scanner saw, if it has one and was asked.
+    """
+
+    cloud: PointCloud
+    started_ns: int
+    ended_ns: int
+    image: Image | None = None
+
+
+@runtime_checkable
+class Scanner(Protocol):
+    """A 3D scanner. Opened by its driver, used as a context.
+
+    Attributes:
+        name: For people, with the serial number.
+        facts: What the device itself says: unit, layout, size, firmware, …; logged.
+    """
+
+    name: str
+    facts: dict[str, str]
+
+    def expose(self) -> Callable[[], Scan]:
+        """Return when the exposure has ended and the arm may move on.
+
+        Calling what it returns waits for the data, a few seconds at most, and gives the scan.
+
+        Raises:
+            DeviceError: The scanner is lost, or gave nothing in time.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the device; safe to call twice."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrame:
+    """One image of a tactile sensor.
+
+    Attributes:
+        image: What its camera saw.
+        time_ns: Middle of the exposure, on the robot's clock.
+    """
+
+    image: Image
+    time_ns: int
+
+
+@runtime_checkable
+class TactileSensor(Protocol):
+    """A camera that watches a tag on a compliant finger.
+
+    Attributes:
+        name: For people.
+        camera_matrix: (3, 3) [px].
+        distortion: (k,) OpenCV's coefficients; empty for none.
+    """
+
+    name: str
+    camera_matrix: Array
+    distortion: Array
+
+    def frame(self) -> SensorFrame | None:
+        """Return the newest frame not yet returned, or None; never waits.
+
+        Raises:
+            DeviceError: The camera is lost.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera; safe to call twice."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@dataclass(frozen=True)
+class RobotDriver:
+    """The recipe's ``robot.driver``, not yet opened.
+
+    Attributes:
+        name: Name of the part.
+        open: Connects; raises DeviceError where it cannot.
+    """
+
+    name: str
+    open: Callable[[], Robot] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class ScannerDriver:
+    """The recipe's ``scanner.driver``, not yet opened.
+
+    Attributes:
+        name: Name of the part.
+        open: Connects; raises DeviceError where it cannot.
+    """
+
+    name: str
+    open: Callable[[], Scanner] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class MotionAllowed:
+    """Whether the person asked for motion (``--move``); without it, nothing moves."""
+
+    allowed: bool = False
