@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.types import Array, Image, PointCloud, Transform
+from flangeye.types import Array, Image, PointCloud, Transform, Truth
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not read
 
 class DeviceError(StageError):
     """A device cannot be opened, or is lost: which, why, and what to do."""
+
+
+class FrameDropped(DeviceError):
+    """A scanner lives, but lost this one exposure: expose again, or leave the pose out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +141,10 @@ class Scanner(Protocol):
         """Return when the exposure has ended and the arm may move on.
 
         Calling what it returns waits for the data, a few seconds at most, and gives the scan.
+        Both may raise; what it returns is called once, and before the next exposure.
 
         Raises:
+            FrameDropped: This exposure gave nothing; the scanner is still there.
             DeviceError: The scanner is lost, or gave nothing in time.
         """
         ...
@@ -150,6 +156,17 @@ class Scanner(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *_: object) -> None: ...
+
+
+@runtime_checkable
+class KnowsTruth(Protocol):
+    """What a simulated scanner tells besides, for its error to be measured; no stage can ask.
+
+    Attributes:
+        truth: Where it really stands.
+    """
+
+    truth: Truth
 
 
 @dataclass(frozen=True, eq=False)

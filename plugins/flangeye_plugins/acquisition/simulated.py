@@ -21,7 +21,6 @@ from flangeye.catalogue import (
     load_standard,
 )
 from flangeye.errors import StageError
-from flangeye.geometry import rigid, rotation_from_rpy
 from flangeye.stage import Choose, Chosen, Params, stage
 from flangeye.types import (
     BASE,
@@ -37,19 +36,20 @@ from flangeye.types import (
     Transform,
     Truth,
 )  # fmt: skip
-from flangeye.units import Angle, Length, param
+from flangeye.units import param
 from flangeye_plugins.acquisition.plans import Plan, Site, poses_near
 from flangeye_plugins.simulation.arm import ImperfectArm
 from flangeye_plugins.simulation.cell import Cell
-from flangeye_plugins.simulation.raycast import Body, Image, Scene
+from flangeye_plugins.simulation.eye import (
+    CameraPose,
+    before_camera,
+    eye_of,
+    middle_of_view,
+)
+from flangeye_plugins.simulation.raycast import Image
 from flangeye_plugins.simulation.reach import Reach
-from flangeye_plugins.simulation.structured_light import StructuredLight
-from flangeye_plugins.simulation.time_of_flight import TimeOfFlight
 
 Floats = NDArray[np.float64]
-
-WORKING_DISTANCE = 0.7
-"""From the scanner to the middle of the workspace, where its range allows: the paper's [m]."""
 
 EPOCH_NS = 1_704_067_200_000_000_000
 """When simulated runs begin: 2024-01-01, 00:00 UTC."""
@@ -62,17 +62,6 @@ FEWEST = 3
 
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
-
-
-class CameraPose(Params):
-    """Where the scanner stands, in ``base``."""
-
-    position: tuple[Length, Length, Length] = param(
-        ("600 mm", "-12.5 mm", "1000 mm"), description="The paper's (17): 1 m above the table."
-    )
-    rpy: tuple[Angle, Angle, Angle] = param(
-        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
-    )
 
 
 class SimulatedParams(Params):
@@ -125,7 +114,7 @@ def acquire_simulated(
     """
     plate = flange if flange.bore else flange_of(robot, load_standard(robot.flange.standard))
     planning, checking, errors, noise = np.random.SeedSequence([VERSION, seed]).spawn(4)
-    base_T_camera = _camera_pose(params.camera)
+    base_T_camera = params.camera.base_T_camera
     reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
     site = _site(reach, scanner, base_T_camera)
     plan: Plan = params.poses(site, np.random.default_rng(planning))
@@ -144,13 +133,8 @@ def acquire_simulated(
     return Captures(session.captures(errors, noise), source, total=len(session.joints))
 
 
-def _camera_pose(camera: CameraPose) -> Floats:
-    return rigid(rotation_from_rpy(*camera.rpy), np.asarray(camera.position))
-
-
 def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
-    distance = min(WORKING_DISTANCE, (scanner.near + scanner.far) / 2)
-    centre = base_T_camera[:3, 3] + distance * base_T_camera[:3, 2]
+    centre = middle_of_view(scanner, base_T_camera)
     return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
 
 
@@ -211,29 +195,22 @@ class _Session:
             1 + len(self.joints)
         )
         arm = ImperfectArm(self.cell.robot, self.params.robot_errors, _rng(of_arm))
-        eye = self._eye(_rng(of_scanner))
+        eye = eye_of(self.scanner, self.params.resolution, self.params.noise, _rng(of_scanner))
         covered = self._covered(_rng(of_covers))
         around = self.cell.around()
         for index, joints in enumerate(self.joints):
             rng = _rng(of_captures[index])
             frames, flange = arm.stand(joints, rng)
             cover = [self.cell.board(flange)] if index in covered else []
-            xyz = eye.scan(self._before_camera(around + self.cell.arm(frames, flange) + cover), rng)
+            bodies = around + self.cell.arm(frames, flange) + cover
+            xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
             yield self._capture(index, xyz, arm.reported(joints))
-
-    def _eye(self, rng: np.random.Generator) -> StructuredLight | TimeOfFlight:
-        kind = StructuredLight if self.scanner.principle == "structured light" else TimeOfFlight
-        return kind(self.scanner, self.params.resolution, self.params.noise, rng)
 
     def _covered(self, rng: np.random.Generator) -> set[int]:
         """Draw the calibration captures in which a board hides the flange."""
         calibration = np.arange(self.checks, len(self.joints))
         count = round(self.params.outliers * len(calibration))
         return set(rng.permutation(calibration)[:count].tolist())
-
-    def _before_camera(self, bodies: list[Body]) -> Scene:
-        camera_T_base = Transform(BASE, CAMERA, self.base_T_camera).inverse().matrix
-        return Scene([body.moved(camera_T_base) for body in bodies])
 
     def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
         role: Role = "verification" if index < self.checks else "calibration"

@@ -42,14 +42,19 @@ class LoopbackControl:
     ``with LoopbackControl("127.0.0.5") as control: control.fault("freeze=3 s")``
     """
 
-    def __init__(self, host: str, port: int = PORT) -> None:
+    def __init__(self, host: str, port: int = PORT, patience: float = PATIENCE) -> None:
         """Connect.
+
+        Args:
+            host: Address of the controller.
+            port: Of its control channel.
+            patience: Longest wait for an answer [s].
 
         Raises:
             StageError: Nothing answers there.
         """
         try:
-            self._socket = socket.create_connection((host, port), timeout=PATIENCE)
+            self._socket = socket.create_connection((host, port), timeout=patience)
         except OSError as error:
             raise StageError(
                 f"no controller on loopback at {host}:{port} ({error.strerror or error}); "

@@ -1,0 +1,1 @@
+"""Robots, scanners and sensors, each behind the same Protocol; see README.md."""
