@@ -8,20 +8,21 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from flangeye.errors import FlangeyeError
+from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
     from flangeye.recipe import Recipe
     from flangeye.registry import Registry
-    from flangeye.replay import Replay
+    from flangeye.replay import Earlier, Replay
     from flangeye.result import Result
     from flangeye.runfolder import RunFolder
-    from flangeye.types import ArchivePath
+    from flangeye.session import Start
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -48,6 +49,8 @@ def main() -> None:
     """Run the command line; every foreseen mistake is one line and an exit code."""
     try:
         app()
+    except NothingMoved as plan:
+        typer.echo(str(plan))
     except FlangeyeError as error:
         _fail(error)
     except BrokenPipeError:
@@ -64,8 +67,11 @@ def _fail(error: FlangeyeError) -> None:
 
 
 @app.command()
-def run(
-    recipe: RecipeName,
+def run(  # noqa: PLR0913  one for each option
+    recipe: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(help="A recipe file, or the name of a shipped recipe."),
+    ] = None,
     archive: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="Recordings to run on, for recipes that start with acquire.archive."),
@@ -85,20 +91,46 @@ def run(
         Optional[str],  # noqa: UP045
         typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
     ] = None,
+    move: Annotated[
+        bool,
+        typer.Option("--move", help="Move the arm; without it the plan is checked and shown."),
+    ] = False,
+    resume: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="RUN", help="Go on with a run that ended early: its folder or log."),
+    ] = None,
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
-    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.devices import MotionAllowed
     from flangeye.registry import load_registry
     from flangeye.runfolder import RunFolder
+    from flangeye.session import Start
     from flangeye.types import ArchivePath
 
     registry = load_registry()
-    checked = load_recipe(find_recipe(recipe), registry, overrides or ())
+    checked, earlier = _recipe_of(recipe, resume, registry, overrides or ())
     replay = _replay(checked, source, at)
-    folder = RunFolder.create(checked.name, out)
-    result = _record(checked, registry, folder, ArchivePath(archive), replay)
+    start = Start(ArchivePath(archive), replay, earlier, MotionAllowed(move))
+    result = _record(checked, registry, RunFolder.create(checked.name, out), start)
     if result.status == "refused":
         raise typer.Exit(1)
+
+
+def _recipe_of(
+    name: str | None, resume: Path | None, registry: Registry, overrides: Sequence[str]
+) -> tuple[Recipe, Earlier | None]:
+    """Return the checked recipe, named or of the run to go on with; and that run."""
+    from flangeye.errors import StageError
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.replay import earlier_run
+
+    if (name is None) == (resume is None):
+        raise StageError("name a recipe, or --resume RUN, which brings its own")
+    if resume is not None:
+        if overrides:
+            raise StageError("--set and --resume: a run goes on with the recipe it began with")
+        return earlier_run(resume, registry)
+    return load_recipe(find_recipe(str(name)), registry, overrides), None
 
 
 def _replay(recipe: Recipe, source: Path | None, at: str | None) -> Replay | None:
@@ -113,13 +145,7 @@ def _replay(recipe: Recipe, source: Path | None, at: str | None) -> Replay | Non
     return replay_from(read_run(source), recipe, at)
 
 
-def _record(
-    recipe: Recipe,
-    registry: Registry,
-    folder: RunFolder,
-    archive: ArchivePath,
-    replay: Replay | None,
-) -> Result:
+def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start) -> Result:
     """Run with a log and a progress bar, and say what came of it."""
     from rich.console import Console
 
@@ -129,7 +155,7 @@ def _record(
     try:
         with ProgressBar(Console(stderr=True)) as progress:
             registry.hooks.register(progress)
-            result = record_run(recipe, registry, folder, archive, replay)
+            result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
             sys.stderr.write(f"what was gathered is in {folder.log}\n")

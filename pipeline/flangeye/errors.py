@@ -29,3 +29,9 @@ class RunStopped(FlangeyeError):
     """The person stopped the run (Ctrl-C)."""
 
     exit_code = 130
+
+
+class NothingMoved(FlangeyeError):
+    """Motion was not asked for: the message is the plan, for people. Nothing is wrong."""
+
+    exit_code = 0

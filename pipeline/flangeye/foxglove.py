@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.geometry import basis_of_plane, quaternion_from_rotation
-from flangeye.types import CircleFeature, PointCloud, Transform
+from flangeye.types import CircleFeature, Image, PointCloud, Transform
 
 WARNING, INFO = 3, 2
 
@@ -53,6 +53,18 @@ def pose_in_frame(transform: Transform, time_ns: int) -> Any:
 
     message = PoseInFrame(frame_id=transform.parent)
     _set_pose(message.pose.position, message.pose.orientation, transform)
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def compressed_image(image: Image, time_ns: int, frame: str = "camera") -> Any:
+    """Return the pixels as a foxglove.CompressedImage, PNG: nothing is lost."""
+    import cv2
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    colour = image.pixels[..., ::-1] if image.pixels.ndim == 3 else image.pixels
+    _, data = cv2.imencode(".png", np.ascontiguousarray(colour))
+    message = CompressedImage(frame_id=frame, format="png", data=data.tobytes())
     message.timestamp.FromNanoseconds(time_ns)
     return message
 

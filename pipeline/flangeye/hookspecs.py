@@ -51,6 +51,11 @@ def flangeye_stage_finished(step: str, capture: str | None, value: Any, seconds:
 
 
 @hookspec
+def flangeye_noted(step: str, name: str, value: Any) -> None:
+    """A step that is under way wrote ``value`` into its journal, under ``name``."""
+
+
+@hookspec
 def flangeye_capture_rejected(rejection: Rejection) -> None:
     """A stage set a capture aside."""
 

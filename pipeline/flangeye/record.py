@@ -12,6 +12,8 @@ topic                         schema                      content
 /tf                           foxglove.FrameTransform     base -> flange, base -> camera
 /step/N.stage                 flangeye.<type> (JSON)      what the step gave, lossless
 /step/N.stage/cloud           foxglove.PointCloud         the points of that value, lossless
+/note/N.stage/name            flangeye.<type> (JSON)      what a step wrote into its journal
+/note/N.stage/name            foxglove.CompressedImage    the same, for images
 /scene                        foxglove.SceneUpdate        fitted circles
 /rejection                    flangeye.Rejection (JSON)   a capture set aside, and why
 /capture/finished             flangeye.Finished (JSON)    nothing more will come of this capture
@@ -38,6 +40,7 @@ from pydantic import TypeAdapter
 
 from flangeye import __version__, foxglove
 from flangeye import types as t
+from flangeye.devices import RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.hookspecs import hookimpl
 
@@ -129,6 +132,17 @@ class Recorder:
         payload = {"capture": capture, "seconds": seconds, "value": _plain(value)}
         self._json(topic, type(value).__name__, payload)
         self._mirror(capture, value)
+
+    @hookimpl
+    def flangeye_noted(self, step: str, name: str, value: Any) -> None:
+        """Log a line of a step's journal."""
+        topic = f"/note/{step}/{name}"
+        if isinstance(value, t.Image):
+            self._proto(topic, foxglove.compressed_image(value, time.time_ns()))
+        else:
+            self._json(topic, type(value).__name__, {"value": _plain(value)})
+        if isinstance(value, RobotState):
+            self._proto("/tf", foxglove.frame_transform(value.base_T_flange, value.time_ns))
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:

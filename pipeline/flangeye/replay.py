@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.recipe import Recipe
-from flangeye.runlog import RunLog
+from flangeye.recipe import Recipe, parse_recipe
+from flangeye.registry import Registry
+from flangeye.runlog import RunLog, read_run
 from flangeye.stage import KINDS
 
 _ORDER = list(KINDS)
@@ -84,6 +86,28 @@ class Replay:
         return found
 
 
+@dataclass(frozen=True)
+class Earlier:
+    """A run that ended early and is gone on with.
+
+    Attributes:
+        log: Its log.
+    """
+
+    log: RunLog
+
+    @property
+    def resumed(self) -> t.Resumed:
+        """The captures it took, whatever became of them."""
+        aside = {rejection.id for rejection in self.log.rejections}
+        return t.Resumed(frozenset({*self.log.finished, *aside}))
+
+    def became(self) -> dict[str, t.Observation | None]:
+        """Return what became of each of them."""
+        nothing = dict.fromkeys(sorted(self.resumed.done))
+        return {**nothing, **{o.id: o for o in self.log.observations()}}
+
+
 def replay_from(log: RunLog, recipe: Recipe, at: str) -> Replay:
     """Return the replay that starts at the step ``at``: its index, its name or its label.
 
@@ -95,3 +119,23 @@ def replay_from(log: RunLog, recipe: Recipe, at: str) -> Replay:
             return Replay(log, step.index, step.stage.kind)
     known = ", ".join(step.stage.name for step in recipe.steps)
     raise StageError(f"--at {at}: the recipe has no such step; its steps are {known}")
+
+
+def earlier_run(path: Path, registry: Registry) -> tuple[Recipe, Earlier]:
+    """Return the recipe of a run that ended early, and what it gathered.
+
+    Args:
+        path: The run's folder, or its log.
+        registry: The plugins on offer.
+
+    Raises:
+        StageError: There is no such log, it holds no recipe, or the run came to its end.
+    """
+    log = read_run(path / "run.mcap" if path.is_dir() else path)
+    if log.result is not None:
+        raise StageError(f"{log.path}: this run came to its end; there is nothing to go on with")
+    text = log.attachments.get("recipe.resolved.yaml")
+    if text is None:
+        raise StageError(f"{log.path}: holds no recipe; it cannot be gone on with")
+    name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
+    return parse_recipe(text.decode(), name, registry), Earlier(log)

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
+from itertools import chain
 from types import NoneType
 from typing import Any, get_args
 
 import pluggy
 
 from flangeye import types as t
+from flangeye.devices import MotionAllowed
 from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
 from flangeye.outcome import Outcome, result_of
 from flangeye.recipe import Recipe
 from flangeye.registry import Registry
-from flangeye.replay import Replay
+from flangeye.replay import Earlier, Replay
 from flangeye.result import Result
 from flangeye.steps import Step
 from flangeye.stopwatch import Stopwatch
@@ -27,32 +30,47 @@ from flangeye.stopwatch import Stopwatch
 class Runner:
     """One run of one recipe."""
 
-    def __init__(self, recipe: Recipe, registry: Registry, archive: t.ArchivePath) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        registry: Registry,
+        archive: t.ArchivePath,
+        motion: MotionAllowed = MotionAllowed(),  # noqa: B008  frozen
+    ) -> None:
         self._recipe = recipe
         self._registry = registry
         self._hooks: pluggy.HookRelay = registry.hooks.hook
         self._values: dict[Any, Any] = {
-            t.Box: None, t.ArchivePath: archive, t.Views: t.Views(), **recipe.context
+            t.Box: None, t.ArchivePath: archive, t.Views: t.Views(), MotionAllowed: motion,
+            **recipe.context,
         }  # fmt: skip
         self._watch = Stopwatch()
         self._outcome = Outcome(t.Source(fingerprint=""))
         self._segmented: dict[str, t.FlangeCloud] | None = None
         self._refined: list[Step] = []
+        self._captures: t.Captures | None = None
 
     @property
     def accepted(self) -> int:
         """How many captures have become observations so far."""
         return len(self._outcome.seen)
 
-    def run(self, replay: Replay | None = None) -> Result:
+    def run(self, replay: Replay | None = None, earlier: Earlier | None = None) -> Result:
         """Run the recipe and return its result.
+
+        Args:
+            replay: Steps to take from an earlier log instead of doing them, if any.
+            earlier: A run that ended early, to go on with, if any.
 
         Raises:
             StageError: A step cannot do its work with the input it was given.
         """
         try:
-            self._observe(replay)
-            self._solve(replay)
+            try:
+                self._observe(replay, earlier)
+                self._solve(replay)
+            finally:
+                self._finish_acquiring()
             self._refine(replay)
             self._verify()
             self._weld()
@@ -64,8 +82,9 @@ class Runner:
 
     # --- acquire, segment, fit: one capture at a time ------------------------------------------
 
-    def _observe(self, replay: Replay | None) -> None:
+    def _observe(self, replay: Replay | None, earlier: Earlier | None = None) -> None:
         """Set up the stream of observations; nothing is acquired yet."""
+        self._values[t.Resumed] = earlier.resumed if earlier else None
         stream = replay.stream() if replay else self._call(self._steps("acquire")[0])
         if replay:
             self._segmented = replay.segmented()
@@ -74,9 +93,13 @@ class Runner:
         self._outcome.source = stream.source
         self._values[t.Box] = self._values[t.Box] or stream.source.workspace
         self._hooks.flangeye_run_started(source=stream.source, total=stream.total)
-        observations = (
+        observations: Iterator[t.Observation] = (
             self._logged(stream) if isinstance(stream, t.Observations) else self._fitted(stream)
         )
+        if earlier:
+            observations = chain(self._gathered(earlier), observations)
+            if isinstance(stream, t.Captures):
+                stream.became.update(earlier.became())
         solvable = t.Observations(observations, stream.source, stream.total)
         self._outcome.seen = solvable.seen
         self._values[t.Observations] = solvable
@@ -89,8 +112,30 @@ class Runner:
             self._hooks.flangeye_capture_finished(capture=observation.id)
             yield observation
 
+    def _gathered(self, earlier: Earlier) -> Iterator[t.Observation]:
+        """Log again what an earlier run gathered, so that this log stands by itself."""
+        acquire, segment, fit = (self._steps(kind)[0] for kind in ("acquire", "segment", "fit"))
+        self._values[t.Views].extend(earlier.log.views())
+        for rejection in earlier.log.rejections:
+            self._reject(rejection)
+        circles = {o.id: o for o in earlier.log.observations()}
+        for capture, flange in earlier.log.flange_clouds():
+            self._hooks.flangeye_captured(step=acquire.label, capture=capture, seconds=0.0)
+            self._finished(segment, capture.id, flange, 0.0)
+            if observation := circles.get(capture.id):
+                self._finished(fit, capture.id, observation.circle, 0.0)
+            self._hooks.flangeye_capture_finished(capture=capture.id)
+            if observation:
+                yield observation
+
+    def _finish_acquiring(self) -> None:
+        """Let go of the source at once: a solver that has enough stops the arm."""
+        if self._captures is not None:
+            self._captures.close()
+
     def _fitted(self, stream: t.Captures) -> Iterator[t.Observation]:
         label = self._steps("acquire")[0].label
+        self._captures = stream
         captures = iter(stream)
         while True:
             before = self._watch.seconds.get(label, 0.0)
@@ -99,8 +144,11 @@ class Runner:
             if capture is None:
                 return
             seconds = self._watch.seconds[label] - before
+            if isinstance(capture, t.Rejection):
+                self._reject(capture)
+                continue
             self._hooks.flangeye_captured(step=label, capture=capture, seconds=seconds)
-            observation = self._through(capture)
+            observation = stream.became[capture.id] = self._through(capture)
             self._hooks.flangeye_capture_finished(capture=capture.id)
             if observation is not None:
                 yield observation
@@ -131,11 +179,13 @@ class Runner:
         step = self._steps(kind)[0]
         value = self._call(step, capture, given)
         if isinstance(value, t.Rejected):
-            rejection = t.Rejection(capture, step.stage.name, value.reason)
-            self._outcome.rejections.append(rejection)
-            self._hooks.flangeye_capture_rejected(rejection=rejection)
+            self._reject(t.Rejection(capture, step.stage.name, value.reason))
             return None
         return value
+
+    def _reject(self, rejection: t.Rejection) -> None:
+        self._outcome.rejections.append(rejection)
+        self._hooks.flangeye_capture_rejected(rejection=rejection)
 
     # --- solve, verify, weld: once -------------------------------------------------------------
 
@@ -204,11 +254,14 @@ class Runner:
         return value
 
     def _arguments(self, step: Step, given: Mapping[Any, Any]) -> dict[str, Any]:
-        values = {**self._values, **given}
+        values = {**self._values, t.Journal: partial(self._noted, step.label), **given}
         arguments = {name: values.get(_bare(need)) for name, need in step.stage.needs.items()}
         if step.params is not None:
             arguments["params"] = step.params
         return arguments
+
+    def _noted(self, step: str, name: str, value: Any) -> None:
+        self._hooks.flangeye_noted(step=step, name=name, value=value)
 
     def _finished(self, step: Step, capture: str | None, value: Any, seconds: float) -> None:
         self._hooks.flangeye_stage_finished(

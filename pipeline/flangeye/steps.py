@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from flangeye import types as t
 from flangeye.catalogue import Flange, RobotModel, ScannerModel, Sphere
-from flangeye.devices import RobotDriver, ScannerDriver
+from flangeye.devices import MotionAllowed, RobotDriver, ScannerDriver
 from flangeye.stage import KINDS, Params, Stage
 
 Complain = Callable[[Sequence[Hashable], str], None]
@@ -57,7 +57,7 @@ class StepOrder:
             given: Types that stages may ask for from the start.
         """
         self._complain = complain
-        self._have: set[Any] = {*given, t.ArchivePath, t.Box}
+        self._have: set[Any] = {*given, t.ArchivePath, t.Box, t.Journal, MotionAllowed}
         self._rank = 0
         self._kinds: list[str] = []
 

@@ -13,10 +13,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, NewType, TypeVar
+from typing import Annotated, Any, Generic, Literal, NewType, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -380,11 +380,29 @@ class Stream(Generic[T]):
             yield item
 
 
-class Captures(Stream[Capture]):
-    """What an ``acquire`` stage gives. Captures are large, so those pulled are not kept."""
+class Captures(Stream[Capture | Rejection]):
+    """What an ``acquire`` stage gives. Captures are large, so those pulled are not kept.
 
-    def __iter__(self) -> Iterator[Capture]:
+    A source that knows a capture to be useless gives its ``Rejection`` in its place.
+
+    Attributes:
+        became: What became of each capture, by id: its observation, or None if it was set aside
+            or kept for verifying. A source that chooses its next pose may look here.
+    """
+
+    def __init__(
+        self, items: Iterable[Capture | Rejection], source: Source, total: int | None = None
+    ) -> None:
+        super().__init__(items, source, total)
+        self.became: dict[str, Observation | None] = {}
+
+    def __iter__(self) -> Iterator[Capture | Rejection]:
         return self._items
+
+    def close(self) -> None:
+        """Tell the source that nothing more is wanted: a generator's ``finally`` runs now."""
+        if isinstance(self._items, Generator):
+            self._items.close()
 
 
 class Observations(Stream[Observation]):
@@ -543,6 +561,24 @@ class ArchivePath:
     """What ``--archive`` named on the command line, if anything."""
 
     path: Path | None = None
+
+
+class Journal(Protocol):
+    """Logs a value under a name, at once, with the step that asked for the journal.
+
+    For what a stage does while it runs: where the arm is, what a loop measured and commanded.
+    """
+
+    def __call__(self, name: str, value: Any) -> None:
+        """Log ``value``: a dataclass of ours, an :class:`Image`, or plain JSON data."""
+        ...
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """Captures that an earlier run already took, by id; a source leaves them out."""
+
+    done: frozenset[str]
 
 
 Seed = NewType("Seed", int)

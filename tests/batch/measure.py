@@ -27,8 +27,7 @@ from flangeye.batch import Request, run_batch  # noqa: E402
 from flangeye.recipe import load_recipe  # noqa: E402
 from flangeye.registry import load_registry  # noqa: E402
 from flangeye.runfolder import RunFolder  # noqa: E402
-from flangeye.session import record_run  # noqa: E402
-from flangeye.types import ArchivePath  # noqa: E402
+from flangeye.session import Start, record_run  # noqa: E402
 
 RECIPE = """\
 title: Toy
@@ -60,7 +59,7 @@ def loop(recipe, folder, sessions):
     for seed in range(sessions):
         checked = load_recipe(recipe, registry, [f"seed={seed}"])
         place = RunFolder.create("toy", folder / str(seed))
-        record_run(checked, registry, place, ArchivePath(None), report=False)
+        record_run(checked, registry, place, Start(), report=False)
 
 
 def batch(recipe, folder, sessions, workers):

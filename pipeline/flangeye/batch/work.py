@@ -17,7 +17,7 @@ from flangeye.errors import FlangeyeError, StageError
 from flangeye.recipe import Recipe, load_recipe
 from flangeye.registry import Registry, load_registry
 from flangeye.runfolder import RunFolder
-from flangeye.session import record_run
+from flangeye.session import Start, record_run
 from flangeye.types import ArchivePath
 
 MAX_STARTS = 2
@@ -80,7 +80,9 @@ def _calibrated(job: Job, session: Session, registry: Registry) -> Outcome:
     path = job.out / session.id
     shutil.rmtree(path, ignore_errors=True)  # the rest of a start that came to no end
     folder = RunFolder.create(recipe.name, path)
-    result = record_run(recipe, registry, folder, ArchivePath(session.archive), report=job.report)
+    result = record_run(
+        recipe, registry, folder, Start(ArchivePath(session.archive)), report=job.report
+    )
     report = f"{session.id}/report.html" if job.report else None
     return replace(outcome_of(result), report=report)
 
