@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 PATIENCE = 3.0
 """Longest time any method of a driver takes, whatever happened to the device [s]."""
 
+GRACE = 0.1
+"""An arm that goes at a velocity brakes when the next command is this late [s]."""
+
 Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
 
 
@@ -65,6 +68,9 @@ class RobotState:
 class Robot(Protocol):
     """An arm. Opened by its driver, used as a context, closed for good at the end.
 
+    Every method but close raises DeviceError when the arm is lost, and a command also when the
+    controller is in a mode in which it cannot move.
+
     Attributes:
         name: For people: what it is and where, ``ur5e at 192.168.1.10``.
         period: Between two of the controller's cycles [s].
@@ -80,15 +86,22 @@ class Robot(Protocol):
         ...
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Start a move to joint angles (n,) [rad]; speed of the fastest joint [rad/s]."""
+        """Start a move to joint angles (n,) [rad]; speed of the fastest joint [rad/s].
+
+        The mode is ``moving`` from here on until the move has ended, so nobody takes an arm that
+        has not begun for one that has arrived.
+        """
         ...
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
-        """Start a straight move of the flange [m/s, m/s^2]."""
+        """Start a straight move of the flange [m/s, m/s^2]; the mode is as for joints."""
         ...
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) until the next command; the arm stops if none comes in time."""
+        """Go on at a twist (6,) until the next command; brake when none comes for GRACE.
+
+        Acceleration in [m/s^2] and [rad/s^2].
+        """
         ...
 
     def wait_cycle(self) -> None:

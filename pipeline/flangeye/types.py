@@ -3,7 +3,8 @@
 * SI units and radians; time in nanoseconds since the epoch.
 * ``parent_T_child`` maps coordinates in ``child`` to coordinates in ``parent``; points carry the
   name of the frame they are given in. Frames: ``base`` (robot base), ``flange`` (ISO 9409-1: origin
-  at the centre of the flange's face, z outwards), ``camera`` (scanner, z along the view).
+  at the centre of the flange's face, z outwards), ``tool`` (what the controller takes for the
+  tool's tip), ``camera`` (scanner, z along the view).
 * Quaternions are xyzw. Covariances of a transform are 6x6, in the order (rotation, translation),
   of a left perturbation in the parent frame, and say about which point the translation is taken:
   ``x' = about + Exp(phi) (x - about) + tau``.
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import core_schema
 
-BASE, FLANGE, CAMERA = "base", "flange", "camera"
+BASE, FLANGE, CAMERA, TOOL = "base", "flange", "camera", "tool"
 
 
 class _AsNestedLists:

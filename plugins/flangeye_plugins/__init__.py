@@ -9,6 +9,7 @@ from flangeye_plugins.acquisition.centres import acquire_centres
 from flangeye_plugins.acquisition.plans import grid
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.drivers.robots.simulated import robot_simulated
 from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
 from flangeye_plugins.fitting.rim import fit_rim
@@ -80,4 +81,5 @@ def flangeye_parts() -> Iterable[Part]:
         error_oracle,
         error_icp_as_in_paper,
         scanner_loopback,
+        robot_simulated,
     )

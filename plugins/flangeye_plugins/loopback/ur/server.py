@@ -15,19 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.errors import StageError
 from flangeye.loopback import LoopbackOptions
 from flangeye_plugins.loopback import control
 from flangeye_plugins.loopback.clock import Clock
 from flangeye_plugins.loopback.contact import Surface
 from flangeye_plugins.loopback.faults import Schedule, parse_fault
 from flangeye_plugins.loopback.network import Network
+from flangeye_plugins.loopback.start import joint_zeros, starting_joints
 from flangeye_plugins.loopback.ur import dashboard, rtde, scriptport
 from flangeye_plugins.loopback.ur.controller import URController
 from flangeye_plugins.loopback.ur.faults import Mischief
-
-HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""Where the arm stands when nothing else is said: the tool points down, half a metre ahead."""
 
 
 def serve(options: LoopbackOptions) -> None:
@@ -63,7 +60,9 @@ class Server:
     def __init__(self, options: LoopbackOptions) -> None:
         """Switch the controller on; nothing listens yet."""
         self._options = options
-        self._box = URController(options.robot, _joints_of(options), _zeros_of(options))
+        zeros = joint_zeros(options.robot, options.seed)
+        self._home = starting_joints(options.robot, options.joints)
+        self._box = URController(options.robot, self._home, zeros)
         if options.floor is not None:
             self._box.arm.surfaces.append(Surface.floor(options.floor))
         self._network = Network(options.host)
@@ -190,36 +189,13 @@ class Server:
 
     def _reset(self, request: Mapping[str, Any]) -> None:
         self._clear(request)
-        self._box.reset(_joints_of(self._options))
+        self._box.reset(self._home)
 
     def _set_surfaces(self, request: Mapping[str, Any]) -> None:
         self._box.arm.surfaces = [Surface(**surface) for surface in request["surfaces"]]
 
     def _put(self, request: Mapping[str, Any]) -> None:
-        joints = np.array(request["joints"], dtype=np.float64)
-        _check_joints(joints, len(self._box.arm.zeros))
-        self._box.arm.put(joints)
+        self._box.arm.put(starting_joints(self._options.robot, request["joints"]))
 
     def _set_unlock(self, request: Mapping[str, Any]) -> None:
         self._box.unlock_after = float(request["seconds"])
-
-
-def _joints_of(options: LoopbackOptions) -> np.ndarray:
-    joints = HOME if options.joints is None else np.array(options.joints)
-    _check_joints(joints, len(options.robot.joints))
-    return joints
-
-
-def _check_joints(joints: np.ndarray, count: int) -> None:
-    if joints.shape != (count,) or not np.isfinite(joints).all():
-        raise StageError(f"the arm has {count} joints; give {count} finite angles")
-
-
-def _zeros_of(options: LoopbackOptions) -> np.ndarray:
-    """Return how far the joints' true zeros are off; the first by definition not at all."""
-    zeros = np.zeros(len(options.robot.joints))
-    if options.seed is not None:
-        draw = np.random.default_rng(options.seed).standard_normal(len(zeros))
-        zeros = options.robot.joint_accuracy * draw
-        zeros[0] = 0.0
-    return zeros
