@@ -19,6 +19,7 @@ from flangeye.types import (
     CircleFeature,
     FlangeCloud,
     HandEye,
+    Look,
     Observations,
     Pair,
     PointCloud,
@@ -34,6 +35,7 @@ from flangeye.types import (
     VerifiedHandEye,
     Views,
     WeldReport,
+    WorkpieceScan,
 )  # fmt: skip
 from flangeye.units import Length
 
@@ -68,7 +70,11 @@ def acquire(seed: Seed, params: AcquireParams) -> Captures:
     source = Source(
         "toy", ("made of four points",), Box(np.zeros(3), np.full(3, 0.4)), Truth(BASE_T_CAMERA)
     )
-    return Captures(captures(), source, params.count)
+
+    def look(_bodies: object) -> PointCloud:
+        return PointCloud(CAMERA, np.float32(CROSS))
+
+    return Captures(captures(), source, params.count, look)
 
 
 @stage("segment.toy")
@@ -150,10 +156,22 @@ def verify(calibration: HandEye, solve: Solver, views: Views, params: VerifyPara
     return Verification(rms <= params.max_rms, reason, figures, {"001": rms})
 
 
+@stage("scan.toy")
+def scan(look: Look | None) -> WorkpieceScan:
+    """See four points and know more."""
+    if look is None:
+        raise StageError("scan.toy: nothing is simulated")
+    return WorkpieceScan(look([]), "toy", ("scanned",), {"seam": np.eye(3)[:2]})
+
+
 @stage("seam.toy")
-def seam(calibration: VerifiedHandEye) -> Seam:
+def seam(calibration: VerifiedHandEye, scan: WorkpieceScan | None) -> Seam:
     """Weld along a line."""
-    return Seam(np.zeros((2, 3)))
+    if scan is not None and scan.truth:
+        raise StageError("seam.toy: the truth must stay with the runner")
+    return Seam(
+        np.eye(3)[:2], np.tile([0.0, 0.0, 1.0], (2, 1)), 1e-8 * np.tile(np.eye(3), (2, 1, 1))
+    )
 
 
 @stage("weld.toy")
@@ -164,7 +182,7 @@ def weld(calibration: VerifiedHandEye, seam: Seam) -> WeldReport:
 
 @hookimpl
 def flangeye_stages():
-    return (acquire, segment, fit, solve, refine, verify, seam, weld)
+    return (acquire, segment, fit, solve, refine, verify, scan, seam, weld)
 
 
 @hookimpl

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.geometry import basis_of_plane, quaternion_from_rotation
-from flangeye.types import CircleFeature, Image, PointCloud, Transform
+from flangeye.geometry import basis_of_plane, quaternion_from_rotation, rigid
+from flangeye.seamline import seam_frames, tube_rings
+from flangeye.types import CircleFeature, Image, PointCloud, Seam, Transform
 
 WARNING, INFO = 3, 2
 
@@ -84,6 +85,39 @@ def circle_scene(capture: str, circle: CircleFeature, time_ns: int) -> Any:
         for x, y, z in points:
             line.points.add(x=x, y=y, z=z)
     return SceneUpdate(entities=[entity])
+
+
+def seam_scene(seam: Seam, time_ns: int) -> Any:
+    """Return a foxglove.SceneUpdate with the planned seam and rings of its tube, in ``base``."""
+    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    entity = SceneEntity(frame_id="base", id="seam")
+    entity.timestamp.FromNanoseconds(time_ns)
+    for points, thickness in [(seam.points_in_base, 3.0), *((r, 1.0) for r in tube_rings(seam))]:
+        line = entity.lines.add(
+            type=LinePrimitive.LINE_STRIP, thickness=thickness, scale_invariant=True
+        )
+        line.pose.orientation.w = 1.0
+        line.color.r, line.color.g, line.color.b, line.color.a = 0.0, 0.45, 0.7, 1.0
+        for x, y, z in points:
+            line.points.add(x=x, y=y, z=z)
+    return SceneUpdate(entities=[entity])
+
+
+def seam_poses(seam: Seam, time_ns: int) -> Any:
+    """Return foxglove.PosesInFrame: along the seam, x in its direction and z into the groove."""
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+
+    message = PosesInFrame(frame_id="base")
+    message.timestamp.FromNanoseconds(time_ns)
+    for point, rotation in zip(seam.points_in_base, seam_frames(seam), strict=True):
+        pose = message.poses.add()
+        _set_pose(
+            pose.position, pose.orientation, Transform("base", "seam", rigid(rotation, point))
+        )
+    return message
 
 
 def circle_lines(circle: CircleFeature, segments: int = 72) -> list[NDArray[np.float64]]:

@@ -25,6 +25,8 @@ class Outcome:
         rejections: Captures set aside before solving.
         refused: Why the calibration was refused.
         seen: The observations that reached the solver.
+        scan: The scan of the workpiece.
+        seam: What was planned from it.
     """
 
     source: t.Source
@@ -33,6 +35,8 @@ class Outcome:
     rejections: list[t.Rejection] = field(default_factory=list)
     refused: str | None = None
     seen: list[t.Observation] = field(default_factory=list)
+    scan: t.WorkpieceScan | None = None
+    seam: t.Seam | None = None
 
     @property
     def status(self) -> str:
@@ -61,6 +65,7 @@ def result_of(outcome: Outcome, recipe: Recipe, registry: Registry, watch: Stopw
         observations=r.observations_result(pairs, outcome.rejections),
         holdout=r.holdout_result(outcome.verifications),
         verifications=r.verifications_result(outcome.verifications),
+        seam=r.seam_result(outcome.seam, outcome.scan),
         timing=_timing(watch),
         provenance=_provenance(outcome, recipe, registry),
     )
@@ -83,6 +88,7 @@ def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:
 
 def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Provenance:
     solver_notes = outcome.calibration.notes if outcome.calibration else ()
+    scan_notes = outcome.scan.notes if outcome.scan else ()
     return r.Provenance(
         versions=r.library_versions(),
         plugins=registry.versions(),
@@ -90,5 +96,5 @@ def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Prove
         recipe_hash=r.sha256(recipe.resolved()),
         input_hash=outcome.source.fingerprint,
         seed=recipe.header.seed,
-        notes=[*outcome.source.notes, *solver_notes],
+        notes=[*outcome.source.notes, *solver_notes, *scan_notes],
     )

@@ -14,7 +14,8 @@ topic                         schema                      content
 /step/N.stage/cloud           foxglove.PointCloud         the points of that value, lossless
 /note/N.stage/name            flangeye.<type> (JSON)      what a step wrote into its journal
 /note/N.stage/name            foxglove.CompressedImage    the same, for images
-/scene                        foxglove.SceneUpdate        fitted circles
+/scene                        foxglove.SceneUpdate        fitted circles; the seam and its tube
+/seam                         foxglove.PosesInFrame       the planned seam, z into the groove
 /rejection                    flangeye.Rejection (JSON)   a capture set aside, and why
 /capture/finished             flangeye.Finished (JSON)    nothing more will come of this capture
 /log                          foxglove.Log                the same for people
@@ -180,6 +181,9 @@ class Recorder:
             self._proto("/scene", foxglove.circle_scene(capture, value, now))
         if isinstance(value, t.HandEye):
             self._proto("/tf", foxglove.frame_transform(value.base_T_camera.transform, now))
+        if isinstance(value, t.Seam):
+            self._proto("/scene", foxglove.seam_scene(value, now))
+            self._proto("/seam", foxglove.seam_poses(value, now))
         if isinstance(value, t.Verification):
             level = foxglove.INFO if value.passed else foxglove.WARNING
             self._log(value.reason, level)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flangeye import types as t
 from flangeye.errors import StageError
@@ -74,13 +75,13 @@ class Replay:
         earlier = _ORDER[: _ORDER.index(self.kind)]
         return [r for r in self.log.rejections if r.stage.partition(".")[0] in earlier]
 
-    def calibration(self, stage: str) -> t.HandEye:
-        """Return what ``stage`` gave.
+    def given(self, stage: str) -> Any:
+        """Return what ``stage``, a step that runs once, gave.
 
         Raises:
             StageError: The run ended before.
         """
-        found = self.log.calibration(stage)
+        found = self.log.given(stage)
         if found is None:
             raise StageError(f"{self.log.path}: ended before {stage}; use --at {stage}")
         return found

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from flangeye import __version__
 from flangeye import types as t
 from flangeye.geometry import covariance_at, rotation_log
+from flangeye.seamline import errors_from, tube_radii
 
 Vector = list[float]
 Matrix = list[list[float]]
@@ -92,6 +93,30 @@ class TruthResult(_Part):
     rotation_error: float = Field(description="[rad]")
 
 
+class SeamTruthResult(_Part):
+    """Simulation only: how far the planned seam is from the true one."""
+
+    rms: float = Field(description="Distance of the planned points from the true seam [m].")
+    max: float
+    inside: float = Field(description="Share of the planned points whose tube holds it.")
+
+
+class SeamResult(_Part):
+    """The planned seam, in the base."""
+
+    source: str
+    length: float = Field(description="[m]")
+    points: Matrix = Field(description="(N, 3) along the root of the groove [m].")
+    openings: Matrix = Field(description="(N, 3) unit vectors towards the torch.")
+    covariance: list[Matrix] = Field(description="(N, 3, 3) of the points [m^2].")
+    tube: Vector = Field(description="(N) with 95 % the seam is not further off than this [m].")
+    half_angle: float | None = Field(None, description="Of the groove [rad].")
+    half_width: float | None = Field(None, description="Of the groove at its shoulders [m].")
+    figures: dict[str, float] = Field(description="What the seam step reports.")
+    notes: list[str]
+    truth: SeamTruthResult | None = None
+
+
 class CorrectionResult(_Part):
     """What is wrong with where the arm says its flange is, estimated with the transforms."""
 
@@ -135,6 +160,7 @@ class Result(_Part):
     holdout: HoldoutResult | None = None
     verifications: dict[str, VerificationResult]
     truth: TruthResult | None = None
+    seam: SeamResult | None = None
     timing: dict[str, StageTiming]
     provenance: Provenance
 
@@ -250,6 +276,35 @@ def verifications_result(found: Mapping[str, t.Verification]) -> dict[str, Verif
         )
         for step, v in found.items()
     }
+
+
+def seam_result(seam: t.Seam | None, scan: t.WorkpieceScan | None) -> SeamResult | None:
+    """Return the section ``seam``."""
+    if seam is None:
+        return None
+    return SeamResult(
+        source=seam.source,
+        length=float(seam.arc_length[-1]),
+        points=seam.points_in_base.tolist(),
+        openings=seam.openings_in_base.tolist(),
+        covariance=seam.covariance.tolist(),
+        tube=tube_radii(seam).tolist(),
+        half_angle=seam.half_angle,
+        half_width=seam.half_width,
+        figures=dict(seam.figures),
+        notes=list(seam.notes),
+        truth=_seam_truth(seam, list(scan.truth.values())) if scan and scan.truth else None,
+    )
+
+
+def _seam_truth(seam: t.Seam, true_seams: list[t.Array]) -> SeamTruthResult:
+    """Compare with the true seam that is nearest: a workpiece may have several."""
+    errors = min((errors_from(seam, truth) for truth in true_seams), key=lambda e: float(e.max()))
+    return SeamTruthResult(
+        rms=float(np.sqrt(np.mean(errors**2))),
+        max=float(errors.max()),
+        inside=float(np.mean(errors <= tube_radii(seam))),
+    )
 
 
 def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair]) -> t.Box | None:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,9 +23,11 @@ _TYPES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
         t.FlangeCloud, t.CircleFeature, t.HandEye, t.VerifiedHandEye, t.Verification, t.Observation,
-        t.Seam, t.WeldReport,
+        t.WorkpieceScan, t.Seam, t.WeldReport,
     )
 }  # fmt: skip
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,18 @@ class RunLog:
 
     def calibration(self, stage: str | None = None) -> t.HandEye | None:
         """Return what ``stage`` gave, or the last calibration of any, if it came so far."""
-        given = [e.value for e in self.entries if isinstance(e.value, t.HandEye)]
         if stage is not None:
-            given = [e.value for e in self.entries if e.stage == stage]
-        return given[-1] if given else None
+            found: t.HandEye | None = self.given(stage)
+            return found
+        return self.last(t.HandEye)
+
+    def given(self, stage: str) -> Any:
+        """Return the last value that ``stage`` gave, None when the run did not come so far."""
+        return next((e.value for e in reversed(self.entries) if e.stage == stage), None)
+
+    def last(self, kind: type[Value]) -> Value | None:
+        """Return the last value of a type that any step gave."""
+        return next((e.value for e in reversed(self.entries) if isinstance(e.value, kind)), None)
 
     def captures(self) -> Iterator[t.Capture]:
         """Yield the captures with the clouds that were logged, thinned or whole."""
@@ -132,7 +142,7 @@ class RunLog:
             if topic == "/capture":
                 meta = json.loads(data)
             elif topic == "/capture/cloud":
-                xyz = _decode_cloud(data)
+                xyz = _decode_cloud(data).xyz
                 if meta["full"]:
                     xyz = xyz.reshape(meta["shape"])
                 yield self._capture(meta["id"], t.PointCloud(t.CAMERA, xyz))
@@ -163,7 +173,7 @@ def read_run(path: Path) -> RunLog:
     clouds: dict[str, t.PointCloud] = {}
     for topic, schema, data in _messages(path, log):
         if schema == "foxglove.PointCloud" and topic.startswith("/step/"):
-            clouds[topic] = t.PointCloud(t.CAMERA, _decode_cloud(data))
+            clouds[topic] = _decode_cloud(data)
         elif topic == "/log":
             log.messages.append(_decode_log(data))
         elif schema.startswith("flangeye."):
@@ -201,10 +211,11 @@ def _decode_value(topic: str, schema: str, data: Any, clouds: dict[str, t.PointC
     return adapter(cls).validate_python({**data, **held})
 
 
-def _decode_cloud(data: bytes) -> Any:
+def _decode_cloud(data: bytes) -> t.PointCloud:
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
-    return foxglove.points_of(PointCloud.FromString(data))
+    message = PointCloud.FromString(data)
+    return t.PointCloud(message.frame_id, foxglove.points_of(message))
 
 
 def _decode_log(data: bytes) -> str:

@@ -7,7 +7,7 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from itertools import chain
 from types import NoneType
@@ -46,6 +46,7 @@ class Runner:
         }  # fmt: skip
         self._watch = Stopwatch()
         self._outcome = Outcome(t.Source(fingerprint=""))
+        self._stream: t.Captures | t.Observations | None = None
         self._segmented: dict[str, t.FlangeCloud] | None = None
         self._refined: list[Step] = []
         self._captures: t.Captures | None = None
@@ -73,7 +74,7 @@ class Runner:
                 self._finish_acquiring()
             self._refine(replay)
             self._verify()
-            self._weld()
+            self._weld(replay)
         except CalibrationRefused as error:
             self._outcome.refused = str(error)
         result = result_of(self._outcome, self._recipe, self._registry, self._watch)
@@ -90,6 +91,7 @@ class Runner:
             self._segmented = replay.segmented()
             self._values[t.Views] = replay.views()
             self._outcome.rejections = replay.rejections()
+        self._stream = stream
         self._outcome.source = stream.source
         self._values[t.Box] = self._values[t.Box] or stream.source.workspace
         self._hooks.flangeye_run_started(source=stream.source, total=stream.total)
@@ -202,13 +204,15 @@ class Runner:
             self._refined.append(step)
 
     def _calibrate(self, step: Step, replay: Replay | None) -> None:
-        """Do a step that gives a calibration, or read it back from the log."""
-        if replay and replay.at > step.index:
-            calibration = replay.calibration(step.stage.name)
-            self._finished(step, None, calibration, 0.0)
-        else:
-            calibration = self._call(step)
-        self._values[t.HandEye] = self._outcome.calibration = calibration
+        self._values[t.HandEye] = self._outcome.calibration = self._once(step, replay)
+
+    def _once(self, step: Step, replay: Replay | None) -> Any:
+        """Do a step that runs once, or read back from the log what it gave."""
+        if replay is None or replay.at <= step.index:
+            return self._call(step)
+        value = replay.given(step.stage.name)
+        self._finished(step, None, value, 0.0)
+        return value
 
     def _solve_subset(self, observations: Sequence[t.Observation]) -> t.HandEye:
         """Solve a subset, and refine it as far as the calibration has been refined."""
@@ -231,10 +235,22 @@ class Runner:
             verified = t.VerifiedHandEye(**values, verifications=self._outcome.verifications)
             self._values[t.VerifiedHandEye] = self._outcome.calibration = verified
 
-    def _weld(self) -> None:
-        for kind, gives in (("seam", t.Seam), ("weld", t.WeldReport)):
-            for step in self._steps(kind):
-                self._values[gives] = self._call(step)
+    def _weld(self, replay: Replay | None) -> None:
+        """Scan the workpiece, plan the seam, weld; what a simulation knows stays here."""
+        for step in self._steps("scan"):
+            self._values[t.Look] = self._look(step, replay)
+            scan = self._outcome.scan = self._once(step, replay)
+            self._values[t.WorkpieceScan] = replace(scan, truth={})
+        for step in self._steps("seam"):
+            self._values[t.Seam] = self._outcome.seam = self._once(step, replay)
+        for step in self._steps("weld"):
+            self._values[t.WeldReport] = self._call(step)
+
+    def _look(self, step: Step, replay: Replay | None) -> t.Look | None:
+        """Return the simulation's scanner; for a log of a simulation, the cell is set up again."""
+        if replay and replay.at <= step.index and replay.source.truth:
+            self._stream = self._call(self._steps("acquire")[0])
+        return self._stream.look if isinstance(self._stream, t.Captures) else None
 
     # --- one call --------------------------------------------------------------------------------
 

@@ -85,6 +85,7 @@ KINDS: Mapping[str, Contract] = {
     "verify": Contract(
         t.HandEye, (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used"
     ),
+    "scan": Contract(None, (t.WorkpieceScan,), (t.WorkpieceScan,), "a scan of the workpiece"),
     "seam": Contract(t.VerifiedHandEye, (t.Seam,), (t.Seam,), "where to weld"),
     "weld": Contract(t.VerifiedHandEye, (t.WeldReport,), (t.WeldReport,), "weld along the seam"),
 }

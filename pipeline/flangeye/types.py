@@ -354,6 +354,10 @@ class VerificationView:
     base_T_flange: Transform
 
 
+Look = Callable[[Sequence[Any]], PointCloud]
+"""Simulation only: scans bodies, given in ``base``, with the scanner that was calibrated, from
+where it stands; gives the cloud in ``camera``. The pose itself stays with the simulation."""
+
 T = TypeVar("T")
 
 
@@ -389,13 +393,19 @@ class Captures(Stream[Capture | Rejection]):
     Attributes:
         became: What became of each capture, by id: its observation, or None if it was set aside
             or kept for verifying. A source that chooses its next pose may look here.
+        look: Simulation only: scans other things with the same scanner, see :data:`Look`.
     """
 
     def __init__(
-        self, items: Iterable[Capture | Rejection], source: Source, total: int | None = None
+        self,
+        items: Iterable[Capture | Rejection],
+        source: Source,
+        total: int | None = None,
+        look: Look | None = None,
     ) -> None:
         super().__init__(items, source, total)
         self.became: dict[str, Observation | None] = {}
+        self.look = look
 
     def __iter__(self) -> Iterator[Capture | Rejection]:
         return self._items
@@ -540,14 +550,69 @@ class VerifiedHandEye(HandEye):
 
 
 @dataclass(frozen=True, eq=False)
-class Seam:
-    """A weld seam.
+class WorkpieceScan:
+    """What the scanner saw of the workpiece, from where it was calibrated.
 
     Attributes:
-        points_in_base: (N, 3) along the seam [m].
+        cloud: In ``camera``.
+        source: Where it comes from, for people.
+        notes: What the person should be told.
+        truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
+            from the stages that plan and weld.
+    """
+
+    cloud: PointCloud
+    source: str
+    notes: tuple[str, ...] = ()
+    truth: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """A weld seam as it is planned, in ``base``, from its start to its end.
+
+    Attributes:
+        points_in_base: (N, 3) along the root of the groove, N of at least 2 [m].
+        openings_in_base: (N, 3) unit vectors out of the groove, towards the torch.
+        covariance: (N, 3, 3) of each point: where it is on the workpiece, and the hand-eye pose,
+            together [m^2]. Neighbours share most of it.
+        half_angle: Between a wall and the opening [rad], or None where it is not known.
+        half_width: From the root's plane to a shoulder [m], or None where it is not known.
+        source: What it was planned from, for people.
+        figures: How well that went, in SI units, by name.
+        notes: What the person should be told.
+        cloud: The part of the scan around it, in ``base``, for people.
     """
 
     points_in_base: Array
+    openings_in_base: Array
+    covariance: Array
+    half_angle: float | None = None
+    half_width: float | None = None
+    source: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    cloud: PointCloud | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points_in_base)
+        _freeze(self, points_in_base=(n, 3), openings_in_base=(n, 3), covariance=(n, 3, 3))
+        if n < 2 or not (np.diff(self.arc_length) > 0).all():
+            raise ValueError("a seam has at least two points, each at another place than the last")
+        if not np.allclose(np.linalg.norm(self.openings_in_base, axis=1), 1.0, atol=1e-6):
+            raise ValueError("Seam.openings_in_base are not unit vectors")
+
+    @property
+    def arc_length(self) -> NDArray[np.float64]:
+        """(N,) way along the seam from its start to each point [m]."""
+        steps = np.linalg.norm(np.diff(self.points_in_base, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def tangents(self) -> NDArray[np.float64]:
+        """(N, 3) unit vectors along the seam, in the direction of welding."""
+        along = np.gradient(self.points_in_base, self.arc_length, axis=0)
+        return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,7 +63,7 @@ def test_a_signature_is_checked_when_it_is_declared():
          "returns FlangeCloud or Rejected"),
         ("segment.c", wrong_input, "stage 'segment.c': a 'segment' stage takes a Capture"),
         ("paint.d", wrong_result, "stage 'paint.d': no kind 'paint'; kinds: acquire, segment, fit, "
-         "solve, refine, verify, seam, weld"),
+         "solve, refine, verify, scan, seam, weld"),
     ]:  # fmt: skip
         with pytest.raises(TypeError) as error:
             stage(name)(function)

@@ -104,6 +104,25 @@ def test_weld_runs_only_after_verification(execute):
     assert refused.of_kind("weld") == []
 
 
+SEAM_RECIPE = TOY_RECIPE + "  - scan.toy\n  - seam.toy\n  - weld.toy\n"
+
+
+def test_a_seam_and_its_true_error_are_in_the_result(execute):
+    result, log = execute(SEAM_RECIPE)
+    assert result.seam.length == pytest.approx(np.sqrt(2))
+    assert result.seam.truth.rms == pytest.approx(0, abs=1e-12)
+    assert result.seam.truth.inside == 1
+    assert result.provenance.notes[-1] == "scanned"
+    assert log.last(t.WorkpieceScan).cloud.xyz.shape == (4, 3)
+
+
+@pytest.mark.parametrize("at", ["verify.toy", "scan.toy", "seam.toy", "weld.toy"])
+def test_a_seam_is_planned_again_from_the_log(execute, at):
+    first, log = execute(SEAM_RECIPE)
+    again, _ = execute(SEAM_RECIPE, at, log)
+    assert without_timing(again) == without_timing(first)
+
+
 @pytest.mark.parametrize("at", ["segment.toy", "fit.toy", "solve.toy", "verify.toy", "3"])
 def test_a_log_is_an_archive(execute, at):
     text = TOY_RECIPE.replace("seed: 3", "seed: 3\nlog: {clouds: full}")

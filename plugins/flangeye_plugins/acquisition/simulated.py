@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -46,8 +47,10 @@ from flangeye_plugins.simulation.eye import (
     eye_of,
     middle_of_view,
 )
-from flangeye_plugins.simulation.raycast import Image
+from flangeye_plugins.simulation.raycast import Body, Image
 from flangeye_plugins.simulation.reach import Reach
+from flangeye_plugins.simulation.structured_light import StructuredLight
+from flangeye_plugins.simulation.time_of_flight import TimeOfFlight
 
 Floats = NDArray[np.float64]
 
@@ -113,7 +116,7 @@ def acquire_simulated(
         StageError: Fewer than three poses are possible.
     """
     plate = flange if flange.bore else flange_of(robot, load_standard(robot.flange.standard))
-    planning, checking, errors, noise = np.random.SeedSequence([VERSION, seed]).spawn(4)
+    planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
     base_T_camera = params.camera.base_T_camera
     reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
     site = _site(reach, scanner, base_T_camera)
@@ -122,7 +125,7 @@ def acquire_simulated(
     checks = _checks(plan, site, params.verification, np.random.default_rng(checking))
     session = _Session(
         Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera,
-        [*checks, *(pose.joints for pose in plan.poses)], len(checks), params,
+        [*checks, *(pose.joints for pose in plan.poses)], len(checks), params, *errors.spawn(2),
     )  # fmt: skip
     source = Source(
         fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
@@ -130,7 +133,8 @@ def acquire_simulated(
         workspace=Box(plan.centre, plan.size),
         truth=Truth(Transform(BASE, CAMERA, base_T_camera)),
     )
-    return Captures(session.captures(errors, noise), source, total=len(session.joints))
+    look = partial(session.look, rng=_rng(later))
+    return Captures(session.captures(noise), source, len(session.joints), look)
 
 
 def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
@@ -186,16 +190,14 @@ class _Session:
     joints: list[Floats]
     checks: int
     params: SimulatedParams
+    of_arm: np.random.SeedSequence
+    of_scanner: np.random.SeedSequence
 
-    def captures(
-        self, errors: np.random.SeedSequence, noise: np.random.SeedSequence
-    ) -> Iterator[Capture]:
+    def captures(self, noise: np.random.SeedSequence) -> Iterator[Capture]:
         """Make the captures, each when it is asked for."""
-        of_arm, of_scanner, of_covers, *of_captures = errors.spawn(2) + noise.spawn(
-            1 + len(self.joints)
-        )
-        arm = ImperfectArm(self.cell.robot, self.params.robot_errors, _rng(of_arm))
-        eye = eye_of(self.scanner, self.params.resolution, self.params.noise, _rng(of_scanner))
+        of_covers, *of_captures = noise.spawn(1 + len(self.joints))
+        arm = ImperfectArm(self.cell.robot, self.params.robot_errors, _rng(self.of_arm))
+        eye = self._eye()
         covered = self._covered(_rng(of_covers))
         around = self.cell.around()
         for index, joints in enumerate(self.joints):
@@ -205,6 +207,15 @@ class _Session:
             bodies = around + self.cell.arm(frames, flange) + cover
             xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
             yield self._capture(index, xyz, arm.reported(joints))
+
+    def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
+        """Scan other bodies, given in ``base``, with the same scanner from the same place."""
+        return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
+
+    def _eye(self) -> StructuredLight | TimeOfFlight:
+        """Return the scanner; its distortion is the same each time."""
+        rng = _rng(self.of_scanner)
+        return eye_of(self.scanner, self.params.resolution, self.params.noise, rng)
 
     def _covered(self, rng: np.random.Generator) -> set[int]:
         """Draw the calibration captures in which a board hides the flange."""
