@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from flangeye.discs import edge_points, sectors, vote_centre
 from flangeye_plugins.fitting.circles import (
     Circles,
+    cauchy_curvature,
     cauchy_weights,
     circle_jacobian,
     circle_residuals,
@@ -56,8 +57,9 @@ class Rings(NamedTuple):
         """Return the (2 + k, 2 + k) covariance of centre and radii [m^2], ``scale`` as fitted."""
         jacobian = circle_jacobian(self.circles, self.points, self.ring)
         stretch = sectors(self.points - self.circles.centre, STRETCHES) + STRETCHES * self.ring
-        weights = cauchy_weights(self.residuals, scale)
-        return clustered_covariance(jacobian, self.residuals, weights, stretch)
+        residuals = self.residuals
+        weights, curvature = cauchy_weights(residuals, scale), cauchy_curvature(residuals, scale)
+        return clustered_covariance(jacobian, residuals, weights, stretch, curvature)
 
 
 def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Rings:

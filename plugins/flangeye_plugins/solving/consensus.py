@@ -13,7 +13,7 @@ from flangeye.statistics import f_quantile, squared_distances
 from flangeye_plugins.solving.equations import Fit, Noise, Rows, linearise, start_at
 from flangeye_plugins.solving.evidence import Evidence, Nuisance
 from flangeye_plugins.solving.generalised import adjust
-from flangeye_plugins.solving.inliers import GATE, find_inliers
+from flangeye_plugins.solving.inliers import find_inliers, gate
 from flangeye_plugins.solving.observability import FINEST_NOISE, require_observable, spread_of
 
 Floats = NDArray[np.float64]
@@ -96,11 +96,11 @@ def _judge(evidence: Evidence, nuisance: Nuisance, fit: Fit) -> tuple[Floats, Ma
     equations = linearise(evidence, nuisance, fit)
     noise, covariance = fit.noise, fit.covariance
     squares = _squares(equations.centres, noise.centre_scale, noise.pose, covariance)
-    agreeing = squares <= 3 * f_quantile(GATE, 3, fit.freedom)
+    agreeing = squares <= 3 * f_quantile(gate(len(evidence)), 3, fit.freedom)
     good = evidence.has_normal
     if good.any():
         tilts = _squares(equations.normals, noise.normal_scale, noise.tilt, covariance)
-        good[good] = tilts <= 2 * f_quantile(GATE, 2, fit.tilt_freedom)
+        good[good] = tilts <= 2 * f_quantile(gate(len(tilts)), 2, fit.tilt_freedom)
     return np.sqrt(squares), agreeing, good
 
 

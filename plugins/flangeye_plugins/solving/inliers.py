@@ -20,8 +20,17 @@ Mask = NDArray[np.bool_]
 
 MOST_TRIPLES = 1000
 """Of 1000 random triples some 200 are free of outliers when 40 % of the pairs are wrong."""
-GATE = 0.999
-"""Probability with which a good pair is kept."""
+NONE_LOST = 0.999
+"""Probability with which a set without any wrong pair loses none."""
+
+
+def gate(count: int) -> float:
+    """Return the probability with which each of so many good pairs has to be kept (Bonferroni).
+
+    A gate for single pairs would lose a good one in every twentieth set of fifty, and each loss
+    makes the noise look smaller and the next loss likelier where errors have heavy tails.
+    """
+    return 1.0 - (1.0 - NONE_LOST) / count
 
 
 def find_inliers(centres: Floats, tcps: Floats, finest: float) -> tuple[Mask, float]:
@@ -39,7 +48,7 @@ def find_inliers(centres: Floats, tcps: Floats, finest: float) -> tuple[Mask, fl
     for _ in range(10):
         sigma = max(_noise(centres, tcps, inliers), finest)
         freedom = 3 * int(inliers.sum()) - 6
-        threshold = sigma * float(np.sqrt(3 * f_quantile(GATE, 3, freedom)))
+        threshold = sigma * float(np.sqrt(3 * f_quantile(gate(len(centres)), 3, freedom)))
         found = graduated_non_convexity(centres, tcps, threshold, half)
         if (found == inliers).all():
             break
