@@ -32,7 +32,7 @@ from flangeye.header import FeatureSection, Header, LimitsSection
 from flangeye.overrides import apply_override
 from flangeye.registry import PluginNotFoundError, Registry
 from flangeye.shipped import shipped
-from flangeye.stage import Params, Part, Stage
+from flangeye.stage import Params, Part, Siblings, Stage
 from flangeye.steps import SECTIONS, Step, StepOrder
 from flangeye.yamlfile import Document, parse_yaml, read_yaml
 
@@ -128,6 +128,10 @@ class _Checker:
     def part(self, name: str) -> Part:
         """Return a part by name; parameters that choose parts ask here."""
         return self._registry.part(name)
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind; parts that have to know them ask here."""
+        return self._registry.siblings(part)
 
     def check(self, name: str, text: str, overrides: Sequence[str]) -> Recipe:
         data = self._document.data

@@ -12,7 +12,7 @@ import pluggy
 
 from flangeye import hookspecs
 from flangeye.errors import FlangeyeError
-from flangeye.stage import Part, Plugin, Stage
+from flangeye.stage import Part, Plugin, Siblings, Stage
 
 
 class PluginNotFoundError(FlangeyeError, LookupError):
@@ -62,6 +62,14 @@ class Registry:
         if name not in self.parts:
             raise self._missing("part", name)
         return self.parts[name]
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind, by the name a recipe gives them."""
+        return {
+            name.partition(".")[2]: other
+            for name, other in sorted(self.parts.items())
+            if other.kind == part.kind and other is not part
+        }
 
     def versions(self) -> dict[str, str]:
         """Return each loaded plugin's entry point and the version of what installed it."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import inspect
 import types as python_types
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -153,16 +153,30 @@ class Part(Plugin):
         return Chosen(self, params if params or not self.params else self.params())
 
 
+Siblings = Mapping[str, Part]
+"""The other parts of a part's kind, by the name a recipe gives them; a part that has to know them
+has an argument ``siblings`` of this type."""
+
+
 @dataclass(frozen=True)
 class Chosen:
-    """A part with its parameters; call it with the part's remaining arguments."""
+    """A part with its parameters; call it with the part's remaining arguments.
+
+    Attributes:
+        part: The part.
+        params: Its parameters, or None when it takes none.
+        offered: The parts a recipe may choose from, for a part that asks for Siblings.
+    """
 
     part: Part
     params: Params | None
+    offered: PartLookup | None = field(default=None, compare=False, repr=False)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the part's function; its parameters are already there."""
-        extra = {"params": self.params} if self.params is not None else {}
+        extra: dict[str, Any] = {} if self.params is None else {"params": self.params}
+        if self.offered is not None and "siblings" in self.part.needs:
+            extra["siblings"] = self.offered.siblings(self.part)
         return self.part.function(*args, **kwargs, **extra)
 
     def to_yaml(self) -> dict[str, Any]:
@@ -178,6 +192,10 @@ class PartLookup(Protocol):
 
     def part(self, name: str) -> Part:
         """Return the part ``kind.name``, or raise LookupError naming the nearest."""
+        ...
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind."""
         ...
 
 
@@ -221,11 +239,12 @@ class Choose:
         if chosen.params is None:
             if raw:
                 raise ValueError(f"{chosen.name} takes no parameters")
-            return Chosen(chosen, None)
+            return Chosen(chosen, None, lookup)
         try:
-            return Chosen(chosen, chosen.params.model_validate(raw or {}, context=lookup))
+            params = chosen.params.model_validate(raw or {}, context=lookup)
         except ValidationError as error:
             raise _below(name, error, chosen.params) from None
+        return Chosen(chosen, params, lookup)
 
 
 def _below(key: str, error: ValidationError, model: type[Params]) -> ValidationError:

@@ -1,13 +1,17 @@
 """reader.folder and reader.auto: the forms a file of poses may have, and what is refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import Field
 
-from flangeye import StageError
-from flangeye.archive import check_ids
+from flangeye import Params, StageError, part
+from flangeye.archive import Archive, NotThisLayout, check_ids
 from flangeye.geometry import rotation_exp
+from flangeye.recipe import load_recipe
+from flangeye.registry import load_registry
 from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.folder import FolderParams, folder
 
@@ -180,3 +184,39 @@ def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path):
         f"{tmp_path}: could be read by ancorasir and folder; choose one, for example "
         "reader: ancorasir"
     )
+
+
+def test_auto_asks_the_readers_of_plugins_too(tmp_path):
+    class StrangeParams(Params):
+        house: str = Field(description="Whose; there is no default.")
+
+    @part("reader.acme")
+    def acme(path: Path) -> Archive:
+        """Read a maker's own layout."""
+        if not (path / "scans.acme").exists():
+            raise NotThisLayout(f"{path}: holds no scans.acme")
+        return Archive("acme", path, (), ())
+
+    @part("reader.strange")
+    def strange(path: Path, params: StrangeParams) -> Archive:
+        """Read a layout that says nothing of itself."""
+        raise AssertionError("asked without its parameter")
+
+    registry = load_registry()
+    for reader in (acme, strange):
+        registry.parts[reader.name] = reader
+    (tmp_path / "scans.acme").touch()
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(
+        "title: auto\nrobot: {model: ur5}\nscanner: {model: phoxi-m}\n"
+        "steps: [acquire.archive, segment.flange, fit.rim, solve.svd]\n"
+    )
+    chosen = load_recipe(recipe, registry).steps[0].params.reader
+    assert chosen(tmp_path).notes == (f"reader: acme, chosen by what {tmp_path} holds",)
+    (tmp_path / "scans.acme").unlink()
+    with pytest.raises(StageError) as error:
+        chosen(tmp_path)
+    assert str(error.value).startswith(
+        f"{tmp_path}: no reader knows this layout: acme (holds no scans.acme); ancorasir (holds "
+    )
+    assert str(error.value).endswith("; strange (has parameters that a recipe must give)")

@@ -1,28 +1,29 @@
-"""Find out which of the built-in readers knows a path."""
+"""Find out which reader knows a path: the built-in ones, and those of every installed plugin."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from flangeye import StageError, part
 from flangeye.archive import Archive, NotThisLayout
-from flangeye.stage import Chosen
+from flangeye.stage import Part, Siblings
 from flangeye_plugins.readers.ancorasir import ancorasir
 from flangeye_plugins.readers.folder import folder
 
-_READERS: Mapping[str, Chosen] = {"ancorasir": ancorasir.bind(), "folder": folder.bind()}
+BUILT_IN: Siblings = {"ancorasir": ancorasir, "folder": folder}
 
 
 @part("reader.auto")
-def auto(path: Path) -> Archive:
-    """Try the built-in readers and take the one that knows the path; says which it was."""
+def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
+    """Try every reader that is installed and take the one that knows the path; says which."""
     found: dict[str, Archive] = {}
     missed: list[str] = []
-    for name, reader in _READERS.items():
+    for name, reader in siblings.items():
         try:
-            found[name] = reader(path)
+            found[name] = _read(reader, path)
         except NotThisLayout as error:
             missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
     if len(found) == 1:
@@ -35,3 +36,17 @@ def auto(path: Path) -> Archive:
             f"reader: {next(iter(found))}"
         )
     raise StageError(f"{path}: no reader knows this layout: {'; '.join(missed)}")
+
+
+def _read(reader: Part, path: Path) -> Archive:
+    """Read with a reader's default parameters.
+
+    Raises:
+        NotThisLayout: It does not know the path, or nothing of it without being told more.
+    """
+    try:
+        chosen = reader.bind()
+    except ValidationError:
+        raise NotThisLayout("has parameters that a recipe must give") from None
+    archive: Archive = chosen(path)
+    return archive
