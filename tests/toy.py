@@ -127,7 +127,7 @@ def solve(observations: Observations, params: SolveParams) -> HandEye:
     pulled = [o for _, o in zip(range(params.at_most), observations, strict=False)]
     if len(pulled) < 3:
         raise StageError(f"solve.toy: 3 poses needed, {len(pulled)} given")
-    camera = np.array([o.circle.centre for o in pulled])
+    camera = np.array([o.feature.centre for o in pulled])
     base = np.array([o.tcp_in_base for o in pulled])
     transform = Transform(BASE, CAMERA, rigid(*kabsch(camera, base)))
     residuals = transform.apply(camera) - base

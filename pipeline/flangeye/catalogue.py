@@ -7,6 +7,7 @@ its source beside it. Here they become checked models in SI units.
 from __future__ import annotations
 
 import difflib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -103,6 +104,13 @@ class RobotModel(Model):
     repeatability: Length
     joint_accuracy: Angle = param(description="Standard deviation of a joint's zero.")
     source: str
+
+
+@dataclass(frozen=True)
+class SecondRobot:
+    """The arm of a recipe that carries the target before the camera on the first."""
+
+    model: RobotModel
 
 
 class ScannerModel(Model):

@@ -223,13 +223,15 @@ def batch(  # noqa: PLR0913  one argument an option
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
-    """Check a recipe without running it: every mistake, with its line."""
+    """Check a recipe without running it: every mistake, with its line; what it has to find."""
+    from flangeye.configuration import Configuration
     from flangeye.recipe import find_recipe, load_recipe
     from flangeye.registry import load_registry
 
     path = find_recipe(recipe)
     checked = load_recipe(path, load_registry(), overrides or ())
     typer.echo(f"{path}: ok, {len(checked.steps)} steps")
+    typer.echo(checked.context[Configuration].describe())
 
 
 @app.command()

@@ -51,6 +51,12 @@ class RobotSection(Section):
     limits: LimitsSection | None = Field(None, description="What the arm must keep to.")
 
 
+class SecondRobotSection(Section):
+    """The arm that carries the target before the first one's camera."""
+
+    model: str = Field(description="A model of data/robots, or a .yaml file of your own.")
+
+
 class ScannerSection(Section):
     """Which scanner, and how to reach it."""
 
@@ -83,6 +89,35 @@ class FeatureSection(Section):
     )
 
 
+class PlaceSection(Section):
+    """Where the target is, in the frame that carries it."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"),
+        description="Roll, pitch, yaw; the target's z points towards the scanner.",
+    )
+
+
+class ConfigurationSection(Section):
+    """Who carries the camera and who the target; what has to be found follows."""
+
+    name: Literal["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"] = "eye-on-base"
+    camera: str | None = Field(
+        None,
+        description="Frame that carries the camera: base, flange, or link1, link2, … for "
+        "eye-on-arm.",
+    )
+    target: str | None = Field(
+        None, description="Frame that carries the target: flange, base or flange2."
+    )
+    place: Literal["known", "unknown"] | PlaceSection = Field(
+        "known",
+        description="Where the target is in that frame: known (at the origin, as the robot's own "
+        "circles are), unknown (a marker), or its position and rpy.",
+    )
+
+
 class WorkspaceSection(BoxSection):
     """Where the work is, in the robot's base; errors are reported over this box."""
 
@@ -101,7 +136,9 @@ class Header(Section):
     title: str = Field(description="One line for people.")
     description: str = Field("", description="More lines for people.")
     robot: RobotSection | None = None
+    second_robot: SecondRobotSection | None = None
     scanner: ScannerSection | None = None
+    configuration: ConfigurationSection = ConfigurationSection()
     feature: FeatureSection = FeatureSection()
     workspace: WorkspaceSection | None = None
     seed: int = Field(0, ge=0, description="The only source of randomness.")

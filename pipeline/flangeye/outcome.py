@@ -69,13 +69,13 @@ def result_of(outcome: Outcome, recipe: Recipe, registry: Registry, watch: Stopw
         timing=_timing(watch),
         provenance=_provenance(outcome, recipe, registry),
     )
-    box = r.workspace_of(outcome.source, recipe.context.get(t.Box), pairs)
+    given = recipe.context.get(t.Box)
+    box = r.work_of(calibration, outcome.source, given) if calibration else None
     if calibration and box:
         result.method = calibration.method
         result.workspace = r.workspace_result(calibration, box)
         if truth := outcome.source.truth:
-            estimate = calibration.base_T_camera.transform
-            result.truth = r.truth_result(estimate, truth.base_T_camera, box)
+            result.truth = r.truth_result(calibration, truth, box)
     return result
 
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 
@@ -18,6 +19,7 @@ from flangeye.catalogue import (
     FlangeStandard,
     RobotModel,
     ScannerModel,
+    SecondRobot,
     Sphere,
     flange_of,
     load_model,
@@ -25,10 +27,18 @@ from flangeye.catalogue import (
     read_model,
     wrist_circle_of,
 )
+from flangeye.configuration import CARRIERS, LINK, Configuration
 from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
 from flangeye.explain import sentence
-from flangeye.header import FeatureSection, Header, LimitsSection
+from flangeye.geometry import rigid, rotation_from_rpy
+from flangeye.header import (
+    ConfigurationSection,
+    FeatureSection,
+    Header,
+    LimitsSection,
+    PlaceSection,
+)
 from flangeye.overrides import apply_override
 from flangeye.registry import PluginNotFoundError, Registry
 from flangeye.shipped import shipped
@@ -176,13 +186,28 @@ class _Checker:
                     context[cls] = load_model(kind, section.model, self.folder)  # type: ignore[arg-type]
             except RecipeError as error:
                 self.complain((kind[:-1], "model"), str(error))
+        self._second_robot(header, context)
         self._drivers(header, context)
+        context[Configuration] = None
+        try:
+            context[Configuration] = _configuration(header, context.get(RobotModel))
+        except RecipeError as error:
+            self.complain(("configuration",), str(error))
         try:
             if RobotModel in context:
                 context[Flange] = self._flange(header.feature, context[RobotModel])
         except RecipeError as error:
             self.complain(("feature",), str(error))
         return context
+
+    def _second_robot(self, header: Header, context: dict[type, Any]) -> None:
+        if header.second_robot is None:
+            return
+        try:
+            model = load_model("robots", header.second_robot.model, self.folder)
+            context[SecondRobot] = SecondRobot(model)
+        except RecipeError as error:
+            self.complain(("second_robot", "model"), str(error))
 
     def _drivers(self, header: Header, context: dict[type, Any]) -> None:
         """Offer the devices the header names, not yet opened, and the limits of the arm."""
@@ -279,3 +304,35 @@ class _Checker:
             except (KeyError, IndexError, TypeError):
                 return parsed
         return node
+
+
+def _configuration(header: Header, robot: RobotModel | None) -> Configuration:
+    """Return the configuration of a recipe, its frames filled in and checked."""
+    section = header.configuration
+    cameras, targets = CARRIERS[section.name]
+    camera, target = section.camera or cameras[0], section.target or targets[0]
+    if LINK in cameras:
+        _require_link(camera, robot)
+    elif camera not in cameras:
+        raise RecipeError(f"{section.name}: the camera is carried by {cameras[0]}, not by {camera}")
+    if target not in targets:
+        allowed = " or ".join(targets)
+        raise RecipeError(f"{section.name}: the target is carried by {allowed}, not by {target}")
+    return Configuration(section.name, camera, target, _place(section))
+
+
+def _require_link(camera: str, robot: RobotModel | None) -> None:
+    links = [f"{LINK}{i + 1}" for i in range(len(robot.joints) if robot else 0)]
+    if robot is None:
+        raise RecipeError("eye-on-arm: where a link is follows from the robot's model; name it")
+    if camera not in links:
+        raise RecipeError(
+            f"eye-on-arm: the camera is carried by a link, {links[0]} to {links[-1]}, not by "
+            f"{camera}; write for example camera: {links[len(links) // 2 - 1]}"
+        )
+
+
+def _place(section: ConfigurationSection) -> Any:
+    if isinstance(section.place, PlaceSection):
+        return rigid(rotation_from_rpy(*section.place.rpy), np.asarray(section.place.position))
+    return np.eye(4) if section.place == "known" else None

@@ -9,7 +9,7 @@ topic                         schema                      content
 /capture                      flangeye.Capture (JSON)     id, pose, joints, time, role, grid shape
 /capture/cloud                foxglove.PointCloud         the scan: thinned, or whole
 /pose                         foxglove.PoseInFrame        the flange as the controller reports it
-/tf                           foxglove.FrameTransform     base -> flange, base -> camera
+/tf                           foxglove.FrameTransform     base -> flange, carrier -> camera, …
 /step/N.stage                 flangeye.<type> (JSON)      what the step gave, lossless
 /step/N.stage/cloud           foxglove.PointCloud         the points of that value, lossless
 /note/N.stage/name            flangeye.<type> (JSON)      what a step wrote into its journal
@@ -120,6 +120,8 @@ class Recorder:
         self._proto("/capture/cloud", foxglove.point_cloud(cloud, xyz, now))
         self._proto("/pose", foxglove.pose_in_frame(capture.base_T_flange, now))
         self._proto("/tf", foxglove.frame_transform(capture.base_T_flange, now))
+        if capture.base2_T_flange2 is not None:
+            self._proto("/tf", foxglove.frame_transform(capture.base2_T_flange2, now))
 
     @hookimpl
     def flangeye_stage_finished(
@@ -180,7 +182,8 @@ class Recorder:
         if isinstance(value, t.CircleFeature) and capture is not None:
             self._proto("/scene", foxglove.circle_scene(capture, value, now))
         if isinstance(value, t.HandEye):
-            self._proto("/tf", foxglove.frame_transform(value.base_T_camera.transform, now))
+            for estimate in value.transforms.values():
+                self._proto("/tf", foxglove.frame_transform(estimate.transform, now))
         if isinstance(value, t.Seam):
             self._proto("/scene", foxglove.seam_scene(value, now))
             self._proto("/seam", foxglove.seam_poses(value, now))

@@ -45,6 +45,8 @@ class Replay:
             raise StageError("--at the acquire step: that is the whole recipe; leave out --from")
         if self.kind == "segment":
             return self._scans()
+        if self.kind == "fit" and not self.log.of_kind("segment"):
+            return self._scans()
         if self.kind == "fit":
             captures = [capture for capture, _ in self.log.flange_clouds()]
             return t.Captures(captures, self.source, len(captures))
@@ -61,7 +63,7 @@ class Replay:
 
     def segmented(self) -> dict[str, t.FlangeCloud] | None:
         """Return the segmented flanges by capture, when segmenting is not done again."""
-        if self.kind != "fit":
+        if self.kind != "fit" or not self.log.of_kind("segment"):
             return None
         return {capture.id: flange for capture, flange in self.log.flange_clouds()}
 

@@ -37,6 +37,11 @@ class TransformResult(_Part):
         "parent frame, the translation taken at `about`."
     )
     about: Vector = Field(description="Point in the parent frame [m].")
+    unobservable: Matrix | None = Field(
+        None,
+        description="Directions (rotation, translation), about the same point, along which the "
+        "estimate is arbitrary and the covariance says nothing.",
+    )
 
 
 class ObservationResult(_Part):
@@ -84,10 +89,23 @@ class WorkspaceResult(_Part):
     predicted_p95: float = Field(description="95 % of the errors over the box are below [m].")
 
 
+class TransformErrorResult(_Part):
+    """Simulation only: how far one transform is off."""
+
+    rotation: float = Field(description="[rad]")
+    translation: float = Field(description="Of the point its covariance is taken about [m].")
+
+
 class TruthResult(_Part):
     """Simulation only: what the calibration is really worth."""
 
-    base_T_camera: Matrix
+    base_T_camera: Matrix | None = Field(None, description="Where the camera is, if it stands.")
+    transforms: dict[str, Matrix] = Field(
+        default_factory=dict, description="Every unknown, as it really is."
+    )
+    errors: dict[str, TransformErrorResult] = Field(
+        default_factory=dict, description="Of every unknown, where its covariance is taken."
+    )
     error_at_centroid: float = Field(description="At the workspace's centre [m].")
     rms_over_workspace: float = Field(description="Over the workspace box [m].")
     rotation_error: float = Field(description="[rad]")
@@ -169,14 +187,16 @@ def transforms_result(calibration: t.HandEye | None) -> dict[str, TransformResul
     """Return the section ``transforms``."""
     if calibration is None:
         return {}
-    estimate = calibration.base_T_camera
-    return {
-        estimate.transform.name: TransformResult(
-            matrix=estimate.transform.matrix.tolist(),
-            covariance=estimate.covariance.tolist(),
-            about=estimate.about.tolist(),
-        )
-    }
+    return {name: _transform(x) for name, x in calibration.transforms.items()}
+
+
+def _transform(estimate: t.TransformEstimate) -> TransformResult:
+    return TransformResult(
+        matrix=estimate.transform.matrix.tolist(),
+        covariance=estimate.covariance.tolist(),
+        about=estimate.about.tolist(),
+        unobservable=estimate.unobservable.tolist() if len(estimate.unobservable) else None,
+    )
 
 
 def correction_result(calibration: t.HandEye | None) -> CorrectionResult | None:
@@ -202,15 +222,16 @@ def observations_result(
 
 
 def _observation(pair: t.Pair) -> ObservationResult:
-    circle = pair.observation.circle
+    feature = pair.observation.feature
+    circle = feature if isinstance(feature, t.CircleFeature) else None
     return ObservationResult(
         id=pair.observation.id,
-        centre_in_camera=circle.centre.tolist(),
-        normal_in_camera=None if circle.normal is None else circle.normal.tolist(),
-        radii=dict(circle.radii),
-        covariance=circle.covariance.tolist(),
-        arc_coverage=circle.arc_coverage,
-        clocking=circle.clocking,
+        centre_in_camera=feature.centre.tolist(),
+        normal_in_camera=None if feature.normal is None else feature.normal.tolist(),
+        radii=dict(circle.radii) if circle else None,
+        covariance=feature.centre_covariance.tolist(),
+        arc_coverage=circle.arc_coverage if circle else None,
+        clocking=circle.clocking if circle else None,
         tcp_in_base=pair.observation.tcp_in_base.tolist(),
         residual=float(np.linalg.norm(pair.residual)),
         residual_in_base=pair.residual.tolist(),
@@ -221,7 +242,7 @@ def _observation(pair: t.Pair) -> ObservationResult:
 
 def workspace_result(calibration: t.HandEye, box: t.Box) -> WorkspaceResult:
     """Return the error to expect over ``box``, from the estimate's covariance alone."""
-    estimate = calibration.base_T_camera
+    estimate = calibration.camera
     covariances = covariance_at(estimate.covariance, estimate.about, box.grid())
     return WorkspaceResult(
         centre=box.centre.tolist(),
@@ -239,19 +260,34 @@ def _p95_of_gaussians(covariances: t.Array, draws: int = 400) -> float:
     return float(np.quantile(np.linalg.norm(roots @ unit.T, axis=1), 0.95))
 
 
-def truth_result(estimate: t.Transform, truth: t.Transform, box: t.Box) -> TruthResult:
+def truth_result(calibration: t.HandEye, truth: t.Truth, box: t.Box) -> TruthResult:
     """Return how far the estimate maps points of the workspace from where they are."""
-    error = estimate.matrix @ truth.inverse().matrix
-
-    def displacement(points: Any) -> Any:
-        return np.linalg.norm(points @ error[:3, :3].T + error[:3, 3] - points, axis=-1)
-
+    error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
+    known = {x.name: x for x in (truth.camera, *truth.others)}
+    found = calibration.transforms
     return TruthResult(
-        base_T_camera=truth.matrix.tolist(),
-        error_at_centroid=float(displacement(box.centre)),
-        rms_over_workspace=float(np.sqrt((displacement(box.grid()) ** 2).mean())),
+        base_T_camera=truth.camera.matrix.tolist() if truth.camera.parent == t.BASE else None,
+        transforms={name: x.matrix.tolist() for name, x in known.items()},
+        errors={name: _error(found[name], known[name]) for name in found if name in known},
+        error_at_centroid=float(_displacement(error, box.centre)),
+        rms_over_workspace=float(np.sqrt((_displacement(error, box.grid()) ** 2).mean())),
         rotation_error=float(np.linalg.norm(rotation_log(error[:3, :3]))),
     )
+
+
+def _error(estimate: t.TransformEstimate, truth: t.Transform) -> TransformErrorResult:
+    """Return how far off one transform is, unobservable directions aside."""
+    error = estimate.transform.matrix @ truth.inverse().matrix
+    shift = error[:3, :3] @ estimate.about + error[:3, 3] - estimate.about
+    twist = np.concatenate([rotation_log(error[:3, :3]), shift])
+    twist -= estimate.unobservable.T @ (estimate.unobservable @ twist)
+    return TransformErrorResult(
+        rotation=float(np.linalg.norm(twist[:3])), translation=float(np.linalg.norm(twist[3:]))
+    )
+
+
+def _displacement(error: t.Array, points: Any) -> Any:
+    return np.linalg.norm(points @ error[:3, :3].T + error[:3, 3] - points, axis=-1)
 
 
 def holdout_result(verifications: Mapping[str, t.Verification]) -> HoldoutResult | None:
@@ -307,14 +343,31 @@ def _seam_truth(seam: t.Seam, true_seams: list[t.Array]) -> SeamTruthResult:
     )
 
 
+def work_of(calibration: t.HandEye, source: t.Source, given: t.Box | None) -> t.Box | None:
+    """Return where the work is, in the frame that carries the camera.
+
+    That of :func:`workspace_of` where it is the base; where the robot moves the camera, the box
+    around what it looked at.
+    """
+    if calibration.camera.transform.parent == t.BASE:
+        return workspace_of(source, given, calibration.pairs)
+    seen = np.array([pair.observation.feature.centre for pair in calibration.pairs])
+    return _around(calibration.camera.transform.apply(seen.reshape(-1, 3)))
+
+
 def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair]) -> t.Box | None:
     """Return the recipe's box, or the source's, or the box around the flange's centres."""
     if given or source.workspace:
         return given or source.workspace
     if not pairs:
         return None
-    centres = np.array([pair.observation.tcp_in_base for pair in pairs])
-    low, high = centres.min(axis=0), centres.max(axis=0)
+    return _around(np.array([pair.observation.tcp_in_base for pair in pairs]))
+
+
+def _around(points: t.Array) -> t.Box | None:
+    if not len(points):
+        return None
+    low, high = points.min(axis=0), points.max(axis=0)
     return t.Box((low + high) / 2, high - low)
 
 

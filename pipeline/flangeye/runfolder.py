@@ -94,6 +94,8 @@ def calibration_yaml(result: Result) -> str:
             "covariance_rotation_translation": estimate.covariance,
             "covariance_about_m": estimate.about,
         }
+        if estimate.unobservable:
+            document[name]["unobservable_rotation_translation"] = estimate.unobservable
     document["recipe_hash"] = result.provenance.recipe_hash
     return "# Maps child coordinates to parent coordinates; metres and radians.\n" + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, width=110

@@ -22,8 +22,8 @@ from flangeye.record import adapter
 _TYPES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        t.FlangeCloud, t.CircleFeature, t.HandEye, t.VerifiedHandEye, t.Verification, t.Observation,
-        t.WorkpieceScan, t.Seam, t.WeldReport,
+        t.FlangeCloud, t.CircleFeature, t.PoseFeature, t.HandEye, t.VerifiedHandEye, t.Verification,
+        t.Observation, t.WorkpieceScan, t.Seam, t.WeldReport,
     )
 }  # fmt: skip
 
@@ -98,7 +98,7 @@ class RunLog:
         return [entry for entry in self.entries if entry.kind == kind]
 
     def observations(self) -> list[t.Observation]:
-        """Return one observation for each circle that was fitted, in order."""
+        """Return one observation for each feature that was fitted, in order."""
         given = [e.value for e in self.of_kind("acquire") if isinstance(e.value, t.Observation)]
         fitted = [
             t.Observation(str(e.capture), e.value, *self._pose(str(e.capture)))
@@ -152,15 +152,22 @@ class RunLog:
         """Whether the raw scans were logged whole."""
         return bool(self.poses) and all(meta["full"] for meta in self.poses.values())
 
-    def _pose(self, capture: str) -> tuple[t.Transform, Any]:
-        meta = self.poses[capture]
-        pose = adapter(t.Transform).validate_python(meta["base_T_flange"])
-        return pose, None if meta["joints"] is None else np.array(meta["joints"])
+    def _pose(self, capture: str) -> tuple[t.Transform, Any, t.Transform | None]:
+        """Return base_T_flange, the joint angles and base2_T_flange2."""
+        meta, read = self.poses[capture], adapter(t.Transform).validate_python
+        joints, second = meta["joints"], meta.get("base2_T_flange2")
+        return (
+            read(meta["base_T_flange"]),
+            None if joints is None else np.array(joints),
+            None if second is None else read(second),
+        )
 
     def _capture(self, capture: str, cloud: t.PointCloud) -> t.Capture:
         meta = self.poses[capture]
-        pose, joints = self._pose(capture)
-        return t.Capture(capture, cloud, pose, joints, meta["time_ns"], meta["role"])
+        pose, joints, second = self._pose(capture)
+        return t.Capture(
+            capture, cloud, pose, joints, meta["time_ns"], meta["role"], base2_T_flange2=second
+        )
 
 
 def read_run(path: Path) -> RunLog:

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from itertools import chain
-from types import NoneType
-from typing import Any, get_args
+from typing import Any
 
 import pluggy
 
@@ -23,7 +22,7 @@ from flangeye.recipe import Recipe
 from flangeye.registry import Registry
 from flangeye.replay import Earlier, Replay
 from flangeye.result import Result
-from flangeye.steps import Step
+from flangeye.steps import Step, bare
 from flangeye.stopwatch import Stopwatch
 
 
@@ -116,16 +115,19 @@ class Runner:
 
     def _gathered(self, earlier: Earlier) -> Iterator[t.Observation]:
         """Log again what an earlier run gathered, so that this log stands by itself."""
-        acquire, segment, fit = (self._steps(kind)[0] for kind in ("acquire", "segment", "fit"))
+        acquire, fit = (self._steps(kind)[0] for kind in ("acquire", "fit"))
+        segments = self._steps("segment")
         self._values[t.Views].extend(earlier.log.views())
         for rejection in earlier.log.rejections:
             self._reject(rejection)
-        circles = {o.id: o for o in earlier.log.observations()}
-        for capture, flange in earlier.log.flange_clouds():
+        fitted = {o.id: o for o in earlier.log.observations()}
+        unsegmented = ((capture, None) for capture in earlier.log.captures())
+        for capture, flange in earlier.log.flange_clouds() if segments else unsegmented:
             self._hooks.flangeye_captured(step=acquire.label, capture=capture, seconds=0.0)
-            self._finished(segment, capture.id, flange, 0.0)
-            if observation := circles.get(capture.id):
-                self._finished(fit, capture.id, observation.circle, 0.0)
+            if flange is not None:
+                self._finished(segments[0], capture.id, flange, 0.0)
+            if observation := fitted.get(capture.id):
+                self._finished(fit, capture.id, observation.feature, 0.0)
             self._hooks.flangeye_capture_finished(capture=capture.id)
             if observation:
                 yield observation
@@ -157,17 +159,23 @@ class Runner:
 
     def _through(self, capture: t.Capture) -> t.Observation | None:
         """Take one capture through segment and fit; None when set aside or kept for verifying."""
-        flange = self._segment(capture)
-        if flange is None:
-            return None
+        given: dict[Any, Any] = {t.Capture: capture}
+        if self._steps("segment"):
+            flange = self._segment(capture)
+            if flange is None:
+                return None
+            if capture.role == "verification":
+                view = t.VerificationView(capture.id, flange, capture.base_T_flange)
+                self._values[t.Views].append(view)
+            given[t.FlangeCloud] = flange
         if capture.role == "verification":
-            view = t.VerificationView(capture.id, flange, capture.base_T_flange)
-            self._values[t.Views].append(view)
             return None
-        circle = self._per_capture("fit", capture.id, {t.FlangeCloud: flange})
-        if circle is None:
+        feature = self._per_capture("fit", capture.id, given)
+        if feature is None:
             return None
-        return t.Observation(capture.id, circle, capture.base_T_flange, capture.joints)
+        return t.Observation(
+            capture.id, feature, capture.base_T_flange, capture.joints, capture.base2_T_flange2
+        )
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
         if self._segmented is not None:
@@ -271,7 +279,7 @@ class Runner:
 
     def _arguments(self, step: Step, given: Mapping[Any, Any]) -> dict[str, Any]:
         values = {**self._values, t.Journal: partial(self._noted, step.label), **given}
-        arguments = {name: values.get(_bare(need)) for name, need in step.stage.needs.items()}
+        arguments = {name: values.get(bare(need)) for name, need in step.stage.needs.items()}
         if step.params is not None:
             arguments["params"] = step.params
         return arguments
@@ -296,9 +304,3 @@ def _guarded(step: Step, arguments: dict[str, Any]) -> Any:
             f"{step.label}: failed with {type(error).__name__}: {error}; this is a mistake in the "
             "plugin (FLANGEYE_DEBUG=1 shows where)"
         ) from error
-
-
-def _bare(need: Any) -> Any:
-    """Return X of ``X | None``."""
-    alternatives = [a for a in get_args(need) if a is not NoneType]
-    return alternatives[0] if NoneType in get_args(need) else need

@@ -50,13 +50,13 @@ class Contract:
     """What every stage of one kind must take and must give.
 
     Attributes:
-        takes: Type of the value the kind works on; None for the first of a recipe.
+        takes: Types of the value the kind works on, of which it needs one; none for the first.
         gives: Types it may return.
         opens: What later steps may ask for once such a step has run.
         meaning: One line for people.
     """
 
-    takes: Any
+    takes: tuple[Any, ...]
     gives: tuple[Any, ...]
     opens: tuple[Any, ...]
     meaning: str
@@ -64,30 +64,30 @@ class Contract:
 
 KINDS: Mapping[str, Contract] = {
     "acquire": Contract(
-        None, (t.Captures, t.Observations), (t.Capture,), "where scans and robot poses come from"
+        (), (t.Captures, t.Observations), (t.Capture,), "where scans and robot poses come from"
     ),
     "segment": Contract(
-        t.Capture,
+        (t.Capture,),
         (t.FlangeCloud, t.Rejected),
         (t.FlangeCloud, t.Views),
         "find the flange in a scan",
     ),
     "fit": Contract(
-        t.FlangeCloud,
-        (t.CircleFeature, t.Rejected),
-        (t.CircleFeature, t.Observations),
-        "the circle's centre, with covariance",
+        (t.FlangeCloud, t.Capture),
+        (t.CircleFeature, t.PoseFeature, t.Rejected),
+        (t.CircleFeature, t.PoseFeature, t.Observations),
+        "the circle's centre or the marker's pose, with covariance",
     ),
-    "solve": Contract(t.Observations, (t.HandEye,), (t.HandEye, t.Solver), "the camera's pose"),
+    "solve": Contract((t.Observations,), (t.HandEye,), (t.HandEye, t.Solver), "the camera's pose"),
     "refine": Contract(
-        t.HandEye, (t.HandEye,), (t.HandEye,), "a calibration changed after solving"
+        (t.HandEye,), (t.HandEye,), (t.HandEye,), "a calibration changed after solving"
     ),
     "verify": Contract(
-        t.HandEye, (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used"
+        (t.HandEye,), (t.Verification,), (t.VerifiedHandEye,), "whether the pose may be used"
     ),
-    "scan": Contract(None, (t.WorkpieceScan,), (t.WorkpieceScan,), "a scan of the workpiece"),
-    "seam": Contract(t.VerifiedHandEye, (t.Seam,), (t.Seam,), "where to weld"),
-    "weld": Contract(t.VerifiedHandEye, (t.WeldReport,), (t.WeldReport,), "weld along the seam"),
+    "scan": Contract((), (t.WorkpieceScan,), (t.WorkpieceScan,), "a scan of the workpiece"),
+    "seam": Contract((t.VerifiedHandEye,), (t.Seam,), (t.Seam,), "where to weld"),
+    "weld": Contract((t.VerifiedHandEye,), (t.WeldReport,), (t.WeldReport,), "weld along the seam"),
 }
 """The kinds of steps, in the order a recipe runs them."""
 
@@ -335,8 +335,9 @@ def _check_contract(declared: Stage) -> None:
     where = f"stage '{declared.name}'"
     if contract is None:
         raise TypeError(f"{where}: no kind '{declared.kind}'; kinds: {', '.join(KINDS)}")
-    if contract.takes is not None and contract.takes not in declared.needs.values():
-        raise TypeError(f"{where}: a '{declared.kind}' stage takes a {contract.takes.__name__}")
+    if contract.takes and not set(contract.takes) & set(declared.needs.values()):
+        wanted = " or a ".join(taken.__name__ for taken in contract.takes)
+        raise TypeError(f"{where}: a '{declared.kind}' stage takes a {wanted}")
     foreign = [g for g in declared.gives if g not in contract.gives]
     if foreign:
         allowed = " or ".join(g.__name__ for g in contract.gives)

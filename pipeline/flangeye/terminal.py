@@ -10,7 +10,7 @@ from rich.console import Console
 
 from flangeye.geometry import rpy_from_rotation
 from flangeye.hookspecs import hookimpl
-from flangeye.result import Result
+from flangeye.result import Result, TransformResult, Vector
 from flangeye.types import Rejection, Source
 
 if TYPE_CHECKING:
@@ -83,24 +83,34 @@ def print_result(console: Console, result: Result) -> None:
     for name, estimate in result.transforms.items():
         lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
-        lines += ["", *_uncertainty(estimate.matrix, np.array(estimate.covariance))]
+        lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
     lines += _errors(result)
     if result.refused:
         lines += ["", f"refused: {result.refused}"]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
-def _uncertainty(matrix: Any, covariance: Any) -> list[str]:
-    std = np.sqrt(np.diag(covariance))
-    rpy = np.degrees(rpy_from_rotation(np.array(matrix)[:3, :3]))
+def _uncertainty(parent: str, estimate: TransformResult) -> list[str]:
+    std = np.sqrt(np.diag(np.array(estimate.covariance)))
+    rpy = np.degrees(rpy_from_rotation(np.array(estimate.matrix)[:3, :3]))
+    unknown = [f"  not observable     {_motion(d)}" for d in estimate.unobservable or []]
     return [
         f"  roll, pitch, yaw   {rpy[0]:.4f}, {rpy[1]:.4f}, {rpy[2]:.4f} deg",
         "  one sigma          "
         + ", ".join(f"{x:.4f}" for x in np.degrees(std[:3]))
-        + " deg about base x, y, z; "
+        + f" deg about {parent} x, y, z; "
         + ", ".join(f"{x * 1e3:.3f}" for x in std[3:])
         + " mm at the work",
+        *unknown,
     ]
+
+
+def _motion(direction: Vector) -> str:
+    """Return ``translation along (0.00, 0.00, 1.00)`` or the like for a unit direction."""
+    kinds = (("rotation about", direction[:3]), ("translation along", direction[3:]))
+    parts = [(kind, np.array(v)) for kind, v in kinds if np.linalg.norm(v) > 1e-3]
+    axes = [(kind, np.round(v / np.linalg.norm(v), 2) + 0.0) for kind, v in parts]
+    return " with ".join(f"{kind} ({', '.join(f'{x:.2f}' for x in v)})" for kind, v in axes)
 
 
 def _errors(result: Result) -> list[str]:

@@ -4,7 +4,9 @@
 * ``parent_T_child`` maps coordinates in ``child`` to coordinates in ``parent``; points carry the
   name of the frame they are given in. Frames: ``base`` (robot base), ``flange`` (ISO 9409-1: origin
   at the centre of the flange's face, z outwards), ``tool`` (what the controller takes for the
-  tool's tip), ``camera`` (scanner, z along the view).
+  tool's tip), ``camera`` (scanner, z along the view), ``target`` (what is looked at, z towards the
+  scanner), ``link3`` (Denavit-Hartenberg's of that link), ``base2`` and ``flange2`` (of a second
+  arm).
 * Quaternions are xyzw. Covariances of a transform are 6x6, in the order (rotation, translation),
   of a left perturbation in the parent frame, and say about which point the translation is taken:
   ``x' = about + Exp(phi) (x - about) + tau``.
@@ -23,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import core_schema
 
-BASE, FLANGE, CAMERA, TOOL = "base", "flange", "camera", "tool"
+BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"
+BASE2, FLANGE2 = "base2", "flange2"
 
 
 class _AsNestedLists:
@@ -181,14 +184,22 @@ class TransformEstimate:
         covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in the
             parent frame.
         about: (3,) point in the parent frame at which the translation part is taken [m].
+        unobservable: (k, 6) unit directions, in the same order and about the same point, that no
+            measurement tells anything of: the estimate is arbitrary along them, and the covariance
+            is of the rest.
     """
 
     transform: Transform
     covariance: Array
     about: Array
+    unobservable: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     def __post_init__(self) -> None:
         _freeze(self, covariance=(6, 6), about=(3,))
+        directions = np.reshape(self.unobservable, (-1, 6))
+        object.__setattr__(
+            self, "unobservable", _frozen(directions, directions.shape, "directions")
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +265,7 @@ class Capture:
         time_ns: When the exposure ended.
         role: ``verification`` captures are kept from every solver.
         image: What a camera in the scanner saw, in the same frame, if one looked.
+        base2_T_flange2: Where a second arm stood, if there is one.
     """
 
     id: str
@@ -263,6 +275,7 @@ class Capture:
     time_ns: int = 0
     role: Role = "calibration"
     image: Image | None = None
+    base2_T_flange2: Transform | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,6 +326,49 @@ class CircleFeature:
         if self.normal is not None or self.normal_covariance is not None:
             _freeze(self, normal=(3,), normal_covariance=(3, 3))
 
+    @property
+    def centre_covariance(self) -> NDArray[np.float64]:
+        """(3, 3) of the centre [m^2]: what every feature has."""
+        return self.covariance
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFeature:
+    """A target whose whole pose was measured, such as a marker.
+
+    Attributes:
+        camera_T_target: Its pose; the target's z points towards the scanner.
+        covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in
+            ``camera``, the translation taken at the target's origin.
+        figures: What the fit has to tell of its quality, by name, in SI units and pixels.
+    """
+
+    camera_T_target: Transform
+    covariance: Array
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _freeze(self, covariance=(6, 6))
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) the target's origin in ``camera`` [m]."""
+        return self.camera_T_target.translation
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """(3,) the target's z in ``camera``."""
+        return self.camera_T_target.rotation[:, 2]
+
+    @property
+    def centre_covariance(self) -> NDArray[np.float64]:
+        """(3, 3) of the origin [m^2]."""
+        return self.covariance[3:, 3:]
+
+
+Feature = CircleFeature | PoseFeature
+"""What a ``fit`` stage measures of a target, in ``camera``."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
@@ -332,17 +388,31 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A fitted circle and the robot pose it belongs to: one equation for the solver."""
+    """A fitted feature and the robot poses it belongs to: one equation for the solver."""
 
     id: str
-    circle: CircleFeature
+    feature: Feature
     base_T_flange: Transform
     joints: Array | None = None
+    base2_T_flange2: Transform | None = None
+
+    @property
+    def circle(self) -> CircleFeature:
+        """The feature, for those who can use nothing but a circle."""
+        if isinstance(self.feature, CircleFeature):
+            return self.feature
+        raise FrameMismatchError(f"observation {self.id} is a pose, and a circle is needed")
+
+    @property
+    def centre_in_mount(self) -> NDArray[np.float64]:
+        """(3,) where the link that carries the target has what was seen, if that is known [m]."""
+        feature = self.feature
+        return feature.centre_in_flange if isinstance(feature, CircleFeature) else np.zeros(3)
 
     @property
     def tcp_in_base(self) -> NDArray[np.float64]:
-        """(3,) the circle's centre as the controller reports it [m]."""
-        return self.base_T_flange.apply(self.circle.centre_in_flange)
+        """(3,) the flange's centre, or what it carries, as the controller reports it [m]."""
+        return self.base_T_flange.apply(self.centre_in_mount)
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,9 +496,15 @@ class Views(list[VerificationView]):
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulated cell knows and no real one does. No stage can ask for it."""
+    """What a simulated cell knows and no real one does. No stage can ask for it.
 
-    base_T_camera: Transform
+    Attributes:
+        camera: Where the camera is, in the frame that carries it.
+        others: The other unknowns of the configuration.
+    """
+
+    camera: Transform
+    others: tuple[Transform, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -454,8 +530,8 @@ class Pair:
 
     Attributes:
         observation: What went in.
-        residual: (3,) measured centre, mapped to ``base``, minus the TCP (corrected, where the
-            solver corrects the arm) [m].
+        residual: (3,) measured centre, mapped to ``base``, minus where the calibration expects
+            it: at the TCP (corrected, where the solver corrects the arm), or at the target [m].
         used: Whether it took part in the estimate.
         reason: Why it did not.
     """
@@ -493,18 +569,35 @@ class HandEye:
     """A calibration that nobody has verified yet.
 
     Attributes:
-        base_T_camera: The camera's pose in the robot's base.
+        camera: The camera's pose in the frame that carries it: ``base_T_camera`` where it stands
+            beside the robot, ``flange_T_camera`` where the robot moves it.
         pairs: Every observation the solver pulled.
         method: Stage that solved it.
         notes: What the solver wants the person to know.
         correction: What it found wrong with the arm; the pose holds with it.
+        others: The configuration's other unknowns, such as ``base_T_target``.
     """
 
-    base_T_camera: TransformEstimate
+    camera: TransformEstimate
     pairs: tuple[Pair, ...]
     method: str
     notes: tuple[str, ...] = ()
     correction: ArmCorrection | None = None
+    others: tuple[TransformEstimate, ...] = ()
+
+    @property
+    def base_T_camera(self) -> TransformEstimate:
+        """The camera's pose in the robot's base, for those who can use nothing else."""
+        if self.camera.transform.parent != BASE:
+            raise FrameMismatchError(
+                f"the calibration is {self.camera.transform.name}, and base_T_camera is needed"
+            )
+        return self.camera
+
+    @property
+    def transforms(self) -> dict[str, TransformEstimate]:
+        """Every estimate by its name, the camera's first."""
+        return {x.transform.name: x for x in (self.camera, *self.others)}
 
 
 @dataclass(frozen=True, eq=False)

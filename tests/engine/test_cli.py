@@ -128,9 +128,13 @@ def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path)
 
 
 def test_check_stages_plugins_schema(flangeye, toy_recipe, tmp_path):
-    assert flangeye("check", toy_recipe)[1] == f"{toy_recipe}: ok, 5 steps\n"
+    assert flangeye("check", toy_recipe)[1] == (
+        f"{toy_recipe}: ok, 5 steps\n"
+        "eye-on-base: [base_T_camera] · camera_T_target = base_T_flange · flange_T_target; "
+        "to be found: base_T_camera\n"
+    )
     out = flangeye("stages")[1]
-    assert "fit: the circle's centre, with covariance\n  fit.toy" in out
+    assert "fit: the circle's centre or the marker's pose, with covariance\n  fit.toy" in out
     out = flangeye("stages", "fit.toy")[1]
     assert "  inlier: length = 0.3 mm  (> 0 in SI)\n" in out
     assert "      Largest distance of a rim point from the circle.\n" in out

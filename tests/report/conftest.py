@@ -208,7 +208,7 @@ def _result(
             )
             for k, v in verifications.items()
         },
-        truth=r.truth_result(calibration.base_T_camera.transform, TRUTH, WORKSPACE)
+        truth=r.truth_result(calibration, t.Truth(TRUTH), WORKSPACE)
         if calibration and source.truth
         else None,
         timing={"2.fit.rim": r.StageTiming(seconds=0.36, calls=12)},

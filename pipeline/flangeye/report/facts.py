@@ -86,7 +86,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
     calibration = log.calibration()
     pairs = calibration.pairs if calibration else _unsolved(log.observations())
     header = parse_yaml(recipe, "recipe").data if recipe else {}
-    box = r.workspace_of(source, _box(header), pairs)
+    box = r.work_of(calibration, source, _box(header)) if calibration else None
     verifications = {e.step: e.value for e in log.of_kind("verify")}
     return r.Result(
         title=str(header.get("title", log.path.name)),
@@ -130,7 +130,7 @@ def _truth(
 ) -> r.TruthResult | None:
     if source.truth is None or calibration is None or box is None:
         return None
-    return r.truth_result(calibration.base_T_camera.transform, source.truth.base_T_camera, box)
+    return r.truth_result(calibration, source.truth, box)
 
 
 def _timing(log: RunLog) -> dict[str, r.StageTiming]:

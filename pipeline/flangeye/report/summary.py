@@ -16,6 +16,9 @@ _FRAMES = {
     t.BASE: "the robot's base",
     t.FLANGE: "the flange",
     t.CAMERA: "the camera",
+    t.TARGET: "the target",
+    t.BASE2: "the second robot's base",
+    t.FLANGE2: "the second robot's flange",
 }
 
 

@@ -87,7 +87,7 @@ def refine_compensate(
     pairs = [_moved(pair, before, after) for pair in calibration.pairs]
     return replace(
         calibration,
-        base_T_camera=widened(calibration.base_T_camera, after),
+        camera=widened(calibration.base_T_camera, after),
         pairs=tuple(pairs),
         notes=(*calibration.notes, *_notes(calibration.pairs, pairs, error, measure(after))),
     )

@@ -11,10 +11,17 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
 from flangeye.catalogue import RobotModel
+from flangeye.configuration import (
+    DEFAULT,
+    Configuration,
+    carriers_of,
+    mapped_and_expected,
+    target_poses,
+)
 from flangeye.correction import corrected_flange
 from flangeye.geometry import covariance_at
 from flangeye.kinematics import Arm
-from flangeye.result import workspace_of
+from flangeye.result import work_of
 from flangeye.statistics import (
     chi2_quantile,
     corners_of,
@@ -75,6 +82,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     workspace: Box | None = None,
     observations: Observations | None = None,
     robot: RobotModel | None = None,
+    configuration: Configuration | None = None,
     seed: Seed = Seed(0),  # noqa: B008  a NewType is the int itself
 ) -> Verification:
     """Deal the poses into folds, solve without each in turn, and measure the error on it.
@@ -91,7 +99,8 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     poses = [pair.observation for pair in calibration.pairs]
     folds = deal(len(poses), params.folds, seed)
     try:
-        held = hold_out(poses, solve, folds, Arm(robot) if robot else None)
+        arm = Arm(robot) if robot else None
+        held = hold_out(poses, solve, folds, arm, configuration or DEFAULT)
     except (StageError, CalibrationRefused) as error:
         return Verification(
             False, f"without one fold of {len(folds)} there is no answer: {error}", {}
@@ -124,6 +133,7 @@ def hold_out(
     solve: Solver,
     folds: Sequence[NDArray[np.intp]],
     arm: Arm | None = None,
+    configuration: Configuration = DEFAULT,
 ) -> HeldOut:
     """Solve without each fold and measure it.
 
@@ -136,10 +146,35 @@ def hold_out(
     for fold in folds:
         without = set(fold.tolist())
         calibration = solve([o for i, o in enumerate(observations) if i not in without])
+        if not configuration.is_default:
+            _measure_loop(calibration, observations, fold, (configuration, arm), held)
+            continue
         for i in fold:
             expected = expected_flange(calibration, observations[i], arm)
             _measure(calibration, observations[i], expected, held, int(i))
     return held
+
+
+def _measure_loop(
+    calibration: HandEye,
+    observations: Sequence[Observation],
+    fold: NDArray[np.intp],
+    given: tuple[Configuration, Arm | None],
+    held: HeldOut,
+) -> None:
+    """Measure a fold of any configuration: where the camera says the target is, and the arms."""
+    configuration, arm = given
+    poses = [observations[i] for i in fold]
+    transforms = {name: x.transform for name, x in calibration.transforms.items()}
+    carriers = carriers_of(configuration, poses, arm)
+    mapped, expected = mapped_and_expected(configuration, transforms, carriers, poses)
+    axes = target_poses(configuration, transforms, carriers)[:, :3, 2]
+    turns = carriers.camera[:, :3, :3] @ calibration.camera.transform.rotation
+    held.errors[fold] = mapped - expected
+    for i, pose, turn, axis in zip(fold, poses, turns, axes, strict=True):
+        held.covariances[i] = turn @ pose.feature.centre_covariance @ turn.T
+        if pose.feature.normal is not None:
+            held.tilts[i] = _angle(turn @ pose.feature.normal, axis)
 
 
 def expected_flange(calibration: HandEye, observation: Observation, arm: Arm | None) -> Floats:
@@ -195,8 +230,8 @@ def _rms(values: Floats) -> float:
 def _predicted_worst_p95(
     calibration: HandEye, workspace: Box | None, source: Source | None
 ) -> float:
-    estimate = calibration.base_T_camera
-    box = workspace_of(source or Source(""), workspace, calibration.pairs)
+    estimate = calibration.camera
+    box = work_of(calibration, source or Source(""), workspace)
     corners = corners_of(box.centre, box.size) if box else estimate.about[None]
     return largest_error_quantile(estimate.covariance, estimate.about, corners)
 
