@@ -15,7 +15,7 @@ from flangeye.recipe import parse_recipe
 from flangeye.replay import replay_from
 from flangeye.runfolder import RunFolder
 from flangeye.runlog import read_run
-from flangeye.session import record_run
+from flangeye.session import Start, record_run
 from flangeye.types import (
     BASE,
     BASE2,
@@ -23,7 +23,6 @@ from flangeye.types import (
     FLANGE,
     FLANGE2,
     TARGET,
-    ArchivePath,
     Capture,
     CircleFeature,
     HandEye,
@@ -189,14 +188,14 @@ def test_a_marker_needs_no_segment_step(registry, tmp_path):
     )
     checked = parse_recipe(text, "r", registry)
     folder = RunFolder.create("r", tmp_path / "run")
-    result = record_run(checked, registry, folder, ArchivePath(None), report=False)
+    result = record_run(checked, registry, folder, Start(), report=False)
     assert [o.id for o in result.observations if o.used] == ["002", "003", "004", "005"]
     assert result.observations[0].radii is None
     log = read_run(folder.log)
     assert isinstance(log.observations()[0].feature, PoseFeature)
     again = replay_from(log, checked, "fit.toy_marker")
     folder = RunFolder.create("r", tmp_path / "again")
-    repeated = record_run(checked, registry, folder, ArchivePath(None), again, report=False)
+    repeated = record_run(checked, registry, folder, Start(replay=again), report=False)
     assert repeated.transforms == result.transforms
 
 
