@@ -1,0 +1,1 @@
+"""Tactile welding: following a seam with a compliant finger, the torch behind it."""

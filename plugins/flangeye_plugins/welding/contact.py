@@ -1,0 +1,59 @@
+"""Whether the tip touches the groove's wall: filtered, with hysteresis in size and time."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+State = Literal["seeking", "held", "lost"]
+
+SMOOTHING = 0.05
+"""Time constant of the filter on the deflection [s]."""
+
+DWELL = 0.1
+"""How long a crossing must last to count [s]."""
+
+LOST, REGAINED = 0.35, 0.6
+"""Shares of the wanted deflection below which contact is doubted, above which it is believed."""
+
+
+class Contact:
+    """A Schmitt trigger on the deflection along the path's normal.
+
+    Attributes:
+        state: Seeking until the wall was felt first; then held or lost.
+        since: When the state was last changed [s].
+        deflection: Filtered, positive when the wall is pressed [m].
+    """
+
+    def __init__(self) -> None:
+        self.state: State = "seeking"
+        self.since = -math.inf
+        self.deflection = 0.0
+        self._crossed: float | None = None
+        self._time: float | None = None
+
+    def update(self, time: float, deflection: float, wanted: float) -> None:
+        """Take one measurement [m] at ``time`` [s]; ``wanted`` is positive."""
+        self._filter(time, deflection)
+        held = self.state == "held"
+        level = (LOST if held else REGAINED) * wanted
+        if (self.deflection < level) != held:
+            self._crossed = None
+            return
+        self._crossed = time if self._crossed is None else self._crossed
+        if time - self._crossed >= DWELL:
+            self.state, self.since = ("lost" if held else "held"), time
+            self._crossed = None
+
+    def doubted(self, deflection: float, wanted: float) -> bool:
+        """Whether one measurement alone speaks against contact."""
+        return self.state != "held" or deflection < LOST * wanted
+
+    def _filter(self, time: float, deflection: float) -> None:
+        if self._time is None:
+            self.deflection = deflection
+        else:
+            weight = 1.0 - math.exp(-(time - self._time) / SMOOTHING)
+            self.deflection += weight * (deflection - self.deflection)
+        self._time = time

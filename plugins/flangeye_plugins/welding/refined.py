@@ -1,0 +1,145 @@
+"""The seam as the tip felt it: the paper's refined path, kept as an offset from the plan.
+
+The plan is wrong mostly as a whole, shifted and turned, so the offset changes slowly even where
+the seam curves. Where nothing was felt (before the start, in a gap, beyond the end) the plan,
+shifted and turned onto what was felt nearby, stands in.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye_plugins.welding.path import Path
+
+Floats = NDArray[np.float64]
+
+BIN = 0.5e-3
+"""Samples are averaged over this length of the seam [m]."""
+
+KERNEL = 1.5e-3
+"""Standard deviation of the smoothing along the seam [m]."""
+
+WINDOW = 60e-3
+"""How far along the seam samples have a say in how the plan is shifted and turned [m]."""
+
+PRIOR = np.array([5e-3, 5e-3, 0.05])
+"""Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
+
+SAMPLE_SIGMA = 0.05e-3
+"""Standard deviation of a bin about a plan that is only shifted and turned [m]."""
+
+
+class _Fit(NamedTuple):
+    """The plan, shifted and turned onto what was felt around one place.
+
+    Attributes:
+        about: (2,) the middle of what was felt [m].
+        motion: (3,) shift [m] and turn [rad] about it.
+        middles: (K,) arc lengths of the bins that were used.
+        counts: (K,) samples in each.
+        residual: (K,) what was felt less what the moved plan predicts [m].
+    """
+
+    about: Floats
+    motion: Floats
+    middles: Floats
+    counts: Floats
+    residual: Floats
+
+
+class RefinedPath:
+    """What the tip felt, by arc length of the plan."""
+
+    def __init__(self, plan: Path, margin: float) -> None:
+        """Start empty, with room for ``margin`` [m] beyond both ends of the plan."""
+        self._plan = plan
+        self._start = -margin
+        count = int((plan.length + 2 * margin) / BIN) + 2
+        self._sum, self._count = np.zeros(count), np.zeros(count)
+        self._middles: Floats = self._start + (np.arange(count, dtype=np.float64) + 0.5) * BIN
+        points, tangents = plan.evaluate(self._middles)
+        self._points, self._normals = points[:, :2], _left(tangents)
+        self._fits: dict[int, _Fit | None] = {}
+        self._pending: list[tuple[float, float, float]] = []
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing has been confirmed yet."""
+        return not self._count.any()
+
+    def add(self, time: float, s: float, offset: float) -> None:
+        """Note that the tip was ``offset`` to the left of the plan at ``s``; not yet believed."""
+        self._pending.append((time, s, offset))
+
+    def confirm(self, until: float) -> None:
+        """Believe what was felt up to the time ``until`` [s]."""
+        while self._pending and self._pending[0][0] <= until:
+            _, s, offset = self._pending.pop(0)
+            index = int((s - self._start) / BIN)
+            if 0 <= index < len(self._count):
+                self._sum[index] += offset
+                self._count[index] += 1
+                self._fits.clear()
+
+    def forget_pending(self) -> None:
+        """Drop what is not yet believed: contact is lost, and it may be wrong already."""
+        self._pending.clear()
+
+    def offsets(self, s: Floats) -> Floats:
+        """Return the seam's offset from the plan at arc lengths (K,), which lie close together."""
+        fit = self._fit(float(s[len(s) // 2]))
+        if fit is None:
+            return np.zeros(len(s))
+        points, tangents = self._plan.evaluate(s)
+        predicted = _rigid_rows(points[:, :2] - fit.about, _left(tangents)) @ fit.motion
+        distance = (s[:, None] - fit.middles) / KERNEL
+        weight = np.exp(-0.5 * distance**2) * fit.counts
+        # One imagined sample without residual: far from every sample the plan's motion decides.
+        return np.asarray(predicted + (weight @ fit.residual) / (weight.sum(axis=1) + 1.0))
+
+    def frame(self, s: float) -> tuple[Floats, Floats]:
+        """Return the point (2,) and the unit normal (2,) of the refined path at ``s``."""
+        before, here, after = self.offsets(s + KERNEL * np.array([-1.0, 0.0, 1.0]))
+        place = self._plan.at(s)
+        tangent = place.tangent + (after - before) / (2 * KERNEL) * place.normal
+        tangent /= np.hypot(*tangent)
+        return place.point + here * place.normal, np.array([-tangent[1], tangent[0]])
+
+    def _fit(self, s: float) -> _Fit | None:
+        """Return how the plan lies about ``s``; kept until something new is believed."""
+        index = int((s - self._start) / BIN)
+        if index not in self._fits:
+            self._fits[index] = self._fitted(float(self._middles[index]))
+        return self._fits[index]
+
+    def _fitted(self, s: float) -> _Fit | None:
+        filled = np.flatnonzero(self._count)
+        if not len(filled):
+            return None
+        distance = np.abs(self._middles[filled] - s)
+        used = filled[distance <= max(WINDOW, float(distance.min()) + WINDOW / 2)]
+        felt = self._sum[used] / self._count[used]
+        about = self._points[used].mean(axis=0)
+        rows = _rigid_rows(self._points[used] - about, self._normals[used])
+        motion = _solve(rows, felt)
+        residual = felt - rows @ motion
+        return _Fit(about, motion, self._middles[used], self._count[used], residual)
+
+
+def _left(tangents: Floats) -> Floats:
+    return np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+
+
+def _rigid_rows(levers: Floats, normals: Floats) -> Floats:
+    """Return (K, 3): how a shift and a small turn of the plan move it along its normals."""
+    turned = normals[:, 1] * levers[:, 0] - normals[:, 0] * levers[:, 1]
+    return np.column_stack([normals, turned])
+
+
+def _solve(rows: Floats, felt: Floats) -> Floats:
+    """Return the shift and turn (3,) that explain the offsets, the smallest where free."""
+    gram = rows.T @ rows + np.diag((SAMPLE_SIGMA / PRIOR) ** 2)
+    return np.asarray(np.linalg.solve(gram, rows.T @ felt))

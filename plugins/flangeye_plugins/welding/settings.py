@@ -1,0 +1,58 @@
+"""How to follow, with units: part of the parameters of ``weld.tactile``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from flangeye.stage import Params
+from flangeye.units import AngularSpeed, Duration, Length, Speed, param
+
+Mode = Literal["tactile", "as_printed", "vision"]
+
+
+class Following(Params):
+    """The controller's parameters; names in brackets are the paper's."""
+
+    speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Of the tip along the seam.")
+    side: Literal["left", "right"] = Field(
+        "left", description="Which wall of the groove to press, seen along the seam."
+    )
+    deflection: Length = param(
+        "2 mm", gt=0, le=0.01, description="Of the tip against the wall (delta_d)."
+    )
+    preload: Length = param("1.5 mm", gt=0, le=0.01, description="Of the tip into the groove.")
+    servo_gain: float = Field(3.0, gt=0, le=20, description="k_p of the deflection servo [1/s].")
+    height_gain: float = Field(3.0, ge=0, le=20, description="Of the preload [1/s].")
+    cross_track_gain: float = Field(
+        1.0, ge=0, le=5, description="How fast an error of the torch is taken back [1/s]."
+    )
+    lateral_speed: Speed = param(
+        "5 mm/s", gt=0, le=0.05, description="Largest speed across the seam, and in height."
+    )
+    turn_rate: AngularSpeed = param(
+        "20 deg/s", gt=0, le=2.0, description="Largest angular velocity of the tool."
+    )
+    inset: Length = param(
+        "5 mm", ge=0, description="How far inside the planned start the tip is set down."
+    )
+    ending: Length = param(
+        "8 mm", ge=0, description="How far before the planned end the tip stops pressing."
+    )
+    probe: Length = param(
+        "0.5 mm", gt=0, description="Deflection with which lost contact is felt for."
+    )
+    reach: Length = param(
+        "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
+    )
+    longest_gap: Length = param(
+        "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
+    )
+    ramp: Speed = param("2 mm/s", gt=0, description="At which the wanted deflection changes.")
+    stale: Duration = param(
+        "150 ms", gt=0, description="Older images slow the weld down until a new one comes."
+    )
+    blind: Duration = param(
+        "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
+    )
