@@ -130,7 +130,8 @@ class Transform:
     def __post_init__(self) -> None:
         _freeze(self, matrix=(4, 4))
         rotation = self.matrix[:3, :3]
-        orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        # Not np.allclose: poses come 500 times a second, and it takes 30 us.
+        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 2e-5
         if not orthonormal or np.linalg.det(rotation) < 0 or tuple(self.matrix[3]) != (0, 0, 0, 1):
             raise ValueError(f"{self.name} is not a rigid transform")
 

@@ -10,6 +10,7 @@ from flangeye_plugins.acquisition.plans import grid
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
+from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
 from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
 from flangeye_plugins.fitting.rim import fit_rim
@@ -82,4 +83,5 @@ def flangeye_parts() -> Iterable[Part]:
         error_icp_as_in_paper,
         scanner_loopback,
         robot_simulated,
+        robot_ur_rtde,
     )

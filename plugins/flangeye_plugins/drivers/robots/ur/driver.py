@@ -1,0 +1,245 @@
+"""``robot.ur_rtde``: arms of Universal Robots through the client library ur_rtde."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.catalogue import RobotModel
+from flangeye.conventions import CONVENTIONS
+from flangeye.devices import DeviceError, Floats, Robot, RobotState
+from flangeye.geometry import hat
+from flangeye.kinematics import Arm
+from flangeye.stage import Params, part
+from flangeye.types import BASE, FLANGE, TOOL, Transform
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.drivers.robots.sdk import require_sdk
+from flangeye_plugins.drivers.robots.ur import dashboard
+from flangeye_plugins.drivers.robots.ur.link import Link, Sample
+from flangeye_plugins.drivers.robots.ur.status import condition_of
+
+POSE = CONVENTIONS["ur"].in_units("m", "rad")
+
+STALE = 0.1
+"""A sample older than this is no news of the arm [s]."""
+
+SAME_TOOL = (1e-4, 1e-3)
+"""Largest difference of two tool offsets [m, rad]; the pendant shows 0.01 mm."""
+
+SAME_ARM = (0.01, 0.03)
+"""Largest distance of the controller's flange from where the model puts it [m, rad]. Arms differ
+from their nominal kinematics by a few millimetres; another arm, or base, by more."""
+
+
+class ToolOffset(Params):
+    """The tool the controller is meant to have set, from the flange."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rotation: tuple[Angle, Angle, Angle] = param(
+        ("0 rad", "0 rad", "0 rad"), description="Rotation vector, as the pendant shows it."
+    )
+
+    @property
+    def flange_T_tool(self) -> Floats:
+        """The offset as a (4, 4) matrix [m]."""
+        return POSE.matrix([*self.position, *self.rotation])
+
+
+class UrRtdeParams(Params):
+    """Parameters of ``robot.ur_rtde``."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
+    tool: ToolOffset = Field(
+        ToolOffset(), description="What the controller's tool is set to; no tool when not given."
+    )
+
+
+@part("robot.ur_rtde")
+def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
+    """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
+
+    On the pendant: power on, brakes released, Remote Control, the payload of what is mounted in
+    the installation, and no other program that writes RTDE registers (fieldbuses do).
+
+    Args:
+        model: The arm; its kinematics are compared with what the controller says.
+        params: See :class:`UrRtdeParams`.
+
+    Raises:
+        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+    """
+    require_sdk("robot.ur_rtde", "rtde_control", extra="ur")
+    name = f"{model.model} at {params.host}"
+    facts = dashboard.require_ready(name, params.host)
+    link = Link(name, params.host, facts.period)
+    try:
+        robot = UrRobot(name, params.host, facts.period, link)
+        robot.require_tool(params.tool.flange_T_tool)
+        robot.require_model(model)
+    except DeviceError:
+        link.close()
+        raise
+    return robot
+
+
+class UrRobot:
+    """An arm of Universal Robots; see :class:`flangeye.devices.Robot`.
+
+    Every call ends within three seconds: connecting within two and a half, commands within one
+    and a half, a stop that nobody answers included.
+    """
+
+    def __init__(self, name: str, host: str, period: float, link: Link) -> None:
+        """Read the tool of a connected controller.
+
+        Raises:
+            DeviceError: It does not tell.
+        """
+        self.name, self.period = name, period
+        self._host, self._link = host, link
+        self._seen = self._commanded = 0
+        self._offset = POSE.matrix(self._link.request("tool"))
+        self._tool_T_flange = np.linalg.inv(self._offset)
+        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self._offset)
+
+    def require_tool(self, expected: Floats) -> None:
+        """Raise DeviceError when the controller has another tool set than the (4, 4) expected."""
+        offset = self._offset
+        if _differ(offset, expected, SAME_TOOL):
+            raise DeviceError(
+                f"{self.name}: the controller's tool is set to {CONVENTIONS['ur'].text(offset)}, "
+                f"the recipe says {CONVENTIONS['ur'].text(expected)}: poses are the flange's, so "
+                "set the tool at the pendant, or robot.driver.ur_rtde.tool in the recipe"
+            )
+
+    def require_model(self, model: RobotModel) -> None:
+        """Raise DeviceError when the flange is not where the model's kinematics put it."""
+        state = self.state()
+        expected = Arm(model).flange(state.joints)
+        if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
+            off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])
+            raise DeviceError(
+                f"{self.name}: its flange is {off * 1e3:.0f} mm from where a {model.model} has it "
+                "at these joint angles: is robot.model the arm that stands there?"
+            )
+
+    def state(self) -> RobotState:
+        """Return the newest sample, tool taken off."""
+        sample = self._fresh()
+        condition = condition_of(sample, sample.number <= self._commanded)
+        base_T_tool = POSE.matrix(sample.tool_pose)
+        base_T_flange = base_T_tool @ self._tool_T_flange
+        return RobotState(
+            base_T_flange=Transform(BASE, FLANGE, base_T_flange),
+            joints=sample.joints,
+            joint_speeds=sample.joint_speeds,
+            time_ns=sample.time_ns,
+            mode=condition.mode,
+            force=_at(base_T_flange, base_T_tool, sample.tool_force),
+            message=condition.message,
+        )
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (6,) [rad]; an arm that moves comes to rest first."""
+        self._require_able()
+        target = [float(angle) for angle in joints]
+        self._command("move_joints", joints=target, speed=speed, acceleration=acceleration)
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        self._require_able()
+        pose = POSE.numbers(base_T_flange.matrix @ self._offset).tolist()
+        self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) of the flange; the controller is told the tool's."""
+        base_T_tool = POSE.matrix(self._require_able().tool_pose)
+        lever = base_T_tool[:3, 3] - (base_T_tool @ self._tool_T_flange)[:3, 3]
+        linear = twist[:3] + hat(twist[3:]) @ lever
+        at_tool = [float(v) for v in (*linear, *twist[3:])]
+        self._command("move_velocity", twist=at_tool, acceleration=acceleration)
+
+    def wait_cycle(self) -> None:
+        """Return when a sample has come that no earlier call waited for."""
+        until = time.monotonic() + STALE
+        while (sample := self._link.sample()) is None or sample.number <= self._seen:
+            if time.monotonic() > until:
+                raise DeviceError(f"{self.name} sends nothing any more: its cycles have stopped")
+            time.sleep(0.1 * self.period)
+        self._seen = sample.number
+
+    def stop(self) -> None:
+        """Brake; where the client does not answer, stop the program through the dashboard."""
+        try:
+            self._command("stop")
+        except DeviceError:
+            with contextlib.suppress(OSError):
+                dashboard.stop(self._host)
+            raise
+
+    def close(self) -> None:
+        """Stop the arm and the controller's program, and end the client's process."""
+        try:
+            self._fresh()
+        except DeviceError:
+            self._link.close(hopeless=True)
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _fresh(self) -> Sample:
+        """Return the newest sample; a young connection has none for a few cycles."""
+        until = time.monotonic() + STALE
+        while True:
+            sample = self._link.sample()
+            age = np.inf if sample is None else 1e-9 * (time.time_ns() - sample.time_ns)
+            if sample is not None and age < STALE:
+                return sample
+            if sample is not None or time.monotonic() > until:
+                raise DeviceError(
+                    f"{self.name}: its last sample is {age:.2f} s old, at most {STALE} s are "
+                    "allowed: the controller or the network has stopped"
+                )
+            time.sleep(self.period)
+
+    def _command(self, what: str, **arguments: Any) -> None:
+        """Give a command; the sample under way now does not know of it yet, nor may the next."""
+        try:
+            self._link.request(what, **arguments)
+        except DeviceError:
+            # What the controller has against it shows a cycle later, if it is still there.
+            self.wait_cycle()
+            self._require_able()
+            raise
+        newest = self._link.sample()
+        self._commanded = newest.number + 1 if newest else 0
+
+    def _require_able(self) -> Sample:
+        """Return the newest sample of an arm that can move; raise DeviceError for another."""
+        sample = self._fresh()
+        condition = condition_of(sample, commanded=False)
+        if condition.message:
+            raise DeviceError(f"{self.name}: {condition.message}")
+        return sample
+
+
+def _differ(pose: Floats, other: Floats, tolerance: tuple[float, float]) -> bool:
+    """Return whether two (4, 4) poses differ; rotations as matrices, whose vectors may jump."""
+    turn = pose[:3, :3].T @ other[:3, :3]
+    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
+    distance = np.linalg.norm(pose[:3, 3] - other[:3, 3])
+    return bool(distance > tolerance[0] or angle > tolerance[1])
+
+
+def _at(base_T_flange: Floats, base_T_tool: Floats, wrench: Floats) -> Floats:
+    """Return a (6,) wrench at the tool's tip as it is at the flange's centre, in base."""
+    lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
+    return np.concatenate([wrench[:3], wrench[3:] + hat(lever) @ wrench[:3]])

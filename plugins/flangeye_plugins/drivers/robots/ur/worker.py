@@ -1,0 +1,348 @@
+"""The process that holds the client library ur_rtde, and nothing else.
+
+The library blocks for ever where a controller has died, returns its last pose for ever, and may
+abort the process it is in. So it lives here, where it can be killed. This file is run as a script,
+with the standard library alone: it starts in a twentieth of the time the package takes.
+
+Samples go into a file mapped into memory, commands come through a socket, a JSON object each.
+When the socket ends, or its owner does, the arm is stopped and the process ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import mmap
+import os
+import select
+import socket
+import struct
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+SAMPLE = struct.Struct("<2q5i24d")
+"""count, time [ns], robot mode, safety mode, runtime state, control (1 remote, 0 local, -1 not
+known), busy; joints, joint speeds, tool pose, tool force. Behind it, a CRC-32: a reader that comes
+while a sample is written sees that it is torn, on any processor."""
+
+SIZE = SAMPLE.size + 4
+DASHBOARD = 29999
+PLAYING = 2
+LOST = 17
+"""Exit code: the connection to the controller has ended."""
+
+WATCHDOG = 5.0
+"""The controller stops the program when it hears less often from this process [Hz]."""
+
+KICK = 0.02
+"""Longest silence towards the controller [s]."""
+
+GRACE = 0.1
+"""A velocity ends when the next command is this late [s]; :data:`flangeye.devices.GRACE`."""
+
+BEGUN = 0.5
+"""A move that has not begun after this has ended already [s]."""
+
+STOP = 4.0
+"""Deceleration of a stop: [m/s^2] along a straight way, [rad/s^2] in joints."""
+
+DRIFT = 50e-6
+"""Largest drift of the controller's clock against this one."""
+
+TAKEN = 1.0
+"""How long to try for registers that another client still has [s]."""
+
+LAST_TRY = 0.3
+"""Longest time for stopping the arm before the process ends [s]."""
+
+ASKING = 0.2
+"""Between two questions whether the control is remote [s]."""
+
+
+class Refused(Exception):
+    """The library or the controller did not do what it was asked."""
+
+
+class Clock:
+    """Tells when the controller took a sample, by this computer's clock.
+
+    The earliest arrival, seen over time, has the least delay in it; delays only ever add.
+    """
+
+    def __init__(self) -> None:
+        self._offset = math.inf
+        self._last = 0.0
+
+    def sampled(self, controller: float, arrived: float) -> float:
+        """Return when a sample of the controller's time ``controller`` was taken [s]."""
+        allowed = self._offset + DRIFT * abs(controller - self._last)
+        self._offset, self._last = min(allowed, arrived - controller), controller
+        return controller + self._offset
+
+
+class Publisher(threading.Thread):
+    """Writes every new sample into the mapped file."""
+
+    def __init__(self, receive: Any, commander: Commander, memory: mmap.mmap, period: float):
+        super().__init__(daemon=True)
+        self._receive, self._commander = receive, commander
+        self._memory, self._period = memory, period
+        self._clock, self._count, self._last = Clock(), 0, -1.0
+        self._owner = os.getppid()
+
+    def run(self) -> None:
+        """Publish until the connection or the owner is gone."""
+        while self._receive.isConnected():
+            sample = self._fresh()
+            if sample is not None:
+                self._write(*sample)
+                # The next one is not before this; until then nothing is to be looked for.
+                time.sleep(0.7 * self._period)
+            else:
+                time.sleep(0.1 * self._period)
+            if os.getppid() != self._owner:
+                self._commander.give_up()
+        os._exit(LOST)
+
+    def _fresh(self) -> tuple[float, list[int], list[float]] | None:
+        """Return a sample not yet seen, all of one cycle; None while there is none."""
+        receive = self._receive
+        stamp = receive.getTimestamp()
+        if stamp == self._last:
+            return None
+        modes = [receive.getRobotMode(), receive.getSafetyMode(), int(receive.getRuntimeState())]
+        numbers = [
+            *receive.getActualQ(),
+            *receive.getActualQd(),
+            *receive.getActualTCPPose(),
+            *receive.getActualTCPForce(),
+        ]
+        if receive.getTimestamp() != stamp:
+            return None
+        self._last = stamp
+        return stamp, modes, numbers
+
+    def _write(self, stamp: float, modes: list[int], numbers: list[float]) -> None:
+        self._count += 1
+        sampled = self._clock.sampled(stamp, time.time())
+        commander = self._commander
+        sample = SAMPLE.pack(
+            self._count, int(sampled * 1e9), *modes, commander.remote, commander.busy(), *numbers
+        )
+        self._memory[:SIZE] = sample + struct.pack("<I", zlib.crc32(sample))
+
+
+class Commander:
+    """Gives the library its commands, one at a time.
+
+    Attributes:
+        remote: Whether programs may come through the network: 1, 0, or -1 where it cannot be asked.
+    """
+
+    def __init__(self, control: Any, receive: Any, period: float) -> None:
+        self.remote = -1
+        self._control, self._receive, self._period = control, receive, period
+        self._operation, self._commanded = -1, -math.inf
+        self._velocity_until = -math.inf
+        self._stopping: Callable[[float], Any] = control.stopL
+
+    def busy(self) -> bool:
+        """Return whether a command is under way, or has yet to begin."""
+        now = time.monotonic()
+        if now < self._velocity_until:
+            return True
+        status = self._control.getAsyncOperationProgressEx()
+        begins = status.operationId() == self._operation and now < self._commanded + BEGUN
+        return begins or status.isAsyncOperationRunning()
+
+    def move_joints(self, joints: Sequence[float], speed: float, acceleration: float) -> None:
+        """Start a move in joint angles."""
+        self._begin(self._control.stopJ)
+        self._require(self._control.moveJ(joints, speed, acceleration, True))
+
+    def move_linear(self, pose: Sequence[float], speed: float, acceleration: float) -> None:
+        """Start a straight move of the tool."""
+        self._begin(self._control.stopL)
+        self._require(self._control.moveL(pose, speed, acceleration, True))
+
+    def move_velocity(self, twist: Sequence[float], acceleration: float) -> None:
+        """Go on at a twist of the tool."""
+        if self._velocity_until == -math.inf and self.busy():
+            self.stop()
+        self._require(self._control.speedL(twist, acceleration, self._period))
+        self._velocity_until = time.monotonic() + GRACE
+        self._stopping = self._control.speedStop
+
+    def stop(self) -> None:
+        """Brake, if there is anything to brake; the next command finds the arm at rest."""
+        if self.busy() or self._velocity_until > -math.inf:
+            self._velocity_until = -math.inf
+            self._stopping(STOP)
+        self._commanded = -math.inf
+
+    def tool(self) -> list[float]:
+        """Return the tool offset."""
+        return list(self._control.getTCPOffset())
+
+    def idle(self) -> None:
+        """Do what is due when no command comes."""
+        if self._receive.getRuntimeState() != PLAYING:
+            return
+        if -math.inf < self._velocity_until < time.monotonic():
+            self.stop()
+        self._control.kickWatchdog()
+
+    def end(self) -> None:
+        """Stop the arm and the program on the controller."""
+        if self._receive.getRuntimeState() == PLAYING:
+            self.stop()
+            self._control.stopScript()
+
+    def give_up(self) -> None:
+        """End the process, after a last try to stop the arm; its watchdog is the one after."""
+        last_try = threading.Thread(target=self.end, daemon=True)
+        last_try.start()
+        last_try.join(LAST_TRY)
+        os._exit(0)
+
+    def _begin(self, stopping: Callable[[float], Any]) -> None:
+        self.stop()
+        self._operation = self._control.getAsyncOperationProgressEx().operationId()
+        self._commanded, self._stopping = time.monotonic(), stopping
+
+    def _require(self, done: bool) -> None:
+        if not done:
+            self._commanded = -math.inf
+            raise Refused("the controller did not take the command")
+
+
+class RemoteControl(threading.Thread):
+    """Asks the dashboard whether the control is still remote."""
+
+    def __init__(self, host: str, commander: Commander) -> None:
+        super().__init__(daemon=True)
+        self._host, self._commander = host, commander
+
+    def run(self) -> None:
+        """Ask for ever, through a new connection when the old one fails."""
+        while True:
+            with contextlib.suppress(OSError), ask_dashboard(self._host) as ask:
+                while True:
+                    self._commander.remote = read_remote(ask("is in remote control"))
+                    time.sleep(ASKING)
+            time.sleep(ASKING)
+
+
+@contextlib.contextmanager
+def ask_dashboard(host: str, patience: float = 1.0) -> Any:
+    """Yield a function that asks the dashboard server one line and returns its answer.
+
+    Raises:
+        OSError: It does not answer.
+    """
+    with (
+        socket.create_connection((host, DASHBOARD), timeout=patience) as line,
+        line.makefile("r", encoding="utf-8", errors="replace") as answers,
+    ):
+        answers.readline()
+
+        def ask(question: str) -> str:
+            line.sendall(question.encode() + b"\n")
+            answer = answers.readline()
+            if not answer:
+                raise ConnectionResetError("the dashboard server has ended")
+            return str(answer).strip()
+
+        yield ask
+
+
+def read_remote(answer: str) -> int:
+    """Return 1 for remote control, 0 for local, -1 where the controller does not know the word."""
+    return {"true": 1, "false": 0}.get(answer.lower(), -1)
+
+
+def serve(line: socket.socket, commander: Commander) -> None:
+    """Do what comes through the socket until it ends."""
+    while True:
+        ready, _, _ = select.select([line], [], [], KICK)
+        if not ready:
+            commander.idle()
+            continue
+        request = line.recv(4096)
+        if not request:
+            commander.give_up()
+        line.send(json.dumps(answer(commander, json.loads(request))).encode())
+
+
+def answer(commander: Commander, request: dict[str, Any]) -> dict[str, Any]:
+    """Return the answer to one request, after doing it."""
+    try:
+        given = getattr(commander, request.pop("do"))(**request)
+    except Exception as error:
+        return {"ok": False, "error": one_line(error)}
+    return {"ok": True, "given": given}
+
+
+def one_line(error: Exception) -> str:
+    """Return what the library says, without its own line ends."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def take_precedence() -> None:
+    """Be as punctual as the machine allows; where this process may not, it is as the rest."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+
+def connect(host: str) -> tuple[Any, Any]:
+    """Return the library's interfaces for reading and for commands, the watchdog set.
+
+    Raises:
+        Exception: Whatever the library raises.
+    """
+    import rtde_control
+    import rtde_receive
+
+    receive = rtde_receive.RTDEReceiveInterface(host)
+    until = time.monotonic() + TAKEN
+    while True:
+        try:
+            control = rtde_control.RTDEControlInterface(host)
+            break
+        except RuntimeError as error:
+            # The controller may not have noticed yet that its last client is gone.
+            if "already in use" not in str(error) or time.monotonic() > until:
+                raise
+            time.sleep(0.1)
+    if not control.setWatchdog(WATCHDOG):
+        raise Refused("the controller did not take the watchdog")
+    return control, receive
+
+
+def main(host: str, period: float, memory: Path, channel: int) -> None:
+    """Connect, say so, and serve."""
+    # First of all, so that the library's threads are as punctual.
+    take_precedence()
+    line = socket.socket(fileno=channel)
+    try:
+        control, receive = connect(host)
+    except Exception as error:
+        line.send(json.dumps({"ok": False, "error": one_line(error)}).encode())
+        os._exit(1)
+    commander = Commander(control, receive, period)
+    with memory.open("r+b") as file:
+        mapped = mmap.mmap(file.fileno(), SIZE)
+    Publisher(receive, commander, mapped, period).start()
+    RemoteControl(host, commander).start()
+    line.send(json.dumps({"ok": True, "given": None}).encode())
+    serve(line, commander)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))
