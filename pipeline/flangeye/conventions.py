@@ -27,6 +27,8 @@ from flangeye.geometry import (
 )
 
 Floats = NDArray[np.float64]
+LengthUnit = Literal["m", "mm"]
+AngleUnit = Literal["rad", "deg"]
 _Token = Mapping[str, str | Any]
 
 NORM_TOLERANCE = 1e-3
@@ -68,8 +70,8 @@ class PoseConvention:
     name: str
     labels: tuple[str, ...]
     rotation: str
-    length: Literal["m", "mm"]
-    angle: Literal["rad", "deg"] = "rad"
+    length: LengthUnit
+    angle: AngleUnit = "rad"
 
     def __post_init__(self) -> None:
         known = ("vector", "xyzw", "wxyz", *EULER_ORDERS)
@@ -93,7 +95,7 @@ class PoseConvention:
         """Unit of each number; empty for a quaternion's."""
         return (self.length,) * 3 + (("",) * 4 if self.is_quaternion else (self.angle,) * 3)
 
-    def in_units(self, length: Literal["m", "mm"], angle: Literal["rad", "deg"]) -> Self:
+    def in_units(self, length: LengthUnit, angle: AngleUnit) -> Self:
         """Return the same convention in other units."""
         return replace(self, length=length, angle=angle)
 
@@ -122,7 +124,15 @@ class PoseConvention:
         return np.concatenate([position, self._written(matrix[:3, :3])])
 
     def read(self, text: str) -> Floats:
-        """Return the pose (4, 4) [m] of typed or pasted text.
+        """Return the pose (4, 4) [m] of typed or pasted text; see :meth:`read_numbers`.
+
+        Raises:
+            ValueError: As there, or as :meth:`matrix`.
+        """
+        return self.matrix(self.read_numbers(text))
+
+    def read_numbers(self, text: str) -> Floats:
+        """Return the row of numbers of typed or pasted text, in the convention's units.
 
         Numbers stand in order, or in any order each behind its label, as a pendant shows them;
         brackets, separators and what else has a label are passed over. A number with a unit of
@@ -135,7 +145,7 @@ class PoseConvention:
         if nested := _NESTED.search(text):
             text = f"{nested[1]} {nested[2]}"
         found = self._in_order([match.groupdict() for match in _TOKEN.finditer(text)])
-        return self.matrix([self._in_own_unit(i, token) for i, token in enumerate(found)])
+        return np.array([self._in_own_unit(i, token) for i, token in enumerate(found)])
 
     def text(self, matrix: Floats) -> str:
         """Return a pose (4, 4) [m] as a person reads it, to 0.01 mm and 0.001 deg."""

@@ -121,6 +121,20 @@ class Robot(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
+@runtime_checkable
+class MovedByHand(Protocol):
+    """What a robot has besides when a person moves it.
+
+    A move then takes as long as it takes, leads past nothing that was planned, and ends near the
+    pose asked for, not at it: when the mode is ready again, the state says where.
+
+    Attributes:
+        by_hand: Always true.
+    """
+
+    by_hand: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """One exposure.

@@ -9,6 +9,7 @@ from flangeye_plugins.acquisition.centres import acquire_centres
 from flangeye_plugins.acquisition.plans import grid
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
 from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
 from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
@@ -82,6 +83,7 @@ def flangeye_parts() -> Iterable[Part]:
         error_oracle,
         error_icp_as_in_paper,
         scanner_loopback,
+        robot_manual,
         robot_simulated,
         robot_ur_rtde,
     )
