@@ -1,6 +1,8 @@
 """solve.robust on arms that err: tool offset and joint offsets, kept only when they help."""
 
+import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from flangeye.catalogue import RobotModel, flange_of, load_model, load_standard
 from flangeye.correction import corrected_flange, follow
-from flangeye.geometry import rigid, rotation_exp, rotation_log
+from flangeye.geometry import basis_of_plane, rigid, rotation_exp, rotation_log
 from flangeye.kinematics import Arm
 from flangeye.statistics import chi2_quantile
 from flangeye.types import (
@@ -101,6 +103,57 @@ def test_a_tool_offset_that_cannot_be_told_apart_is_named(ur5: RobotModel) -> No
         "a constant offset of the seen circle in the flange frame (tool frame, bias of the fit) "
         "does not show, for orientations differ by 0.0 deg at most: it stays in the camera's place"
     )
+
+
+def test_joint_zeros_are_not_taken_for_a_tool_offset(ur5: RobotModel) -> None:
+    """Zeros that are off bend the arm's space, and part of that looks like an offset."""
+    loose = ur5.model_copy(update={"joint_accuracy": 5e-3})
+    zeros = loose.joint_accuracy * np.random.default_rng([2, 2]).standard_normal(6)
+    poses = simulate(loose, 40, offsets=[0.0, *zeros[1:]], with_joints=True, seed=2, tilt=0.8)
+    assert solver(loose, joint_zeros="ignore")(poses).correction is not None
+    assert solver(loose)(poses).correction is None
+
+
+def test_a_tool_offset_is_found_beside_joint_zeros(ur5: RobotModel) -> None:
+    offset = np.array([2.0, -1.5, 0.0]) * MM
+    zeros = ur5.joint_accuracy * np.random.default_rng(5).standard_normal(6)
+    poses = simulate(ur5, 30, tool=offset, offsets=[0.0, *zeros[1:]], with_joints=True)
+    correction = solver(ur5)(poses).correction
+    assert correction is not None
+    np.testing.assert_allclose(correction.tool_offset, offset, atol=0.5 * MM)
+
+
+def clocked(poses: Sequence[Observation], turn: float) -> list[Observation]:
+    """The same poses, the plate's holes turned about its axis by so much [rad]."""
+    seen = []
+    for o in poses:
+        assert o.circle.normal is not None
+        wanted = o.base_T_flange.rotation @ [np.cos(turn), np.sin(turn), 0.0]
+        x, y, _ = basis_of_plane(o.circle.normal) @ TRUTH.rotation.T @ wanted
+        circle = replace(o.circle, clocking=float(np.arctan2(y, x)))
+        seen.append(replace(o, circle=circle))
+    return seen
+
+
+@pytest.mark.parametrize("turn", [0.84, -90.0, 180.0])
+def test_a_constant_clocking_is_estimated_from_the_holes(ur5: RobotModel, turn: float) -> None:
+    plain = simulate(ur5, 20)
+    calibration = solver(ur5)(clocked(plain, np.radians(turn)))
+    (note,) = [n for n in calibration.notes if "(clocking, from the holes in 20 poses)" in n]
+    found, deviation = (float(n) for n in re.findall(r"by (\S+) \+- (\S+) deg", note)[0])
+    assert abs((found - turn + 180) % 360 - 180) <= 4 * deviation
+    assert deviation < 0.2
+    np.testing.assert_array_equal(
+        calibration.base_T_camera.transform.matrix,
+        solver(ur5)(plain).base_T_camera.transform.matrix,
+    )
+
+
+def test_a_clocking_that_cannot_be_told_is_named(ur5: RobotModel) -> None:
+    assert (
+        "a constant turn of the plate about its own axis (clocking) does not show, for holes were "
+        "told apart in 0 of 20 poses: the camera's pose does not depend on it"
+    ) in solver(ur5)(simulate(ur5, 20)).notes
 
 
 def test_a_good_arm_is_not_corrected(ur5: RobotModel) -> None:

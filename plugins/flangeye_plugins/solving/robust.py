@@ -33,6 +33,7 @@ from flangeye_plugins.solving.arm import (
     zeros_of,
 )
 from flangeye_plugins.solving.arrays import estimate_of
+from flangeye_plugins.solving.clocking import clocking_note
 from flangeye_plugins.solving.consensus import find_consensus
 from flangeye_plugins.solving.equations import Fit
 from flangeye_plugins.solving.evidence import Evidence, Nuisance, common_tilt, evidence_of
@@ -167,9 +168,11 @@ def solve_poses(
     if robot is not None and params.joint_offsets == "auto":
         model = with_joint_offsets(model, agree, pulled, Arm(robot), params.joint_prior)
     of_zeros, note = _of_zeros(model, pulled, None if model.corrects_joints else considered)
-    notes = (*model.found.notes, *_noise_notes(model), *note, *model.notes)
+    notes = (*model.found.notes, *_noise_notes(model), *note, _clocking(pulled, model))
     known = estimate(model.found.fit, of_zeros)
-    return HandEye(known, _pairs(pulled, model), "solve.robust", notes, model.correction)
+    return HandEye(
+        known, _pairs(pulled, model), "solve.robust", notes + model.notes, model.correction
+    )
 
 
 def _expected_zeros(
@@ -218,6 +221,12 @@ def estimate(fit: Fit, of_zeros: Floats) -> TransformEstimate:
 
 def _reason(residual: Floats, distance: float) -> str:
     return f"residual {np.linalg.norm(residual) * 1e3:.1f} mm, {distance:.0f} sigma"
+
+
+def _clocking(pulled: Sequence[Observation], model: Model) -> str:
+    found = model.found
+    agreeing = [o for o, used in zip(pulled, found.inliers, strict=True) if used]
+    return clocking_note(agreeing, found.fit)
 
 
 def _noise_notes(model: Model) -> list[str]:
