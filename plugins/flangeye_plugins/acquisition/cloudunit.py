@@ -33,6 +33,11 @@ def median_distance(cloud: PointCloud) -> float:
     return float(np.median(finite)) if len(finite) else math.nan
 
 
+def times_outside(distance: float, scanner: ScannerModel) -> float:
+    """Return how many times nearer than near or farther than far; 1 or less is inside."""
+    return max(scanner.near / max(distance, 1e-12), distance / scanner.far)
+
+
 def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerModel) -> None:
     """Refuse a unit that the scanner's range contradicts.
 
@@ -45,11 +50,11 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerMo
     Raises:
         StageError: Says what the unit looks like instead.
     """
-    if not _times_outside(distance, scanner) > STATED_LIMIT:
+    if not times_outside(distance, scanner) > STATED_LIMIT:
         return
     other = OTHER[unit]
     metres = distance * PER_METRE[unit] / PER_METRE[other]
-    if _times_outside(metres, scanner) <= DETECTED_LIMIT:
+    if times_outside(metres, scanner) <= DETECTED_LIMIT:
         cure = f"these look like {NAMES[other]}: set unit: {other}"
     else:
         cure = f"and {metres:.3g} m with unit {other} does not fit either; is it this scanner?"
@@ -70,7 +75,7 @@ def detect_unit(path: Path, raw: float, scanner: ScannerModel) -> LengthUnit:
         StageError: Neither metres nor millimetres fit.
     """
     units: tuple[LengthUnit, ...] = ("m", "mm")
-    outside = {unit: _times_outside(raw / PER_METRE[unit], scanner) for unit in units}
+    outside = {unit: times_outside(raw / PER_METRE[unit], scanner) for unit in units}
     unit = min(units, key=lambda u: outside[u])
     if outside[unit] > DETECTED_LIMIT:
         raise StageError(
@@ -86,11 +91,6 @@ def unit_note(unit: LengthUnit, how: str, distance: float, scanner: ScannerModel
         f"clouds in {unit} ({how}): the first has its median point at {distance:.3f} m; "
         f"{_range(scanner)}"
     )
-
-
-def _times_outside(distance: float, scanner: ScannerModel) -> float:
-    """Return how many times nearer than near or farther than far; 1 or less is inside."""
-    return max(scanner.near / max(distance, 1e-12), distance / scanner.far)
 
 
 def _range(scanner: ScannerModel) -> str:

@@ -1,0 +1,169 @@
+"""``scanner.azure_kinect``: an Azure Kinect, or one's MKV recording, through pyk4a.
+
+The camera lives in a process of its own: libk4a aborts the process it is in when a device is gone
+at the wrong moment, and a run must not end with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.catalogue import ScannerModel
+from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
+from flangeye.stage import Params, RecipePath, part
+from flangeye.types import Image
+from flangeye.units import Duration, param
+from flangeye_plugins.drivers.scanners.clouds import cloud_of, require_in_range
+from flangeye_plugins.drivers.scanners.opened import OpenScanner
+from flangeye_plugins.drivers.scanners.pipe import Pipe, PipeEndedError
+
+NAME = "scanner.azure_kinect"
+HOST = Path(__file__).with_name("kinect_host.py")
+INSTALL = (
+    "pyk4a-bundle needs NumPy 1: make it a Python of its own (python -m venv kinect; "
+    "kinect/bin/pip install pyk4a-bundle 'numpy<2') and give python: kinect/bin/python"
+)
+
+STARTING = 20.0
+"""Longest time in which the camera starts: a cold one loads its depth engine [s]."""
+
+PER_METRE = 1000.0
+"""The camera's depths are millimetres; see ``_require_millimetres``."""
+
+
+class AzureKinectParams(Params):
+    """Parameters of ``scanner.azure_kinect``."""
+
+    recording: RecipePath | None = Field(
+        None, description="An MKV recording to play instead, one capture an exposure."
+    )
+    device: int = Field(0, ge=0, description="Which camera, if there are several.")
+    depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
+        Field("NFOV_UNBINNED", description="Of the camera; a recording has its own.")
+    )
+    timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
+    python: str | None = Field(
+        None, description="The Python that has pyk4a, where this one cannot have it."
+    )
+
+
+@part("scanner.azure_kinect")
+def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) -> Scanner:
+    """Scan with an Azure Kinect, or play its recording: depth, and colour as the depth camera
+    would see it.
+
+    Args:
+        model: What the scanner can see; a scan far out of its range is refused.
+        params: See :class:`AzureKinectParams`.
+
+    Raises:
+        DeviceError: No SDK, no camera, or no recording.
+    """  # noqa: D205
+    if params.recording is not None and not params.recording.is_file():
+        raise DeviceError(f"{NAME}: no recording at {params.recording}")
+    pipe = _host(params)
+    try:
+        facts = _answer(pipe, STARTING)["facts"]
+    except DeviceError:
+        pipe.close()
+        raise
+    return AzureKinect(pipe, facts, model, params)
+
+
+def _host(params: AzureKinectParams) -> Pipe:
+    asked = {
+        "recording": None if params.recording is None else str(params.recording),
+        "device": params.device,
+        "depth_mode": params.depth_mode,
+        "timeout_ms": round(params.timeout * 1e3),
+    }
+    python = params.python or sys.executable
+    try:
+        return Pipe([python, str(HOST), json.dumps(asked)])
+    except OSError as error:
+        raise DeviceError(f"{NAME}: {python} cannot be run ({error.strerror})") from None
+
+
+def _answer(pipe: Pipe, patience: float) -> dict[str, Any]:
+    """Return what the host says, in its own words where it is an error."""
+    try:
+        answer: dict[str, Any] = json.loads(pipe.line(patience))
+    except PipeEndedError as error:
+        raise DeviceError(f"{NAME}: the SDK has ended its process ({error})") from None
+    except TimeoutError:
+        raise DeviceError(f"{NAME}: no frame in time; is the camera still connected?") from None
+    if answer.get("dropped"):
+        raise FrameDropped(f"{NAME}: {answer['error']}")
+    if "error" in answer:
+        said = answer["error"].partition("\n")[0].strip()
+        cure = f"; {INSTALL}" if "Import" in said or "Module" in said else ""
+        raise DeviceError(f"{NAME}: {said}{cure}")
+    return answer
+
+
+class AzureKinect(OpenScanner):
+    """An open camera or recording."""
+
+    def __init__(
+        self,
+        pipe: Pipe,
+        facts: dict[str, str],
+        model: ScannerModel | None,
+        params: AzureKinectParams,
+    ) -> None:
+        """Take over the process that holds the camera."""
+        what = params.recording.name if params.recording else facts["serial"]
+        super().__init__(f"Azure Kinect {what}", {"unit": "mm", **facts})
+        self._pipe, self._model, self._params = pipe, model, params
+
+    def expose(self) -> Callable[[], Scan]:
+        """Take the next capture; the arm waits until it is here."""
+        started = time.time_ns()
+        with contextlib.suppress(OSError):  # the answer says what became of the process
+            self._pipe.write(b"next\n")
+        answer = _answer(self._pipe, self._params.timeout + 0.5)
+        cloud, depth = (self._array(answer[name], kind) for name, kind in KINDS)
+        colour = self._array(answer["colour"], np.uint8) if answer["colour"] else None
+        ended = time.time_ns()
+
+        def decode() -> Scan:
+            _require_millimetres(self.name, cloud, depth)
+            scanned = cloud_of(cloud, PER_METRE)
+            require_in_range(self.name, scanned, self._model)
+            return Scan(scanned, started, ended, _image(colour, answer))
+
+        return decode
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._pipe.close()
+
+    def _array(self, shape: list[int], kind: Any) -> Any:
+        size = int(np.prod(shape)) * np.dtype(kind).itemsize
+        return np.frombuffer(self._pipe.read(size, PATIENCE), dtype=kind).reshape(shape)
+
+
+KINDS = (("cloud", np.int16), ("depth", np.uint16))
+
+
+def _require_millimetres(name: str, cloud: Any, depth: Any) -> None:
+    """Raise DeviceError unless the cloud's depth is the depth image's, which is in millimetres."""
+    seen = cloud.any(axis=-1)
+    if cloud.shape[:2] != depth.shape or (cloud[seen, 2] != depth[seen]).any():
+        raise DeviceError(f"{name}: the SDK's cloud is not its depth image, organised and in mm")
+
+
+def _image(colour: Any, answer: dict[str, Any]) -> Image | None:
+    if colour is None:
+        return None
+    rgb = np.ascontiguousarray(colour[..., 2::-1])
+    return Image(rgb, np.array(answer["matrix"]), np.array(answer["distortion"]))

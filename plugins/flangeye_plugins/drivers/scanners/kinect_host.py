@@ -1,0 +1,129 @@
+"""Holds an Azure Kinect, or one's recording, in a process of its own; see ``azure_kinect.py``.
+
+Runs under any Python that has pyk4a, without flangeye: libk4a may abort the process it is in, and
+the wheel of pyk4a needs NumPy 1. Takes ``next`` a line on standard input; answers on standard
+output with one line of JSON, and the arrays it names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from typing import Any, BinaryIO
+
+FRESH_NS = 50_000_000
+"""A frame of the running camera is a new one when it came so long after it was asked for: one
+frame's period at 30 Hz, and the longest exposure."""
+
+
+def main() -> None:
+    """Open what the first argument describes, and answer until the input ends."""
+    # libk4a logs to standard output.
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    asked = json.loads(sys.argv[1])
+    try:
+        source, facts = _recording(asked) if asked["recording"] else _device(asked)
+    except Exception as error:
+        _say(out, {"error": f"{type(error).__name__}: {error}"})
+        return
+    _say(out, {"facts": facts})
+    for _ in sys.stdin:
+        try:
+            _answer(out, source)
+        except EOFError:
+            _say(out, {"error": "the recording has ended"})
+        except Exception as error:
+            _say(out, {"error": f"{type(error).__name__}: {error}"})
+
+
+def _recording(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
+    from pyk4a import PyK4APlayback
+
+    playback = PyK4APlayback(asked["recording"])
+    playback.open()
+    settings = playback.configuration
+    facts = {"depth mode": settings["depth_mode"].name, "seconds": f"{playback.length * 1e-6:g}"}
+    if settings["color_track_enabled"]:
+        facts["colour"] = settings["color_format"].name
+    return playback.get_next_capture, facts
+
+
+def _device(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
+    import pyk4a
+
+    count = pyk4a.connected_device_count()
+    if asked["device"] >= count:
+        raise LookupError(f"{count} Azure Kinects are connected")
+    camera = pyk4a.PyK4A(
+        pyk4a.Config(depth_mode=pyk4a.DepthMode[asked["depth_mode"]]), asked["device"]
+    )
+    camera.start()
+
+    def fresh() -> Any:
+        began = time.perf_counter_ns()
+        while True:
+            capture = camera.get_capture(timeout=asked["timeout_ms"])
+            if capture.depth is not None:
+                if capture.depth_system_timestamp_nsec - began > FRESH_NS:
+                    return capture
+
+    return fresh, {"serial": camera.serial, "depth mode": asked["depth_mode"]}
+
+
+def _answer(out: BinaryIO, source: Any) -> None:
+    from pyk4a import CalibrationType
+
+    capture = source()
+    cloud = capture.depth_point_cloud
+    if cloud is None:
+        _say(out, {"error": "a capture without a depth image", "dropped": True})
+        return
+    calibration, colour = capture._calibration, _colour(capture)
+    answer = {
+        "cloud": cloud.shape,
+        "depth": capture.depth.shape,
+        "colour": None if colour is None else colour.shape,
+        "matrix": calibration.get_camera_matrix(CalibrationType.DEPTH).tolist(),
+        "distortion": calibration.get_distortion_coefficients(CalibrationType.DEPTH).tolist(),
+    }
+    _say(out, answer, cloud.tobytes(), capture.depth.tobytes())
+    if colour is not None:
+        out.write(colour.tobytes())
+        out.flush()
+
+
+def _colour(capture: Any) -> Any:
+    """Return the colour image as the depth camera would see it, (H, W, 4) BGRA, or None."""
+    from pyk4a import ImageFormat
+    from pyk4a.capture import color_image_to_depth_camera
+
+    colour = capture.color
+    if colour is not None and capture._color_format == ImageFormat.COLOR_MJPG:
+        colour = _unpacked(colour)
+    elif capture._color_format != ImageFormat.COLOR_BGRA32:
+        return None
+    if colour is None:
+        return None
+    return color_image_to_depth_camera(colour, capture.depth, capture._calibration, True)
+
+
+def _unpacked(jpeg: Any) -> Any:
+    try:
+        import cv2
+    except ImportError:
+        return None
+    return cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2BGRA)
+
+
+def _say(out: BinaryIO, answer: dict[str, Any], *arrays: bytes) -> None:
+    out.write(json.dumps(answer).encode() + b"\n")
+    for array in arrays:
+        out.write(array)
+    out.flush()
+
+
+if __name__ == "__main__":
+    main()
