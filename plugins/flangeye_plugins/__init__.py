@@ -12,6 +12,7 @@ from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_
 from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
 from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
+from flangeye_plugins.drivers.scanners.azure_kinect import scanner_azure_kinect
 from flangeye_plugins.drivers.scanners.genicam import scanner_genicam
 from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
@@ -88,4 +89,5 @@ def flangeye_parts() -> Iterable[Part]:
         robot_simulated,
         robot_ur_rtde,
         scanner_genicam,
+        scanner_azure_kinect,
     )

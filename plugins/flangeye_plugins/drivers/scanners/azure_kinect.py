@@ -20,9 +20,9 @@ from pydantic import Field
 from flangeye.catalogue import ScannerModel
 from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
 from flangeye.stage import Params, RecipePath, part
-from flangeye.types import Image
 from flangeye.units import Duration, param
 from flangeye_plugins.drivers.scanners.clouds import cloud_of, require_in_range
+from flangeye_plugins.drivers.scanners.kinect_view import DepthView
 from flangeye_plugins.drivers.scanners.opened import OpenScanner
 from flangeye_plugins.drivers.scanners.pipe import Pipe, PipeEndedError
 
@@ -37,7 +37,7 @@ STARTING = 20.0
 """Longest time in which the camera starts: a cold one loads its depth engine [s]."""
 
 PER_METRE = 1000.0
-"""The camera's depths are millimetres; see ``_require_millimetres``."""
+"""Depths come in the SDK's format DEPTH16, whose unit is the millimetre."""
 
 
 class AzureKinectParams(Params):
@@ -131,15 +131,17 @@ class AzureKinect(OpenScanner):
         with contextlib.suppress(OSError):  # the answer says what became of the process
             self._pipe.write(b"next\n")
         answer = _answer(self._pipe, self._params.timeout + 0.5)
-        cloud, depth = (self._array(answer[name], kind) for name, kind in KINDS)
-        colour = self._array(answer["colour"], np.uint8) if answer["colour"] else None
+        depth = self._array(answer["depth"], np.uint16)
+        colour = self._array(answer["colour"], np.uint8) if "colour" in answer else None
         ended = time.time_ns()
 
         def decode() -> Scan:
-            _require_millimetres(self.name, cloud, depth)
-            scanned = cloud_of(cloud, PER_METRE)
-            require_in_range(self.name, scanned, self._model)
-            return Scan(scanned, started, ended, _image(colour, answer))
+            view = DepthView(**answer["calibration"])
+            xyz = view.points(depth)
+            cloud = cloud_of(xyz, PER_METRE)
+            require_in_range(self.name, cloud, self._model)
+            image = None if colour is None else view.coloured(xyz, colour)
+            return Scan(cloud, started, ended, image)
 
         return decode
 
@@ -149,21 +151,8 @@ class AzureKinect(OpenScanner):
 
     def _array(self, shape: list[int], kind: Any) -> Any:
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        return np.frombuffer(self._pipe.read(size, PATIENCE), dtype=kind).reshape(shape)
-
-
-KINDS = (("cloud", np.int16), ("depth", np.uint16))
-
-
-def _require_millimetres(name: str, cloud: Any, depth: Any) -> None:
-    """Raise DeviceError unless the cloud's depth is the depth image's, which is in millimetres."""
-    seen = cloud.any(axis=-1)
-    if cloud.shape[:2] != depth.shape or (cloud[seen, 2] != depth[seen]).any():
-        raise DeviceError(f"{name}: the SDK's cloud is not its depth image, organised and in mm")
-
-
-def _image(colour: Any, answer: dict[str, Any]) -> Image | None:
-    if colour is None:
-        return None
-    rgb = np.ascontiguousarray(colour[..., 2::-1])
-    return Image(rgb, np.array(answer["matrix"]), np.array(answer["distortion"]))
+        try:
+            data = self._pipe.read(size, PATIENCE)
+        except (PipeEndedError, TimeoutError) as error:
+            raise DeviceError(f"{self.name}: lost in the middle of a frame ({error})") from None
+        return np.frombuffer(data, dtype=kind).reshape(shape)

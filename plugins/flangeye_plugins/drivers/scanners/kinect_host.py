@@ -18,6 +18,10 @@ FRESH_NS = 50_000_000
 frame's period at 30 Hz, and the longest exposure."""
 
 
+class NoDepthError(Exception):
+    """A capture came without a depth image."""
+
+
 def main() -> None:
     """Open what the first argument describes, and answer until the input ends."""
     # libk4a logs to standard output.
@@ -33,6 +37,8 @@ def main() -> None:
     for _ in sys.stdin:
         try:
             _answer(out, source)
+        except NoDepthError:
+            _say(out, {"error": "a capture without a depth image", "dropped": True})
         except EOFError:
             _say(out, {"error": "the recording has ended"})
         except Exception as error:
@@ -48,7 +54,14 @@ def _recording(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
     facts = {"depth mode": settings["depth_mode"].name, "seconds": f"{playback.length * 1e-6:g}"}
     if settings["color_track_enabled"]:
         facts["colour"] = settings["color_format"].name
-    return playback.get_next_capture, facts
+
+    def following() -> Any:
+        capture = playback.get_next_capture()
+        while capture.depth is None:  # the colour camera starts earlier
+            capture = playback.get_next_capture()
+        return capture
+
+    return following, facts
 
 
 def _device(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
@@ -66,48 +79,52 @@ def _device(asked: dict[str, Any]) -> tuple[Any, dict[str, str]]:
         began = time.perf_counter_ns()
         while True:
             capture = camera.get_capture(timeout=asked["timeout_ms"])
-            if capture.depth is not None:
-                if capture.depth_system_timestamp_nsec - began > FRESH_NS:
-                    return capture
+            if capture.depth is None:
+                raise NoDepthError
+            if capture.depth_system_timestamp_nsec - began > FRESH_NS:
+                return capture
 
     return fresh, {"serial": camera.serial, "depth mode": asked["depth_mode"]}
 
 
 def _answer(out: BinaryIO, source: Any) -> None:
+    capture = source()
+    depth, colour = capture.depth, _colour(capture)
+    calibration = _calibration(capture._calibration, colour is not None)
+    answer = {"depth": depth.shape, "calibration": calibration}
+    if colour is not None:
+        answer["colour"] = colour.shape
+    _say(out, answer, depth.tobytes(), b"" if colour is None else colour.tobytes())
+
+
+def _calibration(calibration: Any, coloured: bool) -> dict[str, Any]:
+    """Return the device's own calibration: its cameras, and where the colour camera is."""
     from pyk4a import CalibrationType
 
-    capture = source()
-    cloud = capture.depth_point_cloud
-    if cloud is None:
-        _say(out, {"error": "a capture without a depth image", "dropped": True})
-        return
-    calibration, colour = capture._calibration, _colour(capture)
-    answer = {
-        "cloud": cloud.shape,
-        "depth": capture.depth.shape,
-        "colour": None if colour is None else colour.shape,
-        "matrix": calibration.get_camera_matrix(CalibrationType.DEPTH).tolist(),
-        "distortion": calibration.get_distortion_coefficients(CalibrationType.DEPTH).tolist(),
+    depth, colour = CalibrationType.DEPTH, CalibrationType.COLOR
+    values: dict[str, Any] = {
+        "matrix": calibration.get_camera_matrix(depth).tolist(),
+        "distortion": calibration.get_distortion_coefficients(depth).tolist(),
     }
-    _say(out, answer, cloud.tobytes(), capture.depth.tobytes())
-    if colour is not None:
-        out.write(colour.tobytes())
-        out.flush()
+    if coloured:
+        rotation, translation = calibration.get_extrinsic_parameters(depth, colour)
+        values["colour"] = {
+            "matrix": calibration.get_camera_matrix(colour).tolist(),
+            "distortion": calibration.get_distortion_coefficients(colour).tolist(),
+            "rotation": rotation.tolist(),
+            "translation": translation.ravel().tolist(),
+        }
+    return values
 
 
 def _colour(capture: Any) -> Any:
-    """Return the colour image as the depth camera would see it, (H, W, 4) BGRA, or None."""
+    """Return the colour image (H, W, 4) BGRA, or None."""
     from pyk4a import ImageFormat
-    from pyk4a.capture import color_image_to_depth_camera
 
     colour = capture.color
     if colour is not None and capture._color_format == ImageFormat.COLOR_MJPG:
-        colour = _unpacked(colour)
-    elif capture._color_format != ImageFormat.COLOR_BGRA32:
-        return None
-    if colour is None:
-        return None
-    return color_image_to_depth_camera(colour, capture.depth, capture._calibration, True)
+        return _unpacked(colour)
+    return colour if capture._color_format == ImageFormat.COLOR_BGRA32 else None
 
 
 def _unpacked(jpeg: Any) -> Any:
@@ -115,7 +132,8 @@ def _unpacked(jpeg: Any) -> Any:
         import cv2
     except ImportError:
         return None
-    return cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2BGRA)
+    image = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2BGRA)
 
 
 def _say(out: BinaryIO, answer: dict[str, Any], *arrays: bytes) -> None:

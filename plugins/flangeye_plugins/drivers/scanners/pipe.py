@@ -8,6 +8,7 @@ import queue
 import subprocess
 import threading
 from collections.abc import Sequence
+from typing import IO, cast
 
 
 class PipeEndedError(Exception):
@@ -26,6 +27,10 @@ class Pipe:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
+        self._in, self._out, self._err = cast(
+            "tuple[IO[bytes], IO[bytes], IO[bytes]]",
+            (self._process.stdin, self._process.stdout, self._process.stderr),
+        )
         self._chunks: queue.Queue[bytes] = queue.Queue()
         self._rest, self._words = b"", b""
         self._readers = [
@@ -40,9 +45,8 @@ class Pipe:
         Raises:
             OSError: The process has ended.
         """
-        assert self._process.stdin  # noqa: S101
-        self._process.stdin.write(data)
-        self._process.stdin.flush()
+        self._in.write(data)
+        self._in.flush()
 
     def line(self, patience: float) -> bytes:
         """Return the next line, without its end.
@@ -72,10 +76,9 @@ class Pipe:
         self._process.wait()
         for reader in self._readers:
             reader.join()
-        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
-            if stream:
-                with contextlib.suppress(OSError):
-                    stream.close()
+        for stream in (self._in, self._out, self._err):
+            with contextlib.suppress(OSError):  # what was not sent yet has nowhere to go
+                stream.close()
 
     def _more(self, patience: float) -> None:
         try:
@@ -93,12 +96,10 @@ class Pipe:
         return f"exit {self._process.wait()}{f': {words[-1]}' if words else ''}"
 
     def _drain(self) -> None:
-        assert self._process.stdout  # noqa: S101
-        while chunk := os.read(self._process.stdout.fileno(), 1 << 20):
+        while chunk := os.read(self._out.fileno(), 1 << 20):
             self._chunks.put(chunk)
         self._chunks.put(b"")
 
     def _listen(self) -> None:
-        assert self._process.stderr  # noqa: S101
-        while chunk := os.read(self._process.stderr.fileno(), 1 << 16):
+        while chunk := os.read(self._err.fileno(), 1 << 16):
             self._words = (self._words + chunk)[-4096:]
