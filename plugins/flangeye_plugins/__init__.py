@@ -15,6 +15,10 @@ from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
 from flangeye_plugins.drivers.scanners.azure_kinect import scanner_azure_kinect
 from flangeye_plugins.drivers.scanners.genicam import scanner_genicam
 from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
+from flangeye_plugins.drivers.scanners.mech_eye import scanner_mech_eye
+from flangeye_plugins.drivers.scanners.realsense import scanner_realsense
+from flangeye_plugins.drivers.scanners.watched_folder import scanner_watched_folder
+from flangeye_plugins.drivers.scanners.zivid import scanner_zivid
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
 from flangeye_plugins.fitting.rim import fit_rim
 from flangeye_plugins.fitting.sphere import fit_sphere
@@ -90,4 +94,8 @@ def flangeye_parts() -> Iterable[Part]:
         robot_ur_rtde,
         scanner_genicam,
         scanner_azure_kinect,
+        scanner_realsense,
+        scanner_zivid,
+        scanner_mech_eye,
+        scanner_watched_folder,
     )

@@ -59,7 +59,7 @@ def test_it_scans_the_arm_where_it_really_is(controller):
     capture = Capture("0", scan.cloud, Transform(BASE, FLANGE, truth.base_T_flange))
     found = segment_flange(capture, FLANGE_5E, params=SegmentParams())
     circle = fit_rim(found, FLANGE_5E, params=RimParams())
-    centre = scanner.truth.base_T_camera.apply(circle.centre)
+    centre = scanner.truth.camera.apply(circle.centre)
     reported = controller.control.state()["joints"]
     assert np.abs(truth.joints - reported).max() > 1e-4
     assert np.linalg.norm(centre - truth.base_T_flange[:3, 3]) < 0.1e-3
