@@ -55,7 +55,7 @@ def test_the_wheel_runs_in_an_empty_folder(flangeye, tmp_path):
 
 
 def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
-    assert "acme 1.0.0: fit.acme_hull" in flangeye("plugins").stdout
+    assert "acme 1.0.0: cost.acme_largest_axis, fit.acme_hull" in flangeye("plugins").stdout
     assert "tolerance: length = 1 mm" in flangeye("stages", "fit.acme_hull").stdout
     recipe = tmp_path / "acme.yaml"
     recipe.write_text(
@@ -73,3 +73,18 @@ def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["provenance"]["plugins"]["acme"] == "1.0.0"
     assert result["status"] == "unverified"
+
+
+def test_a_cost_of_ones_own_is_minimised(flangeye, tmp_path):
+    recipe = tmp_path / "cost.yaml"
+    recipe.write_text(
+        "title: A cost of one's own\n"
+        "steps:\n"
+        "  - acquire.points_as_in_paper: {noise: 0.1 mm}\n"
+        "  - solve.iterative: {error: holdout, reserve: 8, cost: acme_largest_axis, "
+        "required: 0.2 mm}\n"
+    )
+    told = flangeye("run", recipe, "--out", "run")
+    assert told.returncode == 0, told.stderr
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert len(result["observations"]) < 75  # the cost was small enough before all were pulled

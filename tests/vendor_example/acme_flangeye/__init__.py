@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from acme_flangeye.cost import cost_largest_axis
 from flangeye import Params, hookimpl, stage
 from flangeye.catalogue import Flange
 from flangeye.geometry import basis_of_plane
@@ -37,3 +38,8 @@ def fit_hull(cloud: FlangeCloud, flange: Flange, params: HullParams) -> CircleFe
 @hookimpl
 def flangeye_stages():
     return [fit_hull]
+
+
+@hookimpl
+def flangeye_parts():
+    return [cost_largest_axis]
