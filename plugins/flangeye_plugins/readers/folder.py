@@ -60,7 +60,8 @@ def folder(path: Path, params: FolderParams) -> Archive:
         _recording(f"{file}:{line}", row, file.parent, unit)
         for row, line in zip(poses.poses, lines, strict=True)
     ]
-    _refuse_strays(file, recordings)
+    if recordings:  # without any, that is what there is to say
+        _refuse_strays(file, recordings)
     layout = f"folder, {file.name}"
     return Archive(layout, file.parent, recordings, [file], cloud_unit=poses.cloud_unit)
 
