@@ -48,6 +48,8 @@ def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
         words += ["--archive", recordings]
     elif name.endswith("_simulated") and "kinect" not in name:  # which is coarse enough
         words += ["--set", "steps.0.resolution=0.3"]
+    elif name.endswith("_loopback"):
+        words += ["--move"]
     told = flangeye(*words, cwd=tmp_path)
     assert told.returncode == 0, told.stderr
     result = json.loads((tmp_path / "run" / "result.json").read_text())

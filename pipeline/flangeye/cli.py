@@ -319,6 +319,28 @@ def report(
 
 
 @app.command()
+def watch(
+    run: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(metavar="[RUN]", help="A run's folder or log; the newest in ./runs."),
+    ] = None,
+    foxglove: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(metavar="PORT", help="Serve Foxglove on this port too, 8765 by custom."),
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Give up when nothing new came for so long.")
+    ] = 60.0,
+) -> None:
+    """Watch a run as it goes: arm, captures, uncertainty so far."""
+    from rich.console import Console
+
+    from flangeye.watch import watch_run
+
+    watch_run(run, foxglove, Console(), patience)
+
+
+@app.command()
 def loopback(
     robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",

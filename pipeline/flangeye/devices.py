@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, Self, runtime_checkable
+from typing import Any, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,6 +240,15 @@ class TactileSensor(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
+AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
+
+
+def asks_the_person(function: AnyFunction) -> AnyFunction:
+    """Mark a driver's function: it needs the terminal, and nothing it does is urgent."""
+    function.in_this_process = True  # type: ignore[attr-defined]
+    return function
+
+
 @dataclass(frozen=True)
 class RobotDriver:
     """The recipe's ``robot.driver``, not yet opened.
@@ -247,10 +256,13 @@ class RobotDriver:
     Attributes:
         name: Name of the part.
         open: Connects; raises DeviceError where it cannot.
+        in_this_process: Whether it must run in the process that owns the terminal, because it
+            talks to a person; see :func:`asks_the_person`.
     """
 
     name: str
     open: Callable[[], Robot] = field(compare=False)
+    in_this_process: bool = False
 
 
 @dataclass(frozen=True)

@@ -218,7 +218,9 @@ class _Checker:
                     ("robot",), "a robot with a driver needs limits, for example " + LIMITS
                 )
             context[RobotDriver] = RobotDriver(
-                robot.driver.part.name, partial(robot.driver, context.get(RobotModel))
+                robot.driver.part.name,
+                partial(robot.driver, context.get(RobotModel)),
+                getattr(robot.driver.part.function, "in_this_process", False),
             )
         if robot and robot.limits:
             context[LimitsSection] = robot.limits

@@ -149,6 +149,7 @@ class Runner:
                 return
             seconds = self._watch.seconds[label] - before
             if isinstance(capture, t.Rejection):
+                stream.became[capture.id] = None
                 self._reject(capture)
                 continue
             self._hooks.flangeye_captured(step=label, capture=capture, seconds=seconds)

@@ -10,6 +10,7 @@ Two sorts of plugins share one decorator each and one registry:
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import types as python_types
 from collections.abc import Callable, Mapping
@@ -96,6 +97,7 @@ PARTS: Mapping[str, str] = {
     "plan": "the robot poses an acquisition visits",
     "cost": "what solve.iterative minimises of a pose error",
     "error": "how solve.iterative measures a candidate's pose error",
+    "view": "what is guessed of the scanner's place, for planning",
     "robot": "an arm that acquire.live can move",
     "scanner": "a scanner that acquire.live can trigger",
     "sensor": "a tactile sensor that weld.tactile can read",
@@ -140,6 +142,14 @@ class Plugin:
         """Call the function as it was written."""
         return self.function(*args, **kwargs)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel to another process by name: what carries the function's name is the plugin."""
+        return _at, (self.function.__module__, self.function.__qualname__)
+
+
+def _at(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
+
 
 class Stage(Plugin):
     """A step of a recipe."""
@@ -178,6 +188,10 @@ class Chosen:
         if self.offered is not None and "siblings" in self.part.needs:
             extra["siblings"] = self.offered.siblings(self.part)
         return self.part.function(*args, **kwargs, **extra)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel to another process without the parts on offer here."""
+        return Chosen, (self.part, self.params)
 
     def to_yaml(self) -> dict[str, Any]:
         """Return ``{name: parameters}`` as a recipe writes it."""

@@ -735,6 +735,22 @@ class Journal(Protocol):
 
 
 @dataclass(frozen=True)
+class Progress:
+    """What a solver knows while it still takes poses.
+
+    Attributes:
+        poses: How many it has.
+        error: No point of the workspace is off by more, with 95 % probability [m]; None while
+            no answer can be trusted.
+        required: When it stops [m].
+    """
+
+    poses: int
+    error: float | None
+    required: float
+
+
+@dataclass(frozen=True)
 class Resumed:
     """Captures that an earlier run already took, by id; a source leaves them out."""
 

@@ -6,9 +6,10 @@ from flangeye import hookimpl
 from flangeye.stage import Part, Stage
 from flangeye_plugins.acquisition.archive import acquire_archive
 from flangeye_plugins.acquisition.centres import acquire_centres
-from flangeye_plugins.acquisition.plans import grid
+from flangeye_plugins.acquisition.live import acquire_live
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.drivers.robots.loopback import robot_loopback
 from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
 from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
@@ -22,6 +23,9 @@ from flangeye_plugins.drivers.scanners.zivid import scanner_zivid
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
 from flangeye_plugins.fitting.rim import fit_rim
 from flangeye_plugins.fitting.sphere import fit_sphere
+from flangeye_plugins.planning.guess import view_guess, view_shown
+from flangeye_plugins.planning.next_best import next_best
+from flangeye_plugins.planning.plans import grid
 from flangeye_plugins.readers.ancorasir import ancorasir
 from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.folder import folder
@@ -52,6 +56,7 @@ def flangeye_stages() -> Iterable[Stage]:
     return (
         acquire_simulated,
         acquire_archive,
+        acquire_live,
         acquire_centres,
         segment_flange,
         fit_rim,
@@ -81,6 +86,9 @@ def flangeye_parts() -> Iterable[Part]:
         auto,
         folder,
         grid,
+        next_best,
+        view_guess,
+        view_shown,
         cost_translation,
         cost_axes,
         cost_work_radius,
@@ -90,6 +98,7 @@ def flangeye_parts() -> Iterable[Part]:
         error_icp_as_in_paper,
         scanner_loopback,
         robot_manual,
+        robot_loopback,
         robot_simulated,
         robot_ur_rtde,
         scanner_genicam,

@@ -9,9 +9,9 @@ from flangeye import StageError
 from flangeye.catalogue import Sphere, flange_of, load_model, load_standard
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud, Rejected, Transform
 from flangeye.units import SI
-from flangeye_plugins.acquisition.plans import GridParams, grid
 from flangeye_plugins.acquisition.simulated import SimulatedParams, acquire_simulated
 from flangeye_plugins.fitting.sphere import SphereParams, fit_sphere
+from flangeye_plugins.planning.plans import GridParams, grid
 from flangeye_plugins.segmentation.sphere import (
     SegmentSphereParams,
     find_spheres,

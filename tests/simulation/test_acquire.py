@@ -11,8 +11,8 @@ from flangeye import StageError
 from flangeye.catalogue import flange_of, load_model, load_standard, wrist_circle_of
 from flangeye.stage import KINDS
 from flangeye.types import CAMERA
-from flangeye_plugins.acquisition.plans import GridParams, grid
 from flangeye_plugins.acquisition.simulated import CameraPose, SimulatedParams, acquire_simulated
+from flangeye_plugins.planning.plans import GridParams, grid
 
 SMALL = {"counts": (2, 2, 1)}
 

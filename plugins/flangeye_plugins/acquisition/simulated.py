@@ -38,7 +38,8 @@ from flangeye.types import (
     Truth,
 )  # fmt: skip
 from flangeye.units import param
-from flangeye_plugins.acquisition.plans import Plan, Site, poses_near
+from flangeye_plugins.motion.reach import Reach
+from flangeye_plugins.planning.plans import Plan, Site, poses_near
 from flangeye_plugins.simulation.arm import ImperfectArm
 from flangeye_plugins.simulation.cell import Cell
 from flangeye_plugins.simulation.eye import (
@@ -48,7 +49,6 @@ from flangeye_plugins.simulation.eye import (
     middle_of_view,
 )
 from flangeye_plugins.simulation.raycast import Body, Image
-from flangeye_plugins.simulation.reach import Reach
 from flangeye_plugins.simulation.structured_light import StructuredLight
 from flangeye_plugins.simulation.time_of_flight import TimeOfFlight
 
@@ -121,15 +121,16 @@ def acquire_simulated(
     reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
     site = _site(reach, scanner, base_T_camera)
     plan: Plan = params.poses(site, np.random.default_rng(planning))
-    _refuse_too_few(plan, reach, robot, scanner)
+    poses = list(plan.poses)
+    _refuse_too_few(len(poses), plan.wanted, reach, robot, scanner)
     checks = _checks(plan, site, params.verification, np.random.default_rng(checking))
     session = _Session(
         Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera,
-        [*checks, *(pose.joints for pose in plan.poses)], len(checks), params, *errors.spawn(2),
+        [*checks, *(pose.joints for pose in poses)], len(checks), params, *errors.spawn(2),
     )  # fmt: skip
     source = Source(
         fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
-        notes=_notes(plan, robot, scanner),
+        notes=_notes(len(poses), plan.wanted, robot, scanner),
         workspace=Box(plan.centre, plan.size),
         truth=Truth(Transform(BASE, CAMERA, base_T_camera)),
     )
@@ -142,13 +143,15 @@ def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
     return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
 
 
-def _refuse_too_few(plan: Plan, reach: Reach, robot: RobotModel, scanner: ScannerModel) -> None:
-    if len(plan.poses) >= FEWEST:
+def _refuse_too_few(
+    found: int, wanted: int, reach: Reach, robot: RobotModel, scanner: ScannerModel
+) -> None:
+    if found >= FEWEST:
         return
     why = ", ".join(f"{count} {reason}" for reason, count in reach.refused.most_common())
     raise StageError(
         f"acquire.simulated: {robot.model} can show its flange to {scanner.model} at "
-        f"{len(plan.poses)} of {plan.wanted} planned poses, {FEWEST} are needed ({why}); "
+        f"{found} of {wanted} planned poses, {FEWEST} are needed ({why}); "
         "move camera.position, or the plan's centre, or make its size or tilt smaller"
     )
 
@@ -164,9 +167,9 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
     return [pose.joints for pose in found]
 
 
-def _notes(plan: Plan, robot: RobotModel, scanner: ScannerModel) -> tuple[str, ...]:
-    left_out = plan.wanted - len(plan.poses)
-    note = f"simulated: {robot.model} before {scanner.model}, {len(plan.poses)} poses"
+def _notes(found: int, wanted: int, robot: RobotModel, scanner: ScannerModel) -> tuple[str, ...]:
+    left_out = wanted - found
+    note = f"simulated: {robot.model} before {scanner.model}, {found} poses"
     return (note + (f"; {left_out} more were planned and are not possible" if left_out else ""),)
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from flangeye.catalogue import Flange, RobotModel, Sphere
 from flangeye.geometry import rotation_from_rpy
+from flangeye_plugins.motion.clearance import ArmVolume
 from flangeye_plugins.simulation import materials
-from flangeye_plugins.simulation.clearance import ArmVolume
 from flangeye_plugins.simulation.flange_mesh import flange_mesh, wrist_mesh
 from flangeye_plugins.simulation.mesh import (
     COARSE,

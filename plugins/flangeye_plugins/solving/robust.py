@@ -18,9 +18,11 @@ from flangeye.statistics import corners_of, covariance_inflation, largest_error_
 from flangeye.types import (
     Box,
     HandEye,
+    Journal,
     Observation,
     Observations,
     Pair,
+    Progress,
     Solver,
     Source,
     TransformEstimate,
@@ -98,6 +100,7 @@ def solve_robust(
     params: RobustParams,
     workspace: Box | None = None,
     robot: RobotModel | None = None,
+    journal: Journal | None = None,
 ) -> HandEye:
     """Find the poses that agree, then fit them by generalised least squares.
 
@@ -118,11 +121,15 @@ def solve_robust(
 
     if params.required is None:
         return solve(list(observations))
-    return solve(pull(observations, solve, params.required, workspace))
+    return solve(pull(observations, solve, params.required, workspace, journal))
 
 
 def pull(
-    observations: Observations, solve: Solver, required: float, workspace: Box | None
+    observations: Observations,
+    solve: Solver,
+    required: float,
+    workspace: Box | None,
+    journal: Journal | None = None,
 ) -> list[Observation]:
     """Take observations until no point of the workspace is off by more than ``required`` [m]."""
     pulled: list[Observation] = []
@@ -130,7 +137,11 @@ def pull(
         pulled.append(observation)
         if len(pulled) < FEWEST_ONLINE:
             continue
-        if _error_at_work(pulled, solve, workspace, observations.source) <= required:
+        error = _error_at_work(pulled, solve, workspace, observations.source)
+        if journal:
+            told = error if np.isfinite(error) else None
+            journal("progress", Progress(len(pulled), told, required))
+        if error <= required:
             break
     return pulled
 

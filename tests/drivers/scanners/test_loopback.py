@@ -14,9 +14,9 @@ from flangeye.types import BASE, FLANGE, Capture, Transform
 from flangeye.units import SI
 from flangeye_plugins.drivers.scanners.loopback import LoopbackParams, scanner_loopback
 from flangeye_plugins.fitting.rim import RimParams, fit_rim
+from flangeye_plugins.motion.reach import Reach
 from flangeye_plugins.segmentation.flange import SegmentParams, segment_flange
 from flangeye_plugins.simulation.eye import CameraPose, middle_of_view
-from flangeye_plugins.simulation.reach import Reach
 from tests.loopback.process import Process
 
 PHOXI = load_model("scanners", "phoxi-m")

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from flangeye.catalogue import load_model
 from flangeye.geometry import rpy_from_rotation
-from flangeye_plugins.acquisition.plans import GridParams, Site, grid
-from flangeye_plugins.simulation.reach import Reach
+from flangeye_plugins.motion.reach import Reach
+from flangeye_plugins.planning.plans import GridParams, Site, grid
 
 UP = np.diag([1.0, -1.0, -1.0])
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flangeye.catalogue import load_model
 from flangeye.kinematics import Arm
-from flangeye_plugins.simulation.clearance import ArmVolume, segment_distance
+from flangeye_plugins.motion.clearance import ArmVolume, segment_distance
 
 coordinates = st.lists(st.floats(-1, 1), min_size=12, max_size=12)
 

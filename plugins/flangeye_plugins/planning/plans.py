@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -39,12 +39,14 @@ class Site:
             None where the arm cannot show it.
         joints: Gives the joint angles for a flange pose (4, 4), or None where the arm cannot or
             must not go.
+        lost: Gives the places, in order of their visit, of the poses that told nothing.
     """
 
     centre: Floats
     eye: Floats
     facing: Callable[[Floats], Floats | None]
     joints: Callable[[Floats], Floats | None]
+    lost: Callable[[], Collection[int]] = frozenset
 
 
 class PlannedPose(NamedTuple):
@@ -58,13 +60,13 @@ class Plan(NamedTuple):
     """Poses to visit.
 
     Attributes:
-        poses: In the order of their visit.
+        poses: In the order of their visit; a plan may choose each when it is asked for.
         wanted: How many there would be if the arm could go everywhere.
         centre: (3,) of the box they were wanted in, in ``base`` [m].
         size: (3,) edges of that box [m].
     """
 
-    poses: list[PlannedPose]
+    poses: Iterable[PlannedPose]
     wanted: int
     centre: Floats
     size: Floats
@@ -120,7 +122,7 @@ def _pose_at(
 ) -> PlannedPose | None:
     for _ in range(params.attempts):
         pose = _tilted(place, facing, params.tilt, rng)
-        if _angle(pose[:3, 2], site.eye - place) > params.facing:
+        if angle_between(pose[:3, 2], site.eye - place) > params.facing:
             continue
         joints = site.joints(pose)
         if joints is not None:
@@ -149,5 +151,6 @@ def _tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator
     return rigid(rotation_from_rpy(roll, pitch, yaw) @ facing, place)
 
 
-def _angle(first: Floats, second: Floats) -> float:
+def angle_between(first: Floats, second: Floats) -> float:
+    """Return the angle of two vectors (3,) [rad]."""
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))

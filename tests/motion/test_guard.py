@@ -1,0 +1,233 @@
+"""An arm under guard: it arrives, or it stops and says why; nothing is waited for in vain."""
+
+import os
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError
+from flangeye.errors import RunStopped
+from flangeye_plugins.motion import guard as guard_module
+from flangeye_plugins.motion.arm import guarded
+from flangeye_plugins.motion.guard import Charge, Guard
+from flangeye_plugins.motion.route import Router
+from tests.motion.stand_in import (
+    LIMITS,
+    MODEL,
+    StandIn,
+    driver_of,
+    elsewhere,
+    opened_nowhere,
+    turned,
+)
+
+
+def way_to(arm, **turns):
+    joints = arm.state.joints
+    return Router(MODEL, LIMITS, joints).route(joints, turned(joints, **turns))
+
+
+def test_it_drives_there_and_has_settled():
+    robot, told = StandIn(), []
+    with guarded(driver_of(robot), MODEL, LIMITS, told.append) as arm:
+        goal = turned(arm.state.joints, j1=0.3)
+        arm.go(way_to(arm, j1=0.3))
+        state = arm.wait()
+    assert state.joints == pytest.approx(goal, abs=1e-3)
+    assert np.abs(state.joint_speeds).max() < 1e-3
+    assert robot.closed
+    assert len(told) > 2
+    assert all(a.time_ns < b.time_ns for a, b in pairwise(told))
+
+
+def test_it_knows_where_the_arm_was():
+    with guarded(driver_of(StandIn()), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.1))
+        end = arm.wait().time_ns
+        samples = arm.during(end // 2, end)
+    assert samples[0].time_ns <= end // 2 < samples[1].time_ns
+    assert samples[-1].time_ns >= end
+    assert np.abs(np.diff([s.time_ns for s in samples])).max() < 5_000_000
+
+
+def after(seconds, change):
+    """Return a misbehaviour that begins after ``seconds`` of the arm's time."""
+    return lambda robot, state: change(robot, state) if state.time_ns > seconds * 1e9 else state
+
+
+def lost(robot, state):
+    raise DeviceError("no sample for 100 ms: the controller is gone")
+
+
+def moved_aside(robot, state):
+    return replace(state, joints=turned(state.joints, j2=0.1))
+
+
+def rushing(robot, state):
+    return replace(state, joint_speeds=np.full(6, 2.0))
+
+
+def outside(robot, state):
+    return replace(state, base_T_flange=elsewhere(state, [0.0, 0.0, 1.0]))
+
+
+def protected(robot, state):
+    return replace(state, mode="protective stop", message="collision of joint 2")
+
+
+@pytest.mark.parametrize(
+    ("misbehaviour", "line"),
+    [
+        (lost, "no sample for 100 ms: the controller is gone"),
+        (moved_aside, "the arm is 5.7 deg away from the way it was sent"),
+        (rushing, "a joint turns at 115 deg/s, allowed 30 deg/s"),
+        (outside, "the arm is outside the box: z is"),
+        (protected, "the controller reports protective stop: collision of joint 2"),
+    ],
+)
+def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
+    robot = StandIn(after(0.5, misbehaviour))
+    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.8))
+        with pytest.raises(DeviceError) as error:
+            arm.wait()
+        assert str(error.value).startswith(line)
+        assert "stop" in robot.commands()
+        arm.go(way_to(arm, j1=0.1))
+    assert robot.commands().count("move") == 1  # a doubt is not outlived
+
+
+def test_an_arm_that_does_not_set_off_is_noticed():
+    robot = StandIn()
+    robot.arm.step = lambda: None
+    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.8))
+        with pytest.raises(DeviceError, match="has not set off 1 s after it was told to"):
+            arm.wait()
+
+
+def test_an_arm_that_never_arrives_is_noticed():
+    robot = StandIn()
+    move = StandIn.move_joints
+    robot.move_joints = lambda q, v, a: move(robot, robot.arm.stance.joints + 0.5 * (q - robot.arm.stance.joints), v, a)  # fmt: skip
+    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.3))
+        with pytest.raises(DeviceError, match="the arm is not there after"):
+            arm.wait()
+
+
+def test_an_arm_that_moves_untold_is_noticed():
+    robot = StandIn(after(3.0, lambda r, s: replace(s, joint_speeds=np.full(6, 0.1))))
+    with (
+        guarded(driver_of(robot), MODEL, LIMITS) as arm,
+        pytest.raises(DeviceError, match="the arm moves, and was not told to"),
+    ):
+        arm.wait()
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda r, s: replace(s, base_T_flange=elsewhere(s, [0.0, 0.0, 0.163])),
+         "the controller's flange is 163 mm from where the robot's model has it: is a tool set in "
+         "the controller, or is it another model?"),
+        (lambda r, s: replace(s, joints=np.zeros(7)), "the arm has 7 joints, its model 6"),
+    ],
+)  # fmt: skip
+def test_another_arm_than_the_model_is_refused(change, line):
+    with pytest.raises(DeviceError) as error, guarded(driver_of(StandIn(change)), MODEL, LIMITS):
+        pass
+    assert str(error.value) == line
+
+
+def test_a_driver_that_cannot_open_says_so():
+    with (
+        pytest.raises(DeviceError, match=r"^robot.nowhere: nobody answers at 10.0.0.1$"),
+        guarded(opened_nowhere(), MODEL, LIMITS),
+    ):
+        pass
+
+
+def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go():
+    def broken(robot, state):
+        raise ZeroDivisionError("division by zero")
+
+    robot = StandIn(after(0.2, broken))
+    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.8))
+        with pytest.raises(DeviceError, match="the driver failed with ZeroDivisionError: division"):
+            arm.wait()
+    assert robot.closed
+
+
+class Wire:
+    """The guard's end of a wire on which the program says what a test wants, when it wants."""
+
+    def __init__(self, robot, requests):
+        self.robot, self.requests, self.heard = robot, requests, []
+
+    def poll(self, seconds):
+        return bool(self.requests) and self.requests[0][0] <= self.robot.cycles
+
+    def recv(self):
+        _, request = self.requests.pop(0)
+        if request is None:
+            raise EOFError
+        return request
+
+    def send(self, report):
+        self.heard.append(report)
+
+
+@pytest.mark.parametrize("key", ["alarm", "keyboard"])
+def test_the_operator_stops_it_within_one_cycle(key):
+    reading, writing = os.pipe()
+    robot = StandIn()
+    joints = robot.arm.stance.joints
+    way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
+    wire = Wire(robot, [(0, ("go", way)), (2000, ("close", None))])
+    guard = Guard(robot, wire, Charge(lambda: robot, MODEL, LIMITS, **{key: reading}))
+    wait = robot.wait_cycle
+
+    def pressed():
+        wait()
+        if robot.cycles == 300:
+            os.write(writing, b"x " if key == "keyboard" else b"\x02")
+
+    robot.wait_cycle = pressed
+    guard.run()
+    stopped = [cycle for name, cycle in robot.asked if name == "stop"]
+    assert stopped[0] == 300
+    (report,) = [r for r in wire.heard if r.what == "stopped"]
+    assert report.content == ("the space bar" if key == "keyboard" else "Ctrl-C")
+    assert robot.arm.standing
+
+
+def test_the_person_reads_who_stopped_it():
+    robot = StandIn()
+    reading, writing = os.pipe()
+    driver = driver_of(robot)
+    open_guard = guard_module.guard
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "flangeye_plugins.motion.arm.guard",
+            lambda wire, charge: open_guard(wire, charge._replace(alarm=reading)),
+        )
+        with guarded(driver, MODEL, LIMITS) as arm:
+            arm.go(way_to(arm, j1=0.8))
+            os.write(writing, b"\x02")
+            with pytest.raises(RunStopped, match=r"^the operator stopped the arm \(Ctrl-C\)$"):
+                arm.wait()
+
+
+def test_a_program_that_dies_stops_the_arm():
+    robot = StandIn()
+    joints = robot.arm.stance.joints
+    way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
+    wire = Wire(robot, [(0, ("go", way)), (200, None)])
+    guard_module.guard(wire, Charge(lambda: robot, MODEL, LIMITS))
+    assert robot.closed
+    assert ("stop", 200) in robot.asked

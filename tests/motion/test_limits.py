@@ -1,0 +1,59 @@
+"""What a recipe allows an arm, and how it says that something is beyond it."""
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.header import LimitsSection
+from flangeye_plugins.motion.limits import limits_of
+from tests.motion.stand_in import BOX, LIMITS, MODEL
+
+
+def section(**more):
+    return LimitsSection.model_validate({"box": BOX, **more})
+
+
+def test_the_defaults_are_slow():
+    assert LIMITS.speed <= 0.1
+    assert LIMITS.joint_speed <= np.radians(30.0)
+    assert LIMITS.low == pytest.approx([-1.0, -1.0, -0.3])
+    assert LIMITS.high == pytest.approx([1.0, 1.0, 1.1])
+
+
+def test_a_place_outside_the_box_is_named():
+    assert LIMITS.outside(np.zeros(3)) is None
+    assert LIMITS.outside(np.array([0.0, -1.2, 0.0])) == (
+        "outside the box: y is -1200 mm, allowed -1000 to 1000 mm"
+    )
+    assert LIMITS.outside(np.array([0.0, -1.001, 0.0]), slack=0.002) is None
+
+
+def test_the_joint_nearest_to_its_limit_is_named():
+    ranges = [["-90 deg", "90 deg"]] * 6
+    limits = limits_of(section(joints=ranges), MODEL)
+    joints = np.radians([0.0, 0.0, 88.0, 0.0, 0.0, 0.0])
+    assert limits.beyond(joints) is None
+    assert limits.beyond(joints, np.radians(5.0)) == (
+        "joint 3 at 88 deg, its limits are -90 and 90 deg"
+    )
+
+
+def test_the_recipe_narrows_the_arm_and_never_widens_it():
+    limits = limits_of(section(joints=[["-900 deg", "90 deg"]] * 6), MODEL)
+    assert limits.lower == pytest.approx([joint.lower for joint in MODEL.joints])
+    assert limits.upper == pytest.approx(np.full(6, np.radians(90.0)))
+
+
+@pytest.mark.parametrize(
+    ("joints", "line"),
+    [
+        ([["-90 deg", "90 deg"]] * 5,
+         "robot.limits.joints: 5 ranges, but a ur5e has 6 joints; give one [lower, upper] for each"),
+        ([["-90 deg", "90 deg"]] * 5 + [["10 deg", "-10 deg"]],
+         "robot.limits.joints: no angle is left for joint 6 of a ur5e; the lower limit comes first"),
+    ],
+)  # fmt: skip
+def test_limits_for_another_arm_are_refused(joints, line):
+    with pytest.raises(StageError) as error:
+        limits_of(section(joints=joints), MODEL)
+    assert str(error.value) == line

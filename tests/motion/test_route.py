@@ -1,0 +1,66 @@
+"""Ways between postures: checked from end to end, and as slow as the limits want."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flangeye.kinematics import Arm
+from flangeye_plugins.motion.route import Barred, Route, Router
+from tests.motion.stand_in import LIMITS, MODEL, turned
+
+HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+ROUTER = Router(MODEL, LIMITS, HOME)
+
+
+@given(st.lists(st.floats(-0.6, 0.6), min_size=6, max_size=6))
+@settings(max_examples=20, deadline=None)
+def test_flange_and_joints_stay_below_their_speeds(turns):
+    goal = HOME + np.array(turns)
+    way = ROUTER.route(HOME, goal)
+    if isinstance(way, Barred) or np.abs(goal - HOME).max() < 1e-3:
+        return
+    (leg,) = way.legs
+    assert leg.speed <= LIMITS.joint_speed + 1e-12
+    share = np.linspace(0.0, 1.0, 2001)[:, None]
+    places = Arm(MODEL).flange(HOME + share * (goal - HOME))[:, :3, 3]
+    fastest = np.linalg.norm(np.diff(places, axis=0), axis=1).max()
+    seconds_a_step = np.abs(goal - HOME).max() / 2000 / leg.speed
+    assert fastest / seconds_a_step <= LIMITS.speed * 1.01
+
+
+def test_the_time_is_that_of_a_ramp_up_a_ride_and_a_ramp_down():
+    way = ROUTER.route(HOME, turned(HOME, j6=1.0))
+    (leg,) = way.legs
+    assert leg.speed == pytest.approx(LIMITS.joint_speed)
+    assert way.seconds == pytest.approx(1.0 / leg.speed + leg.speed / leg.acceleration)
+
+
+def test_a_way_that_leads_through_the_table_is_barred():
+    low = np.radians([0.0, 0.0, 30.0, -90.0, -90.0, 0.0])
+    way = ROUTER.route(HOME, low)
+    assert isinstance(way, Barred)
+    assert "table" in way.reason
+
+
+def test_a_way_out_of_the_box_is_barred_and_says_where():
+    narrow = replace(LIMITS, high=np.array([-0.4, 1.0, 1.1]))
+    way = Router(MODEL, narrow, HOME).route(HOME, turned(HOME, j1=np.pi))
+    assert isinstance(way, Barred)
+    assert way.reason.startswith("outside the box: x is -")
+    assert "allowed -1000 to -400 mm" in way.reason
+
+
+def test_where_the_straight_way_is_barred_it_goes_by_home():
+    arm, start, goal = Arm(MODEL), turned(HOME, j1=-1.2), turned(HOME, j1=1.2)
+    furthest = np.abs(arm.flange(HOME)[0, 3])
+    behind = replace(LIMITS, low=np.array([-furthest + 0.02, -1.0, -0.3]))
+    assert isinstance(Router(MODEL, behind, HOME).route(start, goal), Barred)
+    folded = turned(HOME, j2=-0.3, j3=0.5)
+    way = Router(MODEL, behind, folded).route(start, goal)
+    assert isinstance(way, Route)
+    assert way.via == "home"
+    assert (way.legs[0].joints == folded).all()
+    assert (way.legs[1].joints == goal).all()
