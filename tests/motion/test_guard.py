@@ -52,9 +52,14 @@ def test_it_knows_where_the_arm_was():
     assert np.abs(np.diff([s.time_ns for s in samples])).max() < 5_000_000
 
 
-def after(seconds, change):
-    """Return a misbehaviour that begins after ``seconds`` of the arm's time."""
-    return lambda robot, state: change(robot, state) if state.time_ns > seconds * 1e9 else state
+def under_way(change):
+    """Return a misbehaviour that begins half a second after the arm was first sent away."""
+
+    def misbehave(robot, state):
+        sent = robot.asked and robot.cycles - robot.asked[0][1] > 250
+        return change(robot, state) if sent else state
+
+    return misbehave
 
 
 def lost(robot, state):
@@ -88,7 +93,7 @@ def protected(robot, state):
     ],
 )
 def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
-    robot = StandIn(after(0.5, misbehaviour))
+    robot = StandIn(under_way(misbehaviour))
     with guarded(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError) as error:
@@ -118,8 +123,12 @@ def test_an_arm_that_never_arrives_is_noticed():
             arm.wait()
 
 
+def pushed(robot, state):
+    return replace(state, joint_speeds=np.full(6, 0.1)) if robot.cycles > 1500 else state
+
+
 def test_an_arm_that_moves_untold_is_noticed():
-    robot = StandIn(after(3.0, lambda r, s: replace(s, joint_speeds=np.full(6, 0.1))))
+    robot = StandIn(pushed)
     with (
         guarded(driver_of(robot), MODEL, LIMITS) as arm,
         pytest.raises(DeviceError, match="the arm moves, and was not told to"),
@@ -154,7 +163,7 @@ def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go():
     def broken(robot, state):
         raise ZeroDivisionError("division by zero")
 
-    robot = StandIn(after(0.2, broken))
+    robot = StandIn(under_way(broken))
     with guarded(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError, match="the driver failed with ZeroDivisionError: division"):

@@ -21,7 +21,7 @@ from flangeye_plugins.motion.limits import Limits
 from flangeye_plugins.motion.route import Route
 from flangeye_plugins.motion.watch import Sample
 
-OPENING = 15.0
+OPENING = 30.0
 """Longest time for a driver to connect, its client library's import included [s]."""
 
 SILENCE = 2.0 * PATIENCE
@@ -38,15 +38,15 @@ class GuardedArm:
         period: Between two of the controller's cycles [s].
     """
 
-    def __init__(self, wire: Connection, told: Told) -> None:
-        """Wait until the arm is open; see :func:`guarded`.
+    def __init__(self, wire: Connection, told: Told, patience: float | None = OPENING) -> None:
+        """Wait until the arm is open, or for ``patience`` [s]; see :func:`guarded`.
 
         Raises:
             DeviceError: It cannot be opened, or must not be moved.
         """
         self._wire, self._told = wire, told
         self._unheard: deque[Report] = deque()
-        opened = self._hear(OPENING, "does not answer")
+        opened = self._hear(patience, "does not answer")
         self.name, self.period, state = opened.content
         self._state: RobotState = state
 
@@ -92,7 +92,7 @@ class GuardedArm:
         with suppress(OSError):  # a guard that is gone has said why; that is still to be heard
             self._wire.send((request, content))
 
-    def _hear(self, patience: float, complaint: str) -> Report:
+    def _hear(self, patience: float | None, complaint: str) -> Report:
         """Return the next report that is no reason to end.
 
         Raises:
@@ -106,7 +106,7 @@ class GuardedArm:
             raise RunStopped(f"the operator stopped the arm ({report.content})")
         return report
 
-    def _read(self, patience: float, complaint: str) -> Report:
+    def _read(self, patience: float | None, complaint: str) -> Report:
         try:
             if not self._wire.poll(patience):
                 raise DeviceError(f"the arm {complaint} ({patience:.0f} s)")
@@ -137,7 +137,8 @@ def guarded(
     start = _in_thread if driver.in_this_process else _in_process
     with ours, start(ours, theirs, charge):
         try:
-            yield GuardedArm(ours, told)
+            # A person who has to say where the arm stands takes the time it takes.
+            yield GuardedArm(ours, told, None if driver.in_this_process else OPENING)
         finally:
             with suppress(OSError):
                 ours.send(("close", None))

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.catalogue import RobotModel
-from flangeye.devices import DeviceError, Robot, RobotState
+from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye_plugins.motion.limits import Limits
 from flangeye_plugins.motion.route import Leg, Route
@@ -87,7 +87,7 @@ class Guard:
 
     def __init__(self, robot: Robot, wire: Connection, charge: Charge) -> None:
         self._robot, self._wire, self._charge = robot, wire, charge
-        self._watch = Watch(charge.model, charge.limits)
+        self._watch = Watch(charge.model, charge.limits, isinstance(robot, MovedByHand))
         self._legs: list[Leg] = []
         self._told_ns = 0
         self._barred: str | None = None

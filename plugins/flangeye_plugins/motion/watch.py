@@ -67,8 +67,9 @@ class Watch:
         leg: The leg it is on, or None while it should stand.
     """
 
-    def __init__(self, robot: RobotModel, limits: Limits) -> None:
-        self._arm, self._limits = Arm(robot), limits
+    def __init__(self, robot: RobotModel, limits: Limits, by_hand: bool = False) -> None:
+        """Begin; an arm that a person moves is where they say, when they say so."""
+        self._arm, self._limits, self._by_hand = Arm(robot), limits, by_hand
         self.samples: deque[Sample] = deque()
         self.leg: Leg | None = None
         self._from = np.zeros(self._arm.n)
@@ -95,6 +96,8 @@ class Watch:
         self._halted_ns = self._halted_ns or state.time_ns
         if state.mode not in ("ready", "moving"):
             raise Doubt(f"the controller reports {state.mode}: {state.message or 'no reason'}")
+        if self._by_hand:
+            return self.leg is not None and state.mode == "ready"
         if self.leg is None:
             self._keep_still(state)
             return False

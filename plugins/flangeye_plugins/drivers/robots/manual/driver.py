@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 
 from flangeye.catalogue import RobotModel
 from flangeye.conventions import CONVENTIONS, LengthUnit
-from flangeye.devices import DeviceError, Floats, Mode, Robot, RobotState
+from flangeye.devices import DeviceError, Floats, Mode, Robot, RobotState, asks_the_person
 from flangeye.kinematics import Arm
 from flangeye.stage import Params, part
 from flangeye.types import BASE, FLANGE, Transform
@@ -49,6 +49,7 @@ class ManualParams(Params):
 
 
 @part("robot.manual")
+@asks_the_person
 def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
     """An arm that a person moves: poses are printed, and typed or pasted as the pendant shows them.
 
