@@ -338,6 +338,33 @@ def watch(
     from flangeye.watch import watch_run
 
     watch_run(run, foxglove, Console(), patience)
+def doctor(
+    archive: Annotated[Path, typer.Argument(help="A run.mcap, or recordings that a reader knows.")],
+    recipe: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="The recipe that would run on it: a file, or the name of a shipped one."),
+    ] = None,
+    overrides: Overrides = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+) -> None:
+    """Name what is wrong with recordings, with the evidence and the recipe's line to change.
+
+    Exit codes: 0 nothing found, 1 something was, 2 the archive cannot be read.
+    """
+    import json
+
+    from flangeye.doctor import as_json, as_text, examine, open_session
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    checked = load_recipe(find_recipe(recipe), registry, overrides or ()) if recipe else None
+    session = open_session(archive, registry, checked)
+    checks = [part for part in registry.parts.values() if part.kind == "check"]
+    diagnosis = examine(session, checks)
+    typer.echo(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
+    if diagnosis.findings:
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -80,6 +80,12 @@ class Runner:
         self._hooks.flangeye_run_finished(result=result.model_dump(mode="json"))
         return result
 
+    def observe(self) -> t.Observations:
+        """Return what the steps before the solver give, as it is pulled."""
+        self._observe(None)
+        observations: t.Observations = self._values[t.Observations]
+        return observations
+
     # --- acquire, segment, fit: one capture at a time ------------------------------------------
 
     def _observe(self, replay: Replay | None, earlier: Earlier | None = None) -> None:

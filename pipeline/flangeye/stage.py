@@ -101,6 +101,7 @@ PARTS: Mapping[str, str] = {
     "robot": "an arm that acquire.live can move",
     "scanner": "a scanner that acquire.live can trigger",
     "sensor": "a tactile sensor that weld.tactile can read",
+    "check": "a mistake in recordings that flangeye doctor can name",
 }
 """The kinds of parts, which steps choose by name in their parameters."""
 

@@ -9,6 +9,7 @@ from flangeye_plugins.acquisition.centres import acquire_centres
 from flangeye_plugins.acquisition.live import acquire_live
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.doctoring import CHECKS
 from flangeye_plugins.drivers.robots.loopback import robot_loopback
 from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
@@ -28,6 +29,7 @@ from flangeye_plugins.planning.next_best import next_best
 from flangeye_plugins.planning.plans import grid
 from flangeye_plugins.readers.ancorasir import ancorasir
 from flangeye_plugins.readers.auto import auto
+from flangeye_plugins.readers.corrected import corrected
 from flangeye_plugins.readers.folder import folder
 from flangeye_plugins.refining.compensate import refine_compensate
 from flangeye_plugins.segmentation.flange import segment_flange
@@ -84,6 +86,7 @@ def flangeye_parts() -> Iterable[Part]:
     return (
         ancorasir,
         auto,
+        corrected,
         folder,
         grid,
         next_best,
@@ -96,6 +99,7 @@ def flangeye_parts() -> Iterable[Part]:
         error_holdout,
         error_oracle,
         error_icp_as_in_paper,
+        *CHECKS,
         scanner_loopback,
         robot_manual,
         robot_loopback,

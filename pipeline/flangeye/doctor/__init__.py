@@ -1,0 +1,7 @@
+"""``flangeye doctor``: names what is wrong with an archive, instead of giving a bad number."""
+
+from flangeye.doctor.examine import Diagnosis, examine
+from flangeye.doctor.opening import open_session
+from flangeye.doctor.telling import as_json, as_text
+
+__all__ = ["Diagnosis", "as_json", "as_text", "examine", "open_session"]

@@ -1,0 +1,97 @@
+"""What was taken as fixed and was not: the target or camera, and where the arm has the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye import part
+from flangeye.diagnosis import Finding, Findings, Floats, Session
+from flangeye.mending import without_tool
+from flangeye_plugins.doctoring.asis import fit_of
+from flangeye_plugins.doctoring.equations import equations_of
+from flangeye_plugins.doctoring.fitting import Fit, fit
+from flangeye_plugins.doctoring.significance import Evidence, best_of, exceedance
+
+FEWEST = 4
+"""Samples on each side of a move."""
+OFFSET = 1e-3
+"""A seen circle further than this from where the arm has it is a mistake [m]."""
+
+
+@part("check.moved")
+def moved(session: Session) -> Findings:
+    """The camera or the target was moved part way through."""
+    seen = np.flatnonzero(session.seen)
+    starts = seen[FEWEST : len(seen) - FEWEST + 1]
+    if not len(starts):
+        return
+    null = fit_of(session)
+    after = np.arange(len(session)) >= starts[:, None]
+    equations = equations_of(session)
+    halves = fit(equations.without(after)), fit(equations.without(~after))
+    evidence = best_of(null, _together(*halves), null.parameters)
+    if evidence.probability < 1:
+        yield _moved_finding(session, evidence, int(starts[evidence.which]))
+
+
+def _together(first: Fit, second: Fit) -> Fit:
+    """Return two fits of separate samples as one."""
+    counts = first.count + second.count
+    share = (first.count / counts)[:, None]
+    residuals = tuple(
+        np.where(np.isfinite(one), one, other)
+        for one, other in zip(first.residuals, second.residuals, strict=True)
+    )
+    return replace(
+        first,
+        likelihood=first.likelihood + second.likelihood,
+        residuals=residuals,
+        scales=np.sqrt(share * first.scales**2 + (1 - share) * second.scales**2),
+        count=counts,
+    )
+
+
+def _moved_finding(session: Session, evidence: Evidence, start: int) -> Finding:
+    later = np.arange(len(session)) >= start
+    shorter = later if later.sum() <= len(session) / 2 else ~later
+    what = (
+        f"the camera or what it looks at moved before '{session.ids[start]}': the samples before "
+        "and from there on fit two calibrations"
+    )
+    kept = session.without(shorter)
+    return Finding("moved target", what, kept.step(), (session.ids[start],), *evidence[1:], kept)
+
+
+@part("check.tool")
+def tool(session: Session) -> Findings:
+    """The poses are those of a tool: what is seen is off by a constant in the flange's frame."""
+    if not np.isfinite(session.places).all() or session.carried == "camera":
+        return
+    null = fit_of(session)
+    free = replace(equations_of(session), places=np.full_like(session.places[None], np.nan))
+    found = fit(free)
+    offset = found.unknowns.place[0, 0] - session.places[0]
+    length = float(np.linalg.norm(offset))
+    evidence = best_of(null, found, 3)
+    freedom = float(null.count[0]) - found.parameters
+    ratio = float(found.likelihood[0] - null.likelihood[0])
+    p = exceedance(ratio, float(null.count[0]), 3, freedom, length / OFFSET)
+    if p == 1 or not _known(found, offset):
+        return
+    listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]
+    what = (
+        f"the seen target is {length * 1e3:.1f} mm from where the arm carries it, constantly: "
+        "the poses are probably those of a tool set in the controller"
+    )
+    mended = session.corrected(without_tool(session.poses, -offset), target_offset=listed)
+    yield Finding("tool offset", what, mended.step(), (), evidence.before, evidence.after, p,
+                  evidence.gain, mended)  # fmt: skip
+
+
+def _known(found: Fit, offset: Floats) -> bool:
+    """Whether the offset is known to a fifth of itself along its own direction."""
+    covariance = np.linalg.pinv(found.information[0], hermitian=True)[6:9, 6:9]
+    direction = offset / np.linalg.norm(offset)
+    return bool(np.sqrt(direction @ covariance @ direction) < 0.2 * np.linalg.norm(offset))

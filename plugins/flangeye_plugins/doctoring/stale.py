@@ -1,0 +1,81 @@
+"""Poses that a driver made up: the identity where it had none, or an old one again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import part
+from flangeye.diagnosis import Finding, Findings, Floats, Mask, Session
+
+SAME = 1e-9
+"""Numbers that differ by less were not measured twice."""
+MOVED = 1e-3
+"""A target that has moved further was seen from another pose [m]."""
+
+
+@part("check.identity")
+def identity(session: Session) -> Findings:
+    """A driver that had nothing to give gave the identity: for a robot pose, or for a marker's."""
+    robot = np.abs(session.poses - np.eye(4)).max(axis=(1, 2)) < SAME
+    marker = _is_identity(session)
+    if robot.any():
+        yield _left_out(session, robot, "identity matrices", _robots(session, robot))
+    if marker.any():
+        what = f"{marker.sum()} of {len(session)} markers are at the camera itself, not turned"
+        yield _left_out(session, marker, "identity matrices", f"{what}: nothing was detected there")
+
+
+def _is_identity(session: Session) -> Mask:
+    at_camera = np.abs(np.nan_to_num(session.centres, nan=1.0)).max(axis=1) < SAME
+    turned = np.abs(session.rotations - np.eye(3)).max(axis=(1, 2))
+    return np.asarray(at_camera & ~(turned > SAME))
+
+
+def _robots(session: Session, wrong: Mask) -> str:
+    return (
+        f"{wrong.sum()} of {len(session)} robot poses are the identity: the flange cannot be in "
+        "the base; the driver had no pose to give"
+    )
+
+
+@part("check.repeated")
+def repeated(session: Session) -> Findings:
+    """A pose or a detection came twice, while the other side shows that the arm had moved."""
+    yield from _repeats(
+        session, session.poses[:, :3].reshape(-1, 12), session.centres, "robot pose"
+    )
+    places = session.poses[:, :3, 3]
+    yield from _repeats(session, session.centres, places, "detection")
+
+
+def _repeats(session: Session, numbers: Floats, others: Floats, what: str) -> Iterator[Finding]:
+    """Find rows that repeat an earlier one to the last digit although the others moved on."""
+    usable = np.isfinite(numbers).all(axis=1) & np.isfinite(others).all(axis=1)
+    wrong: Mask = np.zeros(len(numbers), dtype=np.bool_)
+    for i in np.flatnonzero(usable):
+        same = usable[:i] & (np.abs(numbers[:i] - numbers[i]).max(axis=1, initial=0.0) < SAME)
+        moved = np.linalg.norm(others[:i] - others[i], axis=1) > MOVED
+        wrong[i] = (same & moved).any()
+    if wrong.any() and not _all_identity(session, wrong):
+        told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
+        yield _left_out(
+            session,
+            wrong,
+            f"repeated {what}",
+            f"{told}digit, although the arm had moved: it is stale",
+        )
+
+
+def _all_identity(session: Session, wrong: Mask) -> bool:
+    return bool((np.abs(session.poses[wrong] - np.eye(4)) < SAME).all())
+
+
+def _left_out(session: Session, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:
+    names = [each for each, bad in zip(session.ids, wrong, strict=True) if bad]
+    if (session.seen & ~wrong).sum() < session.seen.sum() / 2:
+        return Finding(name, what, "record again: too little is left", tuple(names))
+    mended = session.without(wrong)
+    return Finding(name, what, mended.step(), tuple(names), mended=mended)

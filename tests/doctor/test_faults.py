@@ -1,0 +1,303 @@
+"""Every mistake, planted in sessions with known truth, is named; clean sessions give nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye.diagnosis import Session
+from flangeye.doctor import examine
+from flangeye.geometry import rigid, rotation_exp
+from flangeye.mending import delayed, inverted, reread, scaled, shifted, transposed, without_tool
+from flangeye_plugins.doctoring import CHECKS
+from tests.doctor.sessions import KINDS, bent, clean, in_motion
+
+CONFIGURATIONS = [(kind, carried) for kind in KINDS for carried in ("target", "camera")]
+TURNED = [("flange", "target"), ("marker", "target"), ("point", "camera")]
+
+
+def session_of(kind="flange", carried="target", seed=1, **changes):
+    return clean(np.random.default_rng(seed), kind=kind, carried=carried, **changes)
+
+
+def named(session):
+    return [finding.name for finding in examine(session, CHECKS).findings]
+
+
+def only(session):
+    (finding,) = examine(session, CHECKS).findings
+    return finding
+
+
+def changed(session, rows, pose):
+    """What the scanner saw in some rows, moved by a transform (4, 4) in the camera."""
+    centres, normals = np.array(session.centres), np.array(session.normals)
+    rotations = np.array(session.rotations)
+    centres[rows] = centres[rows] @ pose[:3, :3].T + pose[:3, 3]
+    normals[rows] = normals[rows] @ pose[:3, :3].T
+    rotations[rows] = pose[:3, :3] @ rotations[rows]
+    return replace(session, centres=centres, normals=normals, rotations=rotations)
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+def test_a_clean_session_gives_nothing(kind, carried):
+    diagnosis = examine(session_of(kind, carried), CHECKS)
+    assert diagnosis.findings == ()
+    assert diagnosis.notes == ()
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(
+    ("factor", "said", "meant"),
+    [(1e3, "m", "mm"), (1e-3, "mm", "m"), (1 / 25.4e-3, "m", "inches"), (25.4, "inches", "mm")],
+)
+def test_robot_positions_in_another_unit(kind, carried, factor, said, meant):
+    session = session_of(kind, carried)
+    finding = only(session.with_poses(scaled(session.poses, factor)))
+    if factor == 25.4:  # as read in inches, meant in mm, or the same factor of other units
+        said, meant = "inches", "mm"
+    assert finding.what.startswith(f"the robot's positions were read in {said} and are in {meant}")
+    assert finding.after.position < 0.3e-3 < finding.before.position
+    assert f"scale: {float(f'{1 / factor:.10g}')}" in finding.fix
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize(("factor", "meant"), [(1e3, "mm"), (1 / 25.4e-3, "inches")])
+def test_target_positions_in_another_unit(kind, carried, factor, meant):
+    session = session_of(kind, carried)
+    finding = only(replace(session, centres=session.centres * factor))
+    assert f"the target's positions were read in m and are in {meant}" in finding.what
+    assert finding.after.position < 0.3e-3
+
+
+def test_both_in_the_same_wrong_unit():
+    session = session_of("centres")
+    both = replace(session, poses=scaled(session.poses, 1e3), centres=session.centres * 1e3)
+    finding = only(both)
+    assert finding.what.endswith("both are in mm")
+    assert "scale: 0.001, target_scale: 0.001" in finding.fix
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+def test_the_base_in_the_flange(kind, carried):
+    session = session_of(kind, carried)
+    finding = only(session.with_poses(inverted(session.poses)))
+    assert finding.what.startswith("the poses are flange_T_base")
+    assert finding.fix == (
+        "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
+    )
+
+
+@pytest.mark.parametrize(("kind", "carried"), TURNED)
+def test_transposed_rotations(kind, carried):
+    session = session_of(kind, carried)
+    assert "transposed: true" in only(session.with_poses(transposed(session.poses))).fix
+
+
+@pytest.mark.parametrize(("kind", "carried"), TURNED)
+@pytest.mark.parametrize(
+    ("read_as", "written_as"),
+    [("xyzw", "wxyz"), ("wxyz", "xyzw"), ("xyz", "ZYX"), ("ZYX", "xyz"), ("vector", "xyz"),
+     ("ZYX", "vector"), ("XYZ", "ZYX"), ("ZYZ", "ZYX")],
+)  # fmt: skip
+def test_rotations_read_in_another_convention(kind, carried, read_as, written_as):
+    session = session_of(kind, carried, turn=0.4)
+    finding = only(session.with_poses(reread(session.poses, written_as, read_as)))
+    assert finding.name == "pose convention"
+    assert finding.after.position < 0.3e-3
+    assert np.allclose(finding.mended.poses, session.poses, atol=1e-6)
+
+
+def test_a_stated_convention_is_the_one_that_is_corrected():
+    session = replace(session_of(turn=0.4), reader={"poses": {"rotation": "ZYX"}})
+    finding = only(session.with_poses(reread(session.poses, "xyz", "ZYX")))
+    assert "read_as: ZYX, written_as: xyz" in finding.fix
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+@pytest.mark.parametrize("by", [1, -1, 2])
+def test_poses_shifted_against_the_scans(kind, carried, by):
+    session = session_of(kind, carried)
+    poses, known = shifted(session.poses, by)
+    finding = only(session.with_poses(poses).where(known))
+    assert f"shift: {-by}" in finding.fix
+
+
+def test_poses_shifted_from_one_scan_on():
+    session = session_of()
+    poses, known = shifted(session.poses, 1, 12)
+    finding = only(session.with_poses(poses).where(known))
+    assert finding.what == "each scan belongs to the pose 1 earlier from '012' on" or (
+        finding.what == "each scan belongs to the pose 1 earlier from '013' on"
+    )
+
+
+@pytest.mark.parametrize("delay", [0.03, -0.08, 0.15])
+def test_a_time_offset_between_the_streams(delay):
+    session = in_motion(np.random.default_rng(2))
+    poses, known = delayed(session.poses, session.times, delay)
+    finding = only(session.with_poses(poses).where(known))
+    assert finding.name in ("time offset", "shifted poses")
+    if finding.name == "time offset":
+        told = float(finding.fix.split("delay: ")[1].partition(" ms")[0])
+        assert told == pytest.approx(-delay * 1e3, abs=2)
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+def test_one_gross_outlier(kind, carried):
+    session = changed(session_of(kind, carried), [7], rigid(np.eye(3), np.array([0.01, 0, 0.02])))
+    finding = only(session)
+    assert finding.name == "outlier"
+    assert finding.samples == ("007",)
+    assert finding.fix.endswith("leave_out: ['007']}")
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+def test_identity_matrices_of_the_robots_driver(kind, carried):
+    session = session_of(kind, carried)
+    poses = np.array(session.poses)
+    poses[[3, 8]] = np.eye(4)
+    finding = only(session.with_poses(poses))
+    assert finding.name == "identity matrices"
+    assert finding.samples == ("003", "008")
+
+
+def test_identity_matrices_of_a_markers_driver():
+    session = session_of("marker")
+    centres, rotations = np.array(session.centres), np.array(session.rotations)
+    centres[[2, 4]], rotations[[2, 4]] = 0.0, np.eye(3)
+    finding = only(replace(session, centres=centres, rotations=rotations))
+    assert finding.what.startswith("2 of 20 markers are at the camera itself")
+
+
+def test_nothing_but_identities():
+    session = session_of("centres")
+    finding = examine(session.with_poses(np.tile(np.eye(4), (20, 1, 1))), CHECKS).findings[0]
+    assert finding.name == "identity matrices"
+    assert finding.fix == "record again: too little is left"
+
+
+def test_a_pose_that_is_stale():
+    session = session_of()
+    poses = np.array(session.poses)
+    poses[9] = poses[8]
+    finding = only(session.with_poses(poses))
+    assert finding.name == "repeated robot pose"
+    assert finding.samples == ("009",)
+
+
+def test_a_detection_that_is_stale():
+    session = session_of("marker")
+    centres, rotations = np.array(session.centres), np.array(session.rotations)
+    centres[5], rotations[5] = centres[4], rotations[4]
+    finding = only(replace(session, centres=centres, rotations=rotations))
+    assert finding.name == "repeated detection"
+
+
+@pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
+def test_a_target_that_moved_half_way(kind, carried):
+    move = rigid(rotation_exp(np.array([0, 0.01, 0])), np.array([0.004, 0, 0]))
+    finding = only(changed(session_of(kind, carried), np.arange(20) >= 11, move))
+    assert finding.name == "moved target"
+    assert finding.samples == ("011",)
+
+
+@pytest.mark.parametrize("kind", ["flange", "centres"])
+def test_the_poses_of_a_tool(kind):
+    session = session_of(kind)
+    offset = np.array([0.002, -0.003, 0.001])
+    finding = only(session.with_poses(without_tool(session.poses, -offset)))
+    assert finding.name == "tool offset"
+    assert np.allclose(finding.mended.poses, session.poses, atol=3e-4)
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+@pytest.mark.parametrize("axis", [(np.pi, 0, 0), (0, 0, np.pi), (0, 0, np.pi / 2)])
+def test_targets_that_were_seen_turned_over(carried, axis):
+    session = session_of("marker", carried)
+    rotations = np.array(session.rotations)
+    rotations[[2, 5, 9]] = rotations[[2, 5, 9]] @ rotation_exp(np.array(axis))
+    finding = only(replace(session, rotations=rotations))
+    assert finding.name == "target flips"
+    assert finding.samples == ("002", "005", "009")
+
+
+@pytest.mark.parametrize("factor", [1.03, 0.9])
+def test_a_marker_that_was_printed_in_another_size(factor):
+    session = session_of("marker")
+    finding = only(replace(session, centres=session.centres * factor))
+    assert finding.name == "target size"
+    assert float(finding.what.split()[3]) == pytest.approx(1 / factor, rel=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["marker", "point"])
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_too_little_rotation(kind, carried):
+    assert named(session_of(kind, carried, turn=1e-4)) == ["too little rotation"]
+
+
+def test_rotation_about_one_axis_only():
+    rng = np.random.default_rng(3)
+    session = session_of("marker")
+    turns = np.array([rotation_exp(np.array([0, 0, a])) for a in rng.normal(0, 0.5, 20)])
+    poses = np.array(session.poses)
+    poses[:, :3, :3] = turns
+    seen = np.linalg.inv(poses[0]) @ poses  # a camera at the first pose, the target at the flange
+    session = replace(
+        session.with_poses(poses),
+        rotations=seen[:, :3, :3] @ [rotation_exp(rng.normal(0, 1e-4, 3)) for _ in poses],
+        centres=seen[:, :3, 3] + rng.normal(0, 1e-4, (20, 3)) + 1e-3,
+    )
+    finding = only(session)
+    assert finding.name == "too little rotation"
+    assert "all turns are about one axis" in finding.what
+
+
+def test_places_on_a_line():
+    session = session_of("centres", box=(0.3, 0.0, 0.0))
+    finding = only(session)
+    assert finding.name == "too little motion"
+    assert finding.fix.startswith("record again")
+
+
+def test_no_rotation_is_only_worth_a_note_where_the_flange_itself_is_seen():
+    diagnosis = examine(session_of("centres", turn=1e-4), CHECKS)
+    assert diagnosis.findings == ()
+    assert [note.name for note in diagnosis.notes] == ["little rotation"]
+
+
+def test_two_mistakes_are_both_named_and_one_line_mends_both():
+    session = changed(session_of(), [4], rigid(np.eye(3), np.array([0.0, 0.0, 0.05])))
+    findings = examine(session.with_poses(scaled(session.poses, 1e3)), CHECKS).findings
+    assert [f.name for f in findings] == ["unit", "outlier"]
+    assert findings[-1].fix == (
+        "- acquire.archive: {reader: {corrected: {reader: auto, scale: 0.001}}, leave_out: ['004']}"
+    )
+
+
+def random_session(seed):
+    """A session without a mistake, of any kind, size and noise, by an arm that is not perfect."""
+    rng = np.random.default_rng(seed)
+    kind, carried = CONFIGURATIONS[seed % len(CONFIGURATIONS)]
+    n, noise = int(rng.integers(8, 40)), rng.uniform(0.03, 0.4) * 1e-3
+    session = clean(rng, n, kind, carried, noise, rng.uniform(0.15, 0.5))
+    return bent(session, rng)
+
+
+@pytest.mark.slow
+def test_no_false_alarm_in_two_hundred_clean_sessions():
+    assert {seed: names for seed in range(200) if (names := named(random_session(seed)))} == {}
+
+
+def test_too_few_samples_are_refused():
+    with pytest.raises(Exception, match="3 samples with a target in them; at least 4 are needed"):
+        examine(session_of(n=3), CHECKS)
+
+
+def test_a_check_never_changes_the_session():
+    session = session_of()
+    before = {name: np.array(getattr(session, name)) for name in ("poses", "centres", "normals")}
+    examine(session, CHECKS)
+    assert isinstance(session, Session)
+    for name, array in before.items():
+        assert np.array_equal(getattr(session, name), array)
