@@ -158,10 +158,7 @@ def _rows(vectors: Iterable[Floats | None]) -> Floats:
 def _rotations(features: Iterable[t.Feature | None]) -> Floats:
     nothing = np.full((3, 3), np.nan)
     return np.array(
-        [
-            f.camera_T_target.rotation if isinstance(f, t.PoseFeature) else nothing
-            for f in features
-        ]
+        [f.camera_T_target.rotation if isinstance(f, t.PoseFeature) else nothing for f in features]
     ).reshape(-1, 3, 3)
 
 
@@ -196,7 +193,7 @@ def _as_recipe(session: Session, recipe: Recipe) -> Session:
     reach = session.reach if scanner is None else (scanner.near, scanner.far)
     reader = _written(getattr(first.params, "reader", None))
     left_out = list(getattr(first.params, "leave_out", ()))
-    configuration: Configuration = recipe.context.get(Configuration, DEFAULT)
+    configuration: Configuration = recipe.context.get(Configuration) or DEFAULT
     return replace(
         _in_configuration(session, configuration),
         reach=reach,

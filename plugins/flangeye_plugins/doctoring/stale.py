@@ -53,12 +53,9 @@ def repeated(session: Session) -> Findings:
 
 def _repeats(session: Session, numbers: Floats, others: Floats, what: str) -> Iterator[Finding]:
     """Find rows that repeat an earlier one to the last digit although the others moved on."""
-    usable = np.isfinite(numbers).all(axis=1) & np.isfinite(others).all(axis=1)
-    wrong: Mask = np.zeros(len(numbers), dtype=np.bool_)
-    for i in np.flatnonzero(usable):
-        same = usable[:i] & (np.abs(numbers[:i] - numbers[i]).max(axis=1, initial=0.0) < SAME)
-        moved = np.linalg.norm(others[:i] - others[i], axis=1) > MOVED
-        wrong[i] = (same & moved).any()
+    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
+    moved = np.linalg.norm(others[:, None] - others[None], axis=2) > MOVED
+    wrong = np.tril((apart < SAME) & moved, k=-1).any(axis=1)
     if wrong.any() and not _all_identity(session, wrong):
         told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
         yield _left_out(

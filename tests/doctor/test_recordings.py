@@ -1,0 +1,210 @@
+"""The command on real recordings: as they are, and with mistakes planted in copies of them."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from flangeye import cli
+from flangeye.diagnosis import Session
+from flangeye.doctor import examine, open_session
+from flangeye.mending import inverted, scaled, shifted
+from flangeye.recipe import load_recipe
+from flangeye.registry import load_registry
+from flangeye_plugins.doctoring import CHECKS
+from tests.doctor.sessions import clean
+
+REGISTRY = load_registry()
+OUTLIERS = {"ur5": {"36", "54", "21", "45"}, "franka": {"72"}, "aubo": set()}
+"""What is wrong with the recordings as published: tests/studies and data/README.md agree."""
+
+
+def named(session):
+    return [finding.name for finding in examine(session, CHECKS).findings]
+
+
+@pytest.fixture(params=["aubo", "ur5", "franka"])
+def recorded(request, ancorasir) -> Session:
+    """A recording without its known outliers."""
+    session = open_session(ancorasir / "data" / request.param, REGISTRY)
+    wrong = np.array([name in OUTLIERS[request.param] for name in session.ids])
+    return session.without(wrong)
+
+
+@pytest.mark.parametrize("name", OUTLIERS)
+def test_the_false_segmentations_that_were_published_and_nothing_else(ancorasir, name):
+    found = examine(open_session(ancorasir / "data" / name, REGISTRY), CHECKS).findings
+    assert {f.name for f in found} <= {"outlier"}
+    assert {sample for f in found for sample in f.samples} == OUTLIERS[name]
+
+
+def test_the_kinects_circle_is_behind_the_flange(ancorasir):
+    """Fitted to the wrist; a recipe that says so (wrist_circle) leaves nothing to find."""
+    (finding,) = examine(open_session(ancorasir / "Kinect_Result", REGISTRY), CHECKS).findings
+    assert finding.name == "tool offset"
+
+
+def test_a_recording_without_its_outliers_is_clean(recorded):
+    assert named(recorded) == []
+
+
+@pytest.mark.parametrize("factor", [1e3, 1 / 25.4e-3])
+def test_recorded_poses_in_another_unit(recorded, factor):
+    assert named(recorded.with_poses(scaled(recorded.poses, factor))) == ["unit"]
+
+
+def test_recorded_poses_the_other_way_round(recorded):
+    assert named(recorded.with_poses(inverted(recorded.poses))) == ["pose direction"]
+
+
+@pytest.mark.parametrize("by", [1, -1])
+def test_recorded_poses_shifted(recorded, by):
+    session = recorded.where(recorded.seen)
+    poses, known = shifted(session.poses, by)
+    assert named(session.with_poses(poses).where(known)) == ["shifted poses"]
+
+
+def test_a_recorded_outlier(recorded):
+    session = recorded.where(recorded.seen)
+    centres = np.array(session.centres)
+    centres[5] += [0.0, 0.05, 0.0]
+    found = examine(Session(**{**vars(session), "centres": centres}), CHECKS).findings
+    assert [(f.name, f.samples) for f in found] == [("outlier", (session.ids[5],))]
+
+
+def test_recorded_poses_replaced_by_identities(recorded):
+    poses = np.array(recorded.poses)
+    poses[[2, 7]] = np.eye(4)
+    assert named(recorded.with_poses(poses)) == ["identity matrices"]
+
+
+def test_a_camera_that_was_moved_half_way(recorded):
+    session = recorded.where(recorded.seen)
+    centres = np.array(session.centres)
+    centres[len(centres) // 2 :] += [0.01, 0.0, 0.004]
+    moved = Session(**{**vars(session), "centres": centres})
+    assert named(moved) == ["moved target"]
+
+
+def run(monkeypatch, capsys, *words):
+    monkeypatch.setattr(sys, "argv", ["flangeye", "doctor", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+        raise SystemExit(0)
+    said = capsys.readouterr()
+    return ended.value.code, said.out, said.err
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An archive of ready-made centres in the layout of the Kinect's recording, with a session."""
+
+    def write(session):
+        rows = [np.concatenate([p[:3, 3] * 1e3, _vector(p)]) for p in session.poses]
+        np.savetxt(tmp_path / "readRobot.txt", rows)
+        np.savetxt(tmp_path / "measureRobot.txt", session.centres * 1e3)
+        return tmp_path
+
+    return write
+
+
+def _vector(pose):
+    from flangeye.geometry import rotation_log
+
+    return rotation_log(pose[:3, :3])
+
+
+RECIPE = """\
+title: Centres
+robot: {model: ur10e}
+steps:
+  - acquire.centres: {reader: ancorasir}
+  - solve.robust
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(RECIPE)
+    return path
+
+
+def session_of(seed=1):
+    return clean(np.random.default_rng(seed), kind="centres")
+
+
+def test_nothing_found_is_exit_code_zero(monkeypatch, capsys, folder):
+    code, out, _ = run(monkeypatch, capsys, folder(session_of()))
+    assert code == 0
+    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 13 checks"
+    assert out.splitlines()[-1] == "nothing found"
+
+
+def test_a_finding_is_exit_code_one_and_its_line_mends_it(monkeypatch, capsys, folder, recipe):
+    session = session_of()
+    archive = folder(session.with_poses(inverted(session.poses)))
+    code, out, _ = run(monkeypatch, capsys, archive, "--recipe", recipe)
+    assert code == 1
+    assert "1. pose direction: the poses are flange_T_base" in out
+    line = out.split("fix: ")[1].splitlines()[0]
+    mended = yaml.safe_load(RECIPE)
+    mended["steps"][0] = yaml.safe_load(line)[0]
+    recipe.write_text(yaml.safe_dump(mended))
+    assert run(monkeypatch, capsys, archive, "--recipe", recipe)[0] == 0
+
+
+def test_json_for_programs(monkeypatch, capsys, folder):
+    session = session_of()
+    archive = folder(session.with_poses(scaled(session.poses, 1e3)))
+    code, out, _ = run(monkeypatch, capsys, archive, "--json")
+    told = json.loads(out)
+    assert code == 1
+    (finding,) = told["findings"]
+    assert finding["name"] == "unit"
+    assert finding["error_before"]["position"] > 10 > 1e-3 > finding["error_after"]["position"]
+    assert finding["probability"] < 1e-6
+    assert finding["fix"].startswith("- acquire.centres: {reader: {corrected: ")
+
+
+@pytest.mark.parametrize(
+    ("make", "words", "line"),
+    [
+        (lambda p: None, ["no-such"], "error: no-such: does not exist"),
+        (lambda p: (p / "poses.csv").write_text("cloud,x_m,y_m,z_m,qx,qy,qz,qw\n"), ["."],
+         "error: .: holds scans (folder, poses.csv), and nothing says what to look for in them; "
+         "add --recipe with the recipe that would run on it"),
+        (lambda p: (p / "x.mcap").write_bytes(b"no log"), ["x.mcap"],
+         "error: x.mcap: is not an MCAP file"),
+        (lambda p: None, [".", "--recipe", "ur5_phoxi-m_simulated"],
+         "error: ur5_phoxi-m_simulated: begins with acquire.simulated, which reads no archive; "
+         "the doctor needs a recipe that begins with acquire.archive or acquire.centres"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_exit_code_two(monkeypatch, capsys, tmp_path, make, words, line):
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path)
+    code, _, err = run(monkeypatch, capsys, *words)
+    assert (code, err.splitlines()[-1]) == (2, line)
+
+
+def test_scans_are_segmented_and_fitted_whatever_is_wrong_with_their_poses(ancorasir, tmp_path):
+    """Six real scans, their poses in millimetres read as metres: beyond any arm for a run."""
+    name = "franka_phoxi-m_2019-sample_archive"
+    from flangeye.recipe import recipe_names
+
+    text = (
+        recipe_names()[name]
+        .read_text()
+        .replace(
+            "{ancorasir: {robot: sample-2019}}",
+            "{corrected: {reader: {ancorasir: {robot: sample-2019}}, scale: 1000}}",
+        )
+    )
+    path = tmp_path / "r.yaml"
+    path.write_text(text)
+    session = open_session(ancorasir, REGISTRY, load_recipe(path, REGISTRY))
+    assert session.seen.sum() == 6
+    assert "unit" in named(session)
