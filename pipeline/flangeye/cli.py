@@ -338,6 +338,9 @@ def watch(
     from flangeye.watch import watch_run
 
     watch_run(run, foxglove, Console(), patience)
+
+
+@app.command()
 def doctor(
     archive: Annotated[Path, typer.Argument(help="A run.mcap, or recordings that a reader knows.")],
     recipe: Annotated[
