@@ -10,6 +10,7 @@ from flangeye_plugins.acquisition.live import acquire_live
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
 from flangeye_plugins.doctoring import CHECKS
+from flangeye_plugins.drivers.robots.aubo.driver import robot_aubo
 from flangeye_plugins.drivers.robots.loopback import robot_loopback
 from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
@@ -101,6 +102,7 @@ def flangeye_parts() -> Iterable[Part]:
         error_icp_as_in_paper,
         *CHECKS,
         scanner_loopback,
+        robot_aubo,
         robot_manual,
         robot_loopback,
         robot_simulated,

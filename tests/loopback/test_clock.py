@@ -6,7 +6,7 @@ import pytest
 
 from flangeye_plugins.loopback.clock import Clock
 from flangeye_plugins.loopback.network import DelayLine
-from flangeye_plugins.loopback.ur.server import _precise_loop
+from flangeye_plugins.loopback.server import _precise_loop
 
 
 def run(coroutine):

@@ -253,7 +253,7 @@ def loopback(monkeypatch, capsys):
         (
             ["franka-panda"],
             "error: no controller on loopback for a franka-panda of Franka Emika; there is one "
-            "for arms of: Universal Robots\n",
+            "for arms of: AUBO, Universal Robots\n",
         ),
         (
             ["ur5e", "--floor", "100"],
@@ -277,7 +277,7 @@ def loopback(monkeypatch, capsys):
         (
             ["ur5e", "--fault", "melt"],
             "error: no fault 'melt'; there are protective-stop, singularity, joint-limit, "
-            "emergency-stop, program-stop, remote-control-off, drop, die, freeze, latency\n",
+            "emergency-stop, drop, die, freeze, latency, program-stop, remote-control-off\n",
         ),
     ],
 )

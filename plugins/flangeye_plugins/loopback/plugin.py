@@ -14,7 +14,16 @@ def _serve_ur(options: LoopbackOptions) -> None:
     serve(options)
 
 
+def _serve_aubo(options: LoopbackOptions) -> None:
+    from flangeye_plugins.loopback.aubo.server import serve
+
+    serve(options)
+
+
 @hookimpl
 def flangeye_loopbacks() -> Iterable[Loopback]:
-    """Offer a controller of Universal Robots."""
-    return (Loopback("ur", "Universal Robots", _serve_ur),)
+    """Offer controllers of Universal Robots and of AUBO."""
+    return (
+        Loopback("ur", "Universal Robots", _serve_ur),
+        Loopback("aubo", "AUBO", _serve_aubo),
+    )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError
+from flangeye_plugins.drivers.robots.ur.worker import ask_dashboard
 from flangeye_plugins.loopback.client import LoopbackControl
 from tests.drivers.robots.cell import in_time, moved, open_ur, until
 from tests.loopback.process import Process
@@ -45,6 +46,13 @@ def start(robot, number):
         robot.move_velocity(downwards, 1.0)
 
 
+def under_way(process, robot, number):
+    """Whether the arm moves; a velocity has to be said again and again."""
+    if number % 3 == 2:
+        robot.move_velocity(downwards, 1.0)
+    return process.control.truth().speed > 0.0
+
+
 def watch(robot, number):
     """Go on as a program does that moves an arm, until something is wrong; return what."""
     while True:
@@ -63,27 +71,44 @@ def watch(robot, number):
 def fail(process, fault, number):
     """Open, move, let it fail, watch, stop, close; every call in time. Return what was seen."""
     process.control.reset()
+    until(lambda: answers(process.host))
     with in_time():
         robot = open_ur(process.host)
-    start(robot, number)
-    until(lambda: process.control.truth().speed > 0.0)
-    process.control.fault(fault)
-    with in_time():
-        seen = watch(robot, number)
-    if number % 2:
+    try:
+        start(robot, number)
+        until(lambda: under_way(process, robot, number))
+        process.control.fault(fault)
         with in_time():
-            try:
-                robot.stop()
-            except DeviceError as error:
-                assert "\n" not in str(error)
-    with in_time():
-        robot.close()
+            seen = watch(robot, number)
+        if number % 2:
+            stop(robot)
+    finally:
+        with in_time():
+            robot.close()
     until(lambda: process.control.truth().speed == 0.0)
     process.control.clear()
     if fault.startswith("latency"):
         # What is still under way stops the next driver's program when it arrives.
         time.sleep(0.5)
     return seen
+
+
+def stop(robot):
+    """Stop an arm that may be lost."""
+    with in_time():
+        try:
+            robot.stop()
+        except DeviceError as error:
+            assert "\n" not in str(error)
+
+
+def answers(host):
+    """Whether the controller is back: it opens its ports one after another."""
+    try:
+        with ask_dashboard(host) as ask:
+            return ask("running")
+    except OSError:
+        return None
 
 
 def fail_often(lanes, fault, times):
@@ -132,7 +157,7 @@ def test_a_controller_that_stops_says_why(lanes, fault, said, times):
         ("remote-control-off", LOCAL),
         ("freeze", "its dashboard server does not answer (nothing within 0.5 s)"),
         ("die", "its dashboard server does not answer (Connection refused)"),
-        ("latency=100 ms", "ms to it and back, at most 40 ms are allowed: connect it by cable"),
+        ("latency=100 ms", "ms to it and back, at most 80 ms are allowed: connect it by cable"),
     ],
 )
 def test_a_controller_that_is_not_ready_is_not_opened(lanes, fault, message):
@@ -160,8 +185,6 @@ def test_an_arm_without_power_is_not_opened(lanes):
 
 
 def release_emergency_stop(host):
-    from flangeye_plugins.drivers.robots.ur.worker import ask_dashboard
-
     with ask_dashboard(host) as ask:
         assert ask("restart safety") == "Restarting safety"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Self
 
 import numpy as np
@@ -13,7 +12,8 @@ from flangeye.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Transform
 from flangeye.units import Angle, AngularSpeed, Duration, param
 from flangeye_plugins.loopback.arm import MotionFault, SimulatedArm
-from flangeye_plugins.loopback.motion import Motion, Speed, joint_move, linear_move
+from flangeye_plugins.loopback.motion import joint_move, linear_move
+from flangeye_plugins.loopback.mover import Mover, Plan
 from flangeye_plugins.loopback.start import joint_zeros, starting_joints
 
 
@@ -58,9 +58,7 @@ class SimulatedRobot:
         zeros = joint_zeros(model, params.joint_errors)
         self.arm = SimulatedArm(model, limits, params.period, joints, zeros)
         self.cycles = 0
-        self._motion: Motion | None = None
-        self._plan: Callable[[], Motion] | None = None
-        self._velocity_ends = 0
+        self._mover = Mover(self.arm)
         self._stopped_by = ""
 
     def state(self) -> RobotState:
@@ -87,30 +85,19 @@ class SimulatedRobot:
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Go on at a twist (6,); it brakes when the next command is :data:`GRACE` late."""
         self._require_ready()
-        if not isinstance(self._motion, Speed):
-            self._motion = Speed(self.arm.twist, twist, acceleration, in_space=True)
-        self._motion.target, self._motion.acceleration = np.array(twist), acceleration
-        self._plan, self._velocity_ends = None, self.cycles + round(GRACE / self.period)
+        self._mover.go_on(twist, acceleration, GRACE)
 
     def wait_cycle(self) -> None:
         """Let one cycle pass."""
         self.cycles += 1
-        if isinstance(self._motion, Speed) and self.cycles > self._velocity_ends:
-            self.stop()
-        if self._plan and self.arm.standing:
-            self._motion, self._plan = self._plan(), None
-        if self._motion:
-            self.arm.drive(self._motion)
         try:
-            self.arm.step()
+            self._mover.step()
         except MotionFault as fault:
             self.protective_stop(str(fault))
-        if self._motion and self._motion.done:
-            self._motion = None
 
     def stop(self) -> None:
         """Begin to brake, in the next cycle."""
-        self._motion = self._plan = None
+        self._mover.halt()
 
     def protective_stop(self, why: str) -> None:
         """Stop as a controller does when it does not like something."""
@@ -131,9 +118,10 @@ class SimulatedRobot:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _begin(self, plan: Callable[[], Motion]) -> None:
+    def _begin(self, plan: Plan) -> None:
         self._require_ready()
-        self._motion, self._plan = None, plan
+        self._mover.halt()
+        self._mover.append(plan)
 
     def _require_ready(self) -> None:
         if self._stopped_by:
@@ -142,8 +130,7 @@ class SimulatedRobot:
     def _mode(self) -> Mode:
         if self._stopped_by:
             return "protective stop"
-        under_way = self._motion or self._plan or not self.arm.standing
-        return "moving" if under_way else "ready"
+        return "moving" if self._mover.busy else "ready"
 
 
 @part("robot.simulated")

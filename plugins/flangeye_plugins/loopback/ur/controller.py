@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,7 @@ class URController:
     Attributes:
         robot: Which arm.
         box: Which generation of control box.
+        cycle: Length of its control cycle [s].
         arm: The arm.
         time: Since it was switched on [s]; the cycle's number times its length.
         registers: The general-purpose registers.
@@ -50,6 +53,7 @@ class URController:
     def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
         """Switch on, with the arm standing at ``joints`` (6,) [rad]."""
         self.robot, self.box = robot, control_box_of(robot)
+        self.cycle = self.box.cycle
         speeds = joint_speeds_of(robot)
         self.arm = SimulatedArm(robot, speeds, self.box.cycle, joints, zeros)
         self.registers = Registers()
@@ -242,6 +246,15 @@ class URController:
         self.stop_program("reset")
         self.arm.slider = 1.0
         self.arm.put(joints)
+
+    def modes(self) -> Mapping[str, Any]:
+        """Return its modes by name, for the control channel."""
+        return {
+            "robot_mode": self.robot_mode.name,
+            "safety": self.safety.name,
+            "runtime": self.runtime.name,
+            "remote_control": self.remote_control,
+        }
 
     def tcp_pose(self) -> Floats:
         """Return the tool's pose (6,) in base, as the pendant shows it."""

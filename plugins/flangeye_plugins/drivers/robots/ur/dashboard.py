@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 from flangeye.devices import DeviceError
@@ -13,9 +14,11 @@ from flangeye_plugins.drivers.robots.ur.worker import ask_dashboard, read_remote
 PATIENCE = 0.5
 """Longest wait for one answer [s]."""
 
-ROUND_TRIP = 0.04
-"""Longest way to the controller and back [s]: connecting takes twenty-five of them, and a velocity
-that comes later than a few cycles follows nothing."""
+ROUND_TRIP = 0.08
+"""Longest way to the controller and back [s]: connecting takes twenty-five of them, and who is told
+so late cannot stop an arm in time."""
+
+QUESTIONS = ("PolyscopeVersion", "safetymode", "robotmode", "is in remote control")
 
 _VERSION = re.compile(r"(\d+)\.\d+")
 
@@ -40,18 +43,15 @@ def require_ready(name: str, host: str) -> Facts:
     """
     try:
         with ask_dashboard(host, PATIENCE) as ask:
-            version = ask("PolyscopeVersion")
-            began = time.monotonic()
-            safety = ask("safetymode").rpartition(" ")[2]
-            trip = time.monotonic() - began
-            power = ask("robotmode").rpartition(" ")[2]
-            remote = read_remote(ask("is in remote control"))
+            said, trips = zip(*(_timed(ask, question) for question in QUESTIONS), strict=True)
     except OSError as error:
         raise DeviceError(
             f"{name}: its dashboard server does not answer ({_reason(error)}): is the controller "
             f"on, is {host} its address, is this computer in its network?"
         ) from None
-    trouble = _trouble(safety, power, remote, trip)
+    version, safety, power, remote = said
+    # One answer may be late because this computer is busy; all of them are where the network is.
+    trouble = _trouble(safety.rpartition(" ")[2], power.rpartition(" ")[2], remote, min(trips))
     if trouble:
         raise DeviceError(f"{name}: {trouble}")
     found = _VERSION.search(version)
@@ -69,12 +69,17 @@ def stop(host: str) -> None:
         ask("stop")
 
 
-def _trouble(safety: str, power: str, remote: int, trip: float) -> str:
+def _timed(ask: Callable[[str], str], question: str) -> tuple[str, float]:
+    began = time.monotonic()
+    return ask(question), time.monotonic() - began
+
+
+def _trouble(safety: str, power: str, remote: str, trip: float) -> str:
     if safety in status.SAFETY_NAMES:
         return status.SAFETY[status.SAFETY_NAMES[safety]][1]
     if power != "RUNNING":
         return status.POWER
-    if remote == 0:
+    if read_remote(remote) == 0:
         return status.REMOTE
     if trip > ROUND_TRIP:
         return (

@@ -12,41 +12,28 @@ from pydantic import Field
 from flangeye.catalogue import RobotModel
 from flangeye.conventions import CONVENTIONS
 from flangeye.devices import DeviceError, Floats, Robot, RobotState
-from flangeye.geometry import hat
-from flangeye.kinematics import Arm
 from flangeye.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Transform
-from flangeye.units import Angle, Length, param
 from flangeye_plugins.drivers.robots.sdk import require_sdk
+from flangeye_plugins.drivers.robots.tool import (
+    ToolOffset,
+    require_model,
+    require_tool,
+    twist_at_tool,
+    wrench_at_flange,
+)
 from flangeye_plugins.drivers.robots.ur import dashboard
 from flangeye_plugins.drivers.robots.ur.link import Link, Sample
 from flangeye_plugins.drivers.robots.ur.status import condition_of
 
-POSE = CONVENTIONS["ur"].in_units("m", "rad")
+SHOWN = CONVENTIONS["ur"]
+POSE = SHOWN.in_units("m", "rad")
+
+OPENING = 2.6
+"""Longest time until the client library is connected, first questions included [s]."""
 
 STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
-
-SAME_TOOL = (1e-4, 1e-3)
-"""Largest difference of two tool offsets [m, rad]; the pendant shows 0.01 mm."""
-
-SAME_ARM = (0.01, 0.03)
-"""Largest distance of the controller's flange from where the model puts it [m, rad]. Arms differ
-from their nominal kinematics by a few millimetres; another arm, or base, by more."""
-
-
-class ToolOffset(Params):
-    """The tool the controller is meant to have set, from the flange."""
-
-    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    rotation: tuple[Angle, Angle, Angle] = param(
-        ("0 rad", "0 rad", "0 rad"), description="Rotation vector, as the pendant shows it."
-    )
-
-    @property
-    def flange_T_tool(self) -> Floats:
-        """The offset as a (4, 4) matrix [m]."""
-        return POSE.matrix([*self.position, *self.rotation])
 
 
 class UrRtdeParams(Params):
@@ -74,12 +61,14 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
     """
     require_sdk("robot.ur_rtde", "rtde_control", extra="ur")
     name = f"{model.model} at {params.host}"
+    began = time.monotonic()
     facts = dashboard.require_ready(name, params.host)
-    link = Link(name, params.host, facts.period)
+    link = Link(name, params.host, facts.period, OPENING - (time.monotonic() - began))
     try:
         robot = UrRobot(name, params.host, facts.period, link)
-        robot.require_tool(params.tool.flange_T_tool)
-        robot.require_model(model)
+        expected = params.tool.flange_T_tool(SHOWN)
+        require_tool(name, "ur_rtde", robot.offset, expected, SHOWN)
+        require_model(name, robot.state(), model)
     except DeviceError:
         link.close()
         raise
@@ -91,6 +80,9 @@ class UrRobot:
 
     Every call ends within three seconds: connecting within two and a half, commands within one
     and a half, a stop that nobody answers included.
+
+    Attributes:
+        offset: (4, 4) ``flange_T_tool`` as the controller has it.
     """
 
     def __init__(self, name: str, host: str, period: float, link: Link) -> None:
@@ -102,30 +94,9 @@ class UrRobot:
         self.name, self.period = name, period
         self._host, self._link = host, link
         self._seen = self._commanded = 0
-        self._offset = POSE.matrix(self._link.request("tool"))
-        self._tool_T_flange = np.linalg.inv(self._offset)
-        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self._offset)
-
-    def require_tool(self, expected: Floats) -> None:
-        """Raise DeviceError when the controller has another tool set than the (4, 4) expected."""
-        offset = self._offset
-        if _differ(offset, expected, SAME_TOOL):
-            raise DeviceError(
-                f"{self.name}: the controller's tool is set to {CONVENTIONS['ur'].text(offset)}, "
-                f"the recipe says {CONVENTIONS['ur'].text(expected)}: poses are the flange's, so "
-                "set the tool at the pendant, or robot.driver.ur_rtde.tool in the recipe"
-            )
-
-    def require_model(self, model: RobotModel) -> None:
-        """Raise DeviceError when the flange is not where the model's kinematics put it."""
-        state = self.state()
-        expected = Arm(model).flange(state.joints)
-        if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
-            off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])
-            raise DeviceError(
-                f"{self.name}: its flange is {off * 1e3:.0f} mm from where a {model.model} has it "
-                "at these joint angles: is robot.model the arm that stands there?"
-            )
+        self.offset = POSE.matrix(self._link.request("tool"))
+        self._tool_T_flange = np.linalg.inv(self.offset)
+        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
 
     def state(self) -> RobotState:
         """Return the newest sample, tool taken off."""
@@ -139,7 +110,7 @@ class UrRobot:
             joint_speeds=sample.joint_speeds,
             time_ns=sample.time_ns,
             mode=condition.mode,
-            force=_at(base_T_flange, base_T_tool, sample.tool_force),
+            force=wrench_at_flange(sample.tool_force, base_T_flange, base_T_tool),
             message=condition.message,
         )
 
@@ -152,15 +123,13 @@ class UrRobot:
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Start a straight move of the flange; an arm that moves comes to rest first."""
         self._require_able()
-        pose = POSE.numbers(base_T_flange.matrix @ self._offset).tolist()
+        pose = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
         self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Go on at a twist (6,) of the flange; the controller is told the tool's."""
         base_T_tool = POSE.matrix(self._require_able().tool_pose)
-        lever = base_T_tool[:3, 3] - (base_T_tool @ self._tool_T_flange)[:3, 3]
-        linear = twist[:3] + hat(twist[3:]) @ lever
-        at_tool = [float(v) for v in (*linear, *twist[3:])]
+        at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
         self._command("move_velocity", twist=at_tool, acceleration=acceleration)
 
     def wait_cycle(self) -> None:
@@ -229,17 +198,3 @@ class UrRobot:
         if condition.message:
             raise DeviceError(f"{self.name}: {condition.message}")
         return sample
-
-
-def _differ(pose: Floats, other: Floats, tolerance: tuple[float, float]) -> bool:
-    """Return whether two (4, 4) poses differ; rotations as matrices, whose vectors may jump."""
-    turn = pose[:3, :3].T @ other[:3, :3]
-    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
-    distance = np.linalg.norm(pose[:3, 3] - other[:3, 3])
-    return bool(distance > tolerance[0] or angle > tolerance[1])
-
-
-def _at(base_T_flange: Floats, base_T_tool: Floats, wrench: Floats) -> Floats:
-    """Return a (6,) wrench at the tool's tip as it is at the flange's centre, in base."""
-    lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
-    return np.concatenate([wrench[:3], wrench[3:] + hat(lever) @ wrench[:3]])

@@ -21,9 +21,6 @@ import numpy as np
 from flangeye.devices import DeviceError, Floats
 from flangeye_plugins.drivers.robots.ur import worker
 
-CONNECTING = 2.3
-"""Longest time until the library is connected [s]."""
-
 ANSWERING = 0.8
 """Longest time until a command is answered [s]; the library answers within a few cycles."""
 
@@ -67,13 +64,14 @@ class Sample(NamedTuple):
 class Link:
     """A connection of the client library to one controller, in a process of its own."""
 
-    def __init__(self, name: str, host: str, period: float) -> None:
+    def __init__(self, name: str, host: str, period: float, patience: float) -> None:
         """Start the process and connect.
 
         Args:
             name: Of the robot, for messages.
             host: Address of the controller.
             period: Length of its cycle [s].
+            patience: Longest time to wait [s].
 
         Raises:
             DeviceError: It cannot connect, or not in time; nothing is left behind.
@@ -99,7 +97,7 @@ class Link:
             )
         self._end = weakref.finalize(self, _let_go, self._line, self._process, self._folder)
         try:
-            self._answer("connect", CONNECTING)
+            self._answer("connect", patience)
         except DeviceError:
             self.close()
             raise
@@ -152,7 +150,7 @@ class Link:
         try:
             message = self._line.recv(65536)
         except TimeoutError:
-            self._give_up(f"did not answer '{what}' within {patience:g} s")
+            self._give_up(f"did not answer '{what}' within {patience:.1f} s")
         except OSError:
             message = b""
         if not message:

@@ -1,0 +1,317 @@
+"""robot.aubo: the unmodified client library against the controller on loopback."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from flangeye.catalogue import load_model
+from flangeye.devices import GRACE, DeviceError, Robot
+from flangeye_plugins.drivers.robots.aubo.driver import AuboParams, robot_aubo
+from flangeye_plugins.loopback.contact import Surface
+from tests.drivers.robots.cell import arrived, in_time, moved, until
+from tests.loopback.process import Process, free_address
+
+pyaubo_sdk = pytest.importorskip("pyaubo_sdk")
+
+AUBO_I5 = load_model("robots", "aubo-i5")
+
+
+def open_aubo(host, **params):
+    return robot_aubo(AUBO_I5, AuboParams(host=host, **params))
+
+
+@pytest.fixture(scope="module")
+def process():
+    with Process(model="aubo-i5") as running:
+        yield running
+
+
+@pytest.fixture
+def controller(process):
+    process.control.clear()
+    process.control.set_surfaces()
+    process.control.reset()
+    until(lambda: reachable(process.host))
+    return process
+
+
+def reachable(host):
+    return pyaubo_sdk.RpcClient().connect(host, 30004) == 0
+
+
+@pytest.fixture
+def robot(controller):
+    with open_aubo(controller.host) as opened:
+        yield opened
+
+
+def test_the_controller_says_where_it_listens(process):
+    assert process.greeting == (
+        f"aubo-i5 on {process.host}: JSON-RPC 30004, control 29998; Ctrl-C ends it\n"
+    )
+
+
+def test_the_state_is_that_of_the_arm(robot, controller):
+    state = robot.state()
+    assert isinstance(robot, Robot)
+    assert robot.name == f"aubo-i5 at {controller.host}"
+    assert (robot.period, state.mode, state.message) == (0.005, "ready", "")
+    truth = controller.control.truth()
+    np.testing.assert_allclose(state.base_T_flange.matrix, truth.base_T_flange, atol=1e-9)
+    np.testing.assert_allclose(state.joints, truth.joints, atol=1e-12)
+    assert abs(time.time_ns() - state.time_ns) < 0.5e9
+
+
+def test_a_straight_move_goes_where_it_should(robot, controller):
+    start = robot.state().base_T_flange
+    target = moved(start, x=0.02, z=-0.03, turn=(0.0, 0.1, -0.2))
+    robot.move_linear(target, speed=0.1, acceleration=0.5)
+    states = []
+    while (state := robot.state()).mode == "moving":
+        states.append(state)
+        robot.wait_cycle()
+    np.testing.assert_allclose(robot.state().base_T_flange.matrix, target.matrix, atol=1e-6)
+    way = np.array([s.base_T_flange.translation for s in states]) - start.translation
+    along = target.translation - start.translation
+    off = np.linalg.norm(np.cross(way, along / np.linalg.norm(along)), axis=1)
+    assert len(states) > 3 and off.max() < 1e-6
+    truth = controller.control.truth()
+    np.testing.assert_allclose(truth.base_T_flange, target.matrix, atol=1e-6)
+
+
+def test_a_joint_move_goes_where_it_should(robot):
+    target = robot.state().joints + [0.1, 0.0, -0.05, 0.0, 0.05, 0.2]
+    robot.move_joints(target, speed=0.5, acceleration=2.0)
+    assert robot.state().mode == "moving"
+    np.testing.assert_allclose(arrived(robot).joints, target, atol=1e-9)
+
+
+def test_a_move_to_where_it_is_ends_soon(robot):
+    with in_time(2.0):
+        robot.move_linear(robot.state().base_T_flange, 0.1, 0.5)
+        assert arrived(robot).mode == "ready"
+
+
+def test_a_second_move_replaces_the_first(robot):
+    start = robot.state().base_T_flange
+    robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
+    until(lambda: robot.state().base_T_flange.translation[2] < start.translation[2] - 1e-3)
+    robot.move_linear(start, 0.1, 0.5)
+    np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
+
+
+def test_velocities_are_followed_and_end_when_no_command_comes(robot, controller):
+    twist = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.05])
+    for _ in range(60):
+        robot.move_velocity(twist, acceleration=1.0)
+        robot.wait_cycle()
+    robot.move_velocity(twist, acceleration=1.0)
+    np.testing.assert_allclose(controller.control.state()["twist"], twist, atol=1e-4)
+    assert robot.state().mode == "moving"
+    began = time.monotonic()
+    until(lambda: controller.control.truth().speed == 0.0)
+    assert time.monotonic() - began > 0.5 * GRACE
+    until(lambda: robot.state().mode == "ready")
+
+
+@pytest.mark.parametrize("move", ["linear", "joints", "velocity"])
+def test_stop_ends_every_motion_soon(robot, controller, move):
+    state = robot.state()
+    if move == "linear":
+        robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
+    elif move == "joints":
+        robot.move_joints(state.joints + 0.5, 0.2, 0.5)
+    else:
+        robot.move_velocity(np.array([0, 0, -0.1, 0, 0, 0]), 1.0)
+    until(lambda: controller.control.truth().speed > 0.001)
+    with in_time(1.0):
+        robot.stop()
+    until(lambda: controller.control.truth().speed == 0.0)
+    until(lambda: robot.state().mode == "ready")
+
+
+def test_what_is_touched_is_felt_at_the_flange(robot, controller):
+    start = robot.state().base_T_flange
+    controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
+    robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
+    np.testing.assert_allclose(arrived(robot).force, [0, 0, 10, 0, 0, 0], atol=0.1)
+
+
+def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(controller):
+    host = controller.host
+    set_tool(host, [0.01, 0, 0.15, 0, 0, np.pi / 2])
+    with pytest.raises(DeviceError) as error:
+        open_aubo(host)
+    assert str(error.value) == (
+        f"aubo-i5 at {host}: the controller's tool is set to X 10.00 mm  Y 0.00 mm  Z 150.00 mm  "
+        "ROLL 0.000 deg  PITCH 0.000 deg  YAW 90.000 deg, the recipe says X 0.00 mm  Y 0.00 mm  "
+        "Z 0.00 mm  ROLL 0.000 deg  PITCH 0.000 deg  YAW 0.000 deg: poses are the flange's, so "
+        "set the tool at the pendant, or robot.driver.aubo.tool in the recipe"
+    )
+    tool = {"position": ("10 mm", "0 mm", "150 mm"), "rotation": ("0 deg", "0 deg", "90 deg")}
+    with open_aubo(host, tool=tool) as robot:
+        flange = robot.state().base_T_flange
+        truth = controller.control.truth()
+        np.testing.assert_allclose(flange.matrix, truth.base_T_flange, atol=1e-9)
+        target = moved(flange, z=-0.02, turn=(0.2, 0.0, 0.0))
+        robot.move_linear(target, 0.1, 0.5)
+        np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, target.matrix, atol=1e-6)
+
+
+@contextmanager
+def library(host):
+    """The robot as somebody else's program sees it."""
+    rpc = pyaubo_sdk.RpcClient()
+    rpc.setLogHandler(lambda *_: None)
+    assert rpc.connect(host, 30004) == 0
+    assert rpc.login("aubo", "123456") == 0
+    yield rpc.getRobotInterface("rob1")
+    rpc.disconnect()
+
+
+def set_tool(host, pose):
+    """Set a tool as somebody at the pendant would."""
+    with library(host) as robot:
+        assert robot.getRobotConfig().setTcpOffset(list(pose)) == 0
+
+
+def test_another_arm_than_the_recipes_is_refused(controller):
+    with pytest.raises(DeviceError) as error:
+        robot_aubo(load_model("robots", "ur5e"), AuboParams(host=controller.host))
+    assert "is robot.model the arm that stands there?" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("fault", "mode", "message"),
+    [
+        (
+            "protective-stop",
+            "protective stop",
+            "protective stop: look why, then release it at the pendant",
+        ),
+        ("emergency-stop", "emergency stop", "emergency stop: release the button"),
+    ],
+)
+def test_an_arm_that_stops_says_why_and_takes_no_command(controller, fault, mode, message):
+    with open_aubo(controller.host) as robot:
+        state = robot.state()
+        robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
+        until(lambda: controller.control.truth().speed > 0.001)
+        controller.control.fault(fault)
+        state = until(lambda: (s := robot.state()).mode == mode and s)
+        assert state.message == message
+        until(lambda: controller.control.truth().speed == 0.0)
+        for move in (
+            lambda: robot.move_joints(state.joints, 0.1, 0.1),
+            lambda: robot.move_linear(state.base_T_flange, 0.1, 0.1),
+            lambda: robot.move_velocity(np.zeros(6), 0.1),
+        ):
+            with in_time(), pytest.raises(DeviceError) as error:
+                move()
+            assert str(error.value) == f"aubo-i5 at {controller.host}: {message}"
+    with in_time(), pytest.raises(DeviceError) as error:
+        open_aubo(controller.host)
+    assert str(error.value) == f"aubo-i5 at {controller.host}: {message}"
+
+
+def test_an_arm_without_power_is_not_opened(controller):
+    with library(controller.host) as robot:
+        assert robot.getRobotManage().poweroff() == 0
+    with pytest.raises(DeviceError) as error:
+        open_aubo(controller.host)
+    assert str(error.value) == (
+        f"aubo-i5 at {controller.host}: the arm is in mode PowerOff: switch it on at the pendant"
+    )
+
+
+@pytest.mark.parametrize("fault", ["drop", "die", "freeze", "latency=300 ms"])
+@pytest.mark.parametrize("times", [3])
+def test_a_controller_that_is_lost_is_an_error_in_time(controller, fault, times):
+    for _ in range(times):
+        controller.control.clear()
+        until(lambda: reachable(controller.host))
+        with in_time():
+            robot = open_aubo(controller.host)
+        robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
+        controller.control.fault(fault)
+        with in_time(), pytest.raises(DeviceError) as error:
+            while True:
+                robot.state()
+        assert "\n" not in str(error.value)
+        assert str(error.value).startswith(f"aubo-i5 at {controller.host}: ")
+        with in_time():
+            robot.close()
+        controller.control.reset()
+
+
+def test_what_the_arm_cannot_do_is_a_protective_stop(robot):
+    state = robot.state()
+    robot.move_linear(moved(state.base_T_flange, x=2.0), 0.2, 1.0)
+    state = until(lambda: (s := robot.state()).mode == "protective stop" and s, 10.0)
+    assert state.message.startswith("protective stop")
+
+
+def test_nobody_there_is_one_line():
+    host = free_address()
+    with in_time(), pytest.raises(DeviceError) as error:
+        open_aubo(host)
+    assert str(error.value) == (
+        f"aubo-i5 at {host}: nothing answers at {host}:30004: is the controller on, is {host} its "
+        "address, is this computer in its network?"
+    )
+
+
+def test_a_missing_library_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyaubo_sdk", None)
+    with pytest.raises(DeviceError) as error:
+        open_aubo("127.0.0.1")
+    assert str(error.value) == (
+        "robot.aubo: the library pyaubo_sdk is not installed: pip install 'flangeye[aubo]'"
+    )
+
+
+def test_a_closed_robot_says_so(controller):
+    robot = open_aubo(controller.host)
+    robot.close()
+    robot.close()
+    with pytest.raises(DeviceError, match=f"aubo-i5 at {controller.host} is closed"):
+        robot.state()
+
+
+def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code():
+    code = (
+        "import sys\n"
+        "from tests.drivers.robots.test_aubo import open_aubo\n"
+        "robot = open_aubo(sys.argv[1])\n"
+        "print('open', flush=True)\n"
+        "input()\n"
+        "sys.exit(7)\n"
+    )
+    with Process(model="aubo-i5") as doomed:
+        running = subprocess.Popen(
+            [sys.executable, "-c", code, doomed.host],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": "."},
+        )
+        assert running.stdout.readline() == "open\n"
+        doomed.end(signal.SIGKILL)
+        with in_time():
+            _, errors = running.communicate("\n")
+    assert (running.returncode, errors) == (7, "")
+
+
+def test_the_wire_refuses_what_it_does_not_know(controller):
+    with library(controller.host) as robot:
+        with pytest.raises(pyaubo_sdk.AuboException, match="getControlBoxTemperature is not simul"):
+            robot.getRobotState().getControlBoxTemperature()
+        assert robot.getMotionControl().moveLine([0.1, 0.2], 0.5, 0.1, 0.0, 0.0) == 5
+        assert robot.getMotionControl().moveJoint([float("nan")] * 6, 0.5, 0.1, 0.0, 0.0) == 5
