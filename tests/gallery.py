@@ -14,6 +14,7 @@ INPUTS = {
     "acquire.simulated": "simulated cell",
     "acquire.archive": "recorded clouds",
     "acquire.centres": "published centres",
+    "acquire.live": "live, on loopback",
 }
 
 

@@ -149,6 +149,7 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
     """Run with a log and a progress bar, and say what came of it."""
     from rich.console import Console
 
+    from flangeye.replay import resumable
     from flangeye.session import record_run
     from flangeye.terminal import ProgressBar, print_result
 
@@ -159,6 +160,11 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
     except FlangeyeError:
         if folder.log.exists():
             sys.stderr.write(f"what was gathered is in {folder.log}\n")
+            if resumable(recipe):
+                sys.stderr.write(
+                    f"go on with it: flangeye run --resume {folder.path}"
+                    f"{' --move' if start.motion.allowed else ''}\n"
+                )
         raise
     print_result(Console(), result)
     typer.echo(f"\n{folder.path}/: report.html  calibration.yaml  result.json  run.mcap")

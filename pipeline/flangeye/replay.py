@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from flangeye import types as t
 from flangeye.errors import StageError
@@ -141,4 +141,12 @@ def earlier_run(path: Path, registry: Registry) -> tuple[Recipe, Earlier]:
     if text is None:
         raise StageError(f"{log.path}: holds no recipe; it cannot be gone on with")
     name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
-    return parse_recipe(text.decode(), name, registry), Earlier(log)
+    recipe = parse_recipe(text.decode(), name, registry)
+    if not resumable(recipe):
+        raise StageError(f"{log.path}: {recipe.steps[0].stage.name} begins anew each time")
+    return recipe, Earlier(log)
+
+
+def resumable(recipe: Recipe) -> bool:
+    """Return whether the recipe's source leaves out what an earlier run already took."""
+    return any(t.Resumed in get_args(need) for need in recipe.steps[0].stage.needs.values())

@@ -76,7 +76,7 @@ def _serial(rs: Any, wanted: str | None) -> str:
         )
     if wanted is None and len(found) == 1:
         return str(found[0])
-    if wanted not in found:
+    if wanted is None or wanted not in found:
         problem = f"no camera {wanted}; there are" if wanted else "several cameras, give serial"
         raise DeviceError(f"{NAME}: {problem}: {', '.join(found)}")
     return wanted

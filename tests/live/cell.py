@@ -1,0 +1,100 @@
+"""A live cell on loopback: a controller, a recipe for it, and the run as a person starts it."""
+
+import json
+import subprocess
+import sys
+import time
+
+from flangeye.errors import StageError
+from flangeye.runlog import read_run
+from tests.loopback.process import Process
+
+START = "180 -90 90 -90 -90 0 deg"
+
+RECIPE = """
+title: A cell on loopback
+robot:
+  model: ur5e
+  driver: {{ur_rtde: {{host: {host}}}}}
+  limits:
+    box: {{centre: [450 mm, 0 mm, 500 mm], size: [1000 mm, 1400 mm, 900 mm]}}
+    speed: {speed}
+    acceleration: 2 m/s^2
+    joint_speed: 100 deg/s
+scanner:
+  model: phoxi-m
+  driver: {{loopback: {{host: {host}, robot: ur5e, resolution: 0.2, {scanner}}}}}
+steps:
+  - acquire.live:
+      view: {{guess: {{position: [620 mm, 0 mm, 980 mm]}}}}
+      poses: {{next_best: {{count: {count}, candidates: 60}}}}
+      verification: 0
+  - segment.flange
+  - fit.rim
+  - solve.robust
+  - verify.holdout: {{max_rms: 2 mm}}
+"""
+
+
+class Cell:
+    """A controller on loopback and a recipe that drives it."""
+
+    def __init__(self, folder, *arguments):
+        self.folder = folder
+        self.controller = Process("--joints", START, "--seed", "1", *arguments)
+        self.control = self.controller.control
+
+    def recipe(self, count=5, scanner="seed: 1", speed="1 m/s"):
+        path = self.folder / "cell.yaml"
+        host = self.controller.host
+        path.write_text(RECIPE.format(host=host, count=count, scanner=scanner, speed=speed))
+        return path
+
+    def start(self, *words):
+        """Start ``flangeye run`` in the background."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "flangeye.cli", "run", *map(str, words)],
+            cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+
+    def run(self, *words, patience=150):
+        """Return exit code, output and errors of ``flangeye run``."""
+        process = self.start(*words)
+        out, err = process.communicate(timeout=patience)
+        return process.returncode, out, err
+
+    def wait_until(self, condition, patience=60):
+        deadline = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < deadline, "it did not come so far"
+            time.sleep(0.02)
+
+    def moving(self):
+        return self.control.truth().speed > 0.05
+
+    def standing(self):
+        return self.control.truth().speed < 1e-4
+
+    def log(self, run="run"):
+        return read_run(self.folder / run / "run.mcap")
+
+    def finished(self):
+        """Return the captures that have gone through so far; none while there is no log yet."""
+        try:
+            return self.log().finished
+        except StageError:
+            return []
+
+    def captures(self, run="run"):
+        """Return the ids of the captures in a run's log, in order."""
+        return list(self.log(run).poses)
+
+    def result(self, run):
+        return json.loads((self.folder / run / "result.json").read_text())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.controller.__exit__()
