@@ -57,6 +57,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell):
     assert [o["id"] for o in result["observations"]] == cell.captures("again")
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell):
     process = cell.start(cell.recipe(), "--move", "--out", "run")
     cell.wait_until(cell.finished, patience=120)
@@ -70,6 +71,7 @@ def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell):
     process.communicate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "line"),
     [
@@ -100,6 +102,7 @@ def test_a_scanner_that_is_lost_stops_the_arm(cell):
     assert cell.standing()
 
 
+@pytest.mark.slow
 def test_a_dropped_frame_costs_one_pose(cell):
     recipe = cell.recipe(count=8, scanner="dropped: 0.4, seed: 3")
     code, _, err = cell.run(recipe, "--move", "--out", "run")
@@ -111,6 +114,7 @@ def test_a_dropped_frame_costs_one_pose(cell):
     assert len(log.poses) + len(log.rejections) == 8
 
 
+@pytest.mark.slow
 def test_the_arm_stands_while_it_is_scanned_and_the_pose_is_its_own(cell):
     code, _, err = cell.run(cell.recipe(), "--move", "--out", "run")
     assert code == 0, err
