@@ -23,12 +23,6 @@ from flangeye.cloudfile import PER_METRE, LengthUnit, check_cloud_file, read_clo
 from flangeye.record import adapter
 from flangeye.runlog import read_run
 from flangeye.types import ArchivePath, Capture, Captures, Source, Transform
-from flangeye_plugins.acquisition.cloudunit import (
-    check_unit,
-    detect_unit,
-    median_distance,
-    unit_note,
-)
 from flangeye_plugins.acquisition.opening import (
     OpeningParams,
     archive_path,
@@ -36,6 +30,12 @@ from flangeye_plugins.acquisition.opening import (
     log_source,
     open_archive,
     skipped_note,
+)
+from flangeye_plugins.readers.cloudunit import (
+    check_unit,
+    detect_unit,
+    median_distance,
+    unit_note,
 )
 
 StatedUnit = Literal["auto", "m", "mm"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flangeye.catalogue import ScannerModel
 from flangeye.devices import DeviceError
 from flangeye.types import CAMERA, PointCloud
-from flangeye_plugins.acquisition.cloudunit import STATED_LIMIT, median_distance, times_outside
+from flangeye_plugins.readers.cloudunit import STATED_LIMIT, median_distance, times_outside
 
 
 def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:

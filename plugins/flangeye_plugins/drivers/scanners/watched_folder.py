@@ -18,8 +18,8 @@ from flangeye.errors import StageError
 from flangeye.stage import Params, RecipePath, part
 from flangeye.types import PointCloud
 from flangeye.units import Duration, param
-from flangeye_plugins.acquisition.cloudunit import check_unit, median_distance
 from flangeye_plugins.drivers.scanners.opened import OpenScanner
+from flangeye_plugins.readers.cloudunit import check_unit, median_distance
 
 NAME = "scanner.watched_folder"
 
