@@ -18,9 +18,10 @@ def hat(v: Floats) -> Floats:
 
 
 def rotation_exp(phi: Floats) -> Floats:
-    """Return the rotation of a rotation vector, (3,) [rad] -> (3, 3) (Rodrigues)."""
-    angle = float(np.linalg.norm(phi))
-    k = hat(np.asarray(phi, dtype=np.float64))
+    """Return the rotations of rotation vectors, (..., 3) [rad] -> (..., 3, 3) (Rodrigues)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    k = hat(phi)
     # sin(x)/x and (1 - cos(x))/x^2 without cancellation near zero.
     a = np.sinc(angle / np.pi)
     b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
@@ -28,32 +29,37 @@ def rotation_exp(phi: Floats) -> Floats:
 
 
 def rotation_log(rotation: Floats) -> Floats:
-    """Return the rotation vector (3,) [rad] of a (3, 3) rotation, its length at most pi."""
+    """Return the rotation vectors (..., 3) [rad] of (..., 3, 3), their length at most pi."""
     q = quaternion_from_rotation(rotation)
-    xyz, w = q[:3], q[3]
-    length = float(np.linalg.norm(xyz))
-    if length < 1e-12:
-        return 2.0 * xyz
-    return np.asarray(xyz / length * 2.0 * np.arctan2(length, w))
+    xyz, w = q[..., :3], q[..., 3:]
+    length = np.linalg.norm(xyz, axis=-1, keepdims=True)
+    # Twice the angle over its sine; at zero angle, where w is one, the ratio is two.
+    ratio = 2.0 * np.arctan2(length, w) / np.maximum(length, 1e-300)
+    return np.asarray(xyz * np.where(length < 1e-12, 2.0, ratio))
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
-    """Return the unit quaternion (4,) xyzw, w >= 0, of a (3, 3) rotation (Bar-Itzhack 2000).
+    """Return unit quaternions (..., 4) xyzw, w >= 0, of (..., 3, 3) (Bar-Itzhack 2000).
 
     The dominant eigenvector of a symmetric matrix: stable at every angle, and the nearest
     rotation where the matrix is not quite orthonormal.
     """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rotation, dtype=np.float64)
-    k = np.array(
+    r = np.asarray(rotation, dtype=np.float64)
+    symmetric = r + np.swapaxes(r, -1, -2)
+    trace = np.trace(r, axis1=-2, axis2=-1)[..., None, None]
+    k = np.empty((*r.shape[:-2], 4, 4))
+    k[..., :3, :3] = symmetric - trace * np.eye(3)
+    k[..., 3, 3] = trace[..., 0, 0]
+    k[..., :3, 3] = k[..., 3, :3] = np.stack(
         [
-            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
-            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
-            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
+            r[..., 2, 1] - r[..., 1, 2],
+            r[..., 0, 2] - r[..., 2, 0],
+            r[..., 1, 0] - r[..., 0, 1],
+        ],
+        axis=-1,
     )
-    q = np.linalg.eigh(k)[1][:, -1]
-    return np.asarray(q if q[3] >= 0 else -q)
+    q = np.linalg.eigh(k)[1][..., -1]
+    return np.asarray(np.where(q[..., 3:] >= 0, q, -q))
 
 
 def rotation_from_quaternion(xyzw: Floats) -> Floats:
@@ -94,6 +100,22 @@ def rigid(rotation: Floats, translation: Floats) -> Floats:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation, translation
     return out
+
+
+def invert(transforms: Floats) -> Floats:
+    """Return the inverses of rigid (..., 4, 4) matrices."""
+    out = np.zeros_like(transforms)
+    out[..., :3, :3] = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    out[..., :3, 3] = -(out[..., :3, :3] @ transforms[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def nearest_rotation(matrices: Floats) -> Floats:
+    """Return the proper rotations (..., 3, 3) nearest to any (..., 3, 3), by Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]
+    return np.asarray(u @ vt)
 
 
 def basis_of_plane(normal: Floats) -> Floats:

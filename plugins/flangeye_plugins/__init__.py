@@ -36,6 +36,8 @@ from flangeye_plugins.refining.compensate import refine_compensate
 from flangeye_plugins.segmentation.flange import segment_flange
 from flangeye_plugins.segmentation.sphere import segment_sphere
 from flangeye_plugins.solving.iterative import solve_iterative
+from flangeye_plugins.solving.maximum_likelihood import solve_maximum_likelihood
+from flangeye_plugins.solving.named import CLOSED_FORMS
 from flangeye_plugins.solving.robust import solve_robust
 from flangeye_plugins.solving.svd import solve_svd
 from flangeye_plugins.studies.by_iteration import verify_by_iteration
@@ -69,6 +71,8 @@ def flangeye_stages() -> Iterable[Stage]:
         solve_robust,
         solve_svd,
         solve_iterative,
+        solve_maximum_likelihood,
+        *CLOSED_FORMS,
         refine_compensate,
         verify_holdout,
         verify_icp,

@@ -136,14 +136,15 @@ def graduated_non_convexity(centres: Floats, tcps: Floats, threshold: float, sta
         return np.ones(len(centres), dtype=bool)
     mu = limit / (2 * squares.max() - limit)
     while True:
-        weights = _truncated_weights(squares, limit, mu)
+        weights = truncated_weights(squares, limit, mu)
         if (np.minimum(weights, 1 - weights) < 1e-6).all() or mu > 1e12:
             return weights > 0.5
         squares = _squares(centres, tcps, kabsch(centres, tcps, weights))
         mu *= 1.4
 
 
-def _truncated_weights(squares: Floats, limit: float, mu: float) -> Floats:
+def truncated_weights(squares: Floats, limit: float, mu: float) -> Floats:
+    """Return the weights of truncated least squares at one step of its graduation."""
     weights = np.sqrt(limit * mu * (mu + 1) / np.maximum(squares, 1e-300)) - mu
     weights[squares <= mu / (mu + 1) * limit] = 1.0
     weights[squares >= (mu + 1) / mu * limit] = 0.0

@@ -1,0 +1,1 @@
+"""Closed forms of the literature, each from its paper. Arrays only."""
