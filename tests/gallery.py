@@ -1,4 +1,4 @@
-"""Writes the table of recipes/README.md from the recipes themselves: python -m tests.gallery"""
+"""Writes the tables of recipes/README.md and README.md from the recipes: python -m tests.gallery"""
 
 import re
 from pathlib import Path
@@ -8,10 +8,24 @@ from flangeye.registry import load_registry
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "recipes" / "README.md"
+FRONT = ROOT / "README.md"
 TABLE = re.compile(r"(<!-- begin gallery -->\n).*?(<!-- end -->)", re.S)
+GRID = re.compile(r"(<!-- begin configurations -->\n).*?(<!-- end -->)", re.S)
+
+CONFIGURATIONS = {
+    "eye-on-base": "eye-on-base",
+    "eye-in-hand": "eye-in-hand",
+    "eye-on-arm-1": "eye-on-arm, case 1",
+    "eye-on-arm-2": "eye-on-arm, case 2",
+    "two-arms": "two arms",
+    "four-axes": "four axes, eye-in-hand",
+}
+"""Recipes of recipes/configurations, by the first word of their name."""
 
 INPUTS = {
     "acquire.simulated": "simulated cell",
+    "acquire.simulated_session": "simulated scans",
+    "acquire.simulated_marker": "simulated marker",
     "acquire.archive": "recorded clouds",
     "acquire.centres": "published centres",
     "acquire.live": "live, on loopback",
@@ -45,10 +59,41 @@ def _row(name, recipe):
     return "| " + " | ".join(cells) + " |"
 
 
+def configurations() -> str:
+    """Return one row for each configuration: marker or not, closed form or maximum likelihood."""
+    rows = [
+        "| configuration | marker: closed form | marker: maximum likelihood "
+        "| no marker: closed form | no marker: maximum likelihood |",
+        "|---|---|---|---|---|",
+    ]
+    for key, words in CONFIGURATIONS.items():
+        cells = [
+            ", ".join(_links(key, marker, how)) or "—"
+            for marker in (True, False)
+            for how in ("closed-form", "most-likely")
+        ]
+        rows.append(f"| {words} | " + " | ".join(cells) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def _links(key: str, marker: bool, how: str) -> list[str]:
+    found = []
+    for name in recipe_names():
+        folder, _, rest = name.partition("/")
+        words = rest.split("_")
+        if folder != "configurations" or words[0] != key or words[2] != how:
+            continue
+        if (words[1] == "marker") is marker:
+            found.append(f"[{words[1]}](recipes/{name}.yaml)")
+    return found
+
+
 def renewed(text: str) -> str:
-    """Return the page with its table made again."""
-    return TABLE.sub(lambda m: m[1] + gallery() + m[2], text)
+    """Return the page with its tables made again."""
+    text = TABLE.sub(lambda m: m[1] + gallery() + m[2], text)
+    return GRID.sub(lambda m: m[1] + configurations() + m[2], text)
 
 
 if __name__ == "__main__":
-    README.write_text(renewed(README.read_text()))
+    for page in (README, FRONT):
+        page.write_text(renewed(page.read_text()))

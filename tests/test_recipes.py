@@ -6,9 +6,13 @@ import sys
 
 import pytest
 
+from flangeye.configuration import Configuration
 from flangeye.recipe import load_recipe, recipe_names
 from flangeye.registry import load_registry
+from flangeye.runfolder import RunFolder
+from flangeye.runlog import read_run
 from flangeye.schema import recipe_schema
+from flangeye.session import Start, record_run
 from flangeye.yamlfile import read_yaml
 
 NAMES = list(recipe_names())
@@ -35,7 +39,7 @@ def test_a_recipe_checks_and_resolves(name):
 
 
 # Those of recipes/paper are studies; tests/studies runs them.
-CALIBRATIONS = [name for name in NAMES if not name.startswith("paper/")]
+CALIBRATIONS = [name for name in NAMES if "/" not in name]
 
 
 @pytest.mark.parametrize("name", CALIBRATIONS)
@@ -61,6 +65,27 @@ def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
             if step.stage.name == "verify.holdout"
         ]
         assert result["truth"]["rms_over_workspace"] < limit
+
+
+CONFIGURATIONS = [name for name in NAMES if name.startswith("configurations/")]
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
+    registry = load_registry()
+    scans = first_step(name) == "acquire.simulated_session"
+    checked = load_recipe(
+        recipe_names()[name], registry, ["steps.0.resolution=0.3"] if scans else []
+    )
+    folder = RunFolder.create(name, tmp_path / "run")
+    result = record_run(checked, registry, folder, Start(), report=False)
+    assert result.status == "verified"
+    assert set(result.transforms) == set(checked.context[Configuration].unknowns)
+    assert sum(o.used for o in result.observations) >= 0.8 * len(result.observations)
+    assert result.truth.rms_over_workspace < 6 * result.workspace.predicted_rms
+    (limit,) = [s.params.max_rms for s in checked.steps if s.stage.name == "verify.holdout"]
+    assert result.truth.rms_over_workspace < limit
+    assert read_run(folder.log).calibration().transforms.keys() == result.transforms.keys()
 
 
 def test_the_published_aubo_clouds_reach_the_target(ancorasir, tmp_path):

@@ -261,16 +261,20 @@ def _p95_of_gaussians(covariances: t.Array, draws: int = 400) -> float:
 
 
 def truth_result(calibration: t.HandEye, truth: t.Truth, box: t.Box) -> TruthResult:
-    """Return how far the estimate maps points of the workspace from where they are."""
+    """Return how far the estimate maps points of the workspace from where they are.
+
+    What is marked as unobservable does not count.
+    """
     error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
     known = {x.name: x for x in (truth.camera, *truth.others)}
+    free = calibration.camera.unobservable[:, 3:]
     found = calibration.transforms
     return TruthResult(
         base_T_camera=truth.camera.matrix.tolist() if truth.camera.parent == t.BASE else None,
         transforms={name: x.matrix.tolist() for name, x in known.items()},
         errors={name: _error(found[name], known[name]) for name in found if name in known},
-        error_at_centroid=float(_displacement(error, box.centre)),
-        rms_over_workspace=float(np.sqrt((_displacement(error, box.grid()) ** 2).mean())),
+        error_at_centroid=float(_displacement(error, box.centre, free)),
+        rms_over_workspace=float(np.sqrt((_displacement(error, box.grid(), free) ** 2).mean())),
         rotation_error=float(np.linalg.norm(rotation_log(error[:3, :3]))),
     )
 
@@ -286,8 +290,10 @@ def _error(estimate: t.TransformEstimate, truth: t.Transform) -> TransformErrorR
     )
 
 
-def _displacement(error: t.Array, points: Any) -> Any:
-    return np.linalg.norm(points @ error[:3, :3].T + error[:3, 3] - points, axis=-1)
+def _displacement(error: t.Array, points: Any, free: t.Array) -> Any:
+    """Return how far points are moved across the rows of ``free``, which do not count."""
+    moved = points @ error[:3, :3].T + error[:3, 3] - points
+    return np.linalg.norm(moved - moved @ free.T @ free, axis=-1)
 
 
 def holdout_result(verifications: Mapping[str, t.Verification]) -> HoldoutResult | None:

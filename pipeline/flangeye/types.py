@@ -135,6 +135,12 @@ class Transform:
         if not orthonormal or np.linalg.det(rotation) < 0 or tuple(self.matrix[3]) != (0, 0, 0, 1):
             raise ValueError(f"{self.name} is not a rigid transform")
 
+    @classmethod
+    def named(cls, name: str, matrix: Any) -> Transform:
+        """Return the transform of a name such as ``base_T_camera``."""
+        parent, _, child = name.partition("_T_")
+        return cls(parent, child, matrix)
+
     @property
     def name(self) -> str:
         """``parent_T_child``."""

@@ -8,6 +8,10 @@ from flangeye_plugins.acquisition.archive import acquire_archive
 from flangeye_plugins.acquisition.centres import acquire_centres
 from flangeye_plugins.acquisition.live import acquire_live
 from flangeye_plugins.acquisition.simulated import acquire_simulated
+from flangeye_plugins.acquisition.simulated_session import (
+    acquire_simulated_marker,
+    acquire_simulated_session,
+)
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
 from flangeye_plugins.doctoring import CHECKS
 from flangeye_plugins.drivers.robots.aubo.driver import robot_aubo
@@ -60,6 +64,8 @@ def flangeye_stages() -> Iterable[Stage]:
     """Offer the built-in stages."""
     return (
         acquire_simulated,
+        acquire_simulated_marker,
+        acquire_simulated_session,
         acquire_archive,
         acquire_live,
         acquire_centres,

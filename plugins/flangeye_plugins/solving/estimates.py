@@ -21,7 +21,7 @@ def transforms_of(
     """Return a configuration's unknowns by name, from X, Y and Z (4, 4)."""
     values = [x, *([y] if configuration.other_base else []), z]
     return {
-        name: Transform(*name.split("_T_"), matrix)
+        name: Transform.named(name, matrix)
         for name, matrix in zip(configuration.unknowns, values, strict=False)
     }
 

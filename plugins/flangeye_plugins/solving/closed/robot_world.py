@@ -59,5 +59,5 @@ def _with_translations(
     left = np.zeros((n, 3, 6))
     left[:, :, :3], left[:, :, 3:] = carried[:, :3, :3], -np.eye(3)
     right = eyes[:, :3, 3] @ z.T - carried[:, :3, 3]
-    found = np.linalg.lstsq(left.reshape(-1, 6), right.ravel(), rcond=None)[0]
+    found = np.asarray(np.linalg.lstsq(left.reshape(-1, 6), right.ravel(), rcond=None)[0], float)
     return rigid(x, found[:3]), rigid(z, found[3:])
