@@ -10,6 +10,8 @@ import pytest
 import yaml
 
 from flangeye import cli, registry
+from flangeye.errors import NothingMoved
+from flangeye.types import Rejection
 from tests import toy
 from tests.conftest import replaced
 
@@ -197,3 +199,57 @@ def test_ctrl_c_keeps_what_was_gathered(flangeye, toy_recipe, monkeypatch):
         "what was gathered is in a/run.mcap", "error: stopped by Ctrl-C",
     ]  # fmt: skip
     assert "3 went through" in flangeye("show", "a/run.mcap")[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((), "error: name a recipe, or --resume RUN, which brings its own"),
+        (("toy.yaml", "--resume", "done"),
+         "error: name a recipe, or --resume RUN, which brings its own"),
+        (("--resume", "done", "--set", "seed=4"),
+         "error: --set and --resume: a run goes on with the recipe it began with"),
+        (("--resume", "nowhere"), "error: nowhere: cannot be read: No such file or directory"),
+        (("--resume", "done"),
+         "error: done/run.mcap: this run came to its end; there is nothing to go on with"),
+        (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_gone_on_with_is_said(flangeye, toy_recipe, tmp_path, words, line):
+    assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
+    log = (tmp_path / "done" / "run.mcap").read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(log[: len(log) // 2])
+    assert flangeye("run", *words)[::2] == (2, f"{line}\n")
+
+
+def test_a_plan_that_was_not_allowed_to_move_is_no_mistake(flangeye, toy_recipe, tmp_path):
+    def acquire(seed, params):
+        raise NothingMoved("stop 1: here\nnothing moved")
+
+    with replaced(toy.acquire, acquire):
+        code, out, err = flangeye("run", toy_recipe, "--out", "here")
+    assert (code, out, err) == (0, "stop 1: here\nnothing moved\n", "")
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_source_may_reject_its_own_captures(flangeye, toy_recipe, tmp_path):
+    plain = toy.acquire.function
+    made = []
+
+    def acquire(seed, params):
+        captures = plain(seed, params)
+        made.append(captures)
+        items = captures._items
+        captures._items = (
+            Rejection(c.id, "acquire.toy", "the arm moved") if c.id == "001" else c for c in items
+        )
+        return captures
+
+    with replaced(toy.acquire, acquire):
+        assert flangeye("run", toy_recipe, "--out", "here")[0] == 0
+    result = json.loads((tmp_path / "here" / "result.json").read_text())
+    aside = [o for o in result["observations"] if not o["used"]]
+    assert [(o["id"], o["reason"]) for o in aside] == [("001", "acquire.toy: the arm moved")]
+    became = made[0].became
+    assert became["001"] is None
+    assert became["000"].id == "000"

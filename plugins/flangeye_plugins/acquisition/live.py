@@ -54,9 +54,6 @@ from flangeye_plugins.motion.watch import Sample
 Floats = NDArray[np.float64]
 
 
-GAP_NS = 30_000_000
-"""Samples of the arm are nearer to one another than this [ns]."""
-
 HOW_TO_MOVE = "\nnothing moved: --move lets the arm go"
 
 
@@ -274,14 +271,13 @@ class Session:
 
 
 def within(samples: Sequence[Sample], start_ns: int, end_ns: int) -> list[Sample]:
-    """Return the samples of an exposure; none when they do not cover it."""
-    covered = (
-        samples
-        and samples[0].time_ns <= start_ns + GAP_NS
-        and samples[-1].time_ns >= end_ns - GAP_NS
-    )
-    inside = [s for s in samples if start_ns - GAP_NS <= s.time_ns <= end_ns + GAP_NS]
-    return inside if covered else []
+    """Return the samples of an exposure, one on either side; none when they do not cover it."""
+    if not samples or samples[0].time_ns > start_ns or samples[-1].time_ns < end_ns:
+        return []
+    times = np.array([sample.time_ns for sample in samples])
+    first = int(np.searchsorted(times, start_ns, side="right")) - 1
+    last = int(np.searchsorted(times, end_ns, side="left"))
+    return list(samples[first : last + 1])
 
 
 def movement(samples: Sequence[Sample]) -> float:

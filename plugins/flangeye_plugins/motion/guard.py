@@ -91,12 +91,14 @@ class Guard:
         self._legs: list[Leg] = []
         self._told_ns = 0
         self._barred: str | None = None
+        self._wanted: tuple[int, int] | None = None
 
     def run(self) -> None:
         """Watch the arm, cycle by cycle, until the program closes the wire."""
         self._open()
         while self._obey():
             self._cycle()
+            self._tell_samples()
 
     def _open(self) -> None:
         try:
@@ -173,8 +175,19 @@ class Guard:
             elif request == "stop":
                 self._halt_if_possible()
             elif request == "samples":
-                self._wire.send(Report("samples", _during(self._watch.samples, *content)))
+                self._wanted = content
         return True
+
+    def _tell_samples(self) -> None:
+        """Answer for an interval once it is over, or when no more will come of it."""
+        if self._wanted is None:
+            return
+        start_ns, end_ns = self._wanted
+        samples = self._watch.samples
+        over = bool(samples) and samples[-1].time_ns >= end_ns
+        if over or self._barred is not None:
+            self._wire.send(Report("samples", _during(samples, start_ns, end_ns)))
+            self._wanted = None
 
     def _go(self, route: Route) -> None:
         self._legs = list(route.legs)
@@ -192,7 +205,7 @@ class Guard:
 
 def _during(samples: Any, start_ns: int, end_ns: int) -> list[Sample]:
     """Return the samples of an interval, and the nearest on either side of it."""
-    times = np.array([sample.time_ns for sample in samples])
+    times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     first = max(int(np.searchsorted(times, start_ns, side="right")) - 1, 0)
     last = int(np.searchsorted(times, end_ns, side="left"))
     return list(samples)[first : last + 1]
