@@ -37,6 +37,7 @@ from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.corrected import corrected
 from flangeye_plugins.readers.folder import folder
 from flangeye_plugins.refining.compensate import refine_compensate
+from flangeye_plugins.seams.scanning import scan_file, scan_live, scan_simulated
 from flangeye_plugins.segmentation.flange import segment_flange
 from flangeye_plugins.segmentation.sphere import segment_sphere
 from flangeye_plugins.solving.iterative import solve_iterative
@@ -82,6 +83,9 @@ def flangeye_stages() -> Iterable[Stage]:
         refine_compensate,
         verify_holdout,
         verify_icp,
+        scan_simulated,
+        scan_file,
+        scan_live,
         acquire_points,
         acquire_published_centres,
         verify_realisations,

@@ -1,0 +1,188 @@
+"""A workpiece to weld: its CAD as triangles, and its seams as polylines, from one YAML file.
+
+::
+
+    title: Plate with a straight V-groove
+    cad: plate.stl            # STL or PLY, beside this file
+    unit: mm                  # of the CAD and of the points below; neither says it itself
+    seams:
+      - name: groove
+        points: [[-100, -10, 14], [100, -10, 14]]   # along the root, from start to end
+        opening: [0, 0, 1]                          # out of the groove, towards the torch
+        half_angle: 40 deg
+        half_width: 8.4 mm
+    source: where the CAD comes from
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+
+from flangeye.catalogue import Model, read_model
+from flangeye.cloudfile import PER_METRE, LengthUnit
+from flangeye.errors import StageError
+from flangeye.shipped import shipped
+from flangeye.units import Angle, Length
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+MESHES = (".stl", ".ply")
+MARGIN = 0.1
+"""A seam may be this far outside the CAD's box, as a share of its diagonal."""
+
+
+class SeamLine(Model):
+    """One seam as the file has it."""
+
+    name: str
+    points: tuple[Vector, ...] = Field(min_length=2, description="Along the root, in order.")
+    opening: Vector = Field(description="Out of the groove, towards the torch; of any length.")
+    half_angle: Angle | None = Field(None, description="Between a wall and the opening.")
+    half_width: Length | None = Field(None, description="From the root to a shoulder, sideways.")
+
+
+class WorkpieceFile(Model):
+    """The file."""
+
+    title: str
+    cad: str = Field(description="STL or PLY file with triangles, beside this one.")
+    unit: LengthUnit = Field(description="Of the CAD's coordinates and of the seams' points.")
+    seams: tuple[SeamLine, ...] = Field(min_length=1)
+    source: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class CadSeam:
+    """One seam in the CAD's frame.
+
+    Attributes:
+        points: (N, 3) along the root [m].
+        opening: (3,) unit vector towards the torch.
+        half_angle: Between a wall and the opening [rad], if known.
+        half_width: From the root to a shoulder [m], if known.
+    """
+
+    points: Floats
+    opening: Floats
+    half_angle: float | None
+    half_width: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Workpiece:
+    """A workpiece in its CAD's own frame.
+
+    Attributes:
+        title: For people.
+        path: Its file.
+        unit: In which the CAD was said to be.
+        vertices: (V, 3) [m].
+        triangles: (T, 3) indices of vertices.
+        seams: By name.
+    """
+
+    title: str
+    path: Path
+    unit: LengthUnit
+    vertices: Floats
+    triangles: NDArray[np.int32]
+    seams: Mapping[str, CadSeam]
+
+    @property
+    def diagonal(self) -> float:
+        """Of the box around it [m]."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+
+def _shipped_or_beside(value: Any, info: ValidationInfo) -> Path:
+    if not isinstance(value, (str, Path)):
+        raise ValueError("a workpiece is a name or a path to a .yaml file")
+    if str(value).endswith((".yaml", ".yml")):
+        path = Path(value).expanduser()
+        return path if info.context is None else info.context.folder / path
+    found = shipped("data") / "workpieces" / f"{value}.yaml"
+    if not found.is_file():
+        known = sorted(p.stem for p in found.parent.glob("*.yaml"))
+        near = difflib.get_close_matches(str(value), known, n=2) or known
+        raise ValueError(f"no workpiece '{value}'; known: {', '.join(near)}, or a .yaml file")
+    return found
+
+
+WorkpiecePath = Annotated[
+    Path,
+    BeforeValidator(_shipped_or_beside),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
+"""A parameter that names a workpiece: a shipped one, or a file beside the recipe."""
+
+
+def load_workpiece(path: Path) -> Workpiece:
+    """Read a workpiece and its CAD.
+
+    Raises:
+        RecipeError: The YAML file is wrong; every mistake with its line.
+        StageError: The CAD cannot be read, or a seam is not on it.
+    """
+    file: WorkpieceFile = read_model(path, WorkpieceFile)
+    scale = 1.0 / PER_METRE[file.unit]
+    vertices, triangles = read_mesh(path.parent / file.cad)
+    vertices = vertices * scale
+    seams = {line.name: _seam(path, line, scale) for line in file.seams}
+    if len(seams) < len(file.seams):
+        raise StageError(f"{path}: two seams have one name")
+    for name, seam in seams.items():
+        _check_on_part(path, name, seam, vertices)
+    return Workpiece(file.title, path, file.unit, vertices, triangles, seams)
+
+
+def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
+    """Return vertices (V, 3), in the file's unit, and triangles (T, 3) of an STL or PLY file.
+
+    Raises:
+        StageError: It is missing, damaged, or holds no triangles.
+    """
+    if path.suffix.lower() not in MESHES:
+        raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
+    if not path.is_file():
+        raise StageError(f"{path}: no such file")
+    import open3d as o3d
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(path)
+    vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    if not len(triangles):
+        raise StageError(f"{path}: holds no triangles; is it a mesh, and whole?")
+    if not np.isfinite(vertices).all():
+        raise StageError(f"{path}: holds vertices that are not finite")
+    return np.array(vertices), np.array(triangles, dtype=np.int32)
+
+
+def _seam(path: Path, line: SeamLine, scale: float) -> CadSeam:
+    points = np.array(line.points) * scale
+    opening = np.array(line.opening)
+    if not (np.linalg.norm(np.diff(points, axis=0), axis=1) > 0).all():
+        raise StageError(f"{path}: seam '{line.name}' has the same point twice in a row")
+    if not np.linalg.norm(opening) > 0:
+        raise StageError(f"{path}: seam '{line.name}' has an opening without a direction")
+    opening = opening / np.linalg.norm(opening)
+    return CadSeam(points, opening, line.half_angle, line.half_width)
+
+
+def _check_on_part(path: Path, name: str, seam: CadSeam, vertices: Floats) -> None:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    outside = np.maximum(np.maximum(low - seam.points, seam.points - high), 0.0)
+    off = float(np.linalg.norm(outside, axis=1).max())
+    if off > MARGIN * np.linalg.norm(high - low):
+        raise StageError(
+            f"{path}: seam '{name}' is {off * 1e3:.4g} mm outside its CAD; both must be in one "
+            "frame and one unit"
+        )
