@@ -37,6 +37,7 @@ from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.corrected import corrected
 from flangeye_plugins.readers.folder import folder
 from flangeye_plugins.refining.compensate import refine_compensate
+from flangeye_plugins.seams.cad import seam_cad
 from flangeye_plugins.seams.scanning import scan_file, scan_live, scan_simulated
 from flangeye_plugins.segmentation.flange import segment_flange
 from flangeye_plugins.segmentation.sphere import segment_sphere
@@ -86,6 +87,7 @@ def flangeye_stages() -> Iterable[Stage]:
         scan_simulated,
         scan_file,
         scan_live,
+        seam_cad,
         acquire_points,
         acquire_published_centres,
         verify_realisations,

@@ -39,12 +39,14 @@ class Plate:
         title: For people.
         root: y of the groove's root at x, (N,) to (N,) [m]; its slope at both ends is zero.
         straight: Whether two stations are enough.
+        ribbed: Whether it has the rib; without, it can be slid or turned and look the same.
     """
 
     name: str
     title: str
     root: Callable[[Floats], Floats]
     straight: bool = False
+    ribbed: bool = True
 
     def stations(self) -> Floats:
         """Return (S,) x of the cross-sections [m]."""
@@ -72,7 +74,7 @@ class Plate:
         aside = np.stack([-slope, np.ones(len(x))], axis=1) / np.hypot(slope, 1.0)[:, None]
         half = DEPTH * np.tan(HALF_ANGLE)
         foot = HEIGHT + 0.0 * x
-        top = HEIGHT + _rib_height(x)
+        top = HEIGHT + (_rib_height(x) if self.ribbed else 0.0 * x)
         middle = np.stack([x, root], axis=1)
         lines = [
             np.column_stack([x, 0 * x - WIDTH / 2, foot]),
@@ -102,7 +104,7 @@ def _solid(top: Floats, bottom: Floats) -> Mesh:
     under = index + stations * corners
     edges = [index[:, 0], index[-1, :], index[::-1, -1], index[0, ::-1]]
     loop = np.concatenate([edge[:-1] for edge in edges])
-    skirt = np.stack([loop + stations * corners, loop])
+    skirt = np.stack([loop, loop + stations * corners])
     triangles = [_quads(index), _quads(under)[:, ::-1], _quads(np.c_[skirt, skirt[:, :1]])]
     vertices = np.concatenate([top.reshape(-1, 3), bottom.reshape(-1, 3)])
     return Mesh(vertices, np.concatenate(triangles).astype(np.int32))
