@@ -17,10 +17,12 @@ demo: $(VENV)/.run
 	$(BIN)/flangeye run ur5_phoxi-m_simulated
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 -m "not slow and not realtime"
+	$(BIN)/python -m pytest -q -m "not slow and realtime"
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 -m "not realtime"
+	$(BIN)/python -m pytest -q -m realtime
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

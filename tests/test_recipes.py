@@ -38,11 +38,16 @@ def test_a_recipe_checks_and_resolves(name):
     assert recipe.header.description
 
 
+def _marked(name):
+    live = name.endswith("_loopback")
+    return pytest.param(name, marks=pytest.mark.realtime) if live else name
+
+
 # Those of recipes/paper are studies; tests/studies runs them.
 CALIBRATIONS = [name for name in NAMES if "/" not in name]
 
 
-@pytest.mark.parametrize("name", CALIBRATIONS)
+@pytest.mark.parametrize("name", [_marked(name) for name in CALIBRATIONS])
 def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
     words = ["run", name, "--out", "run"]
     if name.endswith("_archive"):

@@ -8,6 +8,8 @@ import pytest
 
 from tests.live.cell import Cell
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def cell(tmp_path):

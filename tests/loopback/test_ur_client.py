@@ -10,6 +10,8 @@ from flangeye_plugins.loopback.poses import pose_matrix, twist_between
 from tests.loopback.desk import HOME, away
 from tests.loopback.process import Process
 
+pytestmark = pytest.mark.realtime
+
 reason = "the client library ur-rtde is not installed: pip install 'flangeye[ur]'"
 rtde_control = pytest.importorskip("rtde_control", reason=reason)
 rtde_receive = pytest.importorskip("rtde_receive", reason=reason)

@@ -16,10 +16,13 @@ import pytest
 
 from tests.loopback.process import Process, free_address
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("rtde_control") is None,
-    reason="the client library ur-rtde is not installed: pip install 'flangeye[ur]'",
-)
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(
+        importlib.util.find_spec("rtde_control") is None,
+        reason="the client library ur-rtde is not installed: pip install 'flangeye[ur]'",
+    ),
+]
 
 PROLOGUE = """
 import sys, threading, time

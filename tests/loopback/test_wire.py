@@ -19,6 +19,8 @@ from flangeye_plugins.loopback.contact import Surface
 from tests.loopback.desk import HOME, away
 from tests.loopback.process import Process, free_address
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture(scope="module")
 def process():

@@ -112,6 +112,8 @@ def remote_client(address: str) -> Iterator[Client]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # rows say it
     try:
         kind = asyncio.run(_kind_of_server(address))
+    except OSError:  # a timeout is one too
+        kind = f"no answer within {CONNECT_SECONDS:g} s"
     except Exception as error:  # what answers may be anything
         kind = _told(error)
     if kind != "Scheduler":

@@ -17,6 +17,8 @@ from flangeye_plugins.loopback.contact import Surface
 from tests.drivers.robots.cell import arrived, in_time, moved, until
 from tests.loopback.process import Process, free_address
 
+pytestmark = pytest.mark.realtime
+
 pyaubo_sdk = pytest.importorskip("pyaubo_sdk")
 
 AUBO_I5 = load_model("robots", "aubo-i5")

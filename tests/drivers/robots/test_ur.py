@@ -258,6 +258,8 @@ def test_closing_stops_the_arm_and_the_program(controller):
 PROGRAM = """
 import sys, time
 from tests.drivers.robots.cell import moved, open_ur
+
+pytestmark = pytest.mark.realtime
 robot = open_ur(sys.argv[1])
 robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
 print("moving", flush=True)

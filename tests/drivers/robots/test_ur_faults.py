@@ -14,6 +14,8 @@ from flangeye_plugins.loopback.client import LoopbackControl
 from tests.drivers.robots.cell import in_time, moved, open_ur, until
 from tests.loopback.process import Process
 
+pytestmark = pytest.mark.realtime
+
 pytest.importorskip("rtde_control")
 
 LANES = 2

@@ -19,6 +19,8 @@ from flangeye_plugins.segmentation.flange import SegmentParams, segment_flange
 from flangeye_plugins.simulation.eye import CameraPose, middle_of_view
 from tests.loopback.process import Process
 
+pytestmark = pytest.mark.realtime
+
 PHOXI = load_model("scanners", "phoxi-m")
 UR5E = load_model("robots", "ur5e")
 FLANGE_5E = flange_of(UR5E, load_standard(UR5E.flange.standard))
