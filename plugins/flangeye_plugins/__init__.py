@@ -15,6 +15,7 @@ from flangeye_plugins.acquisition.simulated_session import (
 from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
 from flangeye_plugins.doctoring import CHECKS
 from flangeye_plugins.drivers.robots.aubo.driver import robot_aubo
+from flangeye_plugins.drivers.robots.franky.driver import robot_franky
 from flangeye_plugins.drivers.robots.loopback import robot_loopback
 from flangeye_plugins.drivers.robots.manual.driver import robot_manual
 from flangeye_plugins.drivers.robots.simulated import robot_simulated
@@ -119,6 +120,7 @@ def flangeye_parts() -> Iterable[Part]:
         *CHECKS,
         scanner_loopback,
         robot_aubo,
+        robot_franky,
         robot_manual,
         robot_loopback,
         robot_simulated,

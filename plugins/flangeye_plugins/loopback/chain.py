@@ -103,8 +103,13 @@ class Chain:
 
 
 def _newton_step(jacobian: Floats, error: Floats) -> Floats:
+    """Return the change of the joints; the smallest one for an arm with joints to spare."""
+    rows, columns = jacobian.shape
     try:
-        step = np.linalg.solve(jacobian, error)
+        if rows == columns:
+            step = np.linalg.solve(jacobian, error)
+        else:
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, error)
     except np.linalg.LinAlgError:
         raise UnreachableError("the arm is in a singular position") from None
     return np.asarray(step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300)))

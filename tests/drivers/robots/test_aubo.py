@@ -274,7 +274,8 @@ def test_a_missing_library_is_one_line(monkeypatch):
     with pytest.raises(DeviceError) as error:
         open_aubo("127.0.0.1")
     assert str(error.value) == (
-        "robot.aubo: the library pyaubo_sdk is not installed: pip install 'flangeye[aubo]'"
+        "robot.aubo: needs pyaubo_sdk (import of pyaubo_sdk halted; None in sys.modules); "
+        "pip install 'flangeye[aubo]'"
     )
 
 

@@ -59,7 +59,7 @@ def test_every_arm_starts_flange_down_and_agrees_with_its_kinematics(model):
     np.testing.assert_allclose(state.base_T_flange.matrix, reached, atol=1e-12)
 
 
-@pytest.mark.parametrize("model", ["ur5e", "aubo-i5"])
+@pytest.mark.parametrize("model", ["ur5e", "aubo-i5", "franka-panda"])
 def test_a_straight_move_arrives_within_its_limits(model):
     robot = robot_of(model)
     start = robot.state().base_T_flange

@@ -212,7 +212,8 @@ def test_a_missing_library_is_one_line(monkeypatch):
     with pytest.raises(DeviceError) as error:
         open_ur("127.0.0.1")
     assert str(error.value) == (
-        "robot.ur_rtde: the library rtde_control is not installed: pip install 'flangeye[ur]'"
+        "robot.ur_rtde: needs rtde_control (import of rtde_control halted; None in sys.modules); "
+        "pip install 'flangeye[ur]'"
     )
 
 

@@ -33,17 +33,22 @@ class AuboClient:
         config: Its ``RobotConfig``.
     """
 
-    def __init__(self, name: str, host: str, user: str, password: str) -> None:
+    def __init__(self, sdk: Any, name: str, host: str, user: str, password: str) -> None:
         """Connect and log in.
+
+        Args:
+            sdk: The module ``pyaubo_sdk``.
+            name: Of the robot, for messages.
+            host: Address of the controller.
+            user: Account on it.
+            password: Of that account.
 
         Raises:
             DeviceError: Nobody answers, or the login fails.
         """
-        import pyaubo_sdk
-
         self._name = name
-        self._failure = pyaubo_sdk.AuboException
-        self._rpc = pyaubo_sdk.RpcClient()
+        self._failure = sdk.AuboException
+        self._rpc = sdk.RpcClient()
         self._rpc.setLogHandler(_say_nothing)
         self._rpc.setRequestTimeout(PATIENCE_MS)
         if self.ask("connect", lambda: self._rpc.connect(host, PORT)) != 0:

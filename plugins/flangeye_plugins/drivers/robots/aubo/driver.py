@@ -15,7 +15,6 @@ from flangeye.devices import GRACE, DeviceError, Floats, Mode, Robot, RobotState
 from flangeye.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Transform
 from flangeye_plugins.drivers.robots.aubo.client import AuboClient
-from flangeye_plugins.drivers.robots.sdk import require_sdk
 from flangeye_plugins.drivers.robots.tool import (
     ToolOffset,
     require_model,
@@ -23,6 +22,7 @@ from flangeye_plugins.drivers.robots.tool import (
     twist_at_tool,
     wrench_at_flange,
 )
+from flangeye_plugins.drivers.sdk import load_sdk
 
 POSE = CONVENTIONS["rpy"]
 """The interface's poses: (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
@@ -83,9 +83,9 @@ def robot_aubo(model: RobotModel, params: AuboParams) -> Robot:
     Raises:
         DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
     """
-    require_sdk("robot.aubo", "pyaubo_sdk", extra="aubo")
+    sdk = load_sdk("pyaubo_sdk", "robot.aubo", "pip install 'flangeye[aubo]'")
     name = f"{model.model} at {params.host}"
-    client = AuboClient(name, params.host, params.user, params.password)
+    client = AuboClient(sdk, name, params.host, params.user, params.password)
     try:
         robot = AuboRobot(name, client)
         require_tool(name, "aubo", robot.offset, params.tool.flange_T_tool(POSE), SHOWN)

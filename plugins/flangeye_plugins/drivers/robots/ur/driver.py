@@ -14,7 +14,6 @@ from flangeye.conventions import CONVENTIONS
 from flangeye.devices import DeviceError, Floats, Robot, RobotState
 from flangeye.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Transform
-from flangeye_plugins.drivers.robots.sdk import require_sdk
 from flangeye_plugins.drivers.robots.tool import (
     ToolOffset,
     require_model,
@@ -25,6 +24,7 @@ from flangeye_plugins.drivers.robots.tool import (
 from flangeye_plugins.drivers.robots.ur import dashboard
 from flangeye_plugins.drivers.robots.ur.link import Link, Sample
 from flangeye_plugins.drivers.robots.ur.status import condition_of
+from flangeye_plugins.drivers.sdk import load_sdk
 
 SHOWN = CONVENTIONS["ur"]
 POSE = SHOWN.in_units("m", "rad")
@@ -59,7 +59,7 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
     Raises:
         DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
     """
-    require_sdk("robot.ur_rtde", "rtde_control", extra="ur")
+    load_sdk("rtde_control", "robot.ur_rtde", "pip install 'flangeye[ur]'")
     name = f"{model.model} at {params.host}"
     began = time.monotonic()
     facts = dashboard.require_ready(name, params.host)
