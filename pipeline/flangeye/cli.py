@@ -112,7 +112,7 @@ def run(  # noqa: PLR0913  one for each option
     replay = _replay(checked, source, at)
     start = Start(ArchivePath(archive), replay, earlier, MotionAllowed(move))
     result = _record(checked, registry, RunFolder.create(checked.name, out), start)
-    if result.status == "refused":
+    if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
 
@@ -324,6 +324,22 @@ def report(
     typer.echo(path)
 
 
+@app.command("replay")
+def replay_log(log: LogFile) -> None:
+    """Make the decisions in a log again, from what was measured, and compare."""
+    from flangeye.redo import redo
+    from flangeye.registry import load_registry
+
+    same = True
+    for step, redone in redo(log, load_registry()):
+        typer.echo(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
+        for name, value in redone.figures.items():
+            typer.echo(f"  {name}: {value:.3g}")
+        same = same and redone.same
+    if not same:
+        raise typer.Exit(1)
+
+
 @app.command()
 def watch(
     run: Annotated[
@@ -344,6 +360,40 @@ def watch(
     from flangeye.watch import watch_run
 
     watch_run(run, foxglove, Console(), patience)
+
+
+tactile = typer.Typer(no_args_is_help=True, help="Tactile fingers: find out how one moves.")
+app.add_typer(tactile, name="tactile")
+
+
+@tactile.callback()
+def tactile_group() -> None:
+    """Keep 'calibrate' a word of its own, though it is the only one yet."""
+
+
+@tactile.command("calibrate")
+def tactile_calibrate(
+    recipe: RecipeName,
+    out: Annotated[Path, typer.Option(help="The finger's file to write.")] = Path("finger.yaml"),
+    overrides: Overrides = None,
+    move: Annotated[bool, typer.Option("--move", help="Move the arm, by millimetres.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
+) -> None:
+    """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
+    from flangeye.devices import MotionAllowed
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    checked = load_recipe(find_recipe(recipe), registry, overrides or ())
+
+    def ask(text: str) -> None:
+        typer.echo(text)
+        if not yes:
+            typer.prompt("then press Enter", default="", show_default=False)
+
+    guide = registry.part("guide.tactile")
+    typer.echo(guide(checked, MotionAllowed(move), ask, out))
 
 
 @app.command()

@@ -196,6 +196,14 @@ class KnowsTruth(Protocol):
     truth: Truth
 
 
+class StateSource(Protocol):
+    """Where an arm is, and when: all that a tactile sensor may know of it."""
+
+    def state(self) -> RobotState:
+        """Return the newest sample."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
     """One image of a tactile sensor.

@@ -27,6 +27,7 @@ class Outcome:
         seen: The observations that reached the solver.
         scan: The scan of the workpiece.
         seam: What was planned from it.
+        weld: What the torch did.
     """
 
     source: t.Source
@@ -37,6 +38,7 @@ class Outcome:
     seen: list[t.Observation] = field(default_factory=list)
     scan: t.WorkpieceScan | None = None
     seam: t.Seam | None = None
+    weld: t.WeldReport | None = None
 
     @property
     def status(self) -> str:
@@ -66,6 +68,7 @@ def result_of(outcome: Outcome, recipe: Recipe, registry: Registry, watch: Stopw
         holdout=r.holdout_result(outcome.verifications),
         verifications=r.verifications_result(outcome.verifications),
         seam=r.seam_result(outcome.seam, outcome.scan),
+        weld=r.weld_result(outcome.weld, outcome.scan),
         timing=_timing(watch),
         provenance=_provenance(outcome, recipe, registry),
     )

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from flangeye import __version__
 from flangeye import types as t
 from flangeye.geometry import covariance_at, rotation_log
-from flangeye.seamline import errors_from, tube_radii
+from flangeye.seamline import errors_from, torch_deviation, tube_radii
 
 Vector = list[float]
 Matrix = list[list[float]]
@@ -135,6 +135,28 @@ class SeamResult(_Part):
     truth: SeamTruthResult | None = None
 
 
+class WeldTruthResult(_Part):
+    """Simulation only: how far the torch was from the true seam, across it, after the lead-in."""
+
+    rms: float = Field(description="[m]")
+    max: float
+
+
+class WeldResult(_Part):
+    """What the torch did."""
+
+    mode: str
+    completed: bool
+    reason: str = Field(description="Why it ended early; empty when it did not.")
+    seconds: float = Field(description="From the first cycle to the last.")
+    correction_rms: float | None = Field(
+        None, description="From the plan to the seam as it was felt, across it [m]."
+    )
+    phases: dict[str, float] = Field(description="Time in each phase of the controller [s].")
+    figures: dict[str, float]
+    truth: WeldTruthResult | None = None
+
+
 class CorrectionResult(_Part):
     """What is wrong with where the arm says its flange is, estimated with the transforms."""
 
@@ -179,6 +201,7 @@ class Result(_Part):
     verifications: dict[str, VerificationResult]
     truth: TruthResult | None = None
     seam: SeamResult | None = None
+    weld: WeldResult | None = None
     timing: dict[str, StageTiming]
     provenance: Provenance
 
@@ -359,6 +382,36 @@ def work_of(calibration: t.HandEye, source: t.Source, given: t.Box | None) -> t.
         return workspace_of(source, given, calibration.pairs)
     seen = np.array([pair.observation.feature.centre for pair in calibration.pairs])
     return _around(calibration.camera.transform.apply(seen.reshape(-1, 3)))
+
+
+def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> WeldResult | None:
+    """Return the section ``weld``."""
+    if weld is None:
+        return None
+    ticks = np.diff(weld.time, append=weld.time[-1:])
+    names = np.array(weld.phases)
+    correction = torch_deviation(weld.refined, weld.planned, weld.opening)
+    return WeldResult(
+        mode=weld.mode,
+        completed=weld.completed,
+        reason=weld.reason,
+        seconds=float(weld.time[-1]) if len(weld.time) else 0.0,
+        correction_rms=_rms(correction) if len(correction) else None,
+        phases={name: float(ticks[names == name].sum()) for name in dict.fromkeys(weld.phases)},
+        figures=dict(weld.figures),
+        truth=_weld_truth(weld, list(scan.truth.values())) if scan and scan.truth else None,
+    )
+
+
+def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
+    """Compare with the true seam that is nearest, where the torch was between its ends."""
+    found = [torch_deviation(weld.torch, truth, weld.opening) for truth in true_seams]
+    errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
+    return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))
+
+
+def _rms(values: t.Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair]) -> t.Box | None:

@@ -59,6 +59,21 @@ class Entry:
         return self.stage.partition(".")[0]
 
 
+@dataclass(frozen=True)
+class Note:
+    """One line of a step's journal.
+
+    Attributes:
+        step: Its label, such as ``7.weld.tactile``.
+        name: Under which it was written.
+        value: Plain data; pixels (H, W) or (H, W, 3) for an image.
+    """
+
+    step: str
+    name: str
+    value: Any
+
+
 @dataclass
 class RunLog:
     """What a log holds, its raw clouds aside (see :meth:`captures`).
@@ -190,6 +205,19 @@ def read_run(path: Path) -> RunLog:
     return log
 
 
+def read_notes(path: Path) -> Iterator[Note]:
+    """Yield what steps wrote into their journals, in order, as far as the log goes.
+
+    Raises:
+        StageError: The file is missing, or not an MCAP file.
+    """
+    for topic, schema, data in _messages(path):
+        if topic.startswith("/note/"):
+            step, _, name = topic.removeprefix("/note/").rpartition("/")
+            image = schema == "foxglove.CompressedImage"
+            yield Note(step, name, _decode_image(data) if image else json.loads(data)["value"])
+
+
 def _take(
     log: RunLog, topic: str, schema: str, data: dict[str, Any], clouds: dict[str, t.PointCloud]
 ) -> None:
@@ -223,6 +251,15 @@ def _decode_cloud(data: bytes) -> t.PointCloud:
 
     message = PointCloud.FromString(data)
     return t.PointCloud(message.frame_id, foxglove.points_of(message))
+
+
+def _decode_image(data: bytes) -> Any:
+    import cv2
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    raw = np.frombuffer(CompressedImage.FromString(data).data, dtype=np.uint8)
+    pixels = np.asarray(cv2.imdecode(raw, cv2.IMREAD_UNCHANGED))
+    return pixels if pixels.ndim == 2 else pixels[..., ::-1]
 
 
 def _decode_log(data: bytes) -> str:

@@ -259,7 +259,7 @@ class Runner:
         for step in self._steps("seam"):
             self._values[t.Seam] = self._outcome.seam = self._once(step, replay)
         for step in self._steps("weld"):
-            self._values[t.WeldReport] = self._call(step)
+            self._values[t.WeldReport] = self._outcome.weld = self._call(step)
 
     def _look(self, step: Step, replay: Replay | None) -> t.Look | None:
         """Return the simulation's scanner; for a log of a simulation, the cell is set up again."""

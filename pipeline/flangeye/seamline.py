@@ -42,6 +42,26 @@ def distances_to_line(points: Floats, line: Floats) -> Floats:
     return np.asarray(np.linalg.norm(nearest, axis=2).min(axis=1))
 
 
+def torch_deviation(points: Floats, line: Floats, opening: Floats) -> Floats:
+    """Return how far points (N, 3) are from a polyline (M, 3) across its opening (3,) [m].
+
+    Only of the points that are beside the line: those before its start and beyond its end, where
+    nothing is welded, are left out.
+    """
+    flat = np.eye(3) - np.outer(opening, opening)
+    start, step = line[:-1] @ flat, np.diff(line @ flat, axis=0)
+    lengths = np.einsum("mi,mi->m", step, step)
+    start, step, lengths = start[lengths > 0], step[lengths > 0], lengths[lengths > 0]
+    away = (points @ flat)[:, None] - start
+    share = np.einsum("nmi,mi->nm", away, step) / lengths
+    distance = np.linalg.norm(away - np.clip(share, 0.0, 1.0)[:, :, None] * step, axis=2)
+    nearest = distance.argmin(axis=1)
+    rows = np.arange(len(points))
+    before = (nearest == 0) & (share[rows, 0] < 0.0)
+    beyond = (nearest == len(start) - 1) & (share[rows, -1] > 1.0)
+    return np.asarray(distance[rows, nearest][~before & ~beyond])
+
+
 def seam_frames(seam: Seam) -> Floats:
     """Return (N, 3, 3) ``base_R_seam``: x along the seam, z into the groove, y to the side."""
     x = seam.tangents

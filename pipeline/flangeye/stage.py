@@ -100,6 +100,8 @@ PARTS: Mapping[str, str] = {
     "view": "what is guessed of the scanner's place, for planning",
     "robot": "an arm that acquire.live can move",
     "scanner": "a scanner that acquire.live can trigger",
+    "replay": "decides again, from its journal, what a step decided",
+    "guide": "a guided procedure with the devices of a recipe",
     "sensor": "a tactile sensor that weld.tactile can read",
     "check": "a mistake in recordings that flangeye doctor can name",
 }

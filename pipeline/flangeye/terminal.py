@@ -85,6 +85,7 @@ def print_result(console: Console, result: Result) -> None:
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
         lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
     lines += _errors(result)
+    lines += _weld(result)
     if result.refused:
         lines += ["", f"refused: {result.refused}"]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
@@ -134,6 +135,22 @@ def _errors(result: Result) -> list[str]:
             f"  true error         {_mm(t.rms_over_workspace)} rms over the workspace, "
             f"{_mm(t.error_at_centroid)} at its centre, {np.degrees(t.rotation_error):.4f} deg"
         )
+    return lines
+
+
+def _weld(result: Result) -> list[str]:
+    weld = result.weld
+    if weld is None:
+        return []
+    lines = [f"  weld               {weld.mode}, {weld.seconds:.1f} s"]
+    if weld.correction_rms is not None:
+        lines.append(f"  felt off the plan  {_mm(weld.correction_rms)} rms")
+    if weld.truth:
+        lines.append(
+            f"  torch off the seam {_mm(weld.truth.rms)} rms, {_mm(weld.truth.max)} at most"
+        )
+    if not weld.completed:
+        lines += ["", f"the weld was stopped: {weld.reason}"]
     return lines
 
 

@@ -717,9 +717,56 @@ class Seam:
 
 @dataclass(frozen=True, eq=False)
 class WeldReport:
-    """What the torch did."""
+    """What the tip, the torch and the robot did, in ``base``, in at most a few thousand samples.
 
+    Attributes:
+        mode: How the seam was followed.
+        completed: Whether the torch came to the seam's end.
+        reason: Why it did not; empty when it did.
+        planned: (N, 3) the plan [m].
+        refined: (M, 3) the seam as the tip felt it; M may be zero [m].
+        opening: (3,) unit vector out of the work: deviations are taken across it.
+        time: (K,) since the weld began [s].
+        tip: (K, 3) where the finger's tip was [m].
+        torch: (K, 3) [m].
+        robot: (K, 3) where the tip would have been, undeformed: what was commanded [m].
+        deflection: (K,) of the tip against the wall, as measured [m].
+        wanted: (K,) what was asked of it [m].
+        speed: (K,) of the robot's end point along the plane [m/s].
+        turn: (K,) angular velocity of the tool [rad/s].
+        along: (K,) the torch's way along the plan; the lead-in is before zero [m].
+        phases: K names of what the controller was doing.
+        figures: By name, in SI units.
+        loop: How the loop kept time, by name, in SI units; differs from run to run.
+        notes: What the person should be told.
+    """
+
+    mode: str
+    completed: bool
+    reason: str
+    planned: Array
+    refined: Array
+    opening: Array
+    time: Array
+    tip: Array
+    torch: Array
+    robot: Array
+    deflection: Array
+    wanted: Array
+    speed: Array
+    turn: Array
+    along: Array
+    phases: tuple[str, ...]
+    figures: Mapping[str, float] = field(default_factory=dict)
+    loop: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        k = len(self.phases)
+        _freeze(self, planned=(len(self.planned), 3), refined=(len(self.refined), 3), opening=(3,))
+        _freeze(self, tip=(k, 3), torch=(k, 3), robot=(k, 3))
+        for name in ("time", "deflection", "wanted", "speed", "turn", "along"):
+            _freeze(self, **{name: (k,)})
 
 
 @dataclass(frozen=True)

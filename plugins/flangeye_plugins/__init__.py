@@ -60,6 +60,12 @@ from flangeye_plugins.studies.stored_results import verify_stored_results
 from flangeye_plugins.verification.errors import error_holdout, error_icp
 from flangeye_plugins.verification.holdout import verify_holdout
 from flangeye_plugins.verification.icp import verify_icp
+from flangeye_plugins.welding.replay import replay_tactile
+from flangeye_plugins.welding.simulated.sensor import sensor_simulated_finger
+from flangeye_plugins.welding.tactile import weld_tactile
+from flangeye_plugins.welding.touch.guide import guide_tactile
+from flangeye_plugins.welding.touch.opencv import sensor_opencv
+from flangeye_plugins.welding.touch.recorded import sensor_image_folder, sensor_mcap
 
 
 @hookimpl
@@ -95,6 +101,7 @@ def flangeye_stages() -> Iterable[Stage]:
         verify_icp_as_in_paper,
         verify_by_iteration,
         verify_stored_results,
+        weld_tactile,
     )
 
 
@@ -131,4 +138,10 @@ def flangeye_parts() -> Iterable[Part]:
         scanner_zivid,
         scanner_mech_eye,
         scanner_watched_folder,
+        replay_tactile,
+        guide_tactile,
+        sensor_simulated_finger,
+        sensor_opencv,
+        sensor_image_folder,
+        sensor_mcap,
     )

@@ -124,7 +124,7 @@ class World:
 
     def arrived(self, time):
         ready = self.under_way and self.under_way[0][0] <= time
-        return self.under_way.pop(0)[1] if ready else None
+        return [self.under_way.pop(0)[1]] if ready else []
 
     def row(self, time, tip, command):
         direction = np.array([np.cos(self.angle), np.sin(self.angle)])

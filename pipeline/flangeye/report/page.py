@@ -14,6 +14,7 @@ from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.space import cell_drawing, workspace_drawing
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.report.units import degrees, millimetres, percent
+from flangeye.report.weld import weld_drawing
 from flangeye.runlog import RunLog
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "workspace": workspace_drawing(facts),
         "panels": cloud_panels(facts),
         "cell": cell_drawing(facts),
+        "weld": weld_drawing(facts),
         "set_aside": set_aside_of(facts),
         "timings": timings_of(facts),
         "provenance": provenance_of(facts),

@@ -7,6 +7,8 @@ clipped to what the robot may do, as any robot would.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,29 +24,38 @@ class AsPrinted:
     """The paper's controller.
 
     Attributes:
+        mode: Its name, for people.
         phase: Following until the torch is at the end of the plan.
         reason: Always empty: it knows no reason to stop.
+        tip: Arc length of the plan's point nearest to the robot's end point [m].
+        torch: Arc length of the plan's point nearest to the torch [m].
+        wanted: Deflection asked of the tip, always the same [m].
     """
 
     def __init__(self, plan: Path, distance: float, settings: Following) -> None:
         """Prepare to follow ``plan`` with the torch ``distance`` [m] behind the tip."""
+        self.mode = "as_printed"
         self.phase: Phase = "following"
         self.reason = ""
+        self.tip = self.torch = 0.0
+        self.wanted = settings.deflection
         self._plan, self._distance, self._settings = plan, distance, settings
         self._side = 1.0 if settings.side == "left" else -1.0
         self._displacement = np.zeros(3)
         self._refined: list[Floats] = []
         self._tangents = plan.tangents
 
-    def step(self, pose: ToolPose, touch: Touch | None) -> Command:
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle (lines 3 to 14)."""
-        if touch is not None:
+        for touch in touches:
             self._displacement = turned(touch.displacement, pose.angle)
             self._refined.append((pose.position + self._displacement)[:2])  # lines 17 to 21
         t_d = pose.direction
         n_d = _left(t_d)
         velocity = self._servo(pose)
         torch = pose.position[:2] - self._distance * t_d  # line 9
+        ends = _distances(self._plan.points[:, :2], torch)
+        self.torch = int(np.argmin(ends)) * self._plan.step
         if self._past_end(torch):
             self.phase = "done"
             return STILL
@@ -59,6 +70,7 @@ class AsPrinted:
         """Lines 22 to 27."""
         settings = self._settings
         nearest = int(np.argmin(_distances(self._plan.points[:, :2], pose.position[:2])))
+        self.tip = nearest * self._plan.step
         t_v = self._tangents[nearest]
         n_v = _left(t_v)
         deflection = -float(self._displacement[:2] @ n_v)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +40,35 @@ class Felt:
     height: float
 
 
+class Controller(Protocol):
+    """What moves the tool along a seam.
+
+    Attributes:
+        mode: Its name, for people.
+        phase: What it is doing.
+        reason: Why it stopped.
+        tip: Arc length of the tip's progress on the plan [m].
+        torch: Arc length of the torch's progress [m].
+        wanted: Deflection asked of the tip at present [m].
+    """
+
+    mode: str
+    phase: Phase
+    reason: str
+    tip: float
+    torch: float
+    wanted: float
+
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        ...
+
+
 class Follower:
     """Follows a seam by touch.
 
     Attributes:
+        mode: Its name, for people.
         phase: What it is doing.
         reason: Why it stopped.
         tip: Arc length of the tip's progress on the plan [m].
@@ -63,6 +89,7 @@ class Follower:
             settings: Gains and limits.
             touch: Follow by touch; otherwise the plan alone, for comparison.
         """
+        self.mode = "tactile" if touch else "vision"
         self.phase: Phase = "seeking" if touch else "following"
         self.reason = ""
         self.tip, self.torch = settings.inset, settings.inset - distance
@@ -74,15 +101,19 @@ class Follower:
         self._side = 1.0 if settings.side == "left" else -1.0
         self._track = Track()
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
-        self._seen, self._time, self._bridge = -np.inf, 0.0, 0.0
+        self._time: float | None = None
+        self._seen = self._bridge = 0.0
         self._search = Search(settings.reach)
 
-    def step(self, pose: ToolPose, touch: Touch | None) -> Command:
-        """Return the command for this cycle; ``touch`` is a measurement not yet given, if any."""
-        elapsed, self._time = (pose.time - self._time if self._time else 0.0), pose.time
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        if self._time is None:
+            self._time = self._seen = pose.time
+        elapsed, self._time = pose.time - self._time, pose.time
         self._track.add(pose)
-        if touch is not None and self._touching:
-            self._feel(touch)
+        for touch in touches:
+            if self._touching and touch.time > self._seen:
+                self._feel(touch)
         self._judge(pose)
         if self.phase in ("done", "stopped") or self._felt is None:
             return STILL
@@ -153,8 +184,7 @@ class Follower:
         if self.phase in ("done", "stopped"):
             return
         if self._touching and self.phase != "ending" and pose.time - self._seen > settings.blind:
-            if np.isfinite(self._seen):
-                self._stop(f"no tag was seen for {settings.blind * 1e3:.0f} ms")
+            self._stop(f"no tag was seen for {settings.blind * 1e3:.0f} ms")
         elif self.phase == "bridging" and self.tip - self._bridge > settings.longest_gap:
             self._stop(f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam")
         elif self.phase == "seeking" and self._astray(pose):

@@ -37,6 +37,7 @@ class Path:
         length: From its first point to its last, in the plane.
         points: (M, 3) the curve resampled: in the plane, and its height.
         tangents: (M, 2) unit tangents in the plane.
+        step: Arc length between two of them [m].
     """
 
     def __init__(self, points: Floats) -> None:
@@ -45,8 +46,8 @@ class Path:
         self.length = float(along[-1])
         ticks = np.linspace(0.0, self.length, max(2, round(self.length / STEP)) + 1)
         self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
-        self._step = float(ticks[1])
-        slopes = np.gradient(self.points, self._step, axis=0)
+        self.step = float(ticks[1])
+        slopes = np.gradient(self.points, self.step, axis=0)
         norms = np.linalg.norm(slopes[:, :2], axis=1, keepdims=True)
         self.tangents = slopes[:, :2] / norms
         self._climb = slopes[:, 2]
@@ -56,8 +57,8 @@ class Path:
         """Return the place at arc length ``s``, which may lie beyond either end."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
         inside = min(max(s, 0.0), self.length)
-        index = min(int(inside / self._step), len(self._rows) - 2)
-        share = inside / self._step - index
+        index = min(int(inside / self.step), len(self._rows) - 2)
+        share = inside / self.step - index
         x, y, z, tx, ty = (
             a + share * (b - a)
             for a, b in zip(self._rows[index], self._rows[index + 1], strict=True)
@@ -70,8 +71,8 @@ class Path:
     def evaluate(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) and unit tangents (K, 2) at arc lengths (K,)."""
         inside = np.clip(s, 0.0, self.length)
-        index = np.minimum((inside / self._step).astype(int), len(self.points) - 2)
-        share = (inside / self._step - index)[:, None]
+        index = np.minimum((inside / self.step).astype(int), len(self.points) - 2)
+        share = (inside / self.step - index)[:, None]
         tangent = (1 - share) * self.tangents[index] + share * self.tangents[index + 1]
         tangent /= np.sqrt(np.einsum("ki,ki->k", tangent, tangent))[:, None]
         point = (1 - share) * self.points[index] + share * self.points[index + 1]
@@ -82,7 +83,7 @@ class Path:
         """Return the slope of the height along the path, zero beyond its ends."""
         if not 0.0 <= s <= self.length:
             return 0.0
-        return float(self._climb[min(round(s / self._step), len(self._climb) - 1)])
+        return float(self._climb[min(round(s / self.step), len(self._climb) - 1)])
 
     def advance(self, point: Floats, s: float, reach: float) -> float:
         """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.

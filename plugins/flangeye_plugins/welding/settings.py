@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from flangeye.stage import Params
-from flangeye.units import AngularSpeed, Duration, Length, Speed, param
+from flangeye.stage import Choose, Chosen, Params
+from flangeye.units import AngularSpeed, Duration, Force, Length, Speed, param
+from flangeye_plugins.welding.finger import FingerPath
 
 Mode = Literal["tactile", "as_printed", "vision"]
 
@@ -50,9 +51,34 @@ class Following(Params):
         "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
     )
     ramp: Speed = param("2 mm/s", gt=0, description="At which the wanted deflection changes.")
+    force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
     stale: Duration = param(
         "150 ms", gt=0, description="Older images slow the weld down until a new one comes."
     )
     blind: Duration = param(
         "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
+    )
+
+
+class WeldTactileParams(Following):
+    """Parameters of ``weld.tactile``."""
+
+    finger: FingerPath = param(
+        "srm", description="One of data/fingers, or a .yaml file of one's own."
+    )
+    sensor: Annotated[Chosen, Choose("sensor")] = Field(
+        description="What gives the finger's images, for example {opencv: {device: 0}}."
+    )
+    mode: Mode = Field(
+        "tactile",
+        description="tactile, or for comparison: as_printed (the paper's Algorithm 2), or vision "
+        "(the plan alone, nothing is touched).",
+    )
+    clearance: Length = param(
+        "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
+    )
+    approach_speed: Speed = param("50 mm/s", gt=0, description="Of the flange on its way there.")
+    approach_joint_speed: AngularSpeed = param("20 deg/s", gt=0, description="Of the joints.")
+    turned: float = Field(
+        0.0, ge=-180, le=180, description="Start with the tool at this angle to the seam [deg]."
     )

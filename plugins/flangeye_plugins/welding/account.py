@@ -1,0 +1,114 @@
+"""What a weld amounts to, from what was logged of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.types import Seam, WeldReport
+from flangeye_plugins.welding.chronicle import Chronicle, columns
+from flangeye_plugins.welding.finger import Finger
+from flangeye_plugins.welding.follower import Controller, Follower
+from flangeye_plugins.welding.frame import WorkPlane
+from flangeye_plugins.welding.path import Path
+
+Floats = NDArray[np.float64]
+
+SAMPLES = 2000
+"""At most so many of the cycles go into the report."""
+
+
+def report_of(  # noqa: PLR0913  all that a weld had
+    seam: Seam,
+    plane: WorkPlane,
+    plan: Path,
+    finger: Finger,
+    controller: Controller,
+    chronicle: Chronicle,
+    reason: str,
+) -> WeldReport:
+    """Return the report of a weld."""
+    every = columns(chronicle.cycles)
+    kept = np.unique(np.linspace(0, len(chronicle.cycles) - 1, SAMPLES).round().astype(int))
+    kept = kept[kept >= 0]
+    cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
+    robot = np.array(every["position"]).reshape(-1, 3)[kept]
+    ahead = np.stack([np.cos(cycle["angle"]), np.sin(cycle["angle"]), 0 * cycle["angle"]], axis=1)
+    displaced, deflection = _felt(chronicle, plan, kept)
+    to_base = plane.base_T_plane.apply
+    velocity = cycle["velocity"].reshape(-1, 3)
+    return WeldReport(
+        mode=controller.mode,
+        completed=not reason,
+        reason=reason,
+        planned=seam.points_in_base,
+        refined=to_base(_refined(controller, plan)),
+        opening=plane.base_T_plane.rotation[:, 2],
+        time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
+        tip=to_base(robot + displaced),
+        torch=to_base(robot - finger.torch * ahead),
+        robot=to_base(robot),
+        deflection=deflection,
+        wanted=np.array(every["wanted"])[kept],
+        speed=np.linalg.norm(velocity[:, :2], axis=1),
+        turn=cycle["turn"],
+        along=np.array(every["torch"])[kept],
+        phases=tuple(every["phase"][i] for i in kept),
+        figures=_figures(chronicle),
+        loop=_loop(chronicle),
+    )
+
+
+def _felt(chronicle: Chronicle, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return the tip's displacement (K, 3) in the plane, and against the wall (K,)."""
+    displaced, newest = [], np.zeros(3)
+    for cycle in chronicle.cycles:
+        for number in cycle.touches:
+            newest = np.asarray(chronicle.felt[number].displacement)
+        displaced.append(newest)
+    rows = np.array(displaced).reshape(-1, 3)[kept]
+    angle = np.array([chronicle.cycles[i].angle for i in kept])
+    c, s = np.cos(angle), np.sin(angle)
+    turned = np.stack(
+        [c * rows[:, 0] - s * rows[:, 1], s * rows[:, 0] + c * rows[:, 1], rows[:, 2]], axis=1
+    )
+    _, tangents = plan.evaluate(np.array([chronicle.cycles[i].tip for i in kept]))
+    across = -(tangents[:, 0] * turned[:, 1] - tangents[:, 1] * turned[:, 0])
+    return turned, across
+
+
+def _refined(controller: Controller, plan: Path) -> Floats:
+    """Return the seam as it was felt, (M, 3) in the plane."""
+    if not isinstance(controller, Follower) or controller.refined.empty:
+        return np.zeros((0, 3))
+    s = np.arange(0.0, plan.length, 1e-3)
+    points, tangents = plan.evaluate(s)
+    offsets = np.concatenate([controller.refined.offsets(s[i : i + 1]) for i in range(len(s))])
+    points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    return points
+
+
+def _figures(chronicle: Chronicle) -> Mapping[str, float]:
+    felt = list(chronicle.felt.values())
+    return {
+        "images": float(chronicle.sights),
+        "images_with_tag": float(len(felt)),
+        "turn_max": max((abs(c.turn) for c in chronicle.cycles), default=0.0),
+    }
+
+
+def _loop(chronicle: Chronicle) -> Mapping[str, float]:
+    """Return how the loop kept time; not the same in two equal runs."""
+    if not chronicle.cycles:
+        return {}
+    computing = np.array([c.computing for c in chronicle.cycles])
+    period = np.array([c.period for c in chronicle.cycles[1:]] or [0.0])
+    return {
+        "cycles": float(len(computing)),
+        "computing_median": float(np.median(computing)),
+        "computing_p99": float(np.quantile(computing, 0.99)),
+        "period_median": float(np.median(period)),
+        "period_p99": float(np.quantile(period, 0.99)),
+    }

@@ -1,0 +1,159 @@
+"""What is checked before anything moves; every refusal says what to change."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.catalogue import RobotModel
+from flangeye.errors import StageError
+from flangeye.header import LimitsSection
+from flangeye.kinematics import Arm
+from flangeye.seamline import tube_radii
+from flangeye.types import Seam
+from flangeye_plugins.welding.finger import Finger
+from flangeye_plugins.welding.frame import Tool
+from flangeye_plugins.welding.path import Path
+from flangeye_plugins.welding.settings import Following
+
+Floats = NDArray[np.float64]
+
+LEAN = np.deg2rad(15.0)
+"""The groove's opening may lean from the plane's normal by this much; the tool stays upright."""
+
+SLOPE = np.deg2rad(10.0)
+"""Largest climb of a seam in its plane."""
+
+CROOKED = np.deg2rad(60.0)
+"""Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
+
+SPACING = 10e-3
+"""Poses along the seam are checked at this distance [m]."""
+
+
+def check_finger(finger: Finger, settings: Following) -> None:
+    """Refuse a deflection that the finger does not stand, or a force beyond the limit.
+
+    Raises:
+        StageError: Which, and what is allowed.
+    """
+    asked = max(settings.deflection, settings.preload)
+    if asked > finger.travel:
+        raise StageError(
+            f"weld.tactile: a deflection of {asked * 1e3:.3g} mm is more than finger "
+            f"{finger.model} stands, {finger.travel * 1e3:.3g} mm"
+        )
+    calibration = finger.calibration
+    if calibration is None or calibration.lateral is None or calibration.axial is None:
+        return
+    force = np.hypot(
+        calibration.lateral * settings.deflection, calibration.axial * settings.preload
+    )
+    if force > settings.force:
+        raise StageError(
+            f"weld.tactile: deflection and preload press with {force:.2g} N, allowed are "
+            f"{settings.force:.2g} N; lower them, or raise 'force'"
+        )
+
+
+def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> None:
+    """Refuse a seam that this tool cannot follow.
+
+    Raises:
+        StageError: Too short, steep, curved, or uncertain.
+    """
+    used = settings.inset + settings.ending + settings.speed * settings.deflection / settings.ramp
+    if plan.length <= used:
+        raise StageError(
+            f"weld.tactile: the seam is {plan.length * 1e3:.0f} mm long; inset, ending and ramp "
+            f"alone take {used * 1e3:.0f} mm"
+        )
+    mean = seam.openings_in_base.mean(axis=0)
+    lean = float(
+        np.arccos(np.clip(seam.openings_in_base @ mean / np.linalg.norm(mean), -1, 1).min())
+    )
+    steep = float(np.arctan(np.abs(np.gradient(plan.points[:, 2], plan.step))).max())
+    if lean > LEAN or steep > SLOPE:
+        raise StageError(
+            f"weld.tactile: the seam leaves its plane: it climbs by {np.degrees(steep):.0f} deg "
+            f"(allowed {np.degrees(SLOPE):.0f}), its opening turns by {np.degrees(lean):.0f} deg "
+            f"(allowed {np.degrees(LEAN):.0f}); the tool is not tilted on the way"
+        )
+    crooked = float(np.abs(tool_angles(plan, finger.torch)).max())
+    if crooked > CROOKED:
+        raise StageError(
+            f"weld.tactile: the seam is too curved for a torch {finger.torch * 1e3:.0f} mm behind "
+            f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
+            f"{np.degrees(CROOKED):.0f}"
+        )
+    doubt = float(tube_radii(seam)[0])
+    if doubt > settings.reach:
+        raise StageError(
+            f"weld.tactile: the plan's start is uncertain by {doubt * 1e3:.1f} mm, and the groove "
+            f"is sought within {settings.reach * 1e3:.1f} mm; plan better, or raise 'reach'"
+        )
+
+
+def tool_angles(plan: Path, distance: float) -> Floats:
+    """Return the tool's angles to the seam at the torch [rad], with both ends on the plan."""
+    ahead = np.arange(distance, plan.length, 1e-3)
+    tips, _ = plan.evaluate(ahead)
+    behind = np.array([_chord_end(plan, float(s), distance) for s in ahead])
+    torches, tangents = plan.evaluate(behind)
+    tool = (tips - torches)[:, :2]
+    across = tangents[:, 0] * tool[:, 1] - tangents[:, 1] * tool[:, 0]
+    return np.asarray(np.arctan2(across, np.einsum("ki,ki->k", tangents, tool)))
+
+
+def _chord_end(plan: Path, s: float, distance: float) -> float:
+    """Return where behind ``s`` the plan is first ``distance`` away from its point there."""
+    tip = plan.at(s).point
+    back = np.arange(s, s - 3 * distance, -0.5e-3)
+    away = np.linalg.norm(plan.evaluate(back)[0][:, :2] - tip, axis=1)
+    far = np.flatnonzero(away >= distance)
+    return float(back[far[0]] if len(far) else back[-1])
+
+
+def check_speeds(finger: Finger, settings: Following, limits: LimitsSection) -> None:
+    """Refuse speeds beyond the recipe's limits.
+
+    Raises:
+        StageError: Which, and what is allowed.
+    """
+    lever = float(np.hypot(*finger.tip[:2]))
+    fastest = float(np.hypot(settings.speed, settings.lateral_speed))
+    fastest += settings.turn_rate * lever
+    if fastest > limits.speed:
+        raise StageError(
+            f"weld.tactile: speed, lateral_speed and turn_rate together move the flange at "
+            f"{fastest * 1e3:.3g} mm/s, robot.limits.speed allows {limits.speed * 1e3:.3g} mm/s"
+        )
+
+
+def check_reach(
+    model: RobotModel, tool: Tool, plan: Path, finger: Finger, limits: LimitsSection
+) -> None:
+    """Refuse a seam along which the flange would leave its box, or the arm cannot reach.
+
+    The tip goes on beyond the seam's end by the torch's distance.
+
+    Raises:
+        StageError: Where.
+    """
+    arm = Arm(model)
+    centre, size = np.asarray(limits.box.centre), np.asarray(limits.box.size)
+    for s in np.arange(0.0, plan.length + finger.torch, SPACING):
+        place = plan.at(float(s))
+        angle = float(np.arctan2(place.tangent[1], place.tangent[0]))
+        pose = tool.base_T_flange(np.array([*place.point, place.height]), angle)
+        outside = np.abs(pose.translation - centre) > size / 2
+        where = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"
+        if outside.any():
+            axis = int(np.argmax(outside))
+            raise StageError(
+                f"weld.tactile: {where}, the flange leaves robot.limits.box: "
+                f"{'xyz'[axis]} is {pose.translation[axis] * 1e3:.0f} mm, allowed are "
+                f"{(centre - size / 2)[axis] * 1e3:.0f} to {(centre + size / 2)[axis] * 1e3:.0f} mm"
+            )
+        if not len(arm.inverse(pose.matrix)):
+            raise StageError(f"weld.tactile: {where}, the {model.model} cannot reach the seam")

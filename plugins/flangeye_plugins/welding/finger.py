@@ -1,0 +1,107 @@
+"""The tool: a compliant finger whose camera watches a tag, and a torch behind its tip.
+
+The tool's axes: x from the torch to the tip (t_d of the paper), z out of the work, y to the left.
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+
+from flangeye.catalogue import Model
+from flangeye.shipped import shipped
+from flangeye.units import Angle, Length, Stiffness, param
+
+Floats = NDArray[np.float64]
+Row = tuple[float, float, float]
+
+
+class Tag(Model):
+    """The ArUco tag on the finger."""
+
+    dictionary: str = Field("DICT_4X4_50", description="OpenCV's name of the dictionary.")
+    id: int = Field(0, ge=0)
+    side: Length = param(gt=0, description="Of the black square.")
+
+
+class Lens(Model):
+    """The camera in the finger, in pixels; found by an ordinary camera calibration."""
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3) pinhole matrix."""
+        return np.array(
+            [[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]]
+        )
+
+
+class Calibration(Model):
+    """What ``flangeye tactile calibrate`` finds."""
+
+    rest: tuple[Length, Length, Length] = Field(description="The tag in the camera, undeformed.")
+    rotation: tuple[Angle, Angle, Angle] = Field(description="Its rotation vector there.")
+    gain: tuple[Row, Row, Row] = Field(
+        description="Displacement of the tip, in the tool's axes, per displacement of the tag."
+    )
+    noise: tuple[Length, Length, Length] = Field(
+        description="Standard deviation of one measurement of the tip, in the tool's axes."
+    )
+    lateral: Stiffness | None = Field(None, description="Across the finger, at its tip.")
+    axial: Stiffness | None = Field(None, description="Along the finger.")
+    source: str
+
+
+class Finger(Model):
+    """A finger and its torch."""
+
+    model: str
+    tag: Tag
+    camera: Lens
+    tip: tuple[Length, Length, Length] = Field(description="Undeformed, in the flange's frame.")
+    direction: Angle = param(
+        "0 deg", description="From the flange's x to the direction from the torch to the tip."
+    )
+    torch: Length = param(gt=0, description="How far the torch is behind the tip (||d||).")
+    radius: Length = param(gt=0, description="Of the tip's ball.")
+    travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
+    calibration: Calibration | None = None
+    source: str
+
+    @property
+    def flange_R_tool(self) -> Floats:
+        """(3, 3) the tool's axes in the flange's: z out of the work is back to the robot."""
+        c, s = np.cos(self.direction), np.sin(self.direction)
+        return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def _shipped_or_beside(value: Any, info: ValidationInfo) -> Path:
+    if not isinstance(value, (str, Path)):
+        raise ValueError("a finger is a name or a path to a .yaml file")
+    if str(value).endswith((".yaml", ".yml")):
+        path = Path(value).expanduser()
+        return path if info.context is None else info.context.folder / path
+    found = shipped("data") / "fingers" / f"{value}.yaml"
+    if not found.is_file():
+        known = sorted(p.stem for p in found.parent.glob("*.yaml"))
+        near = difflib.get_close_matches(str(value), known, n=2) or known
+        raise ValueError(f"no finger '{value}'; known: {', '.join(near)}, or a .yaml file")
+    return found
+
+
+FingerPath = Annotated[
+    Path,
+    BeforeValidator(_shipped_or_beside),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
+"""A parameter that names a finger: a shipped one, or a file beside the recipe."""
