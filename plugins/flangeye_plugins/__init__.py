@@ -57,6 +57,7 @@ from flangeye_plugins.studies.points import acquire_points
 from flangeye_plugins.studies.published import acquire_published_centres
 from flangeye_plugins.studies.realisations import verify_realisations
 from flangeye_plugins.studies.stored_results import verify_stored_results
+from flangeye_plugins.studies.weld import scan_as_laid, seam_misplanned
 from flangeye_plugins.verification.errors import error_holdout, error_icp
 from flangeye_plugins.verification.holdout import verify_holdout
 from flangeye_plugins.verification.icp import verify_icp
@@ -102,6 +103,8 @@ def flangeye_stages() -> Iterable[Stage]:
         verify_by_iteration,
         verify_stored_results,
         weld_tactile,
+        scan_as_laid,
+        seam_misplanned,
     )
 
 

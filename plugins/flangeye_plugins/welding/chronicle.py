@@ -60,8 +60,9 @@ class Chronicle:
         felt: Number of an image -> what was felt in it.
     """
 
-    def __init__(self, journal: Journal, beside: bool) -> None:
-        """Write into ``journal``: at once, or in a thread ``beside`` the loop."""
+    def __init__(self, journal: Journal, beside: bool, images: bool = True) -> None:
+        """Write into ``journal``: at once, or in a thread ``beside`` the loop; images if asked."""
+        self._images = images
         self.cycles: list[Cycle] = []
         self.sights = 0
         self.felt: dict[int, Feeling] = {}
@@ -93,7 +94,7 @@ class Chronicle:
         """Write an image and what was felt in it; return its number."""
         number, self.sights = self.sights, self.sights + 1
         felt = sight.feeling
-        self.note("image", sight.image)
+        self._note_image(sight)
         self.note("sight", {"number": number, "time_ns": sight.time_ns, "tag": felt is not None})
         if felt is not None:
             self.felt[number] = felt
@@ -103,8 +104,12 @@ class Chronicle:
     def before(self, sight: Sight) -> None:
         """Write an image that was looked at before anything moved; it has no number."""
         felt = sight.feeling is not None
-        self.note("image", sight.image)
+        self._note_image(sight)
         self.note("sight", {"number": -1, "time_ns": sight.time_ns, "tag": felt})
+
+    def _note_image(self, sight: Sight) -> None:
+        if self._images:
+            self.note("image", sight.image)
 
     def turned(self, cycle: Cycle) -> None:
         """Take in a cycle."""

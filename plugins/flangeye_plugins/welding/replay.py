@@ -85,6 +85,8 @@ class Again:
         )
 
     def _see(self, sight: Mapping[str, Any]) -> None:
+        if self._pixels is None:
+            raise StageError("the log of this weld holds no images: it ran with log_images: false")
         image = image_of(np.asarray(self._pixels, dtype=np.uint8), self._finger)
         self._newest = sight["number"]
         read = self._reader.read(SensorFrame(image, sight["time_ns"]))

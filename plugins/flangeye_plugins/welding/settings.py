@@ -74,6 +74,9 @@ class WeldTactileParams(Following):
         description="tactile, or for comparison: as_printed (the paper's Algorithm 2), or vision "
         "(the plan alone, nothing is touched).",
     )
+    log_images: bool = Field(
+        True, description="Log every image, which replaying needs: 1 MB a second and more."
+    )
     clearance: Length = param(
         "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
     )

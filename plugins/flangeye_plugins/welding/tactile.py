@@ -71,7 +71,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         latest = LatestState(robot.state())
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
-        chronicle = opened.enter_context(Chronicle(journal, beside=not simulated))
+        chronicle = opened.enter_context(Chronicle(journal, not simulated, params.log_images))
         chronicle.note("start", start_of(points, plane, finger, params))
         cell = Cell(Drive(robot, latest, limits), eyes, tool)
         approach(cell, model, plan, chronicle, params)
