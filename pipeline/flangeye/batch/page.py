@@ -30,6 +30,7 @@ _HEADINGS: Mapping[str, str] = {
     "archive": "Archive",
     "seed": "Seed",
     "status": "Status",
+    "reason": "Reason",
     "used": "Used",
     "captures": "Captures",
     "holdout_rms_m": "Held-out rms [mm]",
@@ -41,7 +42,6 @@ _HEADINGS: Mapping[str, str] = {
     "true_centre_m": "True, centre [mm]",
     "true_rotation_rad": "True rotation [°]",
     "seconds": "Seconds",
-    "reason": "Reason",
 }
 
 
