@@ -232,14 +232,24 @@ def test_published_clouds_held_out(aubo: list[Observation]) -> None:
     def svd(observations: Sequence[Observation]) -> HandEye:
         return solve_svd(Observations(observations, Source("test")), SvdParams())
 
-    def rms(solve: Callable[[Sequence[Observation]], HandEye], seed: int) -> float:
-        found = verify_holdout(solve(aubo), solve, HoldoutParams(), robot=robot, seed=Seed(seed))
-        return found.figures["rms_all"]
+    def held_out(
+        solve: Callable[[Sequence[Observation]], HandEye], figure: str, *seeds: int
+    ) -> list[float]:
+        """The figure [mm] for several ways to deal the folds."""
+        found = solve(aubo)
+        return [
+            verify_holdout(found, solve, HoldoutParams(), robot=robot, seed=Seed(seed)).figures[
+                figure
+            ]
+            / MM
+            for seed in seeds
+        ]
 
     assert len(aubo) == 30
-    assert rms(svd, 0) <= 0.43 * MM
-    assert rms(solver(robot), 0) <= 0.43 * MM
-    assert rms(solver(robot, joint_offsets="auto"), 0) <= 0.32 * MM
+    assert max(held_out(svd, "rms_all", 0, 3)) <= 0.43
+    assert max(held_out(solver(robot), "rms", 0, 3)) <= 0.35
+    assert held_out(solver(robot), "rms_all", 0)[0] <= 0.435
+    assert held_out(solver(robot, joint_offsets="auto"), "rms_all", 0)[0] <= 0.32
 
 
 @pytest.mark.parametrize("with_joints", [True, False])

@@ -130,5 +130,5 @@ def _draw(path: Sequence[Session]) -> Any:
         panel.plot([5], [value], "D", color=PRINTED.colour, label="Table 1, where theirs stopped")
         panel.set_xscale("log")
         dress(panel, f"{axis} of the Aubo's verification", "steps of ICP", f"{axis} [mm]")
-    legend(page.panels[0], loc="center right")
+    legend(page.panels[0], loc="lower right")
     return page
