@@ -27,6 +27,7 @@ from flangeye_plugins.drivers.scanners.mech_eye import scanner_mech_eye
 from flangeye_plugins.drivers.scanners.realsense import scanner_realsense
 from flangeye_plugins.drivers.scanners.watched_folder import scanner_watched_folder
 from flangeye_plugins.drivers.scanners.zivid import scanner_zivid
+from flangeye_plugins.fitting.boards import fit_aruco, fit_charuco, fit_checkerboard
 from flangeye_plugins.fitting.ransac import fit_ransac_circle
 from flangeye_plugins.fitting.rim import fit_rim
 from flangeye_plugins.fitting.sphere import fit_sphere
@@ -82,6 +83,9 @@ def flangeye_stages() -> Iterable[Stage]:
         segment_flange,
         fit_rim,
         fit_ransac_circle,
+        fit_charuco,
+        fit_checkerboard,
+        fit_aruco,
         segment_sphere,
         fit_sphere,
         solve_robust,
