@@ -55,12 +55,12 @@ class Board:
     def inner_corners(self) -> Floats:
         """Return the (N, 3) corners between squares in ``target`` [m], row by row from the top."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        return self.place(np.stack([x, y], axis=-1).reshape(-1, 2) * self.square)
+        return self.place(np.asarray(np.stack([x, y], axis=-1).reshape(-1, 2) * self.square))
 
     def outer_corners(self) -> Floats:
         """Return the (4, 3) corners in ``target`` [m], clockwise from the top left."""
         width, height = self.size
-        return self.place(np.array([[0, 0], [width, 0], [width, height], [0, height]]))
+        return self.place(np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
 
     def place(self, from_top_left: Floats) -> Floats:
         """Return (N, 2) places, right and down from the top left corner [m], in ``target``."""

@@ -69,7 +69,7 @@ def test_a_tilted_target_is_found_where_it_is(kind, camera, depth):
     assert off @ np.linalg.solve(feature.covariance, off) < 22.5  # chi-square, 6, 99.9 %
 
 
-@pytest.mark.parametrize("yaw", np.arange(0, 360, 40.0))
+@pytest.mark.parametrize("yaw", np.arange(0, 360, 72.0))
 @pytest.mark.parametrize("kind", FITS)
 def test_no_target_is_taken_for_itself_upside_down(kind, yaw):
     board, fit, params = FITS[kind]

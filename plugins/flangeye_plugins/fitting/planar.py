@@ -80,11 +80,15 @@ def poses_from_pixels(corners: Corners, image: Image, expected: float) -> list[P
         flags=cv2.SOLVEPNP_IPPE,
     )  # fmt: skip
     starts = [
-        rigid(rotation_exp(r.ravel()), t.ravel())
+        rigid(rotation_exp(_vector(r)), _vector(t))
         for r, t in zip(rotations, translations, strict=True)
     ]
     poses = [_least_squares(corners, image, start, expected) for start in starts[:found]]
     return sorted(poses, key=lambda pose: pose.misfit)
+
+
+def _vector(column: object) -> Floats:
+    return np.asarray(column, dtype=np.float64).ravel()
 
 
 def _least_squares(corners: Corners, image: Image, start: Floats, expected: float) -> PlanarPose:
@@ -92,7 +96,7 @@ def _least_squares(corners: Corners, image: Image, start: Floats, expected: floa
     pose = start
     for _ in range(STEPS):
         errors, jacobian = _reprojection(corners, image, pose)
-        step = -np.linalg.lstsq(jacobian, errors, rcond=None)[0]
+        step = np.asarray(-np.linalg.lstsq(jacobian, errors, rcond=None)[0], dtype=np.float64)
         pose = rigid(rotation_exp(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
     errors, jacobian = _reprojection(corners, image, pose)
     misfit, freedom = float(errors @ errors), len(errors) - 6
