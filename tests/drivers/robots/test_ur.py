@@ -19,6 +19,8 @@ from tests.loopback.process import Process, free_address
 
 pytest.importorskip("rtde_control")
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture(scope="module")
 def process():
@@ -259,8 +261,6 @@ def test_closing_stops_the_arm_and_the_program(controller):
 PROGRAM = """
 import sys, time
 from tests.drivers.robots.cell import moved, open_ur
-
-pytestmark = pytest.mark.realtime
 robot = open_ur(sys.argv[1])
 robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
 print("moving", flush=True)
@@ -347,3 +347,14 @@ def test_ctrl_c_does_not_reach_the_client_process(controller):
     os.killpg(running.pid, signal.SIGINT)
     words, _ = running.communicate("\n", timeout=10)
     assert words == "True\n"
+
+
+def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotten():
+    clock = worker.Clock()
+    ahead = 1000.0
+    dates = [clock.sampled(0.002 * i, ahead + 0.002 * i + 0.003 * (i % 5)) for i in range(500)]
+    np.testing.assert_allclose(dates, ahead + 0.002 * np.arange(500), atol=3e-4)
+    late = [clock.sampled(1.0 + 0.002 * i, ahead + 1.0 + 0.002 * i + 0.4) for i in range(15000)]
+    ages = ahead + 1.0 + 0.002 * np.arange(15000) + 0.4 - late
+    assert ages[0] > 0.39 and (ages[:7000] > 0.1).all()
+    assert ages[-1] < 0.001

@@ -165,14 +165,14 @@ class UrRobot:
         self.close()
 
     def _fresh(self) -> Sample:
-        """Return the newest sample; a young connection has none for a few cycles."""
+        """Return the newest sample; wait for one where this computer was too busy to take it."""
         until = time.monotonic() + STALE
         while True:
             sample = self._link.sample()
             age = np.inf if sample is None else 1e-9 * (time.time_ns() - sample.time_ns)
             if sample is not None and age < STALE:
                 return sample
-            if sample is not None or time.monotonic() > until:
+            if time.monotonic() > until:
                 raise DeviceError(
                     f"{self.name}: its last sample is {age:.2f} s old, at most {STALE} s are "
                     "allowed: the controller or the network has stopped"
