@@ -249,7 +249,7 @@ class Session:
         during = within(samples, scan.started_ns, scan.ended_ns)
         if not during:
             return _rejected(
-                stop, "no pose of the arm is known for the exposure: are the clocks one?"
+                stop, "the exposure began before the arm was there, or ended on another clock"
             )
         moved = movement(during)
         if moved > self.moved:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -88,10 +89,13 @@ class WatchedFolder(OpenScanner):
         """Wait for the next file, for as long as ``timeout`` says: a person may have to act.
 
         The exposure is said to have begun when the folder was last seen without the file, so a
-        file that came while the arm moved cannot pass for one of where it stands.
+        file that came while the arm moved cannot pass for one of where it stands. The person is
+        told when to scan.
         """
         limit = time.monotonic() + self._params.timeout
         incomplete = ""
+        self._notice()
+        sys.stderr.write(f"Scan now, and export the cloud into {self._params.path}\n")
         while time.monotonic() < limit:
             self._notice()
             for path in self._settled():
