@@ -47,6 +47,8 @@ class Recording:
         joints: (n,) joint angles [rad], if known.
         role: ``verification`` keeps it from every solver.
         time_ns: When it was taken, 0 if not known.
+        image: The camera's image; None when the archive has none for this pose.
+        camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
     """
 
     id: str
@@ -56,6 +58,8 @@ class Recording:
     joints: Floats | None = None
     role: Role = "calibration"
     time_ns: int = 0
+    image: Path | None = None
+    camera_T_target: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +98,13 @@ def check_ids(archive: Archive) -> None:
         seen.add(recording.id)
 
 
-def check_poses(root: Path, recordings: Sequence[Recording]) -> None:
+def check_poses(root: Path, recordings: Sequence[Recording], whole: bool = False) -> None:
     """Refuse poses that cannot all be true, or that no calibration can be made from.
 
     Args:
         root: What messages begin with.
         recordings: Those that are to be used, verification included.
+        whole: Whether the target's whole pose was seen: then turning alone is motion too.
 
     Raises:
         StageError: A pose out of any arm's reach, one given twice, fewer than three to calibrate
@@ -113,7 +118,7 @@ def check_poses(root: Path, recordings: Sequence[Recording]) -> None:
                 "arm; are the positions in millimetres?"
             )
     _check_distinct(root, recordings)
-    _check_motion(root, [r for r in recordings if r.role == "calibration"])
+    _check_motion(root, [r for r in recordings if r.role == "calibration"], whole)
 
 
 def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
@@ -129,7 +134,7 @@ def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
             )
 
 
-def _check_motion(root: Path, recordings: Sequence[Recording]) -> None:
+def _check_motion(root: Path, recordings: Sequence[Recording], whole: bool) -> None:
     if len(recordings) < MIN_CAPTURES:
         raise StageError(
             f"{root}: {len(recordings)} captures to calibrate with; at least {MIN_CAPTURES} are "
@@ -137,7 +142,7 @@ def _check_motion(root: Path, recordings: Sequence[Recording]) -> None:
         )
     places = np.array([recording.base_T_flange[:3, 3] for recording in recordings])
     spread = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
-    if spread < MIN_SPREAD:
+    if spread < MIN_SPREAD and not whole:
         raise StageError(
             f"{root}: all {len(places)} poses have the flange within {spread * 1e3:.2g} mm of one "
             "place; move it through the workspace"

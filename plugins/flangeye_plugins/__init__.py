@@ -6,7 +6,9 @@ from flangeye import hookimpl
 from flangeye.stage import Part, Stage
 from flangeye_plugins.acquisition.archive import acquire_archive
 from flangeye_plugins.acquisition.centres import acquire_centres
+from flangeye_plugins.acquisition.images import acquire_images
 from flangeye_plugins.acquisition.live import acquire_live
+from flangeye_plugins.acquisition.samples import acquire_samples
 from flangeye_plugins.acquisition.simulated import acquire_simulated
 from flangeye_plugins.acquisition.simulated_session import (
     acquire_simulated_marker,
@@ -37,7 +39,11 @@ from flangeye_plugins.planning.plans import grid
 from flangeye_plugins.readers.ancorasir import ancorasir
 from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.corrected import corrected
+from flangeye_plugins.readers.easy_handeye import easy_handeye
 from flangeye_plugins.readers.folder import folder
+from flangeye_plugins.readers.moveit import moveit
+from flangeye_plugins.readers.table import table
+from flangeye_plugins.readers.zivid import zivid
 from flangeye_plugins.refining.compensate import refine_compensate
 from flangeye_plugins.seams.cad import seam_cad
 from flangeye_plugins.seams.scanning import scan_file, scan_live, scan_simulated
@@ -80,6 +86,8 @@ def flangeye_stages() -> Iterable[Stage]:
         acquire_archive,
         acquire_live,
         acquire_centres,
+        acquire_images,
+        acquire_samples,
         segment_flange,
         fit_rim,
         fit_ransac_circle,
@@ -119,7 +127,11 @@ def flangeye_parts() -> Iterable[Part]:
         ancorasir,
         auto,
         corrected,
+        easy_handeye,
         folder,
+        moveit,
+        table,
+        zivid,
         grid,
         next_best,
         view_guess,

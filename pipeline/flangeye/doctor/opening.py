@@ -69,12 +69,12 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> Session:
 
 def _of_centres(path: Path, registry: Registry) -> Session:
     archive: Archive = registry.part("reader.auto").bind()(path)
-    if not any(r.centre_in_camera is not None for r in archive.recordings):
+    if not _ready_made(archive):
         raise StageError(
             f"{path}: holds scans ({archive.layout}), and nothing says what to look for in them; "
             "add --recipe with the recipe that would run on it"
         )
-    return replace(_of_archive(archive, _ready_made(archive)), acquire="acquire.centres")
+    return _of_archive(archive, _ready_made(archive))
 
 
 def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> Session:
@@ -118,7 +118,12 @@ def _with_stand_in_poses(archive: Archive) -> Archive:
 
 
 def _ready_made(archive: Archive) -> dict[str, t.Feature]:
-    return {
+    markers = {
+        r.id: t.PoseFeature(t.Transform(t.CAMERA, t.TARGET, r.camera_T_target), np.eye(6))
+        for r in archive.recordings
+        if r.camera_T_target is not None
+    }
+    return markers | {
         r.id: t.CircleFeature(r.centre_in_camera, None, {}, np.eye(3), None, 0.0)
         for r in archive.recordings
         if r.centre_in_camera is not None
@@ -129,7 +134,12 @@ def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> Session:
     calibration: Sequence[Recording] = [r for r in archive.recordings if r.role == "calibration"]
     poses = {r.id: r.base_T_flange for r in calibration}
     times = {r.id: r.time_ns for r in calibration}
-    return _session(poses, found, times)
+    session = _session(poses, found, times)
+    if not np.isfinite(session.rotations).any():
+        return replace(session, acquire="acquire.centres")
+    # A marker's place on what carries it is not known unless a recipe says so.
+    unknown = np.full_like(session.places, np.nan)
+    return replace(session, acquire="acquire.samples", places=unknown)
 
 
 def _session(

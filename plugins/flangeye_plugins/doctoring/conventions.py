@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flangeye import part
-from flangeye.conventions import EULER_ORDERS
+from flangeye.conventions import CONVENTIONS, EULER_ORDERS
 from flangeye.diagnosis import Finding, Findings, Session
 from flangeye.mending import inverted, reread, transposed
 from flangeye_plugins.doctoring.asis import fit_of, variants
@@ -55,7 +55,9 @@ def _stated(session: Session) -> str | None:
         return None
     ((_, params),) = session.reader.items()
     rotation = params.get("rotation") if params else None
-    return rotation if isinstance(rotation, str) else None
+    if not isinstance(rotation, str):
+        return None
+    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
 
 
 def _name(rotation: str) -> str:

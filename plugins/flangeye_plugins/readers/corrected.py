@@ -48,7 +48,9 @@ class CorrectedParams(Params):
     transposed: bool = Field(False, description="The rotations' matrices were transposed.")
     scale: float = Field(1.0, gt=0, description="What the robot's positions are multiplied with.")
     target_scale: float = Field(
-        1.0, gt=0, description="What ready-made centres are multiplied with."
+        1.0,
+        gt=0,
+        description="What positions of ready-made centres and markers are multiplied with.",
     )
     inverted: bool = Field(False, description="The poses are flange_T_base.")
     target_offset: tuple[Length, Length, Length] = param(
@@ -100,7 +102,12 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     centre = recording.centre_in_camera
     if centre is not None:
         centre = centre * params.target_scale
-    return replace(recording, base_T_flange=pose[0], centre_in_camera=centre)
+    target = recording.camera_T_target
+    if target is not None:
+        target = scaled(target, params.target_scale)
+    return replace(
+        recording, base_T_flange=pose[0], centre_in_camera=centre, camera_T_target=target
+    )
 
 
 def _shift(
