@@ -10,6 +10,9 @@ from flangeye import hookspecs
 from flangeye.registry import Registry
 from tests import toy
 
+# Installed and run as a vendor would: test_wheel.py.
+collect_ignore = ["vendor_example"]
+
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 
 

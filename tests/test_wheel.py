@@ -55,7 +55,10 @@ def test_the_wheel_runs_in_an_empty_folder(flangeye, tmp_path):
 
 
 def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
-    assert "acme 1.0.0: cost.acme_largest_axis, fit.acme_hull" in flangeye("plugins").stdout
+    assert (
+        "acme 1.0.0: cost.acme_largest_axis, fit.acme_hull, scanner.acme"
+        in flangeye("plugins").stdout
+    )
     assert "tolerance: length = 1 mm" in flangeye("stages", "fit.acme_hull").stdout
     recipe = tmp_path / "acme.yaml"
     recipe.write_text(
@@ -88,3 +91,19 @@ def test_a_cost_of_ones_own_is_minimised(flangeye, tmp_path):
     assert told.returncode == 0, told.stderr
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert len(result["observations"]) < 75  # the cost was small enough before all were pulled
+
+
+def test_a_vendors_own_tests_pass(installed, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    told = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:dash",
+         "--rootdir", tmp_path, ROOT / "tests" / "vendor_example" / "tests"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert told.returncode == 0, told.stdout
+
+
+def test_a_new_plugin_can_be_written_from_the_wheel(flangeye, tmp_path):
+    told = flangeye("new-plugin", "acme", "--kind", "fit")
+    assert told.returncode == 0, told.stderr
+    assert (tmp_path / "flangeye-acme" / "src" / "flangeye_acme" / "fit.py").is_file()

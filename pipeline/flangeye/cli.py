@@ -469,5 +469,18 @@ def loopback(
     find_loopback(offered, model).serve(options)
 
 
+@app.command("new-plugin")
+def new_plugin(
+    name: Annotated[str, typer.Argument(help="Of the plugin, for example acme_hull.")],
+    kind: Annotated[str, typer.Option(help="What it is: scanner, fit, solve, …")],
+    into: Annotated[Path, typer.Option(help="Where its folder is made.")] = Path(),
+) -> None:
+    """Write an installable package with one plugin, a stand-in whose tests pass at once."""
+    from flangeye.newplugin import write_plugin
+
+    folder = write_plugin(name, kind, into)
+    typer.echo(f"{folder}: pip install --editable '{folder}[dev]' && pytest {folder}")
+
+
 if __name__ == "__main__":
     main()

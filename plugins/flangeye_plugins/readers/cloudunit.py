@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flangeye import StageError
 from flangeye.catalogue import ScannerModel
 from flangeye.cloudfile import PER_METRE, LengthUnit
+from flangeye.errors import StageError
 from flangeye.types import PointCloud
 
 STATED_LIMIT = 20.0

@@ -3,6 +3,7 @@
 import numpy as np
 
 from acme_flangeye.cost import cost_largest_axis
+from acme_flangeye.scanner import scanner_acme
 from flangeye import Params, hookimpl, stage
 from flangeye.catalogue import Flange
 from flangeye.geometry import basis_of_plane
@@ -42,4 +43,4 @@ def flangeye_stages():
 
 @hookimpl
 def flangeye_parts():
-    return [cost_largest_axis]
+    return [cost_largest_axis, scanner_acme]

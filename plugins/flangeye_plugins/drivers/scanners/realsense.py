@@ -79,7 +79,7 @@ def _serial(rs: Any, wanted: str | None) -> str:
     if wanted is None or wanted not in found:
         problem = f"no camera {wanted}; there are" if wanted else "several cameras, give serial"
         raise DeviceError(f"{NAME}: {problem}: {', '.join(found)}")
-    return wanted
+    return str(wanted)
 
 
 class Realsense(OpenScanner):

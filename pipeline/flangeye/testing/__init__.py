@@ -1,0 +1,42 @@
+"""The conformance kit: what every plugin of a kind must do, as tests a vendor inherits.
+
+``class TestMyFit(FitConformance): stage = my_fit`` in a test module is all that pytest needs; it
+then runs every ``test_…`` method of the class. Nothing here imports pytest: a method that finds a
+fault raises AssertionError with one line that says what was expected.
+"""
+
+from flangeye.testing.base import Conformance
+from flangeye.testing.costs import CostConformance, ErrorConformance
+from flangeye.testing.devices import RobotConformance, ScannerConformance, SensorConformance
+from flangeye.testing.percapture import FitConformance, SegmentConformance
+from flangeye.testing.solving import RefineConformance, SolveConformance, VerifyConformance
+from flangeye.testing.sources import (
+    AcquireConformance,
+    PlanConformance,
+    ReaderConformance,
+    ViewConformance,
+)
+from flangeye.testing.welding import ScanConformance, SeamConformance, WeldConformance
+
+KITS = {
+    "acquire": AcquireConformance,
+    "segment": SegmentConformance,
+    "fit": FitConformance,
+    "solve": SolveConformance,
+    "refine": RefineConformance,
+    "verify": VerifyConformance,
+    "scan": ScanConformance,
+    "seam": SeamConformance,
+    "weld": WeldConformance,
+    "reader": ReaderConformance,
+    "plan": PlanConformance,
+    "view": ViewConformance,
+    "cost": CostConformance,
+    "error": ErrorConformance,
+    "robot": RobotConformance,
+    "scanner": ScannerConformance,
+    "sensor": SensorConformance,
+}
+"""Kind of stage or part -> its class."""
+
+__all__ = ["KITS", "Conformance", *(kit.__name__ for kit in KITS.values())]

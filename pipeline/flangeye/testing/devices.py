@@ -1,0 +1,294 @@
+"""``robot``, ``scanner`` and ``sensor`` parts: drivers, with a device or its counterpart there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.devices import (
+    GRACE,
+    PATIENCE,
+    DeviceError,
+    FrameDropped,
+    Robot,
+    RobotState,
+    Scan,
+    Scanner,
+    SensorFrame,
+    TactileSensor,
+)
+from flangeye.testing.base import Conformance
+from flangeye.testing.judge import require, require_close, require_one_line, require_round_trip
+from flangeye.testing.sources import logged
+
+OVERSHOOT = 1.05
+"""A speed that is asked for may be exceeded by this much, for a cycle."""
+
+SPEED = 0.3
+"""Of joints in the kit's moves [rad/s]: slow enough for a real arm."""
+
+ACCELERATION = 2.0
+"""Of joints in the kit's moves [rad/s^2]."""
+
+STEP = 0.1
+"""How far the last joint is turned [rad]."""
+
+STANDING = 1e-3
+"""Of joints, less is standing [rad/s]."""
+
+LATE = 1.0
+"""What a busy machine may add to any time that is measured [s]."""
+
+
+class DriverConformance(Conformance):
+    """Base of the three.
+
+    ``params`` say how to reach the device. Where something must be started first, or a test's own
+    fixture gives the parameters, override :meth:`open`.
+
+    Attributes:
+        unreachable: Parameters with which nothing can be reached; the refusal is tested with them.
+    """
+
+    unreachable: ClassVar[Any] = None
+
+    def open(self) -> Any:
+        """Return the device, open."""
+        return self.call()
+
+    @contextmanager
+    def opened(self) -> Iterator[Any]:
+        """Open the device, and close it after."""
+        with self.open() as device:
+            yield device
+
+    def test_closing_twice_is_safe_and_it_opens_again(self) -> None:
+        """A run that broke off is gone on with: the device must be free at once."""
+        for _ in range(3):
+            device = self.open()
+            require(device.name, "the device has no name")
+            device.close()
+            device.close()
+
+    def test_a_device_that_is_not_there_is_one_line(self) -> None:
+        """Which, why, and what to do; within PATIENCE."""
+        if self.unreachable is None:
+            return
+        began = time.monotonic()
+        try:
+            self.plugin.function(*self._models(), params=self.unreachable).close()
+        except DeviceError as error:
+            require_one_line(error)
+        else:
+            raise AssertionError("a device that is not there could be opened")
+        took = time.monotonic() - began
+        require(took < PATIENCE + LATE, f"it took {took:.1f} s to say so, at most {PATIENCE:g} s")
+
+    def _models(self) -> list[Any]:
+        values = {**self._cell(), **self.context()}
+        return [self._value(values, name, need) for name, need in self.plugin.needs.items()]
+
+
+class RobotConformance(DriverConformance):
+    """A ``robot`` part. It moves the last joint by 0.1 rad, at 0.3 rad/s: see that it may."""
+
+    kind = "robot"
+
+    def test_it_says_where_it_is(self) -> None:
+        """A sample in metres, in frames, new, and as the model's own kinematics have it."""
+        with self.opened() as robot:
+            require(isinstance(robot, Robot), "it lacks methods of flangeye.devices.Robot")
+            state = robot.state()
+            require(isinstance(state, RobotState), f"state() gave {type(state).__name__}")
+            pose = state.base_T_flange
+            require((pose.parent, pose.child) == (t.BASE, t.FLANGE), f"the pose is {pose.name}")
+            require(np.linalg.norm(pose.translation) < 5.0, "the pose is not in metres")
+            require(
+                len(state.joints) == len(state.joint_speeds), "joints and speeds differ in number"
+            )
+            require(np.abs(state.joints).max() < 4 * np.pi, "the joints are not in radians")
+            require(0 < robot.period < 0.1, f"a period of {robot.period} s")
+
+    def test_time_goes_on(self) -> None:
+        """Each cycle has a sample of its own."""
+        with self.opened() as robot:
+            first = robot.state().time_ns
+            for _ in range(20):
+                robot.wait_cycle()
+            require(robot.state().time_ns > first, "20 cycles later the sample is as old as before")
+
+    def test_a_joint_move_arrives_and_keeps_to_its_speed(self) -> None:
+        """There and back; never faster than was said."""
+        with self.opened() as robot:
+            start = robot.state().joints
+            target = start + np.eye(len(start))[-1] * STEP
+            for joints in (target, start):
+                robot.move_joints(joints, SPEED, ACCELERATION)
+                fastest, state = self._until_still(robot)
+                require_close(state.joints, joints, 1e-3, "a joint after its move [rad]")
+                require(
+                    0.1 * SPEED < fastest <= SPEED * OVERSHOOT,
+                    f"a joint went at {fastest:.3g} rad/s, {SPEED} was said",
+                )
+
+    def test_it_stops_at_once(self) -> None:
+        """In the middle of a move, and it stays where it stopped."""
+        with self.opened() as robot:
+            start = robot.state().joints
+            robot.move_joints(start + np.eye(len(start))[-1] * 4 * STEP, SPEED, ACCELERATION)
+            self._cycles(robot, 0.3)
+            require(np.abs(robot.state().joint_speeds).max() > STANDING, "the move has not begun")
+            robot.stop()
+            robot.stop()
+            _, state = self._until_still(robot)
+            gone = abs(state.joints[-1] - start[-1])
+            require(gone < 3 * STEP, f"after stop() the joint went on to {gone:.3g} rad")
+            robot.move_joints(start, SPEED, ACCELERATION)
+            self._until_still(robot)
+
+    def test_a_velocity_ends_without_commands(self) -> None:
+        """Nobody asks any more: it brakes after GRACE."""
+        with self.opened() as robot:
+            start = robot.state().joints
+            robot.move_velocity(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]), 0.2)
+            self._cycles(robot, GRACE + 1.0)
+            speed = float(np.abs(robot.state().joint_speeds).max())
+            require(speed < STANDING, f"without commands it still goes at {speed:.3g} rad/s")
+            robot.move_joints(start, SPEED, ACCELERATION)
+            self._until_still(robot)
+
+    def _cycles(self, robot: Robot, seconds: float) -> None:
+        for _ in range(round(seconds / robot.period)):
+            robot.wait_cycle()
+
+    def _until_still(self, robot: Robot) -> tuple[float, RobotState]:
+        """Return the highest joint speed on the way, and where it came to rest."""
+        fastest, still = 0.0, 0
+        for _ in range(round(10.0 / robot.period)):
+            robot.wait_cycle()
+            state = robot.state()
+            speed = float(np.abs(state.joint_speeds).max())
+            fastest = max(fastest, speed)
+            still = still + 1 if speed < STANDING and state.mode != "moving" else 0
+            if still * robot.period > 0.1:
+                return fastest, state
+        raise AssertionError("the arm does not come to rest within 10 s")
+
+
+class ScannerConformance(DriverConformance):
+    """A ``scanner`` part. What it looks at must give points; where, does not matter."""
+
+    kind = "scanner"
+
+    def scanned(self, scanner: Scanner) -> Scan:
+        """Return one scan; a frame that got lost is asked for again."""
+        for _ in range(5):
+            try:
+                return scanner.expose()()
+            except FrameDropped as error:
+                require_one_line(error)
+        raise AssertionError("five exposures in a row were dropped")
+
+    def test_it_gives_points_in_metres(self) -> None:
+        """In ``camera``, single precision, missing points NaN, within the scanner's range."""
+        with self.opened() as scanner:
+            require(isinstance(scanner, Scanner), "it lacks methods of flangeye.devices.Scanner")
+            cloud = self.scanned(scanner).cloud
+        require(cloud.frame == t.CAMERA, f"the cloud is in '{cloud.frame}', not in '{t.CAMERA}'")
+        points = cloud.points()
+        require(len(points), "a scan without a point")
+        require(points.any(axis=1).all(), "missing points are zero; they must be NaN")
+        depth = float(np.median(np.linalg.norm(points, axis=1)))
+        near, far = self.scanner.near / 20, self.scanner.far * 20
+        require(near < depth < far, f"the scan's middle is {depth:.3g} m away: not in metres?")
+
+    def test_it_says_its_unit_and_layout(self) -> None:
+        """The device's own report, for the log; and the layout is as it says."""
+        with self.opened() as scanner:
+            facts = {name.lower(): value for name, value in scanner.facts.items()}
+            require(any("unit" in name for name in facts), "facts do not say the device's unit")
+            cloud = self.scanned(scanner).cloud
+        if "organised" in facts.get("layout", ""):
+            require(cloud.organised, "the device says organised, the cloud is not")
+
+    def test_an_exposure_has_its_time(self) -> None:
+        """Begun after it was asked for, ended before it was given, on this computer's clock."""
+        with self.opened() as scanner:
+            before = time.time_ns()
+            scan = self.scanned(scanner)
+            after = time.time_ns()
+        slack = LATE * 1e9
+        require(scan.started_ns >= before - slack, "the exposure began before it was asked for")
+        require(
+            scan.started_ns <= scan.ended_ns <= after,
+            "the exposure ended before it began, or later",
+        )
+
+    def test_scans_follow_each_other(self) -> None:
+        """A second exposure begins and ends after the first."""
+        with self.opened() as scanner:
+            first, second = self.scanned(scanner), self.scanned(scanner)
+        later = second.started_ns >= first.started_ns and second.ended_ns >= first.ended_ns
+        require(later, "the second scan began or ended before the first")
+
+    def test_a_scan_survives_the_log(self) -> None:
+        """As a capture, written to MCAP and read back."""
+        with self.opened() as scanner:
+            scan = self.scanned(scanner)
+        pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
+        capture = t.Capture("0", scan.cloud, pose, time_ns=scan.ended_ns)
+        require_round_trip(capture, logged)
+
+
+class SensorConformance(DriverConformance):
+    """A ``sensor`` part. A tactile sensor that is on gives frames by itself."""
+
+    kind = "sensor"
+
+    def frames(self, sensor: TactileSensor, count: int) -> list[SensorFrame]:
+        """Return the next frames."""
+        found: list[SensorFrame] = []
+        limit = time.monotonic() + PATIENCE + LATE
+        while len(found) < count and time.monotonic() < limit:
+            frame = sensor.frame()
+            if frame is None:
+                time.sleep(0.002)
+            else:
+                found.append(frame)
+        require(len(found) == count, f"{len(found)} frames within {PATIENCE:g} s, not {count}")
+        return found
+
+    def test_its_frames_are_images_with_a_time(self) -> None:
+        """One after the other, each given once."""
+        with self.opened() as sensor:
+            require(isinstance(sensor, TactileSensor), "it lacks methods of devices.TactileSensor")
+            times = [frame.time_ns for frame in self.frames(sensor, 5)]
+        require(times == sorted(set(times)), "frames are not in order, or one came twice")
+
+    def test_its_camera_is_calibrated(self) -> None:
+        """A pinhole matrix in pixels, of the images it gives."""
+        with self.opened() as sensor:
+            image = self.frames(sensor, 1)[0].image
+            matrix = np.asarray(sensor.camera_matrix)
+        require(matrix.shape == (3, 3), f"a camera matrix of shape {matrix.shape}")
+        rows, columns = image.pixels.shape[:2]
+        inside = 0 < matrix[0, 2] < columns and 0 < matrix[1, 2] < rows
+        require(inside and matrix[0, 0] > 1, "the camera matrix is not in this image's pixels")
+
+    def test_asking_does_not_wait(self) -> None:
+        """The loop at 500 Hz asks in each of its cycles."""
+        with self.opened() as sensor:
+            self.frames(sensor, 1)
+            longest = max(_seconds(sensor.frame) for _ in range(20))
+        require(longest < 0.05 + LATE / 5, f"frame() took {longest:.3f} s")
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    began = time.monotonic()
+    call()
+    return time.monotonic() - began

@@ -1,0 +1,191 @@
+"""``segment`` and ``fit`` stages: one scan in, one feature out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from flangeye.catalogue import Flange, Sphere
+from flangeye.testing.base import Conformance
+from flangeye.testing.judge import (
+    plain,
+    require,
+    require_close,
+    require_covariance,
+    require_refusal,
+    require_round_trip,
+)
+from flangeye.testing.scenes import (
+    MIRRORED,
+    MOVED,
+    SAME,
+    SCALED,
+    Change,
+    Scene,
+    flange_scene,
+    scaled_flange,
+    scaled_sphere,
+    sphere_scene,
+)
+from flangeye.types import (
+    CAMERA,
+    Capture,
+    CircleFeature,
+    FlangeCloud,
+    PointCloud,
+    PoseFeature,
+    Rejected,
+)
+
+BALL = Sphere(radius=0.03, centre_in_flange=(0.0, 0.0, 0.1))
+
+
+class PerCaptureConformance(Conformance):
+    """Base of the two.
+
+    Attributes:
+        feature: What the stage looks for: the flange, or a ball on it.
+        tolerance: How far the centre may be off, on scans without noise [m].
+    """
+
+    feature: ClassVar[Literal["flange", "sphere"]] = "flange"
+    tolerance: ClassVar[float] = 0.1e-3
+
+    def scene(self) -> Scene:
+        """Return the scan all checks start from."""
+        return sphere_scene(BALL) if self.feature == "sphere" else flange_scene(self.flange)
+
+    def given(self, scene: Scene) -> dict[Any, Any]:
+        """Return what the stage works on."""
+        raise NotImplementedError
+
+    def answer(self, change: Change = SAME) -> tuple[Any, Scene]:
+        """Return what the stage makes of the changed scene, and the scene."""
+        scene = self.scene().changed(change)
+        known: Mapping[Any, Any] = {
+            Flange: scaled_flange(self.flange, change.scale),
+            Sphere: scaled_sphere(BALL, change.scale),
+        }
+        return self.call({**known, **self.given(scene)}), scene
+
+    def _require_centre(self, change: Change, what: str) -> None:
+        value, scene = self.answer(change)
+        require(
+            not isinstance(value, Rejected),
+            f"{what}: set aside: {value.reason if isinstance(value, Rejected) else ''}",
+        )
+        within = self.tolerance * change.scale
+        require_close(value.centre, scene.centre, within, f"{what}: the centre [m]")
+        if value.normal is not None:
+            towards = np.asarray(value.normal) @ -np.asarray(value.centre)
+            require(towards > 0, f"{what}: the normal points away from the scanner")
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal input and seed, equal output, to the last bit."""
+        first, again = self.answer()[0], self.answer()[0]
+        require(plain(first) == plain(again), "two calls with equal input differ")
+
+    def test_it_is_right_in_metres_and_in_the_cameras_frame(self) -> None:
+        """The centre of a scan without noise."""
+        self._require_centre(SAME, "a plain scan")
+
+    def test_it_moves_with_the_scene(self) -> None:
+        """Turned and shifted, so is the answer."""
+        self._require_centre(MOVED, "a scan that was moved")
+
+    def test_it_scales_with_the_scene(self) -> None:
+        """A flange a quarter larger, and farther away."""
+        self._require_centre(SCALED, "a scan that was scaled")
+
+    def test_it_follows_a_mirror(self) -> None:
+        """A mirrored scan shows a mirrored flange: its circles are as good."""
+        self._require_centre(MIRRORED, "a scan that was mirrored")
+
+    def test_its_answer_survives_the_log(self) -> None:
+        """Written to MCAP and read back, it is the same."""
+        require_round_trip(self.answer()[0])
+
+
+class SegmentConformance(PerCaptureConformance):
+    """A ``segment`` stage: Capture in, FlangeCloud or Rejected out."""
+
+    kind = "segment"
+    tolerance = 5e-3
+
+    def given(self, scene: Scene) -> dict[Any, Any]:
+        """Return the whole scan."""
+        return {Capture: scene.capture()}
+
+    def test_its_cloud_is_cut_from_the_scan(self) -> None:
+        """Every point of it is one of the scan's, near the feature, and finite."""
+        value, scene = self.answer()
+        require(isinstance(value, FlangeCloud), f"gave {type(value).__name__}, not a FlangeCloud")
+        cloud = value.cloud
+        require(cloud.frame == CAMERA, f"the cloud is in '{cloud.frame}', not in '{CAMERA}'")
+        require(
+            cloud.xyz.ndim == 2 and np.isfinite(cloud.xyz).all(), "the cloud is (N, 3), all finite"
+        )
+        scan = {point.tobytes() for point in scene.capture().cloud.points()}
+        foreign = sum(point.tobytes() not in scan for point in cloud.xyz)
+        require(foreign == 0, f"{foreign} of {len(cloud.xyz)} points are not the scan's")
+        far = np.linalg.norm(cloud.xyz - scene.centre, axis=1).max()
+        require(far < 3 * scene.radius, f"the cloud reaches {far:.3f} m from the centre")
+
+    def test_nothing_to_see_is_refused(self) -> None:
+        """No points at all, and a bare wall."""
+        scene = self.scene()
+        for what, xyz in (
+            ("a scan of nothing", np.full_like(scene.xyz, np.nan)),
+            ("a scan of a bare wall", scene.xyz / scene.xyz[..., 2:]),
+        ):
+            capture = Scene(xyz, scene.centre, scene.normal, scene.radius).capture()
+            given = {Sphere: BALL, Capture: capture}
+            require_refusal(lambda given=given: self.call(given), Rejected, what)  # type: ignore[misc]
+
+
+class FitConformance(PerCaptureConformance):
+    """A ``fit`` stage that works on a FlangeCloud; one for markers overrides :meth:`given`."""
+
+    kind = "fit"
+
+    def given(self, scene: Scene) -> dict[Any, Any]:
+        """Return what a segment stage would have cut out."""
+        return {FlangeCloud: scene.flange_cloud(), Capture: scene.capture()}
+
+    def test_its_covariances_are_covariances(self) -> None:
+        """Symmetric, no negative variance, and not zero."""
+        value, _ = self.answer()
+        require(
+            isinstance(value, (CircleFeature, PoseFeature)),
+            f"gave {type(value).__name__}, not a feature",
+        )
+        require_covariance(value.centre_covariance, "the centre's covariance")
+        require(np.trace(value.centre_covariance) > 0, "no centre is known exactly")
+        if isinstance(value, CircleFeature) and value.normal_covariance is not None:
+            require_covariance(value.normal_covariance, "the normal's covariance")
+
+    def test_its_radius_is_the_scenes(self) -> None:
+        """Radii are radii, not diameters, in metres."""
+        value, scene = self.answer()
+        radii = dict(value.radii) if isinstance(value, CircleFeature) else {}
+        for name in ("rim", "sphere"):
+            if name in radii:
+                require_close(
+                    radii[name], scene.radius, 0.05 * scene.radius, f"radius '{name}' [m]"
+                )
+
+    def test_too_little_is_refused(self) -> None:
+        """Two points, points on a line, one point many times: no circle."""
+        scene = self.scene()
+        line = scene.centre + np.linspace(-1, 1, 200)[:, None] * [scene.radius, 0.0, 0.0]
+        for what, points in (
+            ("two points", line[:2]),
+            ("points on a line", line),
+            ("one point 200 times", np.repeat(line[:1], 200, axis=0)),
+        ):
+            cloud = PointCloud(CAMERA, points.astype(np.float32))
+            little = FlangeCloud(cloud, scene.centre, scene.normal)
+            given = {Sphere: BALL, FlangeCloud: little}
+            require_refusal(lambda given=given: self.call(given), Rejected, what)  # type: ignore[misc]

@@ -1,0 +1,310 @@
+"""``solve``, ``refine`` and ``verify`` stages: from centres and poses to a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import types as t
+from flangeye.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
+from flangeye.testing.base import Conformance
+from flangeye.testing.judge import (
+    plain,
+    require,
+    require_close,
+    require_covariance,
+    require_refusal,
+    require_round_trip,
+)
+from flangeye.testing.scenes import FACING, flange_scene
+
+Floats = NDArray[np.float64]
+
+CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))
+"""``base_T_camera`` of the kit's cell."""
+
+WORK = np.array([0.55, -0.05, 0.45])
+"""Middle of the work, in ``base`` [m]."""
+
+SIZE = np.array([0.3, 0.3, 0.2])
+"""Of the work [m]."""
+
+NOISE = 0.05e-3
+"""Standard deviation of a centre [m]."""
+
+POSES = 16
+
+MOTION = rigid(rotation_exp(np.array([0.3, -0.2, 0.9])), np.array([0.2, 0.1, -0.3]))
+"""Another place for the robot's base."""
+
+SHIFT = rigid(np.eye(3), np.array([0.2, 0.1, -0.3]))
+"""The same without a turn: boxes stay boxes."""
+
+HERE = np.eye(4)
+
+
+def observed(
+    points: Floats, base_T_camera: Floats = CAMERA, noise: float = NOISE, normals: bool = True
+) -> list[t.Observation]:
+    """Return what is observed of flanges at (N, 3) points in ``base``."""
+    rng = np.random.default_rng(1)
+    true = t.Transform(t.BASE, t.CAMERA, base_T_camera)
+    observations = []
+    for index, point in enumerate(points):
+        turn = rotation_exp(rng.uniform(-0.4, 0.4, 3))
+        pose = t.Transform(t.BASE, t.FLANGE, rigid(turn, point))
+        centre = true.inverse().apply(point) + rng.normal(0, noise, 3)
+        normal = true.rotation.T @ turn[:, 2]
+        scatter = 1e-6 * (np.eye(3) - np.outer(normal, normal))
+        circle = t.CircleFeature(
+            centre=centre,
+            normal=normal * -np.sign(normal @ centre) if normals else None,
+            radii={"rim": 0.0315},
+            covariance=max(noise, 1e-6) ** 2 * np.eye(3),
+            normal_covariance=scatter if normals else None,
+            arc_coverage=1.0,
+        )
+        observations.append(t.Observation(f"{index:04d}", circle, pose))
+    return observations
+
+
+def work_points(count: int = POSES) -> Floats:
+    """Return points spread over the work, in ``base`` [m]."""
+    return np.asarray(WORK + np.random.default_rng(2).uniform(-0.5, 0.5, (count, 3)) * SIZE)
+
+
+def reference_solution(observations: Sequence[t.Observation]) -> t.HandEye:
+    """Return the plain least-squares calibration of some observations."""
+    camera = np.array([o.feature.centre for o in observations])
+    base = np.array([o.tcp_in_base for o in observations])
+    pose = t.Transform(t.BASE, t.CAMERA, rigid(*kabsch(camera, base)))
+    pairs = tuple(
+        t.Pair(o, pose.apply(c) - b) for o, c, b in zip(observations, camera, base, strict=True)
+    )
+    estimate = t.TransformEstimate(pose, kabsch_covariance(base, NOISE), base.mean(axis=0))
+    return t.HandEye(estimate, pairs, "solve.kit")
+
+
+def elsewhere(observations: Sequence[t.Observation], motion: Floats) -> list[t.Observation]:
+    """Return the same scans for a robot whose base stands elsewhere."""
+    moved = t.Transform(t.BASE, t.BASE, motion)
+    return [replace(o, base_T_flange=moved @ o.base_T_flange) for o in observations]
+
+
+class SolvingConformance(Conformance):
+    """Base of the three."""
+
+    def views(self, motion: Floats = HERE) -> t.Views:
+        """Return a segmented scan that is kept for verifying, as the true camera sees it."""
+        cloud = flange_scene(self.flange).flange_cloud()
+        pose = t.Transform(t.BASE, t.FLANGE, motion @ CAMERA @ FACING)
+        return t.Views([t.VerificationView("view", cloud, pose)])
+
+    def stream(self, observations: Sequence[t.Observation]) -> t.Observations:
+        """Return observations as a recipe's earlier steps give them."""
+        workspace = t.Box(WORK, SIZE)
+        source = t.Source("kit", workspace=workspace)
+        return t.Observations(observations, source, len(observations))
+
+    def known(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> dict[Any, Any]:
+        """Return what the runner knows beside the calibration."""
+        return {
+            t.Observations: self.stream(observations),
+            t.Solver: reference_solution,
+            t.Views: self.views(motion),
+            t.Box: t.Box(t.Transform(t.BASE, t.BASE, motion).apply(WORK), SIZE),
+        }
+
+    def _require_pose(self, answer: t.HandEye, expected: Floats, within: float, what: str) -> None:
+        """Compare where the work is, not the camera's origin: that is what a pose is for."""
+        found = answer.base_T_camera.transform
+        true = t.Transform(t.BASE, t.CAMERA, expected)
+        corners = true.inverse().apply(np.array([o.observation.tcp_in_base for o in answer.pairs]))
+        require_close(found.apply(corners), true.apply(corners), within, f"{what}: the work [m]")
+
+
+class SolveConformance(SolvingConformance):
+    """A ``solve`` stage: Observations in, HandEye out.
+
+    Attributes:
+        tolerance: How far the work may be off, with 0.05 mm of noise at 16 poses [m].
+    """
+
+    kind = "solve"
+    tolerance: ClassVar[float] = 0.15e-3
+
+    def solved(self, observations: Sequence[t.Observation]) -> t.HandEye:
+        """Return the stage's answer."""
+        answer = self.call(self.known(observations))
+        require(isinstance(answer, t.HandEye), f"gave {type(answer).__name__}, not a HandEye")
+        assert isinstance(answer, t.HandEye)  # noqa: S101  for type checkers
+        return answer
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal observations and seed, equal calibration, to the last bit."""
+        observations = observed(work_points())
+        first, again = self.solved(observations), self.solved(observations)
+        require(plain(first) == plain(again), "two calls with equal input differ")
+
+    def test_it_finds_the_camera_in_metres(self) -> None:
+        """A known cell with 0.05 mm of noise."""
+        answer = self.solved(observed(work_points()))
+        self._require_pose(answer, CAMERA, self.tolerance, "a known cell")
+
+    def test_it_accounts_for_every_observation(self) -> None:
+        """One pair for each that was pulled, and residuals that are what they say."""
+        observations = observed(work_points())
+        answer = self.solved(observations)
+        ids = [pair.observation.id for pair in answer.pairs]
+        require(len(ids) == len(set(ids)), "an observation has several pairs")
+        require(set(ids) <= {o.id for o in observations}, "a pair is of no observation")
+        require(len(ids) >= 3, "fewer than three pairs")
+        if answer.correction is None:
+            pose = answer.base_T_camera.transform
+            for pair in answer.pairs:
+                seen = pose.apply(pair.observation.feature.centre)
+                expected = seen - pair.observation.tcp_in_base
+                require_close(pair.residual, expected, 1e-6, "a residual [m]")
+        for pair in answer.pairs:
+            require(pair.used or pair.reason, f"{pair.observation.id} is unused without a reason")
+
+    def test_its_covariance_is_one(self) -> None:
+        """Symmetric, no negative variance."""
+        answer = self.solved(observed(work_points()))
+        require_covariance(answer.camera.covariance, "the pose's covariance")
+
+    def test_it_moves_with_the_base(self) -> None:
+        """The same scans for a robot that stands elsewhere."""
+        moved = elsewhere(observed(work_points()), MOTION)
+        within = 2 * self.tolerance
+        self._require_pose(self.solved(moved), MOTION @ CAMERA, within, "a base elsewhere")
+
+    def test_it_scales_with_the_cell(self) -> None:
+        """Everything a quarter larger."""
+        camera = CAMERA.copy()
+        camera[:3, 3] *= 1.25
+        answer = self.solved(observed(1.25 * work_points(), camera))
+        self._require_pose(answer, camera, 1.25 * self.tolerance, "a larger cell")
+
+    def test_it_never_gives_a_mirror_image(self) -> None:
+        """Centres in one plane fit their mirror image as well: only the proper one is a pose."""
+        points = work_points()
+        points[:, 2] = WORK[2]
+        answer = self.solved(observed(points, noise=NOISE / 5))
+        self._require_pose(answer, CAMERA, self.tolerance, "centres in one plane")
+
+    def test_too_little_is_refused(self) -> None:
+        """Two poses, all poses at one place, centres on a line."""
+        along = np.linspace(-0.5, 0.5, POSES)[:, None] * [0.3, 0.0, 0.0]
+        for what, points in (
+            ("two poses", work_points(2)),
+            ("all poses at one place", np.repeat(WORK[None], POSES, axis=0)),
+            ("centres on a line", WORK + along),
+        ):
+            few = observed(points, noise=NOISE / 5, normals=False)
+            require_refusal(lambda few=few: self.solved(few), t.Rejected, what)  # type: ignore[misc]
+
+    def test_its_answer_survives_the_log(self) -> None:
+        """Written to MCAP and read back, it is the same."""
+        require_round_trip(self.solved(observed(work_points())))
+
+
+class RefineConformance(SolvingConformance):
+    """A ``refine`` stage: HandEye in, HandEye out.
+
+    Attributes:
+        tolerance: How far the work may be off after refining a good calibration [m].
+    """
+
+    kind = "refine"
+    tolerance: ClassVar[float] = 0.2e-3
+
+    def refined(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> t.HandEye:
+        """Return the stage's answer to the plain calibration of some observations."""
+        given = {t.HandEye: reference_solution(observations), **self.known(observations, motion)}
+        answer = self.call(given)
+        require(isinstance(answer, t.HandEye), f"gave {type(answer).__name__}, not a HandEye")
+        assert isinstance(answer, t.HandEye)  # noqa: S101  for type checkers
+        return answer
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal input and seed, equal output, to the last bit."""
+        observations = observed(work_points())
+        first, again = self.refined(observations), self.refined(observations)
+        require(plain(first) == plain(again), "two calls with equal input differ")
+
+    def test_it_leaves_a_good_calibration_good(self) -> None:
+        """A known cell with 0.05 mm of noise, solved already."""
+        answer = self.refined(observed(work_points()))
+        self._require_pose(answer, CAMERA, self.tolerance, "a good calibration")
+        require_covariance(answer.camera.covariance, "the pose's covariance")
+
+    def test_it_moves_with_the_base(self) -> None:
+        """The same scans for a robot that stands elsewhere."""
+        answer = self.refined(elsewhere(observed(work_points()), MOTION), MOTION)
+        self._require_pose(answer, MOTION @ CAMERA, 2 * self.tolerance, "a base elsewhere")
+
+    def test_its_answer_survives_the_log(self) -> None:
+        """Written to MCAP and read back, it is the same."""
+        require_round_trip(self.refined(observed(work_points())))
+
+
+class VerifyConformance(SolvingConformance):
+    """A ``verify`` stage: HandEye in, Verification out."""
+
+    kind = "verify"
+
+    def judged(
+        self, observations: Sequence[t.Observation], motion: Floats = HERE
+    ) -> t.Verification:
+        """Return the stage's judgement of the plain calibration of some observations."""
+        given = {t.HandEye: reference_solution(observations), **self.known(observations, motion)}
+        answer = self.call(given)
+        require(
+            isinstance(answer, t.Verification), f"gave {type(answer).__name__}, no Verification"
+        )
+        assert isinstance(answer, t.Verification)  # noqa: S101  for type checkers
+        return answer
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal input and seed, equal output, to the last bit."""
+        observations = observed(work_points())
+        first, again = self.judged(observations), self.judged(observations)
+        require(plain(first) == plain(again), "two calls with equal input differ")
+
+    def test_it_passes_a_good_calibration(self) -> None:
+        """A known cell with 0.05 mm of noise."""
+        answer = self.judged(observed(work_points()))
+        require(answer.passed, f"a good calibration fails: {answer.reason}")
+
+    def test_it_fails_a_bad_calibration(self) -> None:
+        """Centres that are off by 20 mm, each elsewhere."""
+        answer = self.judged(observed(work_points(), noise=20e-3))
+        require(not answer.passed, f"a calibration with 20 mm of noise passes: {answer.reason}")
+
+    def test_it_says_what_it_measured(self) -> None:
+        """One line with the figure and the limit; figures and errors that are numbers."""
+        answer = self.judged(observed(work_points()))
+        require(answer.reason and "\n" not in answer.reason, "the reason is one line")
+        require(any(c.isdigit() for c in answer.reason), "the reason names no figure")
+        for name, figure in {**answer.figures, **answer.errors}.items():
+            require(np.isfinite(figure), f"'{name}' is {figure}")
+
+    def test_it_moves_with_the_base(self) -> None:
+        """A robot that stands elsewhere is judged the same."""
+        observations = observed(work_points())
+        here = self.judged(observations)
+        there = self.judged(elsewhere(observations, SHIFT), SHIFT)
+        for name, figure in here.figures.items():
+            require(
+                np.isclose(there.figures.get(name, np.nan), figure, rtol=1e-3, atol=2e-6),
+                f"figure '{name}' depends on where the base stands",
+            )
+
+    def test_its_answer_survives_the_log(self) -> None:
+        """Written to MCAP and read back, it is the same."""
+        require_round_trip(self.judged(observed(work_points())))

@@ -1,0 +1,265 @@
+"""``acquire`` stages, ``reader``, ``plan`` and ``view`` parts: where captures come from."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import types as t
+from flangeye.archive import Archive, check_ids
+from flangeye.geometry import rigid, rotation_exp
+from flangeye.kinematics import Arm
+from flangeye.record import Recorder
+from flangeye.runlog import read_run
+from flangeye.testing.base import Conformance
+from flangeye.testing.judge import (
+    only,
+    plain,
+    require,
+    require_close,
+    require_refusal,
+    require_round_trip,
+)
+
+Floats = NDArray[np.float64]
+
+REACH = 5.0
+"""No arm's flange is farther from its base: a larger number is in millimetres [m]."""
+
+OUT_OF_RANGE = 20.0
+"""A median point so many times nearer or farther than the scanner sees is in another unit."""
+
+LOOKED_AT = 3
+"""Captures that are compared; more would only take longer."""
+
+CAMERA = rigid(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([0.5, 0.0, 1.1]))
+"""``base_T_camera`` of the kit's cell: it looks down at the work."""
+
+
+class AcquireConformance(Conformance):
+    """An ``acquire`` stage: a lazy stream of captures, or of observations.
+
+    Attributes:
+        archive: The recordings it is run on, where it needs any.
+    """
+
+    kind = "acquire"
+    archive: ClassVar[Path | None] = None
+
+    def acquired(self, count: int = LOOKED_AT) -> tuple[Any, list[Any]]:
+        """Return the stream, and its first captures or observations."""
+        stream = self.call({t.ArchivePath: t.ArchivePath(self.archive)})
+        require(
+            isinstance(stream, (t.Captures, t.Observations)),
+            f"gave {type(stream).__name__}, not Captures or Observations",
+        )
+        items = list(itertools.islice(iter(stream), count))
+        if isinstance(stream, t.Captures):
+            stream.close()
+        require(items, "gave nothing")
+        return stream, items
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal input and seed, equal captures, to the last bit."""
+        (first, some), (again, same) = self.acquired(), self.acquired()
+        require(first.source.fingerprint, "the source has no fingerprint")
+        require(
+            first.source.fingerprint == again.source.fingerprint, "the fingerprint is another now"
+        )
+        require(list(map(plain, some)) == list(map(plain, same)), "two runs' captures differ")
+
+    def test_captures_are_named_and_in_order(self) -> None:
+        """Ids are unique; those kept for verifying come first."""
+        stream, items = self.acquired(10_000)
+        ids = [item.id for item in items]
+        require(len(set(ids)) == len(ids), "two captures have the same id")
+        total = stream.total
+        require(total is None or total == len(items), f"{total} were promised, {len(items)} came")
+        roles = [capture.role for capture in only(items, t.Capture)]
+        require(
+            roles == sorted(roles, key="calibration".__eq__), "captures for verifying come first"
+        )
+
+    def test_poses_and_points_are_in_metres_and_frames(self) -> None:
+        """Poses within an arm's reach, points within the scanner's."""
+        for item in self.acquired()[1]:
+            pose = item.base_T_flange
+            require((pose.parent, pose.child) == (t.BASE, t.FLANGE), f"a pose is {pose.name}")
+            far = float(np.linalg.norm(pose.translation))
+            require(far < REACH, f"a flange is {far:.3g} m from its base: not in metres?")
+        for capture in only(self.acquired()[1], t.Capture):
+            require(capture.cloud.frame == t.CAMERA, f"a cloud is in '{capture.cloud.frame}'")
+            points = capture.cloud.points()
+            depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+            near, limit = self.scanner.near / OUT_OF_RANGE, self.scanner.far * OUT_OF_RANGE
+            require(near < depth < limit, f"a scan's middle is {depth:.3g} m away: not in metres?")
+
+    def test_captures_survive_the_log(self) -> None:
+        """Scans, poses and joints come back from MCAP as they went in."""
+        for capture in only(self.acquired()[1], t.Capture):
+            require_round_trip(capture, logged)
+
+    def test_a_missing_archive_is_refused(self) -> None:
+        """Where it needs recordings, it says in one line that there are none."""
+        if t.ArchivePath in self.plugin.needs.values():
+            for path in (None, Path("no/such/recordings")):
+                given = {t.ArchivePath: t.ArchivePath(path)}
+
+                def pull(given: dict[Any, Any] = given) -> Any:
+                    return list(self.call(given))
+
+                require_refusal(pull, t.Rejected, f"archive {path}")
+
+
+def logged(capture: t.Capture) -> t.Capture:
+    """Return a capture as it comes back from an MCAP log with whole clouds."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        with closing(Recorder(path, {"recipe.yaml": ""}, full_clouds=True)) as recorder:
+            recorder.flangeye_captured("0.kit", capture, 0.0)
+        (back,) = read_run(path).captures()
+    require(back.cloud.xyz.shape == capture.cloud.xyz.shape, "the scan's rows and columns are lost")
+    return back
+
+
+class ReaderConformance(Conformance):
+    """A ``reader`` part: a path in, an Archive out.
+
+    Attributes:
+        archive: A folder or file in the reader's layout.
+    """
+
+    kind = "reader"
+    archive: ClassVar[Path]
+
+    def read(self, path: Path | None = None) -> Archive:
+        """Return what the reader makes of a path."""
+        found = self.call({}, path or self.archive)
+        require(isinstance(found, Archive), f"gave {type(found).__name__}, not an Archive")
+        assert isinstance(found, Archive)  # noqa: S101  for type checkers
+        return found
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal files, equal recordings, in equal order."""
+        first, again = ([_traits(r) for r in self.read().recordings] for _ in range(2))
+        require(first == again, "two readings differ")
+
+    def test_its_recordings_are_complete(self) -> None:
+        """Named, within the arm's reach, with files that exist below the root."""
+        archive = self.read()
+        require(archive.recordings, "no recordings")
+        check_ids(archive)
+        for recording in archive.recordings:
+            pose = np.asarray(recording.base_T_flange, dtype=float)
+            t.Transform(t.BASE, t.FLANGE, pose)
+            far = float(np.linalg.norm(pose[:3, 3]))
+            require(far < REACH, f"{recording.id} is {far:.3g} m from the base: not in metres?")
+            if recording.cloud is not None:
+                require(recording.cloud.is_file(), f"{recording.id}: no file {recording.cloud}")
+
+    def test_what_is_no_such_archive_is_refused(self) -> None:
+        """An empty folder and a missing one: in one line."""
+        with tempfile.TemporaryDirectory() as empty:
+            for path in (Path(empty), Path(empty) / "missing"):
+                require_refusal(lambda path=path: self.read(path), t.Rejected, str(path))  # type: ignore[misc]
+
+
+def _traits(recording: Any) -> tuple[Any, ...]:
+    return recording.id, np.asarray(recording.base_T_flange).tobytes(), recording.cloud
+
+
+class PlanConformance(Conformance):
+    """A ``plan`` part: a site and a random generator in, poses to visit out."""
+
+    kind = "plan"
+
+    def planned(self, seed: int = 0, moved: Floats | None = None) -> Any:
+        """Return the plan for the kit's site, or for one whose work is elsewhere."""
+        shift = np.zeros(3) if moved is None else moved
+        arm = Arm(self.robot)
+        eye = CAMERA[:3, 3] + shift
+        site = self.plugin.needs["site"](
+            centre=CAMERA[:3, 3] + 0.7 * CAMERA[:3, 2] + shift,
+            eye=eye,
+            facing=lambda point: _facing(np.asarray(point), eye),
+            joints=lambda pose: np.zeros(arm.n),
+        )
+        return self.call({}, site, np.random.default_rng(seed))
+
+    def poses(self, seed: int = 0, moved: Floats | None = None) -> Floats:
+        """Return the (N, 4, 4) poses of the plan's first captures."""
+        found = [p.base_T_flange for p in itertools.islice(self.planned(seed, moved).poses, 30)]
+        require(found, "a plan without poses")
+        return np.array(found)
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """The generator it is given is its only randomness."""
+        require(np.array_equal(self.poses(3), self.poses(3)), "two plans with one seed differ")
+
+    def test_its_poses_are_poses_inside_its_box(self) -> None:
+        """Rigid, in metres, and where the plan says it works."""
+        plan = self.planned()
+        for pose in self.poses():
+            t.Transform(t.BASE, t.FLANGE, pose)
+            outside = np.abs(pose[:3, 3] - plan.centre) - np.asarray(plan.size) / 2
+            require((outside < 1e-6).all(), f"a pose is {outside.max():.3g} m outside the box")
+
+    def test_its_poses_tell_the_camera(self) -> None:
+        """Three or more, not all on a line: no camera could be found from those."""
+        centres = self.poses()[:, :3, 3]
+        require(len(centres) >= 3, f"{len(centres)} poses, 3 are needed")
+        spread = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
+        require(spread[1] > 0.02 * np.sqrt(len(centres)), "all poses are on a line")
+
+    def test_it_moves_with_the_site(self) -> None:
+        """Scanner and work elsewhere, the poses with them."""
+        shift = np.array([0.1, -0.2, 0.05])
+        here, there = self.poses(), self.poses(moved=shift)
+        require_close(there[:, :3, 3], here[:, :3, 3] + shift, 1e-6, "a pose of a moved site [m]")
+
+    def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
+        """Where the arm can show its flange nowhere, the plan is empty, or it says why."""
+        site = self.plugin.needs["site"](
+            centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
+        )
+
+        def planned() -> Any:
+            plan = self.call({}, site, np.random.default_rng(0))
+            return None if not list(itertools.islice(plan.poses, 1)) else plan
+
+        require_refusal(planned, type(None), "a site that shows nothing")
+
+
+def _facing(point: Floats, eye: Floats) -> Floats:
+    """Return the rotation whose z points from ``point`` to ``eye``."""
+    z = (eye - point) / np.linalg.norm(eye - point)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+class ViewConformance(Conformance):
+    """A ``view`` part: where the scanner stands, before anything is known."""
+
+    kind = "view"
+
+    def guess(self) -> Floats:
+        """Return the guess."""
+        return np.asarray(self.call({}, Arm(self.robot), self.scanner), dtype=float)
+
+    def test_it_gives_the_same_twice(self) -> None:
+        """Equal input, equal guess, to the last bit."""
+        require(np.array_equal(self.guess(), self.guess()), "two guesses differ")
+
+    def test_it_is_a_pose_in_metres(self) -> None:
+        """``base_T_camera``, rigid, in a cell's size."""
+        pose = self.guess()
+        t.Transform(t.BASE, t.CAMERA, pose)
+        far = float(np.linalg.norm(pose[:3, 3]))
+        require(far < REACH, f"the scanner is {far:.3g} m from the base: not in metres?")
