@@ -269,7 +269,7 @@ class RobotDriver:
     """
 
     name: str
-    open: Callable[[], Robot] = field(compare=False)
+    open: Callable[[], Robot] = field(compare=False, repr=False)
     in_this_process: bool = False
 
 
@@ -283,7 +283,7 @@ class ScannerDriver:
     """
 
     name: str
-    open: Callable[[], Scanner] = field(compare=False)
+    open: Callable[[], Scanner] = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True)

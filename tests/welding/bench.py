@@ -81,7 +81,7 @@ def weld(true, plan, mode="tactile", settings=None, **world):
 class World:
     def __init__(
         self, true, plan, controller, settings, *, gaps=(), seed=0, latency=0.03, noise=10e-6,
-        angle=0.0, above=12e-3, hidden=None, longest=80.0,
+        angle=0.0, above=12e-3, hidden=None, longest=80.0, period=PERIOD,
     ):  # fmt: skip
         self.root = Path(true)
         self.contact = Contact(Groove(self.root, SECTION, gaps), Tip())
@@ -91,6 +91,7 @@ class World:
         self.angle = np.arctan2(start.tangent[1], start.tangent[0]) + angle
         self.rng = np.random.default_rng(seed)
         self.latency, self.noise, self.hidden, self.longest = latency, noise, hidden, longest
+        self.period = period
         self.under_way, self.next_image, self.torch_s = [], 1.0, -DISTANCE
 
     def run(self):
@@ -104,9 +105,9 @@ class World:
             phases.append(self.controller.phase)
             if self.controller.phase in ("done", "stopped"):
                 break
-            self.position = self.position + command.velocity * PERIOD
-            self.angle += command.turn * PERIOD
-            time += PERIOD
+            self.position = self.position + command.velocity * self.period
+            self.angle += command.turn * self.period
+            time += self.period
         columns = np.array(rows).T
         done = Weld(self.controller, *columns, phases)
         done.length = self.root.length

@@ -106,3 +106,17 @@ def test_another_side_of_the_groove_does_as_well():
     true = curved(0.08)
     done = weld(true, planning_error(true, seed=1), settings=Following(side="right"))
     assert abs(done.deviation()).max() < 0.4e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seam", [straight, curved])
+def test_a_hundred_planning_errors_without_one_run_away(seam):
+    true = seam(0.1)
+    settings = Following()
+    for seed in range(50):
+        done = weld(true, planning_error(true, seed), settings=settings, seed=seed, period=16e-3)
+        assert done.controller.phase == "done", seed
+        assert rms(done.deviation()) < 0.15e-3, seed
+        assert abs(done.deviation()).max() < 0.4e-3, seed
+        # The tip never goes farther than the sweep that seeks the groove.
+        assert abs(done.tip).max() < settings.reach + 5e-3, seed
