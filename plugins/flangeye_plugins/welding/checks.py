@@ -95,8 +95,8 @@ def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> N
 
 
 def tool_angles(plan: Path, distance: float) -> Floats:
-    """Return the tool's angles to the seam at the torch [rad], with both ends on the plan."""
-    ahead = np.arange(distance, plan.length, 1e-3)
+    """Return the tool's angles to the seam at the torch [rad], with tip and torch on the plan."""
+    ahead = np.arange(distance, plan.length + distance, 1e-3)
     tips, _ = plan.evaluate(ahead)
     behind = np.array([_chord_end(plan, float(s), distance) for s in ahead])
     torches, tangents = plan.evaluate(behind)
