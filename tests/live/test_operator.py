@@ -1,5 +1,6 @@
 """The operator stops the arm: at the keyboard of a real terminal, and by Ctrl-C."""
 
+import contextlib
 import fcntl
 import os
 import pty
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 import time
 
 import pytest
@@ -27,38 +29,43 @@ def cell(tmp_path):
         yield cell
 
 
-def start_in_terminal(cell, *words):
-    """Start ``flangeye run`` in a terminal of its own; return process and the terminal's end."""
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "flangeye.cli", "run", *map(str, words)],
-        cwd=cell.folder, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
-    )  # fmt: skip
-    os.close(theirs)
-    return process, ours
+class Terminal:
+    """``flangeye run`` in a terminal of its own, whose screen is read all the time."""
 
+    def __init__(self, cell, *words):
+        self._end, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "flangeye.cli", "run", *map(str, words)],
+            cwd=cell.folder, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )  # fmt: skip
+        os.close(theirs)
+        self._said = b""
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
 
-def read_to_end(terminal):
-    said = b""
-    while True:
-        try:
-            data = os.read(terminal, 65536)
-        except OSError:  # how Linux says that nobody is at the other end
-            return said.decode(errors="replace")
-        if not data:
-            return said.decode(errors="replace")
-        said += data
+    def press(self, key):
+        os.write(self._end, key)
+
+    def _read(self):
+        with contextlib.suppress(OSError):  # how Linux says that nobody is at the other end
+            while data := os.read(self._end, 65536):
+                self._said += data
+
+    def read_to_end(self):
+        self._reader.join(timeout=30)
+        os.close(self._end)
+        return self._said.decode(errors="replace")
 
 
 @pytest.mark.parametrize(("key", "said"), [(b" ", "the space bar"), (b"\x03", "Ctrl-C")])
 def test_a_key_stops_the_arm(cell, key, said):
-    process, terminal = start_in_terminal(cell, cell.recipe(), "--move", "--out", "run")
+    terminal = Terminal(cell, cell.recipe(), "--move", "--out", "run")
     cell.wait_until(cell.moving, patience=120)
-    os.write(terminal, key)
-    cell.wait_until(cell.standing, patience=2)
-    text = read_to_end(terminal)
-    assert process.wait(timeout=20) == 130
+    terminal.press(key)
+    cell.wait_until(cell.standing, patience=5)
+    assert terminal.process.wait(timeout=30) == 130
+    text = terminal.read_to_end()
     assert said in text
     assert "Traceback" not in text
 
