@@ -66,7 +66,7 @@ def _from_subsets(problem: Problem, rng: np.random.Generator) -> Solution | None
     for _ in range(SUBSETS):
         chosen = rng.choice(n, size, replace=False)
         try:
-            start = start_of(problem.sightings.where(chosen), problem.loop, rng)
+            start = start_of(problem.sightings.where(chosen), problem.loop, rng, restarts=0)
         except (np.linalg.LinAlgError, CalibrationRefused):
             continue
         median = float(np.median(_distances(problem, start)))
@@ -106,6 +106,8 @@ def _cost(problem: Problem, found: Solution) -> float:
 
 def spread(found: Solution) -> tuple[float, float]:
     """Return how well the sightings agree: [m] and [rad], rms over those that do."""
+    if not found.inliers.any():
+        return np.inf, np.inf
     r = found.linear.residuals[found.inliers]
     turn, shift = (np.sqrt((r[:, k : k + 3] ** 2).sum(axis=1).mean()) for k in (0, 3))
     return float(shift), float(turn)

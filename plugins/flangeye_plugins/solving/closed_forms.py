@@ -16,7 +16,7 @@ from flangeye.statistics import covariance_inflation
 from flangeye.types import HandEye, Observation
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.solving.closed.motions import Motions, motions_of, place_of
-from flangeye_plugins.solving.degeneracy import Limits, require_enough, unobservable
+from flangeye_plugins.solving.degeneracy import Limits, require_enough, require_turns, unobservable
 from flangeye_plugins.solving.equations import Noise
 from flangeye_plugins.solving.estimates import (
     columns_of,
@@ -27,7 +27,7 @@ from flangeye_plugins.solving.estimates import (
     transforms_of,
 )
 from flangeye_plugins.solving.likelihood import Problem, weigh, with_noise
-from flangeye_plugins.solving.loop import Unknowns
+from flangeye_plugins.solving.loop import Unknowns, meaningless_turns
 from flangeye_plugins.solving.sightings import Loop, Sightings, loop_of, sightings_of
 
 Floats = NDArray[np.float64]
@@ -77,6 +77,7 @@ def solve_closed(
     loop, sightings = loop_of(configuration), sightings_of(pulled, configuration, arm)
     problem = Problem(sightings, loop, None, None)
     require_enough(problem)
+    require_turns(problem)
     try:
         values = solver(sightings, loop)
     except np.linalg.LinAlgError:
@@ -88,9 +89,12 @@ def solve_closed(
     covariance *= covariance_inflation(found.freedom, found.basis.shape[1])
     transforms = transforms_of(configuration, *values)
     points = points_of_interest(configuration, transforms, pulled, arm)
+    arbitrary = meaningless_turns(sightings, loop, at)
     at_columns = {name: columns_of(name, configuration) for name in transforms}
     estimates = [
-        estimate_at(t, covariance[at_columns[n], at_columns[n]], points[n], np.zeros((6, 0)))
+        estimate_at(
+            t, covariance[at_columns[n], at_columns[n]], points[n], arbitrary[at_columns[n]]
+        )
         for n, t in transforms.items()
     ]
     pairs = pairs_of(configuration, transforms, pulled, arm, [None] * len(pulled))

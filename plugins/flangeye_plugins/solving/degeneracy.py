@@ -55,6 +55,21 @@ def require_enough(problem: Problem) -> None:
         raise StageError(f"all {len(s)} poses are the same: move the arm between captures")
 
 
+def require_turns(problem: Problem) -> None:
+    """Refuse arms that stood still or never turned, before any start is looked for.
+
+    Raises:
+        CalibrationRefused: Names the arm.
+    """
+    if not (problem.loop.y or problem.loop.z):
+        return
+    for name, poses in _arms(problem):
+        if not _turns(poses):
+            raise CalibrationRefused(
+                f"the camera's pose cannot be told from these poses: {name} {_fault_of(poses)}"
+            )
+
+
 def unobservable(problem: Problem, found: Solution, limits: Limits) -> Floats:
     """Return (20, k) unit moves of the unknowns that the poses tell nothing of.
 
@@ -109,19 +124,28 @@ def _of_what(weak: Floats) -> str:
 
 def missing_motion(problem: Problem) -> str:
     """Return what the arms did not do, in words."""
-    s, loop = problem.sightings, problem.loop
-    if not (loop.y or loop.z):
+    if not (problem.loop.y or problem.loop.z):
         return (
             "the target's centres lie on a line as the camera's carrier sees them; move the arm "
             "across it"
         )
-    arms = [("the arm", invert(s.b) @ s.a)]
-    if loop.y:
-        arms = [("the first arm", s.a), ("the second arm", s.b)]
-    for name, poses in arms:
+    for name, poses in _arms(problem):
         if fault := _fault_of(poses):
             return f"{name} {fault}"
     return "the poses are too much alike; spread them, by 20 deg or more about two axes"
+
+
+def _arms(problem: Problem) -> list[tuple[str, Floats]]:
+    """Return each arm's name and (N, 4, 4) poses: one of camera and target against each other."""
+    s = problem.sightings
+    if problem.loop.y:
+        return [("the first arm", s.a), ("the second arm", s.b)]
+    return [("the arm", invert(s.b) @ s.a)]
+
+
+def _turns(poses: Floats) -> bool:
+    turned = rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    return bool(np.linalg.norm(turned, axis=1).max() >= STILL[0])
 
 
 def _fault_of(poses: Floats) -> str | None:

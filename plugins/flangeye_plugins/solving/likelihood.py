@@ -181,7 +181,8 @@ def _graduate(problem: Problem, start: Solution, noise: Noise) -> Solution:
     shares = np.ones(len(limits))
     while mu < 1e8:
         shares = truncated_weights(found.squares / limits, 1.0, mu)
-        if (np.minimum(shares, 1 - shares) < 1e-6).all() or shares.sum() < 3:
+        # Early on all shares are small, and only their ratios matter.
+        if (np.minimum(shares, 1 - shares) < 1e-6).all() or shares.max() < 1e-9:
             break
         found = climb(problem, found.at, noise, shares)
         mu *= GRADUATION

@@ -173,13 +173,25 @@ def free_columns(sightings: Sightings, loop: Loop, at: Unknowns, tilt: float | N
     if loop.y:
         basis.append(np.eye(COLUMNS)[:, 6:12])
     if loop.z:
-        known = {6: 3, 5: 2, 3: 0}[int(sightings.freedoms.max())]
-        turns = np.zeros((COLUMNS, known))
-        turns[12:15] = at.z[:3, :known]
-        basis += [turns, np.eye(COLUMNS)[:, 15:18]]
+        basis += [_turns_of_place(sightings, at, seen=True), np.eye(COLUMNS)[:, 15:18]]
     elif tilt is not None and (sightings.freedoms == 5).any():
         basis.append(np.eye(COLUMNS)[:, 18:])
     return np.concatenate(basis, axis=1)
+
+
+def meaningless_turns(sightings: Sightings, loop: Loop, at: Unknowns) -> Floats:
+    """Return (20, k) the turns of the target's place that its features do not have."""
+    if not loop.z:
+        return np.zeros((COLUMNS, 0))
+    return _turns_of_place(sightings, at, seen=False)
+
+
+def _turns_of_place(sightings: Sightings, at: Unknowns, seen: bool) -> Floats:
+    known = {6: 3, 5: 2, 3: 0}[int(sightings.freedoms.max())]
+    axes = at.z[:3, :known] if seen else at.z[:3, known:3]
+    turns = np.zeros((COLUMNS, axes.shape[1]))
+    turns[12:15] = axes
+    return turns
 
 
 def weights_of(sightings: Sightings, linear: Linear, noise: Noise) -> Floats:

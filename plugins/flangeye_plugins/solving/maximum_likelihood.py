@@ -18,7 +18,7 @@ from flangeye.statistics import covariance_inflation
 from flangeye.types import HandEye, Observation, Observations
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.solving.agreement import find_agreement
-from flangeye_plugins.solving.degeneracy import Limits, require_enough, unobservable
+from flangeye_plugins.solving.degeneracy import Limits, require_enough, require_turns, unobservable
 from flangeye_plugins.solving.estimates import (
     columns_of,
     estimate_at,
@@ -28,7 +28,7 @@ from flangeye_plugins.solving.estimates import (
     transforms_of,
 )
 from flangeye_plugins.solving.likelihood import Problem, Solution
-from flangeye_plugins.solving.loop import ArmNoise
+from flangeye_plugins.solving.loop import ArmNoise, meaningless_turns
 from flangeye_plugins.solving.sightings import loop_of, sightings_of
 
 Floats = NDArray[np.float64]
@@ -92,6 +92,7 @@ def solve_maximum_likelihood(
     arm = Arm(robot) if robot else None
     problem = _problem(pulled, configuration, arm, params)
     require_enough(problem)
+    require_turns(problem)
     found = find_agreement(problem)
     limits = Limits(params.rotation_limit, params.translation_limit, params.unobservable == "mark")
     weak = unobservable(problem, found, limits)
@@ -100,10 +101,14 @@ def solve_maximum_likelihood(
     transforms = transforms_of(configuration, at.x, at.y, at.z)
     points = points_of_interest(configuration, transforms, pulled, arm)
     covariance = found.covariance * covariance_inflation(found.freedom, found.basis.shape[1])
+    arbitrary = np.hstack([weak, meaningless_turns(problem.sightings, problem.loop, at)])
     columns = {name: columns_of(name, configuration) for name in transforms}
     estimates = [
         estimate_at(
-            transform, covariance[columns[name], columns[name]], points[name], weak[columns[name]]
+            transform,
+            covariance[columns[name], columns[name]],
+            points[name],
+            arbitrary[columns[name]],
         )
         for name, transform in transforms.items()
     ]

@@ -21,7 +21,9 @@ Floats = NDArray[np.float64]
 
 GOOD_ENOUGH = np.radians(1.0)
 """Rotations of two arms that agree to this [rad rms] are not looked for from another start."""
-RESTARTS = 40
+RESTARTS = 20
+ROUNDS = 200
+"""Steps of each further search; slower than that it is at the wrong place."""
 
 
 def fewest(sightings: Sightings, loop: Loop) -> int:
@@ -34,24 +36,32 @@ def fewest(sightings: Sightings, loop: Loop) -> int:
     return (5 if normals else 8) if loop.y else (4 if normals else 6)
 
 
-def start_of(sightings: Sightings, loop: Loop, rng: np.random.Generator) -> Unknowns:
+def start_of(
+    sightings: Sightings, loop: Loop, rng: np.random.Generator, restarts: int = RESTARTS
+) -> Unknowns:
     """Return unknowns near the answer, were there no outliers.
+
+    Args:
+        sightings: What was seen.
+        loop: What is unknown.
+        rng: Draws the starts of what has no closed form.
+        restarts: How many more of those, while none is good.
 
     Raises:
         CalibrationRefused: The configuration cannot be solved from such features.
     """
-    x, y, z = _start(sightings, loop, rng)
+    x, y, z = _start(sightings, loop, rng, restarts)
     return Unknowns(x, y, z, np.zeros(2))
 
 
 def _start(
-    sightings: Sightings, loop: Loop, rng: np.random.Generator
+    sightings: Sightings, loop: Loop, rng: np.random.Generator, restarts: int
 ) -> tuple[Floats, Floats, Floats]:
     identity = np.eye(4)
     if not (loop.y or loop.z):
         return _of_camera(sightings, loop), identity, loop.place
     if loop.y and loop.z:
-        return _of_two_arms(sightings, rng)
+        return _of_two_arms(sightings, rng, restarts)
     if not sightings.are_poses:
         return _linear(sightings, loop)
     if loop.z:
@@ -71,7 +81,9 @@ def _of_camera(sightings: Sightings, loop: Loop) -> Floats:
     return rigid(*kabsch(sightings.centres, known))
 
 
-def _of_two_arms(sightings: Sightings, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+def _of_two_arms(
+    sightings: Sightings, rng: np.random.Generator, restarts: int
+) -> tuple[Floats, Floats, Floats]:
     """Return X, Y and Z: rotations by alternation from random starts, until one agrees."""
     if not sightings.are_poses:
         raise CalibrationRefused(
@@ -81,10 +93,10 @@ def _of_two_arms(sightings: Sightings, rng: np.random.Generator) -> tuple[Floats
     given = sightings.a, sightings.poses, sightings.b
     rotations = given[0][:, :3, :3], given[1][:, :3, :3], given[2][:, :3, :3]
     best, error = alternate(rotations, random_rotations(rng))
-    for _ in range(RESTARTS):
+    for _ in range(restarts):
         if error < GOOD_ENOUGH:
             break
-        again, its = alternate(rotations, random_rotations(rng), rounds=300)
+        again, its = alternate(rotations, random_rotations(rng), rounds=ROUNDS)
         if its < error:
             best, error = again, its
     return with_translations(given, best)

@@ -20,7 +20,7 @@ Triple = tuple[Floats, Floats, Floats]
 
 FEWEST_KRONECKER = 12
 """Poses from which the 90 products of the rotations' entries follow."""
-ROUNDS, SETTLED = 3000, 1e-12
+ROUNDS, SETTLED = 3000, 1e-10
 REST = 1e-4
 """An arm rested between two poses that differ by less [rad, m]."""
 
