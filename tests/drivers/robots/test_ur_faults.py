@@ -31,7 +31,7 @@ def lanes():
 
 
 HUNDRED = pytest.param(100, marks=pytest.mark.slow)
-TIMES = pytest.mark.parametrize("times", [4, HUNDRED])
+TIMES = pytest.mark.parametrize("times", [LANES, HUNDRED])
 
 downwards = np.array([0, 0, -0.05, 0, 0, 0])
 numbers = count()
@@ -126,7 +126,6 @@ def fail_often(lanes, fault, times):
 
 
 LOST = ("is lost: its", "its last sample is", "sends nothing any more", "did not answer")
-STOPPED = "protective stop: protective stop: look why, then release it at the pendant"
 LOCAL = "it is in local control: choose Remote Control at the top right of the pendant"
 
 
