@@ -45,6 +45,7 @@ class Session:
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
         changes: Parameters of that step that differ from the recipe's, by what was mended.
+        remarks: Mistakes that opening the archive has shown already, mended here.
     """
 
     ids: tuple[str, ...]
@@ -60,6 +61,7 @@ class Session:
     reader: Reader = "auto"
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
+    remarks: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ids)

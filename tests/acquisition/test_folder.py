@@ -219,4 +219,4 @@ def test_auto_asks_the_readers_of_plugins_too(tmp_path):
     assert str(error.value).startswith(
         f"{tmp_path}: no reader knows this layout: acme (holds no scans.acme); ancorasir (holds "
     )
-    assert str(error.value).endswith("; strange (has parameters that a recipe must give)")
+    assert "; strange (has parameters that a recipe must give)" in str(error.value)

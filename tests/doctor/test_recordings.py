@@ -10,8 +10,8 @@ import yaml
 from flangeye import cli
 from flangeye.diagnosis import Session
 from flangeye.doctor import examine, open_session
-from flangeye.mending import inverted, scaled, shifted
-from flangeye.recipe import load_recipe
+from flangeye.mending import inverted, scaled, shifted, without_tool
+from flangeye.recipe import load_recipe, recipe_names
 from flangeye.registry import load_registry
 from flangeye_plugins.doctoring import CHECKS
 from tests.doctor.sessions import clean
@@ -41,9 +41,16 @@ def test_the_false_segmentations_that_were_published_and_nothing_else(ancorasir,
 
 
 def test_the_kinects_circle_is_behind_the_flange(ancorasir):
-    """Fitted to the wrist; a recipe that says so (wrist_circle) leaves nothing to find."""
+    """It was fitted to the wrist: without a recipe that says so, that is an offset to be named."""
     (finding,) = examine(open_session(ancorasir / "Kinect_Result", REGISTRY), CHECKS).findings
     assert finding.name == "tool offset"
+
+
+def test_a_recipe_that_names_the_wrist_explains_it(ancorasir):
+    recipe = load_recipe(recipe_names()["ur10e_azure-kinect_archive"], REGISTRY)
+    diagnosis = examine(open_session(ancorasir, REGISTRY, recipe), CHECKS)
+    assert diagnosis.findings == ()
+    assert [note.name for note in diagnosis.notes] == ["little rotation"]
 
 
 def test_a_recording_without_its_outliers_is_clean(recorded):
@@ -86,6 +93,38 @@ def test_a_camera_that_was_moved_half_way(recorded):
     centres[len(centres) // 2 :] += [0.01, 0.0, 0.004]
     moved = Session(**{**vars(session), "centres": centres})
     assert named(moved) == ["moved target"]
+
+
+def test_the_poses_of_a_tool_on_an_arm_that_turned(ancorasir):
+    session = open_session(ancorasir / "data" / "ur5", REGISTRY)
+    session = session.without(np.array([name in OUTLIERS["ur5"] for name in session.ids]))
+    offset = np.array([0.0, 0.02, 0.12])
+    (finding,) = examine(session.with_poses(without_tool(session.poses, -offset)), CHECKS).findings
+    assert finding.name == "tool offset"
+    assert finding.after.position < 1e-3 < 5e-3 < finding.before.position
+
+
+def test_clouds_in_another_unit_than_the_recipe_states():
+    path = recipe_names()["ur5_phoxi-m_sample"]
+    recipe = load_recipe(path, REGISTRY, ["steps.0.unit=mm"])
+    archive = recipe.steps[0].params.path
+    (finding,) = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
+    assert finding.name == "unit"
+    assert "these look like metres: set unit: m" in finding.what
+    assert "unit: auto" in finding.fix
+
+
+def test_a_log_of_ours_needs_no_recipe(tmp_path, monkeypatch, capsys):
+    """The sample that comes with the project, run and then examined from its log alone."""
+    monkeypatch.setattr(
+        sys, "argv", ["flangeye", "run", "ur5_phoxi-m_sample", "--out", str(tmp_path / "o")]
+    )
+    with pytest.raises(SystemExit):
+        cli.main()
+    capsys.readouterr()
+    code, out, _ = run(monkeypatch, capsys, tmp_path / "o" / "run.mcap")
+    assert code == 0
+    assert out.startswith("8 of 8 samples have a target in them")
 
 
 def run(monkeypatch, capsys, *words):
@@ -193,8 +232,6 @@ def test_what_cannot_be_read_is_exit_code_two(monkeypatch, capsys, tmp_path, mak
 def test_scans_are_segmented_and_fitted_whatever_is_wrong_with_their_poses(ancorasir, tmp_path):
     """Six real scans, their poses in millimetres read as metres: beyond any arm for a run."""
     name = "franka_phoxi-m_2019-sample_archive"
-    from flangeye.recipe import recipe_names
-
     text = (
         recipe_names()[name]
         .read_text()

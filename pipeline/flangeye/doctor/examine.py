@@ -44,7 +44,7 @@ def examine(session: Session, checks: Iterable[Part]) -> Diagnosis:
         StageError: There are too few samples to tell anything.
     """
     bound = [check.bind() for check in checks]
-    found: list[Finding] = []
+    found = list(session.remarks)
     current = session
     while True:
         offered = list(_offered(current, bound))

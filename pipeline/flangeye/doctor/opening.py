@@ -18,7 +18,7 @@ from flangeye import types as t
 from flangeye.archive import Archive, Recording, check_ids
 from flangeye.catalogue import ScannerModel
 from flangeye.configuration import DEFAULT, Configuration
-from flangeye.diagnosis import Floats, Reader, Session
+from flangeye.diagnosis import Finding, Floats, Reader, Session
 from flangeye.errors import StageError
 from flangeye.geometry import rigid
 from flangeye.recipe import Recipe, parse_recipe
@@ -87,8 +87,16 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> Session:
         )
     archive: Archive = reader(path)
     check_ids(archive)
-    session = _of_archive(_kept(archive, first), _found(archive, first, recipe, registry))
-    return _as_recipe(session, recipe)
+    found, refused = _found(archive, first, recipe, registry)
+    session = _as_recipe(_of_archive(_kept(archive, first), found), recipe)
+    return session if refused is None else _in_other_unit(session, refused)
+
+
+def _in_other_unit(session: Session, refused: StageError) -> Session:
+    """Return the session with the remark that the stated unit of the clouds was refused."""
+    mended = session.with_changes(unit="auto")
+    remark = Finding("unit", str(refused), mended.step())
+    return replace(mended, remarks=(remark,))
 
 
 def _kept(archive: Archive, first: Step) -> Archive:
@@ -97,6 +105,19 @@ def _kept(archive: Archive, first: Step) -> Archive:
 
 
 def _found(
+    archive: Archive, first: Step, recipe: Recipe, registry: Registry
+) -> tuple[dict[str, t.Feature], StageError | None]:
+    """Return what the recipe's steps find in the scans, and why not in the unit that it states."""
+    try:
+        return _found_by(archive, first, recipe, registry), None
+    except StageError as error:
+        if first.params is None or getattr(first.params, "unit", "auto") == "auto":
+            raise
+        any_unit = replace(first, params=first.params.model_copy(update={"unit": "auto"}))
+        return _found_by(archive, any_unit, recipe, registry), error
+
+
+def _found_by(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
 ) -> dict[str, t.Feature]:
     """Return what the recipe's own steps find in the archive's scans, by id."""

@@ -91,7 +91,10 @@ def tool(session: Session) -> Findings:
 
 
 def _known(found: Fit, offset: Floats) -> bool:
-    """Whether the offset is known to a fifth of itself along its own direction."""
+    """Whether the offset is known to a tenth of itself along every direction.
+
+    Where it is not, the smooth errors of an arm pass for one: the poses turn too little.
+    """
     covariance = np.linalg.pinv(found.information[0], hermitian=True)[6:9, 6:9]
-    direction = offset / np.linalg.norm(offset)
-    return bool(np.sqrt(direction @ covariance @ direction) < 0.2 * np.linalg.norm(offset))
+    deviation = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
+    return bool(deviation < 0.1 * np.linalg.norm(offset))

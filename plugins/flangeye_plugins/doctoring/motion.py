@@ -106,9 +106,10 @@ def _offset_unknown(session: Session) -> Findings:
     if known < OFFSET:
         return
     spread, axes = _rotations(session)
+    told = f"{known * 1e3:.2g} mm" if known < 1 else "nothing"
     what = (
         f"the poses turn by {np.degrees(spread):.2g} deg at most, {np.degrees(axes):.2g} deg about "
-        "a second axis: a constant offset of what is seen from the flange could not be told"
+        f"a second axis: a constant offset of what is seen from the flange is known to {told} only"
     )
     yield Finding("little rotation", what, "turn the flange by 20 deg and more about two axes "
                   "to be sure of that", note=True)  # fmt: skip
