@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye_plugins.loopback.contact import Surface
-from flangeye_plugins.loopback.control import PORT
 
 Floats = NDArray[np.float64]
+
+PORT = 29998
+"""Of the control channel. It is here, for a client needs nothing of what serves it."""
 
 PATIENCE = 5.0
 """Longest wait for an answer [s]."""

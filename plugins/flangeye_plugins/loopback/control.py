@@ -13,8 +13,6 @@ from typing import Any
 from flangeye.errors import FlangeyeError
 from flangeye_plugins.loopback.network import LineConnection, Network
 
-PORT = 29998
-
 Action = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
 
 

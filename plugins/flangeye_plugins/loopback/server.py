@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from flangeye.loopback import LoopbackOptions
 from flangeye_plugins.loopback import control
 from flangeye_plugins.loopback.arm import SimulatedArm
+from flangeye_plugins.loopback.client import PORT
 from flangeye_plugins.loopback.clock import Clock
 from flangeye_plugins.loopback.contact import Surface
 from flangeye_plugins.loopback.faults import Schedule, parse_fault
@@ -110,9 +111,7 @@ class Server:
         self._publish: Callable[[int], None] = lambda cycle: None
         # The control channel has a wire of its own, to which nothing happens.
         self._behind = Network(options.host)
-        self._behind.offer(
-            control.PORT, lambda: control.ControlSession(self._behind, self._actions)
-        )
+        self._behind.offer(PORT, lambda: control.ControlSession(self._behind, self._actions))
         self._schedule = Schedule(self._mischief.kinds)
         self._clock = Clock(box.cycle, self._step)
         self._cycle = 0
@@ -161,7 +160,7 @@ class Server:
         ports = ", ".join(f"{name} {port}" for name, port in self._ports.items())
         return (
             f"{self._options.robot.model} on {self._options.host}: {ports}, "
-            f"control {control.PORT}; Ctrl-C ends it"
+            f"control {PORT}; Ctrl-C ends it"
         )
 
     def _farewell(self) -> str:
