@@ -29,22 +29,24 @@ def shah(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
 def li(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
     """Return X and Z (4, 4) of ``G X = Z inv(M)``: Li, Wang & Wu, Int. J. Phys. Sci. 5(10), 2010.
 
-    One linear system for all 24 entries; the rotations are then made orthonormal and, as Shah
-    points out one must, the translations fitted to them again.
+    One linear system for all 24 entries, written for the inverses (``M inv(Z) = inv(X) inv(G)``,
+    whose translations are the camera's, the noisier side); the rotations are then made orthonormal
+    and, as Shah points out one must, the translations fitted to them again.
 
     Args:
         carried: (N, 4, 4) G, target_carrier_T_camera_carrier.
         seen: (N, 4, 4) M, camera_T_target.
     """
-    eyes, n, identity = invert(seen), len(seen), np.eye(3)
+    bases, n, identity = invert(carried), len(seen), np.eye(3)
     rows = np.zeros((n, 12, 24))
-    rows[:, :9, :9] = np.einsum("nij,kl->nikjl", carried[:, :3, :3], identity).reshape(n, 9, 9)
-    rows[:, :9, 9:18] = -np.einsum("ij,nlk->nikjl", identity, eyes[:, :3, :3]).reshape(n, 9, 9)
-    rows[:, 9:, 9:18] = np.einsum("ij,nl->nijl", identity, eyes[:, :3, 3]).reshape(n, 3, 9)
-    rows[:, 9:, 18:21], rows[:, 9:, 21:] = -carried[:, :3, :3], identity
-    right = np.concatenate([np.zeros((n, 9)), carried[:, :3, 3]], axis=1)
+    rows[:, :9, :9] = np.einsum("nij,kl->nikjl", seen[:, :3, :3], identity).reshape(n, 9, 9)
+    rows[:, :9, 9:18] = -np.einsum("ij,nlk->nikjl", identity, bases[:, :3, :3]).reshape(n, 9, 9)
+    rows[:, 9:, 9:18] = np.einsum("ij,nl->nijl", identity, bases[:, :3, 3]).reshape(n, 3, 9)
+    rows[:, 9:, 18:21], rows[:, 9:, 21:] = -seen[:, :3, :3], identity
+    right = np.concatenate([np.zeros((n, 9)), seen[:, :3, 3]], axis=1)
     found = np.linalg.lstsq(rows.reshape(-1, 24), right.ravel(), rcond=None)[0]
-    return _with_translations(carried, eyes, *found[:18].reshape(2, 3, 3))
+    z, x = found[:18].reshape(2, 3, 3).transpose(0, 2, 1)
+    return _with_translations(carried, invert(seen), x, z)
 
 
 def _with_translations(

@@ -76,13 +76,17 @@ def _commutators(a: Floats, b: Floats) -> Floats:
 def andreff(motions: Motions) -> Floats:
     """Return X (4, 4): Andreff, Horaud & Espiau, 3DIM 1999: linear in the rotation's entries.
 
-    ``(R_A x 1 - 1 x R_B^T) vec(R_X) = 0`` with Kronecker products: its null vector, scaled to unit
-    determinant and made orthonormal; then the translation.
+    ``(R_A x 1 - 1 x R_B^T) vec(R_X) = 0`` with Kronecker products, and ``R_X t_B + t_X - R_A t_X =
+    t_A``, together; the rotation is made orthonormal, and the translation fitted to it again.
     """
-    identity = np.eye(3)
-    left = np.einsum("nij,kl->nikjl", motions.a[:, :3, :3], identity)
-    right = np.einsum("ij,nlk->nikjl", identity, motions.b[:, :3, :3])
-    rows = (left - right).reshape(-1, 9)
-    null = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
-    rotation = nearest_rotation(null * np.sign(np.linalg.det(null)))
+    n, identity = len(motions.a), np.eye(3)
+    turns_a, turns_b = motions.a[:, :3, :3], motions.b[:, :3, :3]
+    rows = np.zeros((n, 12, 12))
+    rows[:, :9, :9] = np.einsum("nij,kl->nikjl", turns_a, identity).reshape(n, 9, 9)
+    rows[:, :9, :9] -= np.einsum("ij,nlk->nikjl", identity, turns_b).reshape(n, 9, 9)
+    rows[:, 9:, :9] = np.einsum("ij,nl->nijl", identity, motions.b[:, :3, 3]).reshape(n, 3, 9)
+    rows[:, 9:, 9:] = identity - turns_a
+    right = np.concatenate([np.zeros((n, 9)), motions.a[:, :3, 3]], axis=1)
+    found = np.linalg.lstsq(rows.reshape(-1, 12), right.ravel(), rcond=None)[0]
+    rotation = nearest_rotation(np.asarray(found[:9].reshape(3, 3), dtype=np.float64))
     return rigid(rotation, translation_of(rotation, motions))

@@ -1,0 +1,144 @@
+"""Errors of every solver on simulated sessions: python -m tests.benchmarks.hand_eye [SESSIONS]
+
+Prints the error of X over sessions of n poses within +-tilt, camera noise 0.05 deg and 0.1 mm per
+axis, robot 0.2 mrad and 0.05 mm, beside the Cramer-Rao bound; then how often AXB = YCZ converges
+from a random start.
+
+    python -m tests.benchmarks.hand_eye --write sessions.npz
+
+writes the sessions that tests/benchmarks/opencv4.py solves, with OpenCV 4 in an environment of its
+own, for OpenCV 5 has no hand-eye functions:
+
+    python -m venv cv4 && cv4/bin/pip install "opencv-python-headless<5"
+    cv4/bin/python tests/benchmarks/opencv4.py sessions.npz > tests/benchmarks/opencv4.json
+"""
+
+import sys
+
+import numpy as np
+
+from flangeye.configuration import Configuration
+from flangeye.geometry import rotation_log
+from flangeye_plugins.solving.closed import daniilidis, robot_world, separable
+from flangeye_plugins.solving.closed.comanipulation import alternate, random_rotations
+from flangeye_plugins.solving.closed.motions import motions_of
+from flangeye_plugins.solving.equations import Noise as Extra
+from flangeye_plugins.solving.likelihood import Problem, weigh
+from flangeye_plugins.solving.loop import ArmNoise, Unknowns
+from flangeye_plugins.solving.maximum_likelihood import (
+    MaximumLikelihoodParams,
+    solve_maximum_likelihood,
+)
+from flangeye_plugins.solving.sightings import loop_of, sightings_of
+from tests.configurations.cells import CONFIGURATIONS, session
+
+MARKER = CONFIGURATIONS["eye-in-hand, marker"]
+CASES = {"n=15, 17 deg": (15, np.radians(17)), "n=8, 30 deg": (8, np.radians(30))}
+BY_MOTIONS = {
+    "tsai_lenz": separable.tsai_lenz,
+    "park_martin": separable.park_martin,
+    "horaud_dornaika": separable.horaud_dornaika,
+    "andreff": separable.andreff,
+    "daniilidis": daniilidis.daniilidis,
+}
+BY_BOTH = {"shah": robot_world.shah, "li": robot_world.li}
+STATED = MaximumLikelihoodParams(robot_noise={"rotation": "0.2 mrad", "position": "0.05 mm"})
+
+
+def sessions(case: str, count: int) -> list:
+    """Return the same sessions each time."""
+    n, tilt = CASES[case]
+    rng = np.random.default_rng(2026)
+    return [session(MARKER, rng, n=n, tilt=tilt) for _ in range(count)]
+
+
+def arrays(made) -> tuple[np.ndarray, np.ndarray]:
+    """Return base_T_flange and camera_T_target, both (N, 4, 4)."""
+    carried = np.array([o.base_T_flange.matrix for o in made.observations])
+    return carried, np.array([o.feature.camera_T_target.matrix for o in made.observations])
+
+
+def closed(name: str, made) -> np.ndarray:
+    """Return X (4, 4) by a closed form."""
+    carried, seen = arrays(made)
+    if name in BY_BOTH:
+        return BY_BOTH[name](carried, seen)[0]
+    return BY_MOTIONS[name](motions_of(carried, seen))
+
+
+def most_likely(made) -> np.ndarray:
+    """Return X (4, 4) by maximum likelihood, the noise being stated."""
+    found = solve_maximum_likelihood(made.stream(), STATED, made.configuration)
+    return found.camera.transform.matrix
+
+
+def rms(found: list, made: list) -> tuple[float, float]:
+    """Return the error of X over sessions: rotation [deg] and translation [mm], both rms."""
+    true = [m.truth["flange_T_camera"] for m in made]
+    turns = [rotation_log(f[:3, :3] @ x[:3, :3].T) for f, x in zip(found, true, strict=True)]
+    shifts = [f[:3, 3] - x[:3, 3] for f, x in zip(found, true, strict=True)]
+    turn, shift = (np.sqrt((np.array(e) ** 2).sum(axis=1).mean()) for e in (turns, shifts))
+    return float(np.degrees(turn)), float(shift * 1e3)
+
+
+def bound(made: list) -> tuple[float, float]:
+    """Return the Cramer-Rao bound of the same two figures."""
+    traces = []
+    for m in made:
+        problem = Problem(
+            sightings_of(m.observations, MARKER, None), loop_of(Configuration("eye-in-hand", "flange", "base")),
+            ArmNoise(2e-4, 5e-5), None,
+        )  # fmt: skip
+        at = Unknowns(m.truth["flange_T_camera"], np.eye(4), m.truth["base_T_target"], np.zeros(2))
+        known = weigh(problem, at, Extra(0.0, 0.0), np.ones(len(m.observations))).covariance
+        traces.append([np.trace(known[:3, :3]), np.trace(known[3:6, 3:6])])
+    turn, shift = np.sqrt(np.mean(traces, axis=0))
+    return float(np.degrees(turn)), float(shift * 1e3)
+
+
+def converged(count: int) -> int:
+    """Return how often AXB = YCZ comes from one random start within 1 deg of the answer."""
+    rng, good = np.random.default_rng(12), 0
+    for _ in range(count):
+        made = session(CONFIGURATIONS["two arms, marker"], rng)
+        first = np.array([o.base_T_flange.rotation for o in made.observations])
+        seen = np.array([o.feature.camera_T_target.rotation for o in made.observations])
+        second = np.array([o.base2_T_flange2.rotation for o in made.observations])
+        (x, _, _), _ = alternate((first, seen, second), random_rotations(rng))
+        true = made.truth["flange_T_camera"][:3, :3]
+        good += bool(np.linalg.norm(rotation_log(x @ true.T)) < np.radians(1.0))
+    return good
+
+
+def main(words: list[str]) -> None:
+    if words[:1] == ["--write"]:
+        held = {}
+        for case in CASES:
+            made = sessions(case, 60)
+            held[f"{case}/carried"], held[f"{case}/seen"] = map(
+                np.array, zip(*map(arrays, made), strict=True)
+            )
+            held[f"{case}/truth"] = np.array([m.truth["flange_T_camera"] for m in made])
+        np.savez(words[1], **held)
+        return
+    count = int(words[0]) if words else 200
+    for case in CASES:
+        made = sessions(case, count)
+        print(f"{case}, {count} sessions: error of X, rms")
+        for name in [*BY_MOTIONS, *BY_BOTH]:
+            print(
+                "  {:20} {:.4f} deg {:.3f} mm".format(
+                    name, *rms([closed(name, m) for m in made], made)
+                )
+            )
+        print(
+            "  {:20} {:.4f} deg {:.3f} mm".format(
+                "maximum_likelihood", *rms([most_likely(m) for m in made], made)
+            )
+        )
+        print("  {:20} {:.4f} deg {:.3f} mm".format("Cramer-Rao bound", *bound(made)))
+    print(f"AXB = YCZ from one random start: {converged(count)} of {count} converge")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
