@@ -63,6 +63,10 @@ def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
     assert told.returncode == 0, told.stderr
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["status"] == "verified"
+    if result["weld"]:
+        assert result["weld"]["completed"]
+        assert result["weld"]["truth"]["rms"] < 0.15e-3
+        assert result["weld"]["truth"]["max"] < 0.4e-3
     if first_step(name) == "acquire.simulated":
         (limit,) = [
             step.params.max_rms

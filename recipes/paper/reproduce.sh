@@ -59,6 +59,21 @@ for target in flange sphere; do
 done
 study table2 .
 
+# --- Figure 13, simulated; the tables are in plugins/flangeye_plugins/welding ---------------------
+
+for seam in straight curved; do
+  recipe="$here/fig13_$seam.yaml"
+  gap='[{start: 90 mm, length: 20 mm}]'
+  batch "$recipe" --repeat 8 --vary seed --out "fig13_$seam"
+  batch "$recipe" --repeat 2 --vary seed --set-grid steps.5.mode=vision,as_printed \
+    --out "fig13-others_$seam"
+  batch "$recipe" --repeat 2 --vary seed --set steps.5.sensor.simulated_finger.gaps="$gap" \
+    --out "fig13-gap_$seam"
+  batch "$recipe" --repeat 2 --vary seed --set steps.5.turned=90 --out "fig13-across_$seam"
+done
+[ -d "$here/../../plugins" ] &&
+  python -m flangeye_plugins.studies fig13 . --out "$here/../../plugins/flangeye_plugins/welding"
+
 # --- beyond the paper: errors on poses that took no part --------------------------------------
 
 [ -d aubo-fitted ] ||

@@ -212,6 +212,28 @@ def record() -> tuple[Work, Work]:
     )  # fmt: skip
 
 
+def finger() -> tuple[Work, Work]:
+    """Reading one image of a finger beside blurring it; 60 images a second are asked for."""
+    import cv2
+
+    from flangeye.catalogue import read_model
+    from flangeye.devices import SensorFrame
+    from flangeye.shipped import shipped
+    from flangeye_plugins.welding.eyes import Reader
+    from flangeye_plugins.welding.finger import Finger
+    from flangeye_plugins.welding.simulated.render import FingerCamera, Optics, typical_compliance
+
+    model = read_model(shipped("data") / "fingers" / "srm.yaml", Finger)
+    camera = FingerCamera(model, Optics(), np.random.default_rng(0))
+    frame = SensorFrame(camera.image(*typical_compliance().tag(np.array([2e-3, 0.0, 1e-3]))), 0)
+    reader = Reader(model)
+    pixels = frame.image.pixels
+    return (
+        Work(lambda: reader.read(frame), "an image of a finger", pixels.size),
+        Work(lambda: cv2.GaussianBlur(pixels, (0, 0), 3.0), "OpenCV's Gaussian blur of it"),
+    )
+
+
 CASES = {
     "acquire.simulated": acquire,
     "segment.flange": segment,
@@ -222,4 +244,5 @@ CASES = {
     "solve.robust": robust,
     "read_cloud": read,
     "log": record,
+    "finger": finger,
 }

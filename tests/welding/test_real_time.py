@@ -26,7 +26,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not installed")
 PATIENT = {"blind": "5 s", "stale": "1 s"}
 
 
-@pytest.mark.slow
+@pytest.mark.realtime
 def test_the_torch_stays_in_the_seam_in_real_time(tmp_path):
     seam = planned("v-straight", shift=(1e-3, -1.5e-3, 0.0), turn=np.deg2rad(1.0), end=0.03)
     sensor = Chosen(sensor_simulated_finger, SimulatedFingerParams(rate=15.0))

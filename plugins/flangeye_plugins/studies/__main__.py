@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from flangeye import FlangeyeError
-from flangeye_plugins.studies import fig9, fig10, fig11, heldout, page, table1, table2
+from flangeye_plugins.studies import fig9, fig10, fig11, fig13, heldout, page, table1, table2
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
@@ -45,6 +45,12 @@ def _table2(batches: Batches, out: Out = Path()) -> None:
 def _fig11(batches: Batches, archive: Archive, out: Out = Path()) -> None:
     """Error by the number of poses, published recordings."""
     fig11.fig11(batches, archive, out)
+
+
+@app.command("fig13")
+def _fig13(batches: Batches, out: Out = Path()) -> None:
+    """Paths of a weld, and the torch's distance from the true seam, simulated."""
+    fig13.fig13(batches, out)
 
 
 @app.command("heldout")

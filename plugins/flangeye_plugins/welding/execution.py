@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,7 +104,8 @@ def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: fl
     except DeviceError as error:
         return str(error)
     finally:
-        cell.drive.robot.stop()
+        with suppress(DeviceError):  # an arm that is lost cannot be told anything
+            cell.drive.robot.stop()
     return controller.reason
 
 
