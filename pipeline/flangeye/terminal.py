@@ -85,6 +85,7 @@ def print_result(console: Console, result: Result) -> None:
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
         lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
     lines += _errors(result)
+    lines += _seam(result)
     lines += _weld(result)
     if result.refused:
         lines += ["", f"refused: {result.refused}"]
@@ -135,6 +136,20 @@ def _errors(result: Result) -> list[str]:
             f"  true error         {_mm(t.rms_over_workspace)} rms over the workspace, "
             f"{_mm(t.error_at_centroid)} at its centre, {np.degrees(t.rotation_error):.4f} deg"
         )
+    return lines
+
+
+def _seam(result: Result) -> list[str]:
+    seam = result.seam
+    if seam is None:
+        return []
+    lines = ["", f"seam: {seam.source}"]
+    start, end = (", ".join(f"{1e3 * x:.1f}" for x in seam.points[i]) for i in (0, -1))
+    lines.append(f"  from ({start}) to ({end}) mm in base, {_mm(seam.length)} along")
+    lines.append(f"  tube               95 % within {_mm(max(seam.tube))} of the plan")
+    if t := seam.truth:
+        told = f"{_mm(t.rms)} rms, {_mm(t.max)} at most, {t.inside:.0%} of it inside the tube"
+        lines.append(f"  true error         {told}")
     return lines
 
 

@@ -46,6 +46,7 @@ from flangeye_plugins.readers.table import table
 from flangeye_plugins.readers.zivid import zivid
 from flangeye_plugins.refining.compensate import refine_compensate
 from flangeye_plugins.seams.cad import seam_cad
+from flangeye_plugins.seams.groove import seam_groove
 from flangeye_plugins.seams.scanning import scan_file, scan_live, scan_simulated
 from flangeye_plugins.segmentation.flange import segment_flange
 from flangeye_plugins.segmentation.sphere import segment_sphere
@@ -108,6 +109,7 @@ def flangeye_stages() -> Iterable[Stage]:
         scan_file,
         scan_live,
         seam_cad,
+        seam_groove,
         acquire_points,
         acquire_published_centres,
         verify_realisations,

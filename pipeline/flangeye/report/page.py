@@ -11,6 +11,7 @@ from flangeye.report.account import provenance_of, set_aside_of, timings_of
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.residuals import errors_of, residual_figure
+from flangeye.report.seam import seam_view
 from flangeye.report.space import cell_drawing, workspace_drawing
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.report.units import degrees, millimetres, percent
@@ -62,6 +63,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "workspace": workspace_drawing(facts),
         "panels": cloud_panels(facts),
         "cell": cell_drawing(facts),
+        "seam": seam_view(facts),
         "weld": weld_drawing(facts),
         "set_aside": set_aside_of(facts),
         "timings": timings_of(facts),
