@@ -168,7 +168,9 @@ class Scanner(Protocol):
         """Return when the exposure has ended and the arm may move on.
 
         Calling what it returns waits for the data, a few seconds at most, and gives the scan.
-        Both may raise; what it returns is called once, and before the next exposure.
+        Both may raise; what it returns is called once, and before the next exposure. Only where
+        a person has to act, as with a watched folder, does it take longer than PATIENCE; ``close``
+        from another thread ends that wait.
 
         Raises:
             FrameDropped: This exposure gave nothing; the scanner is still there.

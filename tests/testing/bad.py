@@ -1,6 +1,7 @@
 """Plugins that are wrong in one way each, for the kit to find."""
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from flangeye import types as t
 from flangeye.archive import Archive, Recording
 from flangeye.catalogue import Flange, RobotModel, ScannerModel
 from flangeye.devices import DeviceError, Robot, Scan, Scanner, SensorFrame, TactileSensor
+from flangeye.diagnosis import Finding, Session
 from flangeye.kinematics import Arm
+from flangeye.redo import Redone
 from flangeye.testing.solving import reference_solution
 from flangeye_plugins.drivers.robots.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.fitting.rim import RimParams, fit_rim
@@ -295,8 +298,7 @@ def twice_as_fast(self, joints, speed, acceleration):
 
 
 def never_late(self, twist, acceleration):
-    SimulatedRobot.move_velocity(self, twist, acceleration)
-    self._velocity_ends = 10**9
+    self._mover.go_on(twist, acceleration, 1e6)
 
 
 class Eye:
@@ -341,3 +343,22 @@ def sleepy(self):
 
 def gone(*_, **__):
     raise DeviceError("line one\nline two")
+
+
+def check(find):
+    @part("check.bad")
+    def check_bad(session: Session) -> Iterable[Finding]:
+        """Look badly."""
+        return find(session)
+
+    return check_bad
+
+
+def finding(what="all is lost"):
+    return Finding("bad", what, "begin again")
+
+
+@part("replay.bad")
+def replay_bad(log: Path, step: str) -> Redone:
+    """Decide badly."""
+    return Redone(log.read_text(), True)

@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.cloudfile import write_cloud
+from flangeye.registry import load_registry
 from flangeye.testing import (
     AcquireConformance,
+    CheckConformance,
     CostConformance,
     ErrorConformance,
     FitConformance,
     PlanConformance,
     ReaderConformance,
     RefineConformance,
+    ReplayConformance,
     RobotConformance,
     ScannerConformance,
     SegmentConformance,
@@ -201,3 +204,19 @@ def exporting(model):
 
     scanner.expose = export_and_expose
     return scanner
+
+
+def checks():
+    """One class for each check of flangeye doctor."""
+    registry = load_registry()
+    for name, plugin in registry.parts.items():
+        if plugin.kind == "check":
+            title = "Test" + name.title().replace(".", "").replace("_", "")
+            yield title, type(title, (CheckConformance,), {"part": plugin})
+
+
+globals().update(checks())
+
+
+class TestReplayTactile(ReplayConformance):
+    part = load_registry().parts["replay.tactile"]

@@ -627,6 +627,34 @@ CASES = [
         "not in this image's pixels",
         {},
     ),
+    (
+        "check",
+        "test_it_gives_the_same_twice",
+        bad.check(lambda s: [bad.finding(str(random()))]),
+        "two calls with equal",
+        {},
+    ),
+    (
+        "check",
+        "test_it_finds_nothing_where_nothing_is_wrong",
+        bad.check(lambda s: [bad.finding()]),
+        "found in good recordings: all is lost",
+        {},
+    ),
+    (
+        "check",
+        "test_too_little_is_no_crash",
+        bad.check(lambda s: [] if len(s) > 2 else [s.ids[5]]),
+        "two samples: must be refused with StageError in one line, not IndexError",
+        {},
+    ),
+    (
+        "replay",
+        "test_a_log_that_is_none_is_refused",
+        bad.replay_bad,
+        "must be refused with StageError in one line, not FileNotFoundError",
+        {},
+    ),
     ("sensor", "test_asking_does_not_wait", bad.sensor(frame=bad.sleepy), "frame\\(\\) took", {}),
 ]
 

@@ -5,6 +5,7 @@ then runs every ``test_…`` method of the class. Nothing here imports pytest: a
 fault raises AssertionError with one line that says what was expected.
 """
 
+from flangeye.testing.afterwards import CheckConformance, GuideConformance, ReplayConformance
 from flangeye.testing.base import Conformance
 from flangeye.testing.costs import CostConformance, ErrorConformance
 from flangeye.testing.devices import RobotConformance, ScannerConformance, SensorConformance
@@ -36,6 +37,9 @@ KITS = {
     "robot": RobotConformance,
     "scanner": ScannerConformance,
     "sensor": SensorConformance,
+    "replay": ReplayConformance,
+    "guide": GuideConformance,
+    "check": CheckConformance,
 }
 """Kind of stage or part -> its class."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 
 from flangeye import types as t
+from flangeye.catalogue import read_model
 from flangeye.devices import (
     GRACE,
     PATIENCE,
@@ -20,8 +21,10 @@ from flangeye.devices import (
     Scan,
     Scanner,
     SensorFrame,
+    StateSource,
     TactileSensor,
 )
+from flangeye.shipped import shipped
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import require, require_close, require_one_line, require_round_trip
 from flangeye.testing.sources import logged
@@ -250,6 +253,13 @@ class SensorConformance(DriverConformance):
 
     kind = "sensor"
 
+    def context(self) -> Mapping[Any, Any]:
+        """Return an arm that stands, and the shipped finger for a part that asks for one."""
+        finger = self.plugin.needs.get("finger")
+        shipped_finger = shipped("data") / "fingers" / "srm.yaml"
+        known = {} if finger is None else {finger: read_model(shipped_finger, finger)}
+        return {StateSource: _Standing(), **known}
+
     def frames(self, sensor: TactileSensor, count: int) -> list[SensorFrame]:
         """Return the next frames."""
         found: list[SensorFrame] = []
@@ -286,6 +296,14 @@ class SensorConformance(DriverConformance):
             self.frames(sensor, 1)
             longest = max(_seconds(sensor.frame) for _ in range(20))
         require(longest < 0.05 + LATE / 5, f"frame() took {longest:.3f} s")
+
+
+class _Standing:
+    """An arm that stands, on this computer's clock."""
+
+    def state(self) -> RobotState:
+        pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
+        return RobotState(pose, np.zeros(6), np.zeros(6), time.time_ns(), "ready")
 
 
 def _seconds(call: Callable[[], Any]) -> float:

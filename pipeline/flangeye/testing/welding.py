@@ -9,13 +9,20 @@ import numpy as np
 from flangeye import types as t
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import plain, require, require_covariance, require_round_trip
-from flangeye.testing.solving import CAMERA, observed, reference_solution, work_points
+from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
 
 
 def verified() -> t.VerifiedHandEye:
     """Return the kit's calibration, as if it had passed."""
     solved = reference_solution(observed(work_points()))
     return t.VerifiedHandEye(solved.camera, solved.pairs, solved.method)
+
+
+def straight_seam() -> t.Seam:
+    """Return a seam of 0.1 m across the kit's work, open upwards."""
+    points = WORK + np.linspace([-0.05, 0.0, 0.0], [0.05, 0.0, 0.0], 21)
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    return t.Seam(points, up, np.tile(1e-8 * np.eye(3), (len(points), 1, 1)), source="kit")
 
 
 class OnceConformance(Conformance):
@@ -25,7 +32,7 @@ class OnceConformance(Conformance):
 
     def answer(self) -> Any:
         """Return what the stage gives."""
-        value = self.call({t.VerifiedHandEye: verified()})
+        value = self.call({t.VerifiedHandEye: verified(), t.Seam: straight_seam()})
         require(
             isinstance(value, self.gives),
             f"gave {type(value).__name__}, not a {self.gives.__name__}",
