@@ -95,6 +95,11 @@ def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
     (limit,) = [s.params.max_rms for s in checked.steps if s.stage.name == "verify.holdout"]
     assert result.truth.rms_over_workspace < limit
     assert read_run(folder.log).calibration().transforms.keys() == result.transforms.keys()
+    if "_seam-" in name:
+        seam = result["seam"]
+        assert seam["truth"]["inside"] > 0.9
+        assert seam["truth"]["rms"] < 0.3e-3
+        assert max(seam["tube"]) < 1e-3
 
 
 def test_the_published_aubo_clouds_reach_the_target(ancorasir, tmp_path):
