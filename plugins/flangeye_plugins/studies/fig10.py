@@ -68,11 +68,11 @@ def _draw(rows: Sequence[Row]) -> Any:
         dress(panel, f"emulated as printed, in {unit}", "poses", f"standard deviation [{unit}]")
         panel.set_ylim(bottom=0)
         legend(panel)
-    for poses, limit in ((10, WITHIN_TEN), (20, WITHIN_TWENTY)):
+    for poses, limit, above in ((10, WITHIN_TEN, 3), (20, WITHIN_TWENTY, -10)):
         page.panels[0].plot([poses, 75], [limit, limit], ":", color=PRINTED.colour)
         page.panels[0].annotate(
-            f"below {limit:g} mm within {poses}, says the paper", (75, limit), fontsize=7,
-            xytext=(0, 3), textcoords="offset points", ha="right", color=PRINTED.colour,
+            f"below {limit:g} mm within {poses}, says the paper", (poses, limit), fontsize=7,
+            xytext=(2, above), textcoords="offset points", color=PRINTED.colour,
         )  # fmt: skip
     _at_work(page.panels[2], rows)
     return page

@@ -122,5 +122,5 @@ def _draw(trials: Sequence[Trials]) -> Any:
         panel.set_xticks(range(3), names)
         logarithmic(panel, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
         dress(panel, title, "", "error [mm]")
-    legend(page.panels[0], loc="lower right")
+    legend(page.panels[0], loc="upper right")
     return page
