@@ -79,6 +79,14 @@ def test_a_free_radius_costs_depth():
     assert along @ free @ along > 25 * (along @ known @ along)
 
 
+@pytest.mark.parametrize("share", [0.85, 0.95, 1.1, 1.2])
+def test_a_radius_that_is_known_roughly_is_found_on_a_cap(share):
+    radius = SPHERE.radius * share
+    found = fit(*cap(to=65.0, radius=radius), radius="free", radius_tolerance=SI(6e-3))
+    assert found.radii["sphere"] == pytest.approx(radius, abs=2e-5)
+    assert np.linalg.norm(found.centre - CENTRE) < 3e-5
+
+
 def test_a_radius_that_is_off_moves_the_centre_as_the_covariance_says():
     larger = 2e-5
     exact = {"scanner_error": SI(0), "radius_error": SI(larger)}
