@@ -49,6 +49,7 @@ class Recording:
         time_ns: When it was taken, 0 if not known.
         image: The camera's image; None when the archive has none for this pose.
         camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
+        base2_T_flange2: (4, 4) pose of a second arm's flange in its base, if there is one.
     """
 
     id: str
@@ -60,6 +61,7 @@ class Recording:
     time_ns: int = 0
     image: Path | None = None
     camera_T_target: Floats | None = None
+    base2_T_flange2: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)

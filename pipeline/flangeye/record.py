@@ -181,6 +181,8 @@ class Recorder:
         now = time.time_ns()
         if isinstance(value, t.CircleFeature) and capture is not None:
             self._proto("/scene", foxglove.circle_scene(capture, value, now))
+        if isinstance(value, t.PoseFeature) and capture is not None:
+            self._proto("/tf", foxglove.frame_transform(value.camera_T_target, now))
         if isinstance(value, t.HandEye):
             for estimate in value.transforms.values():
                 self._proto("/tf", foxglove.frame_transform(estimate.transform, now))

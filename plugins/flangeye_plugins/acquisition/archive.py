@@ -29,6 +29,7 @@ from flangeye_plugins.acquisition.opening import (
     base_T_flange,
     log_source,
     open_archive,
+    second_arm,
     skipped_note,
 )
 from flangeye_plugins.readers.cloudunit import (
@@ -151,6 +152,7 @@ def _captures(
             recording.joints,
             recording.time_ns,
             recording.role,
+            base2_T_flange2=second_arm(recording),
         )
 
 

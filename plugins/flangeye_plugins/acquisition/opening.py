@@ -12,7 +12,7 @@ from pydantic import Field
 from flangeye import Choose, Chosen, Params, RecipePath, StageError
 from flangeye.archive import Archive, Recording, check_ids, check_poses, digests_of, fingerprint_of
 from flangeye.runlog import RunLog
-from flangeye.types import ArchivePath, Source, Transform
+from flangeye.types import BASE2, FLANGE2, ArchivePath, Source, Transform
 from flangeye.units import param
 
 NAMED_AT_MOST = 12
@@ -81,6 +81,12 @@ def _listed(names: Sequence[str]) -> str:
 def base_T_flange(recording: Recording) -> Transform:
     """Return the recording's pose as the value stages see."""
     return Transform("base", "flange", recording.base_T_flange)
+
+
+def second_arm(recording: Recording) -> Transform | None:
+    """Return the second arm's pose, if the archive has one, as the value stages see."""
+    pose = recording.base2_T_flange2
+    return None if pose is None else Transform(BASE2, FLANGE2, pose)
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording]) -> Source:

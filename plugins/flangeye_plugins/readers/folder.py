@@ -17,6 +17,9 @@ The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` (a 
       - cloud: scan_001.pcd
         position: [412.5, -120.0, 310.2]
         quaternion_xyzw: [0.0, 1.0, 0.0, 0.0]
+
+There a pose may also have ``second:``, the flange of a second arm in that arm's own base, with a
+position and a rotation of its own.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from flangeye.archive import Archive, Floats, NotThisLayout, Recording
 from flangeye.cloudfile import PER_METRE, LengthUnit, write_cloud
 from flangeye.geometry import quaternion_from_rotation
 from flangeye.types import Capture
-from flangeye_plugins.readers.folder_poses import PoseRow, read_poses
+from flangeye_plugins.readers.folder_poses import ArmPose, PoseRow, read_poses
 from flangeye_plugins.readers.poses import pose_from_quaternion, pose_from_rotation_vector
 
 POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
@@ -123,16 +126,18 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
 
 
 def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
-    position = np.array(row.position) / PER_METRE[unit]
     name = row.id or Path(row.cloud).stem
     joints = None if row.joints_rad is None else np.array(row.joints_rad)
+    called = f"{where}: pose '{name}'"
+    second = None if row.second is None else _pose(f"{called}, second", row.second, unit)
     return Recording(
-        name, _pose(f"{where}: pose '{name}'", row, position), root / row.cloud, None, joints,
-        row.role, row.time_ns,
+        name, _pose(called, row, unit), root / row.cloud, None, joints, row.role, row.time_ns,
+        base2_T_flange2=second,
     )  # fmt: skip
 
 
-def _pose(where: str, row: PoseRow, position: Floats) -> Floats:
+def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
+    position = np.array(row.position) / PER_METRE[unit]
     if row.quaternion_xyzw is not None:
         return pose_from_quaternion(where, position, row.quaternion_xyzw)
     return pose_from_rotation_vector(where, position, row.rotation_vector_rad or ())

@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -18,25 +18,31 @@ from flangeye.yamlfile import read_yaml
 Triple = tuple[float, float, float]
 
 
-class PoseRow(BaseModel):
-    """One pose, as ``poses.yaml`` has it."""
+class ArmPose(BaseModel):
+    """Where an arm's flange was."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
-    cloud: str = Field(min_length=1)
-    id: str | None = None
     position: Triple
     quaternion_xyzw: tuple[float, float, float, float] | None = None
     rotation_vector_rad: Triple | None = None
-    role: Role = "calibration"
-    time_ns: int = Field(0, ge=0)
-    joints_rad: tuple[float, ...] | None = None
 
     @model_validator(mode="after")
-    def _one_rotation(self) -> PoseRow:
+    def _one_rotation(self) -> Self:
         if (self.quaternion_xyzw is None) == (self.rotation_vector_rad is None):
             raise ValueError("needs a quaternion or a rotation vector, one of the two")
         return self
+
+
+class PoseRow(ArmPose):
+    """One pose, as ``poses.yaml`` has it; ``second`` is that of a second arm, in its own base."""
+
+    cloud: str = Field(min_length=1)
+    id: str | None = None
+    second: ArmPose | None = None
+    role: Role = "calibration"
+    time_ns: int = Field(0, ge=0)
+    joints_rad: tuple[float, ...] | None = None
 
 
 class PosesFile(BaseModel):
