@@ -358,3 +358,16 @@ def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotte
     ages = ahead + 1.0 + 0.002 * np.arange(15000) + 0.4 - late
     assert ages[0] > 0.39 and (ages[:7000] > 0.1).all()
     assert ages[-1] < 0.001
+
+
+def test_a_program_that_is_not_let_run_for_a_while_still_reads_the_arm(robot, monkeypatch):
+    read = robot._link.sample
+
+    def read_and_be_held_up():
+        sample = read()
+        time.sleep(0.3)
+        return sample
+
+    monkeypatch.setattr(robot._link, "sample", read_and_be_held_up)
+    assert robot.state().mode == "ready"
+    robot.wait_cycle()

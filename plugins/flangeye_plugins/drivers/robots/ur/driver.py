@@ -135,10 +135,12 @@ class UrRobot:
     def wait_cycle(self) -> None:
         """Return when a sample has come that no earlier call waited for."""
         until = time.monotonic() + STALE
+        late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:
-            if time.monotonic() > until:
+            if late:
                 raise DeviceError(f"{self.name} sends nothing any more: its cycles have stopped")
             time.sleep(0.1 * self.period)
+            late = time.monotonic() > until
         self._seen = sample.number
 
     def stop(self) -> None:
@@ -168,11 +170,13 @@ class UrRobot:
         """Return the newest sample; wait for one where this computer was too busy to take it."""
         until = time.monotonic() + STALE
         while True:
+            # The time comes first: who is not let run for a while after reading has read it fresh.
+            late, now = time.monotonic() > until, time.time_ns()
             sample = self._link.sample()
-            age = np.inf if sample is None else 1e-9 * (time.time_ns() - sample.time_ns)
+            age = np.inf if sample is None else 1e-9 * (now - sample.time_ns)
             if sample is not None and age < STALE:
                 return sample
-            if time.monotonic() > until:
+            if late:
                 raise DeviceError(
                     f"{self.name}: its last sample is {age:.2f} s old, at most {STALE} s are "
                     "allowed: the controller or the network has stopped"
