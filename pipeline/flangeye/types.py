@@ -763,6 +763,9 @@ class WeldReport:
 
     def __post_init__(self) -> None:
         k = len(self.phases)
+        for name in ("refined", "tip", "torch", "robot"):
+            if not len(getattr(self, name)):  # JSON does not tell (0, 3) from (0,)
+                object.__setattr__(self, name, np.zeros((0, 3)))
         _freeze(self, planned=(len(self.planned), 3), refined=(len(self.refined), 3), opening=(3,))
         _freeze(self, tip=(k, 3), torch=(k, 3), robot=(k, 3))
         for name in ("time", "deflection", "wanted", "speed", "turn", "along"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,9 @@ INSTALL = "pip install 'flangeye[realsense]'"
 
 STALE = 2
 """Frames of a running camera that may have been exposed before they were asked for."""
+
+RUN_OUT_MS = 200
+"""A recording that gives no frame for so long has ended [ms]."""
 
 SAME_UNIT = 1e-6
 """Largest relative difference of two reports of one unit, in single precision."""
@@ -122,7 +126,16 @@ class Realsense(OpenScanner):
         """Stop the camera."""
         if not self._closed:
             self._closed = True
+            if self._params.recording is not None:
+                self._run_out()
             self._pipeline.stop()
+
+    def _run_out(self) -> None:
+        """Let a recording come to its end: stopped while it is read, the SDK may abort."""
+        limit = time.monotonic() + PATIENCE
+        with contextlib.suppress(RuntimeError):
+            while time.monotonic() < limit:
+                self._pipeline.wait_for_frames(RUN_OUT_MS)
 
     def _facts(self, profile: Any) -> dict[str, str]:
         depth = profile.get_stream(self._rs.stream.depth).as_video_stream_profile()
