@@ -159,7 +159,7 @@ RECIPE = """\
 title: Centres
 robot: {model: ur10e}
 steps:
-  - acquire.centres: {reader: ancorasir}
+  - acquire.centres: {reader: ancorasir, centre_noise: 0.2 mm}
   - solve.robust
 """
 
@@ -189,6 +189,10 @@ def test_a_finding_is_exit_code_one_and_its_line_mends_it(monkeypatch, capsys, f
     assert code == 1
     assert "1. pose direction: the poses are flange_T_base" in out
     line = out.split("fix: ")[1].splitlines()[0]
+    assert line == (
+        "- acquire.centres: {reader: {corrected: {reader: ancorasir, inverted: true}}, "
+        "centre_noise: 0.2 mm}"
+    )
     mended = yaml.safe_load(RECIPE)
     mended["steps"][0] = yaml.safe_load(line)[0]
     recipe.write_text(yaml.safe_dump(mended))

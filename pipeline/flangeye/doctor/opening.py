@@ -7,7 +7,7 @@ object to.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from flangeye.recipe import Recipe, parse_recipe
 from flangeye.registry import Registry
 from flangeye.runlog import read_run
 from flangeye.runner import Runner
-from flangeye.stage import Chosen, Part
+from flangeye.stage import Chosen, Params, Part
 from flangeye.steps import Step
 
 APART = 0.01
@@ -223,23 +223,26 @@ def _as_recipe(session: Session, recipe: Recipe) -> Session:
     scanner: ScannerModel | None = recipe.context.get(ScannerModel)
     reach = session.reach if scanner is None else (scanner.near, scanner.far)
     reader = _written(getattr(first.params, "reader", None))
-    left_out = list(getattr(first.params, "leave_out", ()))
     configuration: Configuration = recipe.context.get(Configuration) or DEFAULT
     return replace(
         _in_configuration(session, configuration),
         reach=reach,
         reader=reader,
         acquire=first.stage.name,
-        changes={"leave_out": left_out} if left_out else {},
+        changes={} if first.params is None else _given(first.params, {"reader", "path"}),
     )
 
 
 def _written(reader: Any) -> Reader:
-    """Return a reader as people write it, without parameters at their defaults."""
+    """Return a reader as people write it: its name, with the parameters that were stated."""
     if not isinstance(reader, Chosen):
         return "auto"
     name = reader.part.name.partition(".")[2]
-    if reader.params is None:
-        return name
-    params = reader.params.model_dump(mode="json", exclude_defaults=True)
+    params = {} if reader.params is None else _given(reader.params)
     return {name: params} if params else name
+
+
+def _given(params: Params, apart_from: Set[str] = frozenset()) -> dict[str, Any]:
+    """Return the parameters that the recipe states, as it may write them."""
+    stated = set(params.model_fields_set - apart_from)
+    return params.model_dump(mode="json", include=stated)
