@@ -26,10 +26,12 @@ def hand_eye(sigma=(1e-6, 1e-7), error=None):
 
 
 @lru_cache(maxsize=32)
-def scanned(workpiece="v-straight", seed=0, resolution=RESOLUTION, noise=1.0, **given):
+def scanned(workpiece="v-straight", seed=0, resolution=RESOLUTION, distortion=1.0, **given):
     """Return the simulated scan and its true seam (N, 3) in base."""
     model = load_model("scanners", "phoxi-m")
-    eye = eye_of(model, resolution, noise, np.random.default_rng(seed + 50))
+    error = max(distortion * model.calibration_error, 1e-12)
+    model = model.model_copy(update={"calibration_error": error})
+    eye = eye_of(model, resolution, 1.0, np.random.default_rng(seed + 50))
     rng = np.random.default_rng(seed + 1000)
 
     def look(bodies):

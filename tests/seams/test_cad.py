@@ -7,13 +7,14 @@ import pytest
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.catalogue import load_model
-from flangeye.geometry import rigid, rotation_from_rpy
+from flangeye.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.seamline import errors_from, tube_radii
 from flangeye.types import CAMERA, Box, PointCloud, Seed, WorkpieceScan
 from flangeye.workpiece import load_workpiece
 from flangeye_plugins.seams.cad import CadParams, seam_cad
+from flangeye_plugins.seams.scanning import SimulatedScanParams
 from flangeye_plugins.simulation.workpiece import PLATES, _description
-from tests.seams.scenes import hand_eye, scanned, write_plate
+from tests.seams.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
 
 MM = 1e-3
 PHOXI = load_model("scanners", "phoxi-m")
@@ -211,3 +212,34 @@ def test_a_file_without_triangles_is_no_cad(tmp_path):
         StageError, match=r"plate.stl: holds no triangles; is it a mesh, and whole\?"
     ):
         load_workpiece(path)
+
+
+@pytest.mark.slow
+def test_the_registration_is_as_uncertain_as_it_says():
+    """Errors of the fit against its own covariance, over scans without the scanner's distortion.
+
+    The mean squared Mahalanobis distance of six parameters is six; 8 scans vary it by a quarter.
+    """
+    squares = []
+    for seed in range(8):
+        scan, _ = scanned("v-curved", seed=seed, resolution=0.3, distortion=0.0)
+        squares.append(squared_error(scan, seed))
+    assert 1.0 < np.mean(squares) < 12.0
+
+
+def squared_error(scan, seed):
+    """Return the squared Mahalanobis distance of a fit from the truth."""
+    from flangeye_plugins.seams.cad import _limits
+    from flangeye_plugins.seams.part import Part
+    from flangeye_plugins.seams.register import register
+
+    workpiece = load_workpiece(CadParams(workpiece="v-curved").workpiece)
+    seam = workpiece.seams["groove"]
+    points = scan.cloud.points().astype(np.float64)
+    params = CadParams(workpiece="v-curved")
+    fit = register(points, Part(workpiece), seam, _limits(params), np.random.default_rng(seed)).fit
+    true = BASE_T_CAMERA.inverse().matrix @ SimulatedScanParams().base_T_part
+    motion = fit.pose @ np.linalg.inv(true)
+    shift = motion[:3, :3] @ fit.about + motion[:3, 3] - fit.about
+    error = np.concatenate([rotation_log(motion[:3, :3]), shift])
+    return float(error @ np.linalg.solve(fit.covariance, error))
