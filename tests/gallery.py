@@ -83,7 +83,7 @@ def _links(key: str, marker: bool, how: str) -> list[str]:
         words = rest.split("_")
         if folder != "configurations" or words[0] != key or words[2] != how:
             continue
-        if (words[1] == "marker") is marker:
+        if words[1].startswith("marker") is marker:
             found.append(f"[{words[1]}](recipes/{name}.yaml)")
     return found
 

@@ -103,6 +103,9 @@ class SessionParams(Params):
     four_axes: bool = Field(
         False, description="The first arm's flange only moves, and turns about the vertical."
     )
+    in_turns: bool = Field(
+        False, description="Of two arms, one rests at its first pose while the other moves."
+    )
 
 
 class MarkerParams(SessionParams):
@@ -248,7 +251,7 @@ def _plan(
     if configuration.other_base and second is None:
         raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
     other = Arm(second.model) if second and configuration.other_base else None
-    cast = Cast(configuration, Arm(robot), other, params.four_axes)
+    cast = Cast(configuration, Arm(robot), other, params.four_axes, params.in_turns)
     known = configuration.place
     place = params.place.matrix if known is None else np.asarray(known)
     camera = params.camera.matrix if params.camera else None

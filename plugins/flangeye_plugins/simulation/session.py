@@ -103,12 +103,14 @@ class Cast:
         first: The first arm.
         second: The second one, where there is one.
         four_axes: Whether the first arm's flange only moves and turns about the base's z.
+        in_turns: Whether of two arms one rests at its first pose while the other moves.
     """
 
     configuration: Configuration
     first: Arm
     second: Arm | None
     four_axes: bool = False
+    in_turns: bool = False
 
 
 def draw_stands(
@@ -123,10 +125,14 @@ def draw_stands(
         rng: Draws the joints.
     """
     joints = _around(home[0], spread, rng)
+    if cast.in_turns:
+        joints[::2] = home[0]
     frames, flange = cast.first.frames(joints), cast.first.flange(joints)
     if cast.four_axes:
         flange = _of_four_axes(flange[0], spread, rng)
     second = None if cast.second is None else _around(home[1], spread, rng)
+    if cast.in_turns and second is not None:
+        second[1::2] = home[1]
     carried: dict[str, Floats] = {BASE: np.tile(np.eye(4), (DRAWS, 1, 1)), FLANGE: flange}
     if cast.second is not None and second is not None:
         carried[FLANGE2] = cast.second.flange(second)
