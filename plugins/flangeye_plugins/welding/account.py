@@ -12,6 +12,7 @@ from flangeye_plugins.welding.chronicle import Chronicle, columns
 from flangeye_plugins.welding.finger import Finger
 from flangeye_plugins.welding.follower import Controller, Follower
 from flangeye_plugins.welding.frame import WorkPlane
+from flangeye_plugins.welding.motion import turned
 from flangeye_plugins.welding.path import Path
 
 Floats = NDArray[np.float64]
@@ -36,7 +37,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
     ahead = np.stack([np.cos(cycle["angle"]), np.sin(cycle["angle"]), 0 * cycle["angle"]], axis=1)
-    displaced, deflection = _felt(chronicle, plan, kept)
+    tip, deflection = _felt(chronicle, plan, kept)
     to_base = plane.base_T_plane.apply
     velocity = cycle["velocity"].reshape(-1, 3)
     return WeldReport(
@@ -47,10 +48,10 @@ def report_of(  # noqa: PLR0913  all that a weld had
         refined=to_base(_refined(controller, plan)),
         opening=plane.base_T_plane.rotation[:, 2],
         time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
-        tip=to_base(robot + displaced),
+        tip=to_base(tip),
         torch=to_base(robot - finger.torch * ahead),
         robot=to_base(robot),
-        deflection=deflection,
+        deflection=controller.side * deflection,
         wanted=np.array(every["wanted"])[kept],
         speed=np.linalg.norm(velocity[:, :2], axis=1),
         turn=cycle["turn"],
@@ -62,21 +63,25 @@ def report_of(  # noqa: PLR0913  all that a weld had
 
 
 def _felt(chronicle: Chronicle, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return the tip's displacement (K, 3) in the plane, and against the wall (K,)."""
-    displaced, newest = [], np.zeros(3)
-    for cycle in chronicle.cycles:
-        for number in cycle.touches:
-            newest = np.asarray(chronicle.felt[number].displacement)
-        displaced.append(newest)
-    rows = np.array(displaced).reshape(-1, 3)[kept]
-    angle = np.array([chronicle.cycles[i].angle for i in kept])
-    c, s = np.cos(angle), np.sin(angle)
-    turned = np.stack(
-        [c * rows[:, 0] - s * rows[:, 1], s * rows[:, 0] + c * rows[:, 1], rows[:, 2]], axis=1
-    )
-    _, tangents = plan.evaluate(np.array([chronicle.cycles[i].tip for i in kept]))
-    across = -(tangents[:, 0] * turned[:, 1] - tangents[:, 1] * turned[:, 0])
-    return turned, across
+    """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).
+
+    Each image meets the pose of its own time; until the next one the tip stays there.
+    """
+    every = columns(chronicle.cycles)
+    robot = np.array(every["position"]).reshape(-1, 3)
+    felt = [chronicle.felt[number] for touches in every["touches"] for number in touches]
+    used = np.cumsum([len(touches) for touches in every["touches"]], dtype=int)[kept]
+    if not felt:
+        return robot[kept], np.zeros(len(kept))
+    times = np.array([feeling.time_ns for feeling in felt]) * 1e-9
+    then = np.stack([np.interp(times, every["time"], axis) for axis in robot.T], axis=1)
+    angle = np.interp(times, every["time"], every["angle"])
+    moved = np.array([turned(f.displacement, a) for f, a in zip(felt, angle, strict=True)])
+    _, tangents = plan.evaluate(np.interp(times, every["time"], every["tip"]))
+    across = tangents[:, 1] * moved[:, 0] - tangents[:, 0] * moved[:, 1]
+    newest = np.maximum(used - 1, 0)
+    tip = np.where((used > 0)[:, None], (then + moved)[newest], robot[kept])
+    return tip, np.where(used > 0, across[newest], 0.0)
 
 
 def _refined(controller: Controller, plan: Path) -> Floats:

@@ -40,7 +40,7 @@ class AsPrinted:
         self.tip = self.torch = 0.0
         self.wanted = settings.deflection
         self._plan, self._distance, self._settings = plan, distance, settings
-        self._side = 1.0 if settings.side == "left" else -1.0
+        self.side = 1.0 if settings.side == "left" else -1.0
         self._displacement = np.zeros(3)
         self._refined: list[Floats] = []
         self._tangents = plan.tangents
@@ -74,7 +74,7 @@ class AsPrinted:
         t_v = self._tangents[nearest]
         n_v = _left(t_v)
         deflection = -float(self._displacement[:2] @ n_v)
-        across = -settings.servo_gain * (deflection - self._side * settings.deflection)
+        across = -settings.servo_gain * (deflection - self.side * settings.deflection)
         most = settings.lateral_speed
         return np.asarray(settings.speed * t_v + np.clip(across, -most, most) * n_v)
 

@@ -45,6 +45,7 @@ class Controller(Protocol):
 
     Attributes:
         mode: Its name, for people.
+        side: 1 for the left wall, -1 for the right one.
         phase: What it is doing.
         reason: Why it stopped.
         tip: Arc length of the tip's progress on the plan [m].
@@ -53,6 +54,7 @@ class Controller(Protocol):
     """
 
     mode: str
+    side: float
     phase: Phase
     reason: str
     tip: float
@@ -98,7 +100,7 @@ class Follower:
         self.contact = Contact()
         self._plan, self._settings, self._touching = plan, settings, touch
         self._steering = Steering(distance, settings.cross_track_gain, settings.turn_rate)
-        self._side = 1.0 if settings.side == "left" else -1.0
+        self.side = 1.0 if settings.side == "left" else -1.0
         self._track = Track()
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
@@ -137,7 +139,7 @@ class Follower:
         tip = pose.position + turned(touch.displacement, pose.angle)
         s = self._plan.foot(tip[:2], self.tip)
         place = self._plan.at(s)
-        deflection = self._side * float((pose.position - tip)[:2] @ place.normal)
+        deflection = self.side * float((pose.position - tip)[:2] @ place.normal)
         self.contact.update(touch.time, deflection, max(self.wanted, self._settings.probe))
         felt = Felt(float((tip[:2] - place.point) @ place.normal), float(tip[2]) - place.height)
         if self.phase == "seeking":
@@ -237,10 +239,10 @@ class Follower:
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
         """Return V_r (3,): along the plan; the servo (14) across it and in height."""
         settings, place, felt = self._settings, self._plan.at(self.tip), self._seam_at_tip()
-        deflection = self._side * (self._lateral(pose) - felt.offset)
+        deflection = self.side * (self._lateral(pose) - felt.offset)
         height = float(pose.position[2]) - place.height - felt.height
         most = settings.lateral_speed
-        across = -self._side * settings.servo_gain * (deflection - self.wanted)
+        across = -self.side * settings.servo_gain * (deflection - self.wanted)
         if self.phase == "seeking" and not self._search.found:
             across = settings.servo_gain * self._search.step(self._lateral(pose))
         preload = settings.preload if self._touching else 0.0
