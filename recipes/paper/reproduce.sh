@@ -82,8 +82,11 @@ for seam in straight curved; do
     --out "fig13-gap_$seam"
   batch "$recipe" --repeat 2 --vary seed --set steps.5.turned=90 --out "fig13-across_$seam"
 done
-[ -d "$here/../../plugins" ] &&
-  python -m flangeye_plugins.studies fig13 . --out "$here/../../plugins/flangeye_plugins/welding"
+welding=$here/../../plugins/flangeye_plugins/welding
+if [ -d "$welding" ]; then
+  python -m flangeye_plugins.studies fig13 . --out "$welding"
+  python -m flangeye_plugins.studies page "$welding/README.md"
+fi
 
 # --- beyond the paper: errors on poses that took no part --------------------------------------
 
