@@ -60,7 +60,7 @@ def least_trimmed_squares(centres: Floats, tcps: Floats) -> Mask:
     """Return the better half of the pairs: with the smallest squared residuals among halves.
 
     Rousseeuw & Van Driessen (2006): a start from every triple (1000 of them at most), then
-    refits to the half with the smallest residuals until it stays the same.
+    refits to the half with the smallest residuals for as long as these get smaller.
     """
     n = len(centres)
     h = (n + 3) // 2
@@ -95,15 +95,19 @@ def _fit_triples(centres: Floats, tcps: Floats) -> tuple[Floats, Floats]:
 def _concentrate(
     centres: Floats, tcps: Floats, motion: tuple[Floats, Floats], h: int
 ) -> tuple[Mask, float]:
-    """Refit to the ``h`` pairs with the smallest residuals until they stay the same."""
-    kept = np.zeros(len(centres), dtype=bool)
+    """Refit to the ``h`` pairs with the smallest residuals for as long as these get smaller.
+
+    Exact pairs have residuals of rounding alone, which never settle on one half.
+    """
+    kept, least = np.zeros(len(centres), dtype=bool), np.inf
     while True:
         squares = _squares(centres, tcps, motion)
         now = np.zeros_like(kept)
         now[np.argsort(squares, kind="stable")[:h]] = True
-        if (now == kept).all():
-            return kept, float(squares[kept].sum())
-        kept = now
+        total = float(squares[now].sum())
+        if total >= least:
+            return kept, least
+        kept, least = now, total
         motion = kabsch(centres[kept], tcps[kept])
 
 

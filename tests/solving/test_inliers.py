@@ -1,0 +1,17 @@
+"""Which pairs of centres and TCPs agree."""
+
+import numpy as np
+import pytest
+
+from flangeye.geometry import rotation_exp
+from flangeye_plugins.solving.inliers import find_inliers
+
+
+@pytest.mark.parametrize("count", [9, 15, 30])
+def test_exact_pairs_end_in_a_moment_and_all_agree(count):
+    rng = np.random.default_rng(count)
+    tcps = rng.uniform(-0.2, 0.2, (count, 3))
+    turn, shift = rotation_exp(np.array([0.3, -2.0, 1.0])), np.array([0.6, 0.0, 1.0])
+    centres = (tcps - shift) @ turn
+    inliers, _ = find_inliers(centres, tcps, 1e-5)
+    assert inliers.all()
