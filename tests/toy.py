@@ -177,7 +177,12 @@ def seam(calibration: VerifiedHandEye, scan: WorkpieceScan | None) -> Seam:
 @stage("weld.toy")
 def weld(calibration: VerifiedHandEye, seam: Seam) -> WeldReport:
     """Weld nothing."""
-    return WeldReport()
+    none = np.zeros(0)
+    return WeldReport(
+        mode="toy", completed=True, reason="", planned=seam.points_in_base, refined=none,
+        opening=np.array([0.0, 0.0, 1.0]), time=none, tip=none, torch=none, robot=none,
+        deflection=none, wanted=none, speed=none, turn=none, along=none, phases=(),
+    )  # fmt: skip
 
 
 @hookimpl

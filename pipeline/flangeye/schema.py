@@ -66,6 +66,14 @@ class _Builder:
         kind = node.get("x-flangeye-part")
         if kind is None:
             return {key: self._with_parts(value) for key, value in node.items()}
-        parts = [p for name, p in self._registry.parts.items() if name.startswith(f"{kind}.")]
         kept = {k: v for k, v in node.items() if k not in ("x-flangeye-part", "default")}
-        return {**kept, "oneOf": [self.entry(part, f"{kind}.") for part in parts]}
+        return {**kept, "allOf": [self._choice(kind)]}
+
+    def _choice(self, kind: str) -> dict[str, str]:
+        """Return a reference to the parts of one kind; a part may choose among its own kind."""
+        name = f"part.{kind}"
+        if name not in self.definitions:
+            self.definitions[name] = {}  # found by those of its own kind
+            parts = [p for n, p in self._registry.parts.items() if n.startswith(f"{kind}.")]
+            self.definitions[name] = {"oneOf": [self.entry(p, f"{kind}.") for p in parts]}
+        return {"$ref": f"#/$defs/{name}"}

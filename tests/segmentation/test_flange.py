@@ -36,7 +36,7 @@ def scans(outliers, count):
     stream = step.stage(**asked, params=step.params)
     captures = [capture for _, capture in zip(range(count), stream, strict=False)]
     flange = next(v for k, v in recipe.context.items() if k.__name__ == "Flange")
-    return captures, flange, stream.source.truth.base_T_camera
+    return captures, flange, stream.source.truth.camera
 
 
 def found(capture, flange, **params):

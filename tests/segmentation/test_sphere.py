@@ -35,7 +35,7 @@ def acquire(resolution=0.25, sphere=SPHERE, **changes):
 def scanned():
     """Captures of a UR10e with a sphere on its flange, and where the sphere truly is."""
     captures = acquire(robot_errors=0.0)
-    truth = captures.source.truth.base_T_camera
+    truth = captures.source.truth.camera
     found = list(captures)
     centres = [truth.inverse().apply(c.base_T_flange.apply(SPHERE.centre_in_flange)) for c in found]
     return list(zip(found, centres, strict=True))

@@ -34,7 +34,7 @@ def scanned(seed=0):
 
 def in_flange(capture, truth):
     """Return the scan's points in the reported flange frame, by the true camera pose."""
-    camera_T_flange = truth.base_T_camera.inverse() @ capture.base_T_flange
+    camera_T_flange = truth.camera.inverse() @ capture.base_T_flange
     return camera_T_flange.inverse().apply(capture.cloud.points())
 
 
@@ -60,7 +60,7 @@ def test_captures_are_complete():
 def test_the_truth_is_the_papers_camera_pose():
     source = acquire().source
     expected = [[0, -1, 0, 0.6], [-1, 0, 0, -0.0125], [0, 0, -1, 1], [0, 0, 0, 1]]
-    assert source.truth.base_T_camera.matrix == pytest.approx(np.array(expected), abs=1e-15)
+    assert source.truth.camera.matrix == pytest.approx(np.array(expected), abs=1e-15)
     assert source.workspace.centre == pytest.approx([0.6, -0.0125, 0.3])
     assert source.workspace.size == pytest.approx([0.3, 0.3, 0.2])
     assert source.notes == ("simulated: ur5 before phoxi-m, 4 poses",)

@@ -131,7 +131,7 @@ def clocked(poses: Sequence[Observation], turn: float) -> list[Observation]:
         wanted = o.base_T_flange.rotation @ [np.cos(turn), np.sin(turn), 0.0]
         x, y, _ = basis_of_plane(o.circle.normal) @ TRUTH.rotation.T @ wanted
         circle = replace(o.circle, clocking=float(np.arctan2(y, x)))
-        seen.append(replace(o, circle=circle))
+        seen.append(replace(o, feature=circle))
     return seen
 
 
