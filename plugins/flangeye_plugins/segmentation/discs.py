@@ -72,12 +72,15 @@ def of_size(part: Floats, plane: Plane, pitch: float, flange: Flange) -> Disc:
     return Disc(plane, part.mean(axis=0), across, 0.0, flaw, 0)
 
 
-def compare(disc: Disc, around: Floats, pitch: float, flange: Flange, limits: Limits) -> Disc:
+def compare(
+    disc: Disc, around: Floats, nearby: Floats, pitch: float, flange: Flange, limits: Limits
+) -> Disc:
     """Return a disc of the right size with what else keeps it from being the flange, if anything.
 
     Args:
         disc: From :func:`of_size`.
         around: (N, 3) all points in its plane near it, edges included [m].
+        nearby: (M, 3) all points near it, before and behind its plane too [m].
         pitch: Typical distance of neighbours there [m].
         flange: What to look for.
         limits: What it must fulfil.
@@ -87,7 +90,7 @@ def compare(disc: Disc, around: Floats, pitch: float, flange: Flange, limits: Li
     disc = disc._replace(centre=disc.plane.lift(centre), seen=float(np.mean(shares)))
     flaws = (
         _missing_ring(disc, shares, flange, limits),
-        _missing_plate(disc, around, flange),
+        _missing_plate(disc, nearby, flange),
         _too_steep(disc, limits),
     )
     for rank, flaw in enumerate(flaws, 1):
@@ -106,10 +109,11 @@ def _missing_ring(disc: Disc, shares: list[float], flange: Flange, limits: Limit
     return None
 
 
-def _missing_plate(disc: Disc, around: Floats, flange: Flange) -> str | None:
+def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
     """Return what is wrong with the plate that must stand before a wrist circle."""
     if flange.bore is not None:
         return None
+    around = nearby[np.abs(disc.plane.heights(nearby)) < 2 * flange.details.thickness]
     radius = np.linalg.norm(disc.plane.flatten(around - disc.centre + disc.plane.point), axis=1)
     radius /= flange.rim
     circle = around[(radius > PLATE_ENDS) & (radius < 1.05)]

@@ -39,8 +39,9 @@ def coarse_view(xyz: Singles, pitch: float) -> Grid | None:
     """
     if xyz.ndim == 3:
         view = thin_out(xyz, pitch)
-        # A sparse organised scan may have all its points between the thinned lines.
-        if np.isfinite(view.xyz[..., 2]).any():
+        # A sparse organised scan may have all its points between the thinned lines, or none of
+        # them beside another.
+        if np.isfinite(view.angle) and np.isfinite(view.xyz[..., 2]).any():
             return view
     points = xyz.reshape(-1, 3)
     # The sum of the three is finite when they are; a point behind the scanner is none.

@@ -71,4 +71,4 @@ def _compared(disc: Disc, xyz: Singles, pitch: float, flange: Flange, limits: Li
     if plane is None:
         return disc
     around = nearby[np.abs(plane.heights(nearby)) < max(3 * plane.sigma, LEAST_SLAB)]
-    return compare(disc._replace(plane=plane), around, pitch, flange, limits)
+    return compare(disc._replace(plane=plane), around, nearby, pitch, flange, limits)
