@@ -1,6 +1,7 @@
 """Archives that cannot be used: one line and exit code 2 in run, a row with the reason in batch."""
 
 import csv
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +74,8 @@ CASES = {
     clouds_without_poses:
         ": no reader knows this layout: ancorasir (holds none of calib_data.json, "
         "calibration_robot_pose_data.npy, calibration_robot_pose_data.npz, data.txt, "
-        "readRobot.txt); folder (holds clouds (5), but none of poses.csv, poses.yaml, poses.yml, "
-        "poses.json)",
+        "readRobot.txt);* folder (holds clouds (5), but none of poses.csv, poses.yaml, poses.yml, "
+        "poses.json);* not tried, for a recipe must give their parameters: *",
     an_empty_list_of_poses: ": holds no poses",
     poses_without_clouds: "/00.pcd: does not exist",
     counts_that_differ:
@@ -89,6 +90,7 @@ CASES = {
         "/02.pcd: is the verification cloud 04.pcd again; a cloud that verifies must not be "
         "calibrated with",
 }  # fmt: skip
+"""What is said of each; ``*`` stands for readers that are not named here."""
 
 
 @pytest.fixture
@@ -115,7 +117,8 @@ def test_run_says_one_line(spoil, bad, flangeye, tmp_path):
     folder = bad(spoil)
     code, _, err = flangeye("run", "bad.yaml", "--archive", folder)
     assert code == 2
-    assert err == f"error: {folder}{CASES[spoil]}\n"
+    assert fnmatchcase(err, f"error: {folder}{CASES[spoil]}\n")
+    assert err.count("\n") == 1
     assert not (tmp_path / "runs").exists()
 
 
@@ -128,4 +131,4 @@ def test_batch_has_a_row_with_the_reason_for_each(bad, flangeye):
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["failed"] * len(CASES)
     for row, folder, line in zip(rows, folders, CASES.values(), strict=True):
-        assert row["reason"] == f"{folder}{line}"
+        assert fnmatchcase(row["reason"], f"{folder}{line}")

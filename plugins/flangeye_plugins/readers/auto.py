@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from pydantic import ValidationError
 
 from flangeye import StageError, part
 from flangeye.archive import Archive, NotThisLayout
-from flangeye.stage import Part, Siblings
+from flangeye.stage import Chosen, Part, Siblings
 from flangeye_plugins.readers.ancorasir import ancorasir
 from flangeye_plugins.readers.folder import folder
 
@@ -19,13 +20,8 @@ BUILT_IN: Siblings = {"ancorasir": ancorasir, "folder": folder}
 @part("reader.auto")
 def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
     """Try every reader that is installed and take the one that knows the path; says which."""
-    found: dict[str, Archive] = {}
-    missed: list[str] = []
-    for name, reader in siblings.items():
-        try:
-            found[name] = _read(reader, path)
-        except NotThisLayout as error:
-            missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
+    bound = {name: _bound(reader) for name, reader in siblings.items()}
+    found, missed = _tried({name: reader for name, reader in bound.items() if reader}, path)
     if len(found) == 1:
         ((name, archive),) = found.items()
         note = f"reader: {name}, chosen by what {archive.root} holds"
@@ -35,18 +31,27 @@ def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
             f"{path}: could be read by {' and '.join(found)}; choose one, for example "
             f"reader: {next(iter(found))}"
         )
+    untried = [name for name, reader in bound.items() if reader is None]
+    if untried:
+        missed.append(f"not tried, for a recipe must give their parameters: {', '.join(untried)}")
     raise StageError(f"{path}: no reader knows this layout: {'; '.join(missed)}")
 
 
-def _read(reader: Part, path: Path) -> Archive:
-    """Read with a reader's default parameters.
-
-    Raises:
-        NotThisLayout: It does not know the path, or nothing of it without being told more.
-    """
+def _bound(reader: Part) -> Chosen | None:
+    """Return a reader with its default parameters, or None if some have no default."""
     try:
-        chosen = reader.bind()
+        return reader.bind()
     except ValidationError:
-        raise NotThisLayout("has parameters that a recipe must give") from None
-    archive: Archive = chosen(path)
-    return archive
+        return None
+
+
+def _tried(readers: Mapping[str, Chosen], path: Path) -> tuple[dict[str, Archive], list[str]]:
+    """Return what each reader gave that knows the path, and the others' reasons."""
+    found: dict[str, Archive] = {}
+    missed: list[str] = []
+    for name, reader in readers.items():
+        try:
+            found[name] = reader(path)
+        except NotThisLayout as error:
+            missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
+    return found, missed
