@@ -65,9 +65,18 @@ def watch(robot, number):
                 state = robot.state()
                 robot.wait_cycle()
             except DeviceError as error:
-                return str(error)
+                return reason_of(robot) or str(error)
         if state.mode not in ("ready", "moving"):
             return f"{state.mode}: {state.message}"
+
+
+def reason_of(robot):
+    """Why the controller takes no command, if it still says so: it may have refused one first."""
+    try:
+        state = robot.state()
+    except DeviceError:
+        return None
+    return None if state.mode in ("ready", "moving") else f"{state.mode}: {state.message}"
 
 
 def fail(process, fault, number):
@@ -125,7 +134,13 @@ def fail_often(lanes, fault, times):
     return seen
 
 
-LOST = ("is lost: its", "its last sample is", "sends nothing any more", "did not answer")
+LOST = (
+    "is lost: its",
+    "its last sample is",
+    "sends nothing any more",
+    "did not answer",
+    "Timeout connecting to UR dashboard server",
+)
 LOCAL = "it is in local control: choose Remote Control at the top right of the pendant"
 
 
