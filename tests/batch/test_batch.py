@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,8 @@ from flangeye.batch.software import software_of
 from flangeye.batch.work import STARTS, WORKER_DIED, Job
 
 SLURM = Path(cluster.__file__).with_name("slurm_cluster.py")
+PATIENCE = 120
+"""Seconds after which a process is taken to hang; it answers in a few."""
 
 
 def rows(folder):
@@ -120,32 +123,51 @@ def test_a_port_that_is_no_scheduler(batch, monkeypatch):
             batch(scheduler=address)
 
 
+@contextmanager
+def running(command, **options):
+    """Start a command in a process group of its own, of which nothing is left at the end.
+
+    Not in a session of its own: Linux may give each session an equal share of the processor, and
+    the process would starve beside a busy test run.
+    """
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, process_group=0, stdout=pipe, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+
 def test_ctrl_c_keeps_what_came_so_far(recipe, tmp_path):
     """Sent to the whole group, as a terminal does: the workers must not answer it."""
     command = [
         sys.executable, "-m", "flangeye.cli", "batch", str(recipe), "--repeat", "100",
         "--set", "steps.3.wait=100 ms", "--no-report", "--workers", "1", "--out", "out",
     ]  # fmt: skip
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    process = subprocess.Popen(command, start_new_session=True, **pipes)
-    deadline = time.monotonic() + 30
-    while len(list(tmp_path.glob("out/*/session.json"))) < 3 and time.monotonic() < deadline:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    said, _ = process.communicate(timeout=30)
+    with running(command, stderr=subprocess.STDOUT) as process:
+        deadline = time.monotonic() + PATIENCE
+        while len(list(tmp_path.glob("out/*/session.json"))) < 3:
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert said.strip() == "stopped; the same command goes on from here"
     assert 0 < len(rows(tmp_path / "out")) < 100
     assert (tmp_path / "out" / "summary.html").exists()
 
 
-SBATCH = """\
-#!/bin/sh
+SBATCH = f"""\
+#!{sys.executable}
 # Stands in for SLURM: starts the job's script on this machine.
-cp "$1" job.sh
-setsid sh job.sh >job.log 2>&1 &
-echo $! >job.pid
-echo "Submitted batch job 1"
+import pathlib, shutil, subprocess, sys
+shutil.copy(sys.argv[1], "job.sh")
+with open("job.log", "w") as log:
+    job = subprocess.Popen(["sh", "job.sh"], process_group=0, stdout=log, stderr=log)
+pathlib.Path("job.pid").write_text(str(job.pid))
+print("Submitted batch job 1")
 """
 
 
@@ -163,13 +185,11 @@ def slurm(tmp_path, monkeypatch):
     text = SLURM.read_text().replace("NODES = 4", "NODES = 1").replace("CORES = 16", "CORES = 2")
     script.write_text(text.replace('"/tmp"', repr(str(tmp_path))))
     environment = {**os.environ, "PATH": f"{bin_}{os.pathsep}{os.environ['PATH']}"}
-    process = subprocess.Popen(
-        [sys.executable, script], env=environment, stdout=subprocess.PIPE, text=True
-    )
-    line = process.stdout.readline()
-    yield line.split()[-1]
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=30)
+    with running([sys.executable, script], env=environment) as process:
+        line = process.stdout.readline()
+        yield line.split()[-1]
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
 
 
