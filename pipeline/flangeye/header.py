@@ -138,9 +138,9 @@ class Header(Section):
     robot: RobotSection | None = None
     second_robot: SecondRobotSection | None = None
     scanner: ScannerSection | None = None
-    configuration: ConfigurationSection = ConfigurationSection()
-    feature: FeatureSection = FeatureSection()
+    configuration: ConfigurationSection = Field(default_factory=ConfigurationSection)
+    feature: FeatureSection = Field(default_factory=FeatureSection)
     workspace: WorkspaceSection | None = None
     seed: int = Field(0, ge=0, description="The only source of randomness.")
-    log: LogSection = LogSection()
+    log: LogSection = Field(default_factory=LogSection)
     steps: list[Any] = Field(min_length=1, description="Stages in order, each with parameters.")

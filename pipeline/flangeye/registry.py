@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import gc
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import cast
@@ -123,16 +125,33 @@ def load_registry() -> Registry:
     hooks = pluggy.PluginManager(hookspecs.NAME)
     hooks.add_hookspecs(hookspecs)
     registry = Registry(hooks)
-    for entry_point in sorted(entry_points(group=hookspecs.NAME), key=_builtin_first):
-        distribution = entry_point.dist
-        registry.installed[entry_point.name] = distribution.version if distribution else "unknown"
-        try:
-            registry.register(entry_point.name, entry_point.load())
-        except DuplicatePluginError:
-            raise
-        except Exception as error:  # a vendor's import may fail in any way
-            registry.broken[entry_point.name] = error
+    with _collector_paused():
+        for entry_point in sorted(entry_points(group=hookspecs.NAME), key=_builtin_first):
+            _load(registry, entry_point)
     return registry
+
+
+def _load(registry: Registry, entry_point: EntryPoint) -> None:
+    distribution = entry_point.dist
+    registry.installed[entry_point.name] = distribution.version if distribution else "unknown"
+    try:
+        registry.register(entry_point.name, entry_point.load())
+    except DuplicatePluginError:
+        raise
+    except Exception as error:  # a vendor's import may fail in any way
+        registry.broken[entry_point.name] = error
+
+
+@contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Leave the garbage collector off: modules stay, so looking through them finds nothing."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
 
 
 def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:
