@@ -73,7 +73,7 @@ class SimulatedParams(Params):
     poses: Annotated[Chosen, Choose("plan")] = param(
         {"grid": {}}, description="Where the robot goes."
     )
-    camera: CameraPose = Field(CameraPose(), description="The scanner's true pose.")
+    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     verification: int = Field(
         1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
     )

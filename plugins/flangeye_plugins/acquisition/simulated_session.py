@@ -89,7 +89,7 @@ class SessionParams(Params):
         "to see the target at the first pose.",
     )
     place: PlaceParams = Field(
-        PlaceParams(),
+        default_factory=PlaceParams,
         description="The target's true place in what carries it, where the recipe does not know "
         "it; with camera it follows from the first pose.",
     )

@@ -35,7 +35,7 @@ class LoopbackParams(Params):
 
     host: str = Field("127.0.0.1", description="Where the controller on loopback listens.")
     robot: str = Field("ur5e", description="What it moves: a model of data/robots, or a file.")
-    camera: CameraPose = Field(CameraPose(), description="The scanner's true pose.")
+    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     workspace: tuple[Length, Length, Length] = param(
         ("300 mm", "300 mm", "200 mm"), description="The wall and the stand are beside this box."
     )

@@ -64,7 +64,8 @@ class AuboParams(Params):
     user: str = Field("aubo", description="Account on the controller.")
     password: str = Field("123456", description="Of that account; this is the one it comes with.")
     tool: ToolOffset = Field(
-        ToolOffset(), description="What the controller's tool is set to; no tool when not given."
+        default_factory=ToolOffset,
+        description="What the controller's tool is set to; no tool when not given.",
     )
 
 

@@ -53,7 +53,7 @@ class FrankyParams(Params):
         True, description="Insist on a real-time kernel; without one, moves may be cut short."
     )
     tool: ToolOffset = Field(
-        ToolOffset(), description="The end effector set in Desk; none when not given."
+        default_factory=ToolOffset, description="The end effector set in Desk; none when not given."
     )
 
 

@@ -41,7 +41,8 @@ class UrRtdeParams(Params):
 
     host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
     tool: ToolOffset = Field(
-        ToolOffset(), description="What the controller's tool is set to; no tool when not given."
+        default_factory=ToolOffset,
+        description="What the controller's tool is set to; no tool when not given.",
     )
 
 
