@@ -64,7 +64,8 @@ class OpenCVCamera:
         """
         with self._lock:
             frame, self._newest = self._newest, None
-        if frame is None and self._lost:
+            lost = self._lost  # within the lock: no image comes after the camera is lost
+        if frame is None and lost:
             raise DeviceError(f"{self.name}: gives no more images; is it still connected?")
         return frame
 
