@@ -138,15 +138,21 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         require_inside(guard.state, allowed)
         opened = opening.enter_context(eye.open())
         itinerary = planned(guard.state.joints)
-        source = Source(
-            fingerprint=_fingerprint(arm, eye, opened),
-            notes=(f"live: {guard.name} and {opened.name}",),
-            workspace=Box(itinerary.centre, itinerary.size),
-            truth=opened.truth if isinstance(opened, KnowsTruth) else None,
-        )
         release = opening.pop_all()
     done = resumed.done if resumed else frozenset()
-    return LiveCaptures(Session(itinerary, guard, opened, params.moved, done), source, release)
+    session = Session(itinerary, guard, opened, params.moved, done)
+    return LiveCaptures(session, _source(session, arm, eye), release)
+
+
+def _source(session: Session, arm: RobotDriver, eye: ScannerDriver) -> Source:
+    """Return what is known of a session before its first capture."""
+    itinerary, scanner = session.itinerary, session.scanner
+    return Source(
+        fingerprint=_fingerprint(arm, eye, scanner),
+        notes=(f"live: {session.arm.name} and {scanner.name}",),
+        workspace=Box(itinerary.centre, itinerary.size),
+        truth=scanner.truth if isinstance(scanner, KnowsTruth) else None,
+    )
 
 
 def require_inside(state: RobotState, allowed: Limits) -> None:
