@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+import os
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,6 +14,9 @@ from tests import toy
 
 # Installed and run as a vendor would: test_wheel.py.
 collect_ignore = ["vendor_example"]
+
+# What flangeye remembers for its user is not the tests' to change, nor to read.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="flangeye-tests-")
 
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from flangeye import __version__
 from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
@@ -43,6 +44,24 @@ Overrides = Annotated[
     ),
 ]
 LogFile = Annotated[Path, typer.Argument(help="The run.mcap of a run.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"flangeye {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Say which one this is."
+        ),
+    ] = False,
+) -> None:
+    """Nothing but what stands before a command."""
 
 
 def main() -> None:
@@ -257,11 +276,15 @@ def stages(
     name: Annotated[str | None, typer.Argument(help="A stage or part, for its parameters.")] = None,
 ) -> None:
     """List stages and parts; with NAME its parameters, units, defaults and meaning."""
-    from flangeye.catalogue_text import describe_all, describe_one
+    if name is None:
+        from flangeye.listing import list_stages
+
+        typer.echo(list_stages())
+        return
+    from flangeye.catalogue_text import describe_one
     from flangeye.registry import load_registry
 
-    registry = load_registry()
-    typer.echo(describe_one(registry, name) if name else describe_all(registry))
+    typer.echo(describe_one(load_registry(), name))
 
 
 @app.command()
