@@ -6,6 +6,7 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -144,7 +145,8 @@ class Runner:
             self._captures.close()
 
     def _fitted(self, stream: t.Captures) -> Iterator[t.Observation]:
-        label = self._steps("acquire")[0].label
+        acquire = self._steps("acquire")[0]
+        label = acquire.label
         self._captures = stream
         captures = iter(stream)
         while True:
@@ -157,6 +159,10 @@ class Runner:
             if isinstance(capture, t.Rejection):
                 stream.became[capture.id] = None
                 self._reject(capture)
+                continue
+            if (fault := _unread_joint(capture)) is not None:
+                stream.became[capture.id] = None
+                self._reject(t.Rejection(capture.id, acquire.stage.name, fault))
                 continue
             self._hooks.flangeye_captured(step=label, capture=capture, seconds=seconds)
             observation = stream.became[capture.id] = self._through(capture)
@@ -298,6 +304,15 @@ class Runner:
         self._hooks.flangeye_stage_finished(
             step=step.label, capture=capture, value=value, seconds=seconds
         )
+
+
+def _unread_joint(capture: t.Capture) -> str | None:
+    """Return which joint angle is no number: a driver that had none to give leaves NaN."""
+    joints = () if capture.joints is None else capture.joints.tolist()
+    for number, angle in enumerate(joints, 1):
+        if not math.isfinite(angle):
+            return f"joint {number} is {angle}: the arm's driver had no angle to give"
+    return None
 
 
 def _guarded(step: Step, arguments: dict[str, Any]) -> Any:

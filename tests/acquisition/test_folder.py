@@ -91,7 +91,7 @@ def test_a_unit_said_twice_must_agree(tmp_path):
          ":1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing"),
         (HEADING.replace("qw", "w") + ROW,
          ":1: column 'w' is not known; known: cloud, id, role, time_ns, x_m, y_m, z_m, x_mm, y_mm, "
-         "z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …"),
+         "z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, second_x_m, …"),
         (HEADING.replace("qw", "qx") + ROW, ":1: column 'qx' comes twice"),
         (HEADING.replace("cloud", "cloud,j1_rad,j2_rad") + ROW.replace(".pcd,", ".pcd,1,,"),
          ":2: poses.0.joints_rad.1: Input should be a valid number, unable to parse string as a "

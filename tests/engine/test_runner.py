@@ -3,6 +3,7 @@
 import gc
 import json
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,24 @@ def test_the_same_recipe_gives_the_same_result_bit_for_bit(execute):
 def test_a_solver_that_stops_pulling_stops_the_acquisition(execute):
     execute(TOY_RECIPE.replace("- solve.toy", "- solve.toy: {at_most: 4}"))
     assert toy.acquired == ["000", "001", "002", "003"]
+
+
+def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(execute):
+    plain = toy.acquire.function
+
+    def unread(seed, params):
+        made = plain(seed, params)
+        angles = (np.array([0.1, np.nan if i == 2 else 0.2]) for i in range(params.count))
+        captures = (replace(c, joints=q) for c, q in zip(made, angles, strict=True))
+        return t.Captures(captures, made.source, params.count)
+
+    with replaced(toy.acquire, unread):
+        result, log = execute(TOY_RECIPE)
+    reason = "joint 2 is nan: the arm's driver had no angle to give"
+    assert [(r.id, r.stage, r.reason) for r in log.rejections] == [("002", "acquire.toy", reason)]
+    (aside,) = [o for o in result.observations if not o.used]
+    assert (aside.id, aside.reason) == ("002", f"acquire.toy: {reason}")
+    assert "002" not in log.poses
 
 
 def test_captures_are_not_kept(execute):

@@ -8,7 +8,9 @@
 The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` (a file name);
 ``x_m, y_m, z_m`` or ``x_mm, y_mm, z_mm``; ``qx, qy, qz, qw`` or a rotation vector
 ``rx_rad, ry_rad, rz_rad``; and if wanted ``id`` (the cloud's name without its ending), ``role``
-(``calibration`` or ``verification``), ``time_ns`` and joint angles ``j1_rad, j2_rad, …``.
+(``calibration`` or ``verification``), ``time_ns`` and joint angles ``j1_rad, j2_rad, …``. The
+flange of a second arm, in that arm's own base, has the same columns with ``second_`` before their
+names (``second_x_mm, …, second_qw``).
 
 ``poses.yaml`` or ``poses.json`` says the same, with the unit of the positions once::
 
@@ -18,8 +20,7 @@ The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` (a 
         position: [412.5, -120.0, 310.2]
         quaternion_xyzw: [0.0, 1.0, 0.0, 0.0]
 
-There a pose may also have ``second:``, the flange of a second arm in that arm's own base, with a
-position and a rotation of its own.
+There the second arm's pose is ``second:``, with a position and a rotation of its own.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from flangeye import Params, StageError, part
 from flangeye.archive import Archive, Floats, NotThisLayout, Recording
 from flangeye.cloudfile import PER_METRE, LengthUnit, write_cloud
 from flangeye.geometry import quaternion_from_rotation
-from flangeye.types import Capture
-from flangeye_plugins.readers.folder_poses import ArmPose, PoseRow, read_poses
+from flangeye.types import Capture, Transform
+from flangeye_plugins.readers.folder_poses import SECOND, ArmPose, PoseRow, read_poses
 from flangeye_plugins.readers.poses import pose_from_quaternion, pose_from_rotation_vector
 
 POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
@@ -74,7 +75,7 @@ def write_folder(path: Path, captures: Iterable[Capture]) -> None:
 
     Args:
         path: Folder to write into; it is made.
-        captures: At least one; with or without joint angles, all of them alike.
+        captures: At least one; with or without joint angles and a second arm, all of them alike.
     """
     path.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
@@ -88,16 +89,20 @@ def write_folder(path: Path, captures: Iterable[Capture]) -> None:
 
 
 def _row_of(capture: Capture) -> dict[str, Any]:
-    pose = capture.base_T_flange
-    position = zip(("x_m", "y_m", "z_m"), pose.translation.tolist(), strict=True)
-    rotation = quaternion_from_rotation(pose.rotation).tolist()
     joints = [] if capture.joints is None else capture.joints.tolist()
+    second = capture.base2_T_flange2
     return {
         "cloud": f"{capture.id}.pcd", "id": capture.id, "role": capture.role,
-        "time_ns": capture.time_ns, **dict(position),
-        **dict(zip(("qx", "qy", "qz", "qw"), rotation, strict=True)),
+        "time_ns": capture.time_ns, **_cells_of(capture.base_T_flange),
         **{f"j{i}_rad": angle for i, angle in enumerate(joints, 1)},
+        **({} if second is None else _cells_of(second, SECOND)),
     }  # fmt: skip
+
+
+def _cells_of(pose: Transform, prefix: str = "") -> dict[str, float]:
+    numbers = [*pose.translation.tolist(), *quaternion_from_rotation(pose.rotation).tolist()]
+    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    return {prefix + name: number for name, number in zip(names, numbers, strict=True)}
 
 
 def _poses_file(path: Path) -> Path:

@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -63,6 +63,8 @@ _POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _VECTOR = ("rx_rad", "ry_rad", "rz_rad")
 _OTHERS = ("cloud", "id", "role", "time_ns")
+SECOND = "second_"
+"""What the columns of a second arm's pose begin with."""
 _JOINT = re.compile(r"j[1-9]\d?_rad")
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -118,33 +120,69 @@ def _cells(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _unit_of(file: Path, heading: Sequence[str]) -> LengthUnit | None:
-    known = [*_OTHERS, *sum(_POSITIONS.values(), ()), *_QUATERNION, *_VECTOR]
+    _refuse_unknown(file, heading)
+    unit = _unit_stated(heading)
+    if unit == "none":
+        raise StageError(f"{file}:1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing")
+    second = [name.removeprefix(SECOND) for name in heading if name.startswith(SECOND)]
+    if second and _unit_stated(second) != unit:
+        wanted = ", ".join(SECOND + name for name in _POSITIONS[unit])
+        raise StageError(
+            f"{file}:1: the second arm's columns {wanted} are missing; they have the first's unit"
+        )
+    return unit
+
+
+def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
+    of_pose = [*sum(_POSITIONS.values(), ()), *_QUATERNION, *_VECTOR]
+    known = [*_OTHERS, *of_pose]
     for name in heading:
         if heading.count(name) > 1:
             raise StageError(f"{file}:1: column '{name}' comes twice")
-        if name not in known and not _JOINT.fullmatch(name):
+        of_second = name.startswith(SECOND) and name.removeprefix(SECOND) in of_pose
+        if name not in known and not of_second and not _JOINT.fullmatch(name):
             raise StageError(
-                f"{file}:1: column '{name}' is not known; known: {', '.join(known)}, j1_rad, …"
+                f"{file}:1: column '{name}' is not known; known: {', '.join(known)}, j1_rad, …, "
+                f"{SECOND}x_m, …"
             )
+
+
+def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
+    """Return the unit that position columns name, ``none`` where there are no such columns."""
     for unit, names in _POSITIONS.items():
         if set(names) <= set(heading):
             return unit
-    raise StageError(f"{file}:1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing")
+    return "none"
 
 
 def _row(
     cells: Mapping[str, str], unit: LengthUnit | None, joints: Sequence[str]
 ) -> dict[str, Any]:
     """Return a CSV row, its empty cells left out, in the shape a YAML entry has."""
-    several = {
-        "position": _POSITIONS[unit], "quaternion_xyzw": _QUATERNION,
-        "rotation_vector_rad": _VECTOR, "joints_rad": joints,
-    }  # fmt: skip
     row: dict[str, Any] = {name: cells[name] for name in _OTHERS if name in cells}
-    for key, names in several.items():
-        if any(name in cells for name in names):
-            row[key] = [cells.get(name, "") for name in names]
+    row |= _grouped(cells, {**_columns_of_pose(unit), "joints_rad": joints})
+    second = {n.removeprefix(SECOND): c for n, c in cells.items() if n.startswith(SECOND)}
+    if second:
+        row["second"] = _grouped(second, _columns_of_pose(unit))
     return row
+
+
+def _columns_of_pose(unit: LengthUnit | None) -> dict[str, Sequence[str]]:
+    return {
+        "position": _POSITIONS[unit], "quaternion_xyzw": _QUATERNION,
+        "rotation_vector_rad": _VECTOR,
+    }  # fmt: skip
+
+
+def _grouped(
+    cells: Mapping[str, str], several: Mapping[str, Sequence[str]]
+) -> dict[str, list[str]]:
+    """Return the cells of columns that belong together, under the name YAML has for them."""
+    return {
+        key: [cells.get(name, "") for name in names]
+        for key, names in several.items()
+        if any(name in cells for name in names)
+    }
 
 
 def _checked(
