@@ -7,6 +7,7 @@ topic                         schema                      content
 ============================  ==========================  ======================================
 /source                       flangeye.Source (JSON)      where captures come from, and notes
 /capture                      flangeye.Capture (JSON)     id, pose, joints, time, role, grid shape
+/capture/image                foxglove.CompressedImage    what a camera saw, lossless
 /capture/cloud                foxglove.PointCloud         the scan: thinned, or whole
 /pose                         foxglove.PoseInFrame        the flange as the controller reports it
 /tf                           foxglove.FrameTransform     base -> flange, carrier -> camera, …
@@ -107,16 +108,18 @@ class Recorder:
 
     @hookimpl
     def flangeye_captured(self, step: str, capture: t.Capture, seconds: float) -> None:
-        """Log the scan and the pose."""
+        """Log the scan, the image and the pose."""
         cloud, now = capture.cloud, time.time_ns()
         xyz = cloud.xyz.reshape(-1, 3) if self._full else _thinned(cloud)
         meta = _plain(capture) | {
             "shape": list(cloud.xyz.shape),
-            "full": self._full,
+            "full": self._full or not cloud.xyz.size,
             "step": step,
             "seconds": seconds,
         }
         self._json("/capture", "Capture", meta)
+        if capture.image is not None:  # before the cloud, with which a capture is whole
+            self._proto("/capture/image", foxglove.compressed_image(capture.image, now))
         self._proto("/capture/cloud", foxglove.point_cloud(cloud, xyz, now))
         self._proto("/pose", foxglove.pose_in_frame(capture.base_T_flange, now))
         self._proto("/tf", foxglove.frame_transform(capture.base_T_flange, now))
@@ -237,8 +240,11 @@ def dump_result(result: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a flowing value as plain JSON data, its clouds left out."""
-    return adapter(type(value)).dump_python(value, mode="json", exclude=set(clouds_of(value)))
+    """Return a flowing value as plain JSON data, without what has a channel of its own."""
+    left_out: dict[str, Any] = dict.fromkeys(clouds_of(value), True)
+    if isinstance(value, t.Capture):
+        left_out["image"] = {"pixels"}
+    return adapter(type(value)).dump_python(value, mode="json", exclude=left_out)
 
 
 def _thinned(cloud: t.PointCloud) -> NDArray[np.float32]:

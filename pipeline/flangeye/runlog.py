@@ -151,16 +151,19 @@ class RunLog:
         return next((e.value for e in reversed(self.entries) if isinstance(e.value, kind)), None)
 
     def captures(self) -> Iterator[t.Capture]:
-        """Yield the captures with the clouds that were logged, thinned or whole."""
+        """Yield the captures with their images, and their clouds as logged, thinned or whole."""
         meta: dict[str, Any] = {}
+        pixels = None
         for topic, _, data in _messages(self.path):
             if topic == "/capture":
-                meta = json.loads(data)
+                meta, pixels = json.loads(data), None
+            elif topic == "/capture/image":
+                pixels = _decode_image(data)
             elif topic == "/capture/cloud":
                 xyz = _decode_cloud(data).xyz
                 if meta["full"]:
                     xyz = xyz.reshape(meta["shape"])
-                yield self._capture(meta["id"], t.PointCloud(t.CAMERA, xyz))
+                yield self._capture(meta["id"], t.PointCloud(t.CAMERA, xyz), pixels)
 
     @property
     def has_full_clouds(self) -> bool:
@@ -177,12 +180,11 @@ class RunLog:
             None if second is None else read(second),
         )
 
-    def _capture(self, capture: str, cloud: t.PointCloud) -> t.Capture:
+    def _capture(self, capture: str, cloud: t.PointCloud, pixels: Any = None) -> t.Capture:
         meta = self.poses[capture]
         pose, joints, second = self._pose(capture)
-        return t.Capture(
-            capture, cloud, pose, joints, meta["time_ns"], meta["role"], base2_T_flange2=second
-        )
+        image = None if pixels is None else t.Image(pixels, **meta["image"])
+        return t.Capture(capture, cloud, pose, joints, meta["time_ns"], meta["role"], image, second)
 
 
 def read_run(path: Path) -> RunLog:

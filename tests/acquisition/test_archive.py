@@ -4,6 +4,7 @@ import re
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from flangeye.record import Recorder
 from flangeye.types import ArchivePath, Capture, PointCloud, Source, Transform
 from flangeye_plugins.acquisition import archive as module
 from flangeye_plugins.acquisition.archive import ArchiveParams, acquire_archive
+from flangeye_plugins.acquisition.camera import CameraParams
 from flangeye_plugins.readers.auto import auto
 from flangeye_plugins.readers.folder import write_folder
 
@@ -125,6 +127,62 @@ def test_a_log_of_thinned_scans_is_refused(refused, captures, tmp_path):
         f"{path}: holds no whole scans; record with log: {{clouds: full}}, or use flangeye run "
         "--from to start at a later step"
     )
+
+
+# --- images ------------------------------------------------------------------------------------
+
+FOCAL, MIDDLE = 40.0, (9.5, 7.0)
+
+
+def add_image(archive, name, bend=0.0):
+    """Put an organised cloud and the image of its grid in the place of a cloud."""
+    v, u = np.indices((15, 20), dtype=float)
+    rays = np.stack([(u - MIDDLE[0]) / FOCAL, (v - MIDDLE[1]) / FOCAL, np.ones_like(u)], axis=-1)
+    rays[..., 0] += bend * rays[..., 0] ** 3
+    cloud = PointCloud("camera", (0.45 + 1e-3 * len(name)) * rays)
+    write_cloud(archive / f"{name}.pcd", cloud)
+    pixels = np.full((15, 20), len(name), np.uint8)
+    (archive / f"{name}.png").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+
+
+def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(acquire, archive):
+    add_image(archive, "two")
+    add_image(archive, "three")
+    stream = acquire()
+    images = {capture.id: capture.image for capture in stream}
+    assert {name for name, image in images.items() if image} == {"two", "three"}
+    assert np.allclose(
+        images["two"].camera_matrix, [[FOCAL, 0, 9.5], [0, FOCAL, 7], [0, 0, 1]], atol=1e-3
+    )
+    assert images["three"].pixels[0, 0] == len("three")
+    assert (
+        "camera of the images: focal length 40.0, 40.0 px, principal point 9.5, 7.0 px, by the "
+        "clouds under them"
+    ) in stream.source.notes
+
+
+def test_the_stated_camera_goes_before_what_the_clouds_imply(acquire, archive):
+    add_image(archive, "two", bend=30.0)
+    stated = CameraParams(focal_length=(41, 42), principal_point=(9, 8), distortion=(0.1, 0.2))
+    (image,) = [c.image for c in acquire(camera=stated) if c.image]
+    assert np.allclose(np.diag(image.camera_matrix), [41, 42, 1])
+    assert np.allclose(image.distortion, [0.1, 0.2])
+
+
+def test_images_of_no_known_camera_are_left_out_and_that_is_told(acquire, archive):
+    add_image(archive, "two", bend=30.0)
+    stream = acquire()
+    assert all(capture.image is None for capture in stream)
+    assert stream.source.notes[-1] == (
+        "left out the images, such as two.png: no pinhole camera fits the clouds under them; write "
+        "camera: {focal_length: [fx, fy], principal_point: [cx, cy]}"
+    )
+
+
+def test_two_images_of_one_cloud_are_refused(refused, archive):
+    add_image(archive, "two")
+    shutil.copy(archive / "two.png", archive / "two.bmp")
+    assert refused() == f"{archive}: two.bmp and two.png both belong to two.pcd; keep one of them"
 
 
 # --- units -------------------------------------------------------------------------------------

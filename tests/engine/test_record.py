@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,30 @@ def test_what_is_written_is_read(tmp_path):
         "2.fit.toy", "fit.toy", "fit", "a",
     )  # fmt: skip
     assert np.array_equal(entry.value.centre, CIRCLE.centre)
+
+
+@pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])
+def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(tmp_path, shape):
+    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    matrix = np.array([[500.0, 0, 20], [0, 501, 15], [0, 0, 1]])
+    image = t.Image(pixels, matrix, np.array([-0.1, 0.01]))
+    nothing = t.PointCloud(t.CAMERA, np.zeros((0, 3), np.float32))
+    second = t.Transform(t.BASE2, t.FLANGE2, np.eye(4))
+    seen = replace(CAPTURE, image=image, cloud=nothing, base2_T_flange2=second)
+    recorder = Recorder(tmp_path / "r.mcap", {}, full_clouds=False)
+    recorder.flangeye_run_started(t.Source("hash"), 2)
+    recorder.flangeye_captured("0.acquire.toy", seen, 0.1)
+    recorder.flangeye_captured("0.acquire.toy", replace(CAPTURE, id="b"), 0.1)
+    recorder.close()
+    log = read_run(tmp_path / "r.mcap")
+    assert set(log.poses["a"]["image"]) == {"camera_matrix", "distortion"}
+    assert log.poses["a"]["full"]  # an image without a cloud is whole
+    first, other = log.captures()
+    assert np.array_equal(first.image.pixels, pixels)
+    assert np.array_equal(first.image.camera_matrix, matrix)
+    assert np.array_equal(first.image.distortion, image.distortion)
+    assert first.base2_T_flange2.name == "base2_T_flange2"
+    assert other.image is None
 
 
 def test_viewers_find_foxglove_schemas_and_frames(tmp_path):

@@ -44,9 +44,12 @@ def flangeye(monkeypatch, *words):
     return ended.value.code
 
 
+def transforms(folder):
+    return json.loads((folder / "result.json").read_text())["transforms"]
+
+
 def check_result(folder, turn, shift):
-    result = json.loads((folder / "result.json").read_text())
-    found = np.array(result["transforms"]["flange_T_camera"]["matrix"])
+    found = np.array(transforms(folder)["flange_T_camera"]["matrix"])
     off = rotation_log(found[:3, :3].T @ FLANGE_T_CAMERA[:3, :3])
     assert np.degrees(np.linalg.norm(off)) < turn
     assert np.linalg.norm(found[:3, 3] - FLANGE_T_CAMERA[:3, 3]) < shift
@@ -128,6 +131,9 @@ def test_a_folder_of_images_with_kuka_poses_is_calibrated(tmp_path, monkeypatch)
     )
     assert flangeye(monkeypatch, "run", path, "--archive", folder, "--out", tmp_path / "o") == 0
     check_result(tmp_path / "o", 0.1, 0.6e-3)
+    again = ("--from", tmp_path / "o" / "run.mcap", "--at", "fit.charuco", "--out", tmp_path / "p")
+    assert flangeye(monkeypatch, "run", path, *again) == 0
+    assert transforms(tmp_path / "p") == transforms(tmp_path / "o")
     assert flangeye(monkeypatch, "doctor", folder, "--recipe", path) == 0
     wrong = path.read_text().replace("rotation: kuka", "rotation: fanuc")
     path.write_text(wrong)

@@ -22,7 +22,8 @@ from flangeye.catalogue import ScannerModel
 from flangeye.cloudfile import PER_METRE, LengthUnit, check_cloud_file, read_cloud
 from flangeye.record import adapter
 from flangeye.runlog import read_run
-from flangeye.types import ArchivePath, Capture, Captures, Source, Transform
+from flangeye.types import ArchivePath, Capture, Captures, Image, PointCloud, Source, Transform
+from flangeye_plugins.acquisition.camera import CameraParams, image_of_cloud, read_image
 from flangeye_plugins.acquisition.opening import (
     OpeningParams,
     archive_path,
@@ -55,6 +56,11 @@ class ArchiveParams(OpeningParams):
         description="What to do about a cloud that cannot be read: refuse the archive, or set the "
         "capture aside and report it.",
     )
+    camera: CameraParams | None = Field(
+        None,
+        description="The camera that took the images beside the clouds; not needed where a cloud "
+        "is organised as its image, for then it tells.",
+    )
 
 
 @stage("acquire.archive")
@@ -73,12 +79,19 @@ def acquire_archive(scanner: ScannerModel, archive: ArchivePath, params: Archive
     digests = digests_of(r.cloud for r in usable if r.cloud)
     check_distinct_clouds(usable, digests)
     unit, unit_told = _unit(recorded, usable, params.unit, scanner)
-    digests |= digests_of(recorded.files)
+    images = [r.image for r in usable if r.image]
+    digests |= digests_of([*recorded.files, *images])
     source = Source(
         fingerprint_of(recorded.root, digests),
-        (f"archive: {recorded.layout}, {recorded.root}", *recorded.notes, *notes, unit_told),
+        (
+            f"archive: {recorded.layout}, {recorded.root}",
+            *recorded.notes,
+            *notes,
+            unit_told,
+            *_camera_note(usable, params.camera),
+        ),
     )
-    return Captures(_captures(usable, unit, scanner), source, total=len(usable))
+    return Captures(_captures(usable, unit, scanner, params.camera), source, total=len(usable))
 
 
 def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[str]]:
@@ -139,9 +152,12 @@ def _first_distance(root: Path, usable: Sequence[Recording]) -> tuple[Path, floa
 
 
 def _captures(
-    usable: Iterable[Recording], unit: LengthUnit, scanner: ScannerModel
+    usable: Iterable[Recording],
+    unit: LengthUnit,
+    scanner: ScannerModel,
+    camera: CameraParams | None,
 ) -> Iterator[Capture]:
-    """Read one cloud at a time."""
+    """Read one cloud at a time, and the image beside it."""
     for recording, path in _clouds(usable):
         cloud = read_cloud(path, unit)
         check_unit(path, median_distance(cloud), unit, scanner)
@@ -152,8 +168,34 @@ def _captures(
             recording.joints,
             recording.time_ns,
             recording.role,
-            base2_T_flange2=second_arm(recording),
+            _image(recording, cloud, camera),
+            second_arm(recording),
         )
+
+
+def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> list[str]:
+    """Return what to tell of the images' camera, by the first one; nothing where it is stated."""
+    first = next((r for r in usable if r.image), None)
+    if camera is not None or first is None or first.image is None or first.cloud is None:
+        return []
+    image = image_of_cloud(read_image(first.image), read_cloud(first.cloud))
+    if image is None:
+        return [
+            f"left out the images, such as {first.image.name}: no pinhole camera fits the clouds "
+            "under them; write camera: {focal_length: [fx, fy], principal_point: [cx, cy]}"
+        ]
+    (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
+    told = f"focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, {cy:.1f} px"
+    return [f"camera of the images: {told}, by the clouds under them"]
+
+
+def _image(recording: Recording, cloud: PointCloud, camera: CameraParams | None) -> Image | None:
+    if recording.image is None:
+        return None
+    pixels = read_image(recording.image)
+    if camera is not None:
+        return camera.image(pixels)
+    return image_of_cloud(pixels, cloud)
 
 
 def _replay(path: Path) -> Captures:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -11,24 +10,21 @@ from pydantic import Field
 from flangeye import StageError, stage
 from flangeye.archive import Recording, check_poses, digests_of, fingerprint_of
 from flangeye.cloudfile import LengthUnit, read_cloud
-from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Image, PointCloud, Source
+from flangeye.types import CAMERA, ArchivePath, Capture, Captures, PointCloud, Source
+from flangeye_plugins.acquisition.camera import CameraParams, read_image
 from flangeye_plugins.acquisition.opening import (
     OpeningParams,
     archive_path,
     base_T_flange,
     open_archive,
+    second_arm,
     skipped_note,
 )
 
 
-class ImagesParams(OpeningParams):
+class ImagesParams(OpeningParams, CameraParams):
     """Which archive, and the camera that took its images."""
 
-    focal_length: tuple[float, float] = Field(description="fx and fy of the camera's matrix [px].")
-    principal_point: tuple[float, float] = Field(description="cx and cy [px].")
-    distortion: tuple[float, ...] = Field(
-        (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
-    )
     cloud_unit: LengthUnit = Field(
         "m", description="Unit of the clouds that lie beside the images, where the archive's "
         "layout does not say."
@@ -63,32 +59,12 @@ def _captures(
     usable: Sequence[Recording], params: ImagesParams, unit: LengthUnit
 ) -> Iterator[Capture]:
     """Read one image at a time."""
-    (fx, fy), (cx, cy) = params.focal_length, params.principal_point
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     nothing = PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))
     for recording in usable:
         if recording.image is not None:
-            image = Image(read_image(recording.image), matrix, np.array(params.distortion))
+            image = params.image(read_image(recording.image))
             cloud = read_cloud(recording.cloud, unit) if recording.cloud else nothing
             yield Capture(
                 recording.id, cloud, base_T_flange(recording), recording.joints,
-                recording.time_ns, recording.role, image,
+                recording.time_ns, recording.role, image, second_arm(recording),
             )  # fmt: skip
-
-
-def read_image(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """Return the grey values (H, W) of an image file.
-
-    Raises:
-        StageError: It is missing or damaged.
-    """
-    import cv2
-
-    try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise StageError(f"{path}: cannot be read: {error.strerror}") from None
-    pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if pixels is None:
-        raise StageError(f"{path}: is not an image, or is damaged")
-    return np.asarray(pixels, dtype=np.uint8)

@@ -14,6 +14,7 @@ from flangeye.archive import Archive, Recording, check_ids, check_poses, digests
 from flangeye.runlog import RunLog
 from flangeye.types import BASE2, FLANGE2, ArchivePath, Source, Transform
 from flangeye.units import param
+from flangeye_plugins.readers.scans import with_companion
 
 NAMED_AT_MOST = 12
 """Ids a note lists in full; of more, the rest is counted."""
@@ -53,6 +54,8 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     """
     archive: Archive = params.reader(path)
     check_ids(archive)
+    recordings = [with_companion(recording) for recording in archive.recordings]
+    archive = replace(archive, recordings=recordings)
     if not params.leave_out:
         return archive
     known = {recording.id for recording in archive.recordings}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from glob import escape
 from pathlib import Path
 
 from flangeye import StageError
@@ -44,3 +46,25 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
     if len(clouds) + len(images) < len(scans):
         raise StageError(f"{scans[0]}: is neither a cloud nor an image this can read")
     return Recording(name, pose, clouds[0] if clouds else None, image=images[0] if images else None)
+
+
+def with_companion(recording: Recording) -> Recording:
+    """Return a recording with the image of its cloud's name, or the cloud of its image's.
+
+    Raises:
+        StageError: There are two.
+    """
+    if recording.cloud and not recording.image:
+        return replace(recording, image=_beside(recording.cloud, IMAGES))
+    if recording.image and not recording.cloud:
+        return replace(recording, cloud=_beside(recording.image, CLOUDS))
+    return recording
+
+
+def _beside(scan: Path, suffixes: Sequence[str]) -> Path | None:
+    named_alike = sorted(scan.parent.glob(f"{escape(scan.stem)}.*"))
+    found = [path for path in named_alike if path.suffix.lower() in suffixes]
+    if len(found) > 1:
+        names = " and ".join(path.name for path in found)
+        raise StageError(f"{scan.parent}: {names} both belong to {scan.name}; keep one of them")
+    return found[0] if found else None
