@@ -1,0 +1,104 @@
+"""The values that flow between stages, and the conventions they follow.
+
+* SI units and radians; time in nanoseconds since the epoch.
+* ``parent_T_child`` maps coordinates in ``child`` to coordinates in ``parent``; points carry the
+  name of the frame they are given in. Frames: ``base`` (robot base), ``flange`` (ISO 9409-1: origin
+  at the centre of the flange's face, z outwards), ``tool`` (what the controller takes for the
+  tool's tip), ``camera`` (scanner, z along the view), ``target`` (what is looked at, z towards the
+  scanner), ``link3`` (Denavit-Hartenberg's of that link), ``base2`` and ``flange2`` (of a second
+  arm).
+* Quaternions are xyzw. Covariances of a transform are 6x6, in the order (rotation, translation),
+  of a left perturbation in the parent frame, and say about which point the translation is taken:
+  ``x' = about + Exp(phi) (x - about) + tau``.
+* Everything is frozen, arrays are read-only, and shapes and finiteness are checked here and
+  nowhere else.
+"""
+
+from flangeye.types.arrays import Array, FloatArray, Pixels
+from flangeye.types.calibration import (
+    ArmCorrection,
+    HandEye,
+    Pair,
+    PoseError,
+    Solver,
+    Verification,
+    VerifiedHandEye,
+)
+from flangeye.types.clouds import PointCloud
+from flangeye.types.features import (
+    CircleFeature,
+    Feature,
+    Observation,
+    PoseFeature,
+    Rejected,
+    Rejection,
+    VerificationView,
+)
+from flangeye.types.frames import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    TOOL,
+    Box,
+    FrameMismatchError,
+    Transform,
+    TransformEstimate,
+)
+from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed
+from flangeye.types.scans import Capture, FlangeCloud, Image, Role, WorkpieceScan
+from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
+from flangeye.types.welding import Seam, WeldReport
+
+__all__ = [
+    "BASE",
+    "BASE2",
+    "CAMERA",
+    "FLANGE",
+    "FLANGE2",
+    "TARGET",
+    "TOOL",
+    "ArchivePath",
+    "ArmCorrection",
+    "Array",
+    "Box",
+    "Capture",
+    "Captures",
+    "CircleFeature",
+    "Feature",
+    "FlangeCloud",
+    "FloatArray",
+    "FrameMismatchError",
+    "HandEye",
+    "Image",
+    "Journal",
+    "Look",
+    "Observation",
+    "Observations",
+    "Pair",
+    "Pixels",
+    "PointCloud",
+    "PoseError",
+    "PoseFeature",
+    "Progress",
+    "Rejected",
+    "Rejection",
+    "Resumed",
+    "Role",
+    "Seam",
+    "Seed",
+    "Solver",
+    "Source",
+    "Stream",
+    "Transform",
+    "TransformEstimate",
+    "Truth",
+    "Verification",
+    "VerificationView",
+    "VerifiedHandEye",
+    "Views",
+    "WeldReport",
+    "WorkpieceScan",
+]

@@ -1,0 +1,52 @@
+"""Arrays as the values hold them: read-only, of a checked shape, and finite."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import core_schema
+
+
+class _AsNestedLists:
+    """Lets pydantic read and write an array as nested JSON lists, bit for bit."""
+
+    def __init__(self, dtype: type[np.generic]) -> None:
+        self._dtype = dtype
+
+    def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            lambda value: np.asarray(value, dtype=self._dtype),
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda a: a.tolist()),
+        )
+
+    def __get_pydantic_json_schema__(self, _schema: Any, _handler: Any) -> dict[str, Any]:
+        return {"type": "array"}
+
+
+Array = Annotated[NDArray[np.float64], _AsNestedLists(np.float64)]
+Pixels = Annotated[NDArray[np.uint8], _AsNestedLists(np.uint8)]
+FloatArray = NDArray[np.float32] | NDArray[np.float64]
+
+
+def frozen(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    """Return a read-only float64 copy of ``value``; refuse another shape or non-finite entries."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} holds values that are not finite")
+    array.setflags(write=False)
+    return array
+
+
+def freeze(instance: Any, **shapes: tuple[int, ...]) -> None:
+    """Make the arrays of a frozen dataclass read-only; refuse one of another shape.
+
+    Raises:
+        ValueError: Names the class and the array.
+    """
+    for name, shape in shapes.items():
+        what = f"{type(instance).__name__}.{name}"
+        object.__setattr__(instance, name, frozen(getattr(instance, name), shape, what))

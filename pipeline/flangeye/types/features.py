@@ -1,0 +1,141 @@
+"""What was measured of a target in one capture, and why a capture was set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.types.arrays import Array, freeze
+from flangeye.types.frames import FrameMismatchError, Transform
+from flangeye.types.scans import FlangeCloud
+
+
+@dataclass(frozen=True, eq=False)
+class CircleFeature:
+    """A circle fitted to the flange, or a sphere fitted to one mounted on it, in ``camera``.
+
+    Attributes:
+        centre: (3,) [m].
+        normal: (3,) unit normal of the face, towards the scanner; None where only centres exist.
+        radii: Fitted radii by name, for example ``{"rim": .., "bore": ..}`` [m].
+        covariance: (3, 3) of the centre [m^2].
+        normal_covariance: (3, 3) of the normal, singular along it; None with the normal.
+        arc_coverage: Share of the rim's circumference that was seen, 0 to 1; 0 if not known.
+        clocking: Angle of the hole pattern about the normal [rad], or None when not visible.
+        centre_in_flange: (3,) where the arm carries that centre, in ``flange`` [m]: its origin,
+            unless a target is mounted on it.
+    """
+
+    centre: Array
+    normal: Array | None
+    radii: Mapping[str, float]
+    covariance: Array
+    normal_covariance: Array | None
+    arc_coverage: float
+    clocking: float | None = None
+    centre_in_flange: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        freeze(self, centre=(3,), covariance=(3, 3), centre_in_flange=(3,))
+        if self.normal is not None or self.normal_covariance is not None:
+            freeze(self, normal=(3,), normal_covariance=(3, 3))
+
+    @property
+    def centre_covariance(self) -> NDArray[np.float64]:
+        """(3, 3) of the centre [m^2]: what every feature has."""
+        return self.covariance
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFeature:
+    """A target whose whole pose was measured, such as a marker.
+
+    Attributes:
+        camera_T_target: Its pose; the target's z points towards the scanner.
+        covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in
+            ``camera``, the translation taken at the target's origin.
+        figures: What the fit has to tell of its quality, by name, in SI units and pixels.
+    """
+
+    camera_T_target: Transform
+    covariance: Array
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        freeze(self, covariance=(6, 6))
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) the target's origin in ``camera`` [m]."""
+        return self.camera_T_target.translation
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """(3,) the target's z in ``camera``."""
+        return self.camera_T_target.rotation[:, 2]
+
+    @property
+    def centre_covariance(self) -> NDArray[np.float64]:
+        """(3, 3) of the origin [m^2]."""
+        return self.covariance[3:, 3:]
+
+
+Feature = CircleFeature | PoseFeature
+"""What a ``fit`` stage measures of a target, in ``camera``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """What a per-capture stage returns instead of a value: the capture is set aside, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Rejection:
+    """A capture that was set aside: which, by which stage, and why."""
+
+    id: str
+    stage: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A fitted feature and the robot poses it belongs to: one equation for the solver."""
+
+    id: str
+    feature: Feature
+    base_T_flange: Transform
+    joints: Array | None = None
+    base2_T_flange2: Transform | None = None
+
+    @property
+    def circle(self) -> CircleFeature:
+        """The feature, for those who can use nothing but a circle."""
+        if isinstance(self.feature, CircleFeature):
+            return self.feature
+        raise FrameMismatchError(f"observation {self.id} is a pose, and a circle is needed")
+
+    @property
+    def centre_in_mount(self) -> NDArray[np.float64]:
+        """(3,) where the link that carries the target has what was seen, if that is known [m]."""
+        feature = self.feature
+        return feature.centre_in_flange if isinstance(feature, CircleFeature) else np.zeros(3)
+
+    @property
+    def tcp_in_base(self) -> NDArray[np.float64]:
+        """(3,) the flange's centre, or what it carries, as the controller reports it [m]."""
+        return self.base_T_flange.apply(self.centre_in_mount)
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationView:
+    """A segmented flange kept from the solver, for verifiers that compare whole clouds."""
+
+    id: str
+    flange: FlangeCloud
+    base_T_flange: Transform

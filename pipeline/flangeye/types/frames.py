@@ -1,0 +1,136 @@
+"""Where things are: frames, transforms between them, and how well these are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.types.arrays import Array, FloatArray, freeze, frozen
+from flangeye.types.clouds import PointCloud
+
+BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"
+
+BASE2, FLANGE2 = "base2", "flange2"
+
+
+class FrameMismatchError(ValueError):
+    """Two values that meet are not expressed in the same frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Rigid transform ``parent_T_child``.
+
+    Attributes:
+        parent: Frame the result is expressed in.
+        child: Frame the input is expressed in.
+        matrix: (4, 4) homogeneous matrix, translation in [m].
+    """
+
+    parent: str
+    child: str
+    matrix: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, matrix=(4, 4))
+        rotation = self.matrix[:3, :3]
+        # Not np.allclose: poses come 500 times a second, and it takes 30 us.
+        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 2e-5
+        if not orthonormal or np.linalg.det(rotation) < 0 or tuple(self.matrix[3]) != (0, 0, 0, 1):
+            raise ValueError(f"{self.name} is not a rigid transform")
+
+    @classmethod
+    def named(cls, name: str, matrix: Any) -> Transform:
+        """Return the transform of a name such as ``base_T_camera``."""
+        parent, _, child = name.partition("_T_")
+        return cls(parent, child, matrix)
+
+    @property
+    def name(self) -> str:
+        """``parent_T_child``."""
+        return f"{self.parent}_T_{self.child}"
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) rotation ``parent_R_child``."""
+        return self.matrix[:3, :3]
+
+    @property
+    def translation(self) -> NDArray[np.float64]:
+        """(3,) origin of ``child`` in ``parent`` [m]."""
+        return self.matrix[:3, 3]
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Return ``parent_T_other``; refuse frames that do not meet."""
+        self._require(self.child, other.parent)
+        return Transform(self.parent, other.child, self.matrix @ other.matrix)
+
+    def apply(self, xyz: FloatArray) -> NDArray[np.float64]:
+        """Map (..., 3) coordinates in ``child`` to coordinates in ``parent``."""
+        return np.asarray(xyz, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def apply_cloud(self, cloud: PointCloud) -> PointCloud:
+        """Return the cloud expressed in ``parent``; refuse a cloud in another frame."""
+        self._require(self.child, cloud.frame)
+        return PointCloud(self.parent, self.apply(cloud.xyz).astype(np.float32))
+
+    def inverse(self) -> Transform:
+        """Return ``child_T_parent``."""
+        inverted = np.eye(4)
+        inverted[:3, :3] = self.rotation.T
+        inverted[:3, 3] = -self.rotation.T @ self.translation
+        return Transform(self.child, self.parent, inverted)
+
+    def _require(self, expected: str, got: str) -> None:
+        if expected != got:
+            raise FrameMismatchError(f"{self.name} acts on frame '{expected}', not on '{got}'")
+
+
+@dataclass(frozen=True, eq=False)
+class TransformEstimate:
+    """A transform that was estimated, with what is known of its error.
+
+    Attributes:
+        transform: The estimate.
+        covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in the
+            parent frame.
+        about: (3,) point in the parent frame at which the translation part is taken [m].
+        unobservable: (k, 6) unit directions, in the same order and about the same point, that no
+            measurement tells anything of: the estimate is arbitrary along them, and the covariance
+            is of the rest.
+    """
+
+    transform: Transform
+    covariance: Array
+    about: Array
+    unobservable: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    def __post_init__(self) -> None:
+        freeze(self, covariance=(6, 6), about=(3,))
+        directions = np.reshape(self.unobservable, (-1, 6))
+        object.__setattr__(self, "unobservable", frozen(directions, directions.shape, "directions"))
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An axis-aligned box in the robot's base: where the work is.
+
+    Attributes:
+        centre: (3,) [m].
+        size: (3,) full edge lengths [m].
+    """
+
+    centre: Array
+    size: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, centre=(3,), size=(3,))
+
+    def grid(self, n: int = 5) -> NDArray[np.float64]:
+        """Return (n^3, 3) points spread evenly over the box, its faces included."""
+        ticks = np.linspace(-0.5, 0.5, n)
+        unit = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.asarray(self.centre + unit * self.size)

@@ -1,0 +1,102 @@
+"""What sensors gave: clouds, images, and the captures they came with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from flangeye.types.arrays import Array, Pixels, freeze
+from flangeye.types.clouds import PointCloud
+from flangeye.types.frames import Transform
+
+Role = Literal["calibration", "verification"]
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """What a calibrated camera saw.
+
+    Attributes:
+        pixels: (H, W) grey or (H, W, 3) RGB, uint8.
+        camera_matrix: (3, 3) pinhole matrix [px].
+        distortion: (k,) OpenCV's distortion coefficients; empty for an undistorted image.
+    """
+
+    pixels: Pixels
+    camera_matrix: Array
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        pixels = np.asarray(self.pixels)
+        grey_or_rgb = pixels.ndim == 2 or pixels.shape[2:] == (3,)
+        if pixels.dtype != np.uint8 or not grey_or_rgb:
+            got = f"{pixels.shape} {pixels.dtype}"
+            raise ValueError(f"an image is (H, W) or (H, W, 3) uint8, not {got}")
+        view = pixels.view()
+        view.setflags(write=False)
+        object.__setattr__(self, "pixels", view)
+        freeze(self, camera_matrix=(3, 3), distortion=np.shape(self.distortion))
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One look at the flange: where the robot says it stood, and what the scanner saw.
+
+    Attributes:
+        id: Unique within a run.
+        cloud: The scan, in ``camera``; without points where only an image was taken.
+        base_T_flange: Pose read from the controller.
+        joints: (n,) joint angles [rad], when known.
+        time_ns: When the exposure ended.
+        role: ``verification`` captures are kept from every solver.
+        image: What a camera in the scanner saw, in the same frame, if one looked.
+        base2_T_flange2: Where a second arm stood, if there is one.
+    """
+
+    id: str
+    cloud: PointCloud
+    base_T_flange: Transform
+    joints: Array | None = None
+    time_ns: int = 0
+    role: Role = "calibration"
+    image: Image | None = None
+    base2_T_flange2: Transform | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FlangeCloud:
+    """The part of one scan that is the flange's face and rim.
+
+    Attributes:
+        cloud: (N, 3) points in ``camera``, all finite.
+        centre: (3,) rough centre of the disc in ``camera`` [m]; a start for fitting.
+        normal: (3,) rough unit normal in ``camera``, towards the scanner.
+    """
+
+    cloud: PointCloud
+    centre: Array
+    normal: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, centre=(3,), normal=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class WorkpieceScan:
+    """What the scanner saw of the workpiece, from where it was calibrated.
+
+    Attributes:
+        cloud: In ``camera``.
+        source: Where it comes from, for people.
+        notes: What the person should be told.
+        truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
+            from the stages that plan and weld.
+    """
+
+    cloud: PointCloud
+    source: str
+    notes: tuple[str, ...] = ()
+    truth: Mapping[str, Array] = field(default_factory=dict)

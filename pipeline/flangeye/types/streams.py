@@ -1,0 +1,111 @@
+"""Values that arrive one at a time, and where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from flangeye.types.clouds import PointCloud
+from flangeye.types.features import Observation, Rejection, VerificationView
+from flangeye.types.frames import Box, Transform
+from flangeye.types.scans import Capture
+
+Look = Callable[[Sequence[Any]], PointCloud]
+"""Simulation only: scans bodies, given in ``base``, with the scanner that was calibrated, from
+where it stands; gives the cloud in ``camera``. The pose itself stays with the simulation."""
+
+T = TypeVar("T")
+
+
+class Stream(Generic[T]):
+    """Values pulled one at a time, of which those already pulled are kept.
+
+    A solver that has reached its target simply stops iterating: nothing more is acquired.
+
+    Attributes:
+        source: What is known of where the values come from.
+        total: How many there will be, when known.
+        seen: The values pulled so far.
+    """
+
+    def __init__(self, items: Iterable[T], source: Source, total: int | None = None) -> None:
+        self._items = iter(items)
+        self.source = source
+        self.total = total
+        self.seen: list[T] = []
+
+    def __iter__(self) -> Iterator[T]:
+        yield from list(self.seen)
+        for item in self._items:
+            self.seen.append(item)
+            yield item
+
+
+class Captures(Stream[Capture | Rejection]):
+    """What an ``acquire`` stage gives. Captures are large, so those pulled are not kept.
+
+    A source that knows a capture to be useless gives its ``Rejection`` in its place.
+
+    Attributes:
+        became: What became of each capture, by id: its observation, or None if it was set aside
+            or kept for verifying. A source that chooses its next pose may look here.
+        look: Simulation only: scans other things with the same scanner, see :data:`Look`.
+    """
+
+    def __init__(
+        self,
+        items: Iterable[Capture | Rejection],
+        source: Source,
+        total: int | None = None,
+        look: Look | None = None,
+    ) -> None:
+        super().__init__(items, source, total)
+        self.became: dict[str, Observation | None] = {}
+        self.look = look
+
+    def __iter__(self) -> Iterator[Capture | Rejection]:
+        return self._items
+
+    def close(self) -> None:
+        """Tell the source that nothing more is wanted: a generator's ``finally`` runs now."""
+        if isinstance(self._items, Generator):
+            self._items.close()
+
+
+class Observations(Stream[Observation]):
+    """What a ``solve`` stage takes; an ``acquire`` stage may give it where no clouds exist."""
+
+
+class Views(list[VerificationView]):
+    """The verification views seen so far; they come before the first observation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated cell knows and no real one does. No stage can ask for it.
+
+    Attributes:
+        camera: Where the camera is, in the frame that carries it.
+        others: The other unknowns of the configuration.
+    """
+
+    camera: Transform
+    others: tuple[Transform, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Where captures come from.
+
+    Attributes:
+        fingerprint: Hash of everything the captures are made from.
+        notes: What the person should be told: what was skipped, detected, converted.
+        workspace: Where the work is; the box of the flange's centres when not given.
+        truth: Simulation only.
+    """
+
+    fingerprint: str
+    notes: Sequence[str] = ()
+    workspace: Box | None = None
+    truth: Truth | None = None
