@@ -1,0 +1,5 @@
+"""``python -m flangeye.cli`` is ``flangeye``."""
+
+from flangeye.cli import main
+
+main()

@@ -1,0 +1,86 @@
+"""Devices: calibrate a finger, be a controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from flangeye.cli.app import Overrides, RecipeName, app
+
+tactile = typer.Typer(no_args_is_help=True, help="Tactile fingers: find out how one moves.")
+app.add_typer(tactile, name="tactile")
+
+
+@tactile.callback()
+def tactile_group() -> None:
+    """Keep 'calibrate' a word of its own, though it is the only one yet."""
+
+
+@tactile.command("calibrate")
+def tactile_calibrate(
+    recipe: RecipeName,
+    out: Annotated[Path, typer.Option(help="The finger's file to write.")] = Path("finger.yaml"),
+    overrides: Overrides = None,
+    move: Annotated[bool, typer.Option("--move", help="Move the arm, by millimetres.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
+) -> None:
+    """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
+    from flangeye.devices import MotionAllowed
+    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    checked = load_recipe(find_recipe(recipe), registry, overrides or ())
+
+    def ask(text: str) -> None:
+        typer.echo(text)
+        if not yes:
+            typer.prompt("then press Enter", default="", show_default=False)
+
+    guide = registry.part("guide.tactile")
+    typer.echo(guide(checked, MotionAllowed(move), ask, out))
+
+
+@app.command()
+def loopback(
+    robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    faults: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--fault",
+            metavar="NAME[=DURATION][@WHEN]",
+            help="Let something go wrong, for example 'freeze=3 s@moving'.",
+        ),
+    ] = None,
+    floor: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Height of a surface to touch, for example '100 mm'."),
+    ] = None,
+    joints: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Where the arm starts, for example '0 -90 90 -90 -90 0 deg'."),
+    ] = None,
+    seed: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(help="Give the arm errors of its joints' zeros, drawn with this seed."),
+    ] = None,
+) -> None:
+    """Be a robot's controller on loopback, for its own driver to connect to."""
+    from flangeye.catalogue import load_model
+    from flangeye.loopback import LoopbackOptions, find_loopback, read_height, read_joints
+    from flangeye.registry import load_registry
+
+    model = load_model("robots", robot)
+    offered = [each for some in load_registry().hooks.hook.flangeye_loopbacks() for each in some]
+    options = LoopbackOptions(
+        robot=model,
+        host=host,
+        joints=read_joints(joints) if joints is not None else None,
+        floor=read_height(floor) if floor is not None else None,
+        faults=tuple(faults or ()),
+        seed=seed,
+    )
+    find_loopback(offered, model).serve(options)
