@@ -4,16 +4,15 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from flangeye.catalogue import load_model
-from flangeye.devices import GRACE, DeviceError, Robot
+from flangeye.devices import DeviceError
 from flangeye_plugins.drivers.robots.aubo.driver import AuboParams, robot_aubo
-from flangeye_plugins.loopback.contact import Surface
+from tests.drivers.robots.behaviour import DrivesAnArm
 from tests.drivers.robots.cell import arrived, in_time, moved, until
 from tests.loopback.process import Process, free_address
 
@@ -53,96 +52,17 @@ def robot(controller):
         yield opened
 
 
+class TestAubo(DrivesAnArm):
+    model = "aubo-i5"
+    period = 0.005
+    twist_off = 1e-4
+    opened = staticmethod(open_aubo)
+
+
 def test_the_controller_says_where_it_listens(process):
     assert process.greeting == (
         f"aubo-i5 on {process.host}: JSON-RPC 30004, control 29998; Ctrl-C ends it\n"
     )
-
-
-def test_the_state_is_that_of_the_arm(robot, controller):
-    state = robot.state()
-    assert isinstance(robot, Robot)
-    assert robot.name == f"aubo-i5 at {controller.host}"
-    assert (robot.period, state.mode, state.message) == (0.005, "ready", "")
-    truth = controller.control.truth()
-    np.testing.assert_allclose(state.base_T_flange.matrix, truth.base_T_flange, atol=1e-9)
-    np.testing.assert_allclose(state.joints, truth.joints, atol=1e-12)
-    assert abs(time.time_ns() - state.time_ns) < 0.5e9
-
-
-def test_a_straight_move_goes_where_it_should(robot, controller):
-    start = robot.state().base_T_flange
-    target = moved(start, x=0.02, z=-0.03, turn=(0.0, 0.1, -0.2))
-    robot.move_linear(target, speed=0.1, acceleration=0.5)
-    states = []
-    while (state := robot.state()).mode == "moving":
-        states.append(state)
-        robot.wait_cycle()
-    np.testing.assert_allclose(robot.state().base_T_flange.matrix, target.matrix, atol=1e-6)
-    way = np.array([s.base_T_flange.translation for s in states]) - start.translation
-    along = target.translation - start.translation
-    off = np.linalg.norm(np.cross(way, along / np.linalg.norm(along)), axis=1)
-    assert len(states) > 3 and off.max() < 1e-6
-    truth = controller.control.truth()
-    np.testing.assert_allclose(truth.base_T_flange, target.matrix, atol=1e-6)
-
-
-def test_a_joint_move_goes_where_it_should(robot):
-    target = robot.state().joints + [0.1, 0.0, -0.05, 0.0, 0.05, 0.2]
-    robot.move_joints(target, speed=0.5, acceleration=2.0)
-    assert robot.state().mode == "moving"
-    np.testing.assert_allclose(arrived(robot).joints, target, atol=1e-9)
-
-
-def test_a_move_to_where_it_is_ends_soon(robot):
-    with in_time(2.0):
-        robot.move_linear(robot.state().base_T_flange, 0.1, 0.5)
-        assert arrived(robot).mode == "ready"
-
-
-def test_a_second_move_replaces_the_first(robot):
-    start = robot.state().base_T_flange
-    robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
-    until(lambda: robot.state().base_T_flange.translation[2] < start.translation[2] - 1e-3)
-    robot.move_linear(start, 0.1, 0.5)
-    np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
-
-
-def test_velocities_are_followed_and_end_when_no_command_comes(robot, controller):
-    twist = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.05])
-    for _ in range(60):
-        robot.move_velocity(twist, acceleration=1.0)
-        robot.wait_cycle()
-    robot.move_velocity(twist, acceleration=1.0)
-    np.testing.assert_allclose(controller.control.state()["twist"], twist, atol=1e-4)
-    assert robot.state().mode == "moving"
-    began = time.monotonic()
-    until(lambda: controller.control.truth().speed == 0.0)
-    assert time.monotonic() - began > 0.5 * GRACE
-    until(lambda: robot.state().mode == "ready")
-
-
-@pytest.mark.parametrize("move", ["linear", "joints", "velocity"])
-def test_stop_ends_every_motion_soon(robot, controller, move):
-    state = robot.state()
-    if move == "linear":
-        robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
-    elif move == "joints":
-        robot.move_joints(state.joints + 0.5, 0.2, 0.5)
-    else:
-        robot.move_velocity(np.array([0, 0, -0.1, 0, 0, 0]), 1.0)
-    until(lambda: controller.control.truth().speed > 0.001)
-    with in_time(1.0):
-        robot.stop()
-    until(lambda: controller.control.truth().speed == 0.0)
-    until(lambda: robot.state().mode == "ready")
-
-
-def test_what_is_touched_is_felt_at_the_flange(robot, controller):
-    start = robot.state().base_T_flange
-    controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
-    robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
-    np.testing.assert_allclose(arrived(robot).force, [0, 0, 10, 0, 0, 0], atol=0.1)
 
 
 def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(controller):
@@ -277,14 +197,6 @@ def test_a_missing_library_is_one_line(monkeypatch):
         "robot.aubo: needs pyaubo_sdk (import of pyaubo_sdk halted; None in sys.modules); "
         "pip install 'flangeye[aubo]'"
     )
-
-
-def test_a_closed_robot_says_so(controller):
-    robot = open_aubo(controller.host)
-    robot.close()
-    robot.close()
-    with pytest.raises(DeviceError, match=f"aubo-i5 at {controller.host} is closed"):
-        robot.state()
 
 
 def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code():

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from flangeye.catalogue import load_model
-from flangeye.devices import GRACE, DeviceError, Robot
+from flangeye.devices import GRACE, DeviceError
 from flangeye_plugins.drivers.robots.ur import worker
 from flangeye_plugins.drivers.robots.ur.driver import UrRtdeParams, robot_ur_rtde
-from flangeye_plugins.loopback.contact import Surface
+from tests.drivers.robots.behaviour import DrivesAnArm
 from tests.drivers.robots.cell import arrived, in_time, moved, open_ur, until
 from tests.loopback.process import Process, free_address
 
@@ -41,109 +41,11 @@ def robot(controller):
         yield opened
 
 
-def test_the_state_is_that_of_the_arm(robot, controller):
-    state = robot.state()
-    assert isinstance(robot, Robot)
-    assert robot.name == f"ur5e at {controller.host}"
-    assert (robot.period, state.mode, state.message) == (0.002, "ready", "")
-    truth = controller.control.truth()
-    np.testing.assert_allclose(state.base_T_flange.matrix, truth.base_T_flange, atol=1e-9)
-    np.testing.assert_allclose(state.joints, truth.joints, atol=1e-12)
-    assert abs(time.time_ns() - state.time_ns) < 0.1e9
-    np.testing.assert_array_equal(robot.flange_T_tool.matrix, np.eye(4))
-
-
-def test_a_straight_move_goes_where_it_should(robot, controller):
-    target = moved(robot.state().base_T_flange, z=-0.03, turn=(0.0, 0.1, -0.2))
-    with in_time(1.0):
-        robot.move_linear(target, speed=0.1, acceleration=0.5)
-    assert robot.state().mode == "moving"
-    state = arrived(robot)
-    assert state.mode == "ready"
-    np.testing.assert_allclose(state.base_T_flange.matrix, target.matrix, atol=1e-6)
-    truth = controller.control.truth()
-    np.testing.assert_allclose(truth.base_T_flange, target.matrix, atol=1e-6)
-
-
-def test_a_joint_move_goes_where_it_should(robot):
-    target = robot.state().joints + [0.1, 0.0, -0.05, 0.0, 0.05, 0.2]
-    robot.move_joints(target, speed=0.5, acceleration=2.0)
-    np.testing.assert_allclose(arrived(robot).joints, target, atol=1e-9)
-
-
-def test_a_move_to_where_it_is_ends_at_once(robot):
-    with in_time(2.0):
-        robot.move_linear(robot.state().base_T_flange, 0.1, 0.5)
-        assert arrived(robot).mode == "ready"
-
-
-def test_a_second_move_replaces_the_first(robot):
-    start = robot.state().base_T_flange
-    robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
-    until(lambda: robot.state().base_T_flange.translation[2] < start.translation[2] - 1e-3)
-    robot.move_linear(start, 0.1, 0.5)
-    np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
-
-
-def test_velocities_are_followed_and_end_when_no_command_comes(robot, controller):
-    twist = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.05])
-    for _ in range(100):
-        robot.move_velocity(twist, acceleration=1.0)
-        robot.wait_cycle()
-    robot.move_velocity(twist, acceleration=1.0)
-    np.testing.assert_allclose(controller.control.state()["twist"], twist, atol=1e-6)
-    assert robot.state().mode == "moving"
-    began = time.monotonic()
-    until(lambda: controller.control.truth().speed == 0.0)
-    assert time.monotonic() - began > 0.5 * GRACE
-    until(lambda: robot.state().mode == "ready")
-
-
-def test_a_velocity_after_a_move_begins_at_rest_and_a_move_after_a_velocity_too(robot):
-    start = robot.state().base_T_flange
-    robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
-    for _ in range(20):
-        robot.wait_cycle()
-    for _ in range(50):
-        robot.move_velocity(np.array([0, 0, 0.05, 0, 0, 0]), 1.0)
-        robot.wait_cycle()
-    robot.move_linear(start, 0.1, 0.5)
-    np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
-
-
-@pytest.mark.parametrize("move", ["linear", "joints", "velocity"])
-def test_stop_ends_every_motion_soon(robot, controller, move):
-    state = robot.state()
-    if move == "linear":
-        robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
-    elif move == "joints":
-        robot.move_joints(state.joints + 0.5, 0.2, 0.5)
-    else:
-        robot.move_velocity(np.array([0, 0, -0.1, 0, 0, 0]), 1.0)
-    until(lambda: controller.control.truth().speed > 0.01)
-    with in_time(1.0):
-        robot.stop()
-    until(lambda: controller.control.truth().speed == 0.0)
-    until(lambda: robot.state().mode == "ready")
-    robot.stop()
-    assert robot.state().mode in ("ready", "moving")
-
-
-def test_cycles_follow_the_controllers(robot):
-    robot.wait_cycle()
-    began, first = time.monotonic(), robot.state().time_ns
-    for _ in range(100):
-        robot.wait_cycle()
-    cycles = (robot.state().time_ns - first) * 1e-9 / robot.period
-    assert cycles >= 99
-    assert time.monotonic() - began < 2.0
-
-
-def test_what_is_touched_is_felt_at_the_flange(robot, controller):
-    start = robot.state().base_T_flange
-    controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
-    robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
-    np.testing.assert_allclose(arrived(robot).force, [0, 0, 10, 0, 0, 0], atol=0.1)
+class TestUr(DrivesAnArm):
+    model = "ur5e"
+    period = 0.002
+    twist_off = 1e-6
+    opened = staticmethod(open_ur)
 
 
 TOOL = {
@@ -240,16 +142,6 @@ def test_the_grace_is_the_same_on_both_sides():
     assert worker.GRACE == GRACE
 
 
-def test_a_closed_robot_says_so(controller):
-    robot = open_ur(controller.host)
-    robot.close()
-    robot.close()
-    with pytest.raises(DeviceError, match=f"ur5e at {controller.host} is closed"):
-        robot.state()
-    with pytest.raises(DeviceError, match="is closed"):
-        robot.move_joints(np.zeros(6), 0.1, 0.1)
-
-
 def test_closing_stops_the_arm_and_the_program(controller):
     with open_ur(controller.host) as robot:
         robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
@@ -260,6 +152,7 @@ def test_closing_stops_the_arm_and_the_program(controller):
 
 PROGRAM = """
 import sys, time
+from tests.drivers.robots.behaviour import DrivesAnArm
 from tests.drivers.robots.cell import moved, open_ur
 robot = open_ur(sys.argv[1])
 robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
