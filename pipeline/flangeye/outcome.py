@@ -12,6 +12,7 @@ from flangeye import types as t
 from flangeye.recipe import Recipe
 from flangeye.registry import Registry
 from flangeye.stopwatch import Stopwatch
+from flangeye.workspace import work_of
 
 
 @dataclass
@@ -73,7 +74,7 @@ def result_of(outcome: Outcome, recipe: Recipe, registry: Registry, watch: Stopw
         provenance=_provenance(outcome, recipe, registry),
     )
     given = recipe.context.get(t.Box)
-    box = r.work_of(calibration, outcome.source, given) if calibration else None
+    box = work_of(calibration, outcome.source, given) if calibration else None
     if calibration and box:
         result.method = calibration.method
         result.workspace = r.workspace_result(calibration, box)

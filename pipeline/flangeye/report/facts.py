@@ -16,6 +16,7 @@ from flangeye import result as r
 from flangeye import types as t
 from flangeye.runlog import RunLog
 from flangeye.units import parse_quantity
+from flangeye.workspace import work_of
 from flangeye.yamlfile import parse_yaml
 
 INCOMPLETE = "incomplete"
@@ -86,7 +87,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
     calibration = log.calibration()
     pairs = calibration.pairs if calibration else _unsolved(log.observations())
     header = parse_yaml(recipe, "recipe").data if recipe else {}
-    box = r.work_of(calibration, source, _box(header)) if calibration else None
+    box = work_of(calibration, source, _box(header)) if calibration else None
     verifications = {e.step: e.value for e in log.of_kind("verify")}
     return r.Result(
         title=str(header.get("title", log.path.name)),

@@ -13,7 +13,6 @@ from pydantic import Field
 from flangeye import FlangeyeError, Params, stage
 from flangeye.catalogue import RobotModel
 from flangeye.kinematics import Arm
-from flangeye.result import workspace_of
 from flangeye.statistics import corners_of, covariance_inflation, largest_error_quantile
 from flangeye.types import (
     Box,
@@ -28,6 +27,7 @@ from flangeye.types import (
     TransformEstimate,
 )
 from flangeye.units import Angle, Length, param
+from flangeye.workspace import workspace_of
 from flangeye_plugins.solving.arm import (
     unknown_zeros,
     with_joint_offsets,

@@ -21,7 +21,6 @@ from flangeye.configuration import (
 from flangeye.correction import corrected_flange
 from flangeye.geometry import covariance_at
 from flangeye.kinematics import Arm
-from flangeye.result import work_of
 from flangeye.statistics import (
     chi2_quantile,
     corners_of,
@@ -40,6 +39,7 @@ from flangeye.types import (
     Verification,
 )
 from flangeye.units import Length, param
+from flangeye.workspace import work_of
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,67 @@
+"""``result.json``: the public contract of a run. SI units and radians throughout.
+
+The models below are its definition; ``flangeye schema --result`` prints them as JSON Schema. Runs
+of the same recipe, input and seed give the same document bit for bit, ``timing`` aside.
+"""
+
+from flangeye.result.calibration import (
+    correction_result,
+    holdout_result,
+    observations_result,
+    transforms_result,
+    truth_result,
+    verifications_result,
+    workspace_result,
+)
+from flangeye.result.contract import (
+    CorrectionResult,
+    HoldoutResult,
+    Matrix,
+    ObservationResult,
+    Provenance,
+    Result,
+    SeamResult,
+    SeamTruthResult,
+    StageTiming,
+    TransformErrorResult,
+    TransformResult,
+    TruthResult,
+    Vector,
+    VerificationResult,
+    WeldResult,
+    WeldTruthResult,
+    WorkspaceResult,
+)
+from flangeye.result.provenance import library_versions, sha256
+from flangeye.result.welding import seam_result, weld_result
+
+__all__ = [
+    "CorrectionResult",
+    "HoldoutResult",
+    "Matrix",
+    "ObservationResult",
+    "Provenance",
+    "Result",
+    "SeamResult",
+    "SeamTruthResult",
+    "StageTiming",
+    "TransformErrorResult",
+    "TransformResult",
+    "TruthResult",
+    "Vector",
+    "VerificationResult",
+    "WeldResult",
+    "WeldTruthResult",
+    "WorkspaceResult",
+    "correction_result",
+    "holdout_result",
+    "library_versions",
+    "observations_result",
+    "seam_result",
+    "sha256",
+    "transforms_result",
+    "truth_result",
+    "verifications_result",
+    "weld_result",
+    "workspace_result",
+]

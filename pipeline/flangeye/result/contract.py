@@ -1,0 +1,190 @@
+"""What ``result.json`` says: a model for each of its sections."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Vector = list[float]
+Matrix = list[list[float]]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+class TransformResult(_Part):
+    """An estimated transform."""
+
+    matrix: Matrix = Field(description="4x4, maps child coordinates to parent coordinates.")
+    covariance: Matrix = Field(
+        description="6x6, order (rotation [rad], translation [m]), of a left perturbation in the "
+        "parent frame, the translation taken at `about`."
+    )
+    about: Vector = Field(description="Point in the parent frame [m].")
+    unobservable: Matrix | None = Field(
+        None,
+        description="Directions (rotation, translation), about the same point, along which the "
+        "estimate is arbitrary and the covariance says nothing.",
+    )
+
+
+class ObservationResult(_Part):
+    """One capture and what became of it; measured values are null when it was set aside early."""
+
+    id: str
+    centre_in_camera: Vector | None = None
+    normal_in_camera: Vector | None = None
+    radii: dict[str, float] | None = None
+    covariance: Matrix | None = Field(None, description="3x3, of the centre [m^2].")
+    arc_coverage: float | None = Field(None, description="Share of the rim that was seen.")
+    clocking: float | None = Field(None, description="Angle of the hole pattern [rad], if seen.")
+    tcp_in_base: Vector | None = None
+    residual: float | None = Field(None, description="Distance of mapped centre and TCP [m].")
+    residual_in_base: Vector | None = Field(None, description="Mapped centre minus TCP [m].")
+    used: bool
+    reason: str | None = Field(None, description="Why it was not used.")
+
+
+class HoldoutResult(_Part):
+    """Errors on poses that took no part in the estimate."""
+
+    folds: int
+    rms: float
+    median: float
+    p95: float
+    figures: dict[str, float] = Field(description="Everything else verify.holdout reports.")
+
+
+class VerificationResult(_Part):
+    """One verify step."""
+
+    passed: bool
+    reason: str
+    figures: dict[str, float]
+    errors: dict[str, float] = Field(description="Per pose, by observation id [m].")
+
+
+class WorkspaceResult(_Part):
+    """Where errors are reported, and the error to expect there."""
+
+    centre: Vector
+    size: Vector
+    predicted_rms: float = Field(description="Root mean square over the box, from the covariance.")
+    predicted_p95: float = Field(description="95 % of the errors over the box are below [m].")
+
+
+class TransformErrorResult(_Part):
+    """Simulation only: how far one transform is off."""
+
+    rotation: float = Field(description="[rad]")
+    translation: float = Field(description="Of the point its covariance is taken about [m].")
+
+
+class TruthResult(_Part):
+    """Simulation only: what the calibration is really worth."""
+
+    base_T_camera: Matrix | None = Field(None, description="Where the camera is, if it stands.")
+    transforms: dict[str, Matrix] = Field(
+        default_factory=dict, description="Every unknown, as it really is."
+    )
+    errors: dict[str, TransformErrorResult] = Field(
+        default_factory=dict, description="Of every unknown, where its covariance is taken."
+    )
+    error_at_centroid: float = Field(description="At the workspace's centre [m].")
+    rms_over_workspace: float = Field(description="Over the workspace box [m].")
+    rotation_error: float = Field(description="[rad]")
+
+
+class SeamTruthResult(_Part):
+    """Simulation only: how far the planned seam is from the true one."""
+
+    rms: float = Field(description="Distance of the planned points from the true seam [m].")
+    max: float
+    inside: float = Field(description="Share of the planned points whose tube holds it.")
+
+
+class SeamResult(_Part):
+    """The planned seam, in the base."""
+
+    source: str
+    length: float = Field(description="[m]")
+    points: Matrix = Field(description="(N, 3) along the root of the groove [m].")
+    openings: Matrix = Field(description="(N, 3) unit vectors towards the torch.")
+    covariance: list[Matrix] = Field(description="(N, 3, 3) of the points [m^2].")
+    tube: Vector = Field(description="(N) with 95 % the seam is not further off than this [m].")
+    half_angle: float | None = Field(None, description="Of the groove [rad].")
+    half_width: float | None = Field(None, description="Of the groove at its shoulders [m].")
+    figures: dict[str, float] = Field(description="What the seam step reports.")
+    notes: list[str]
+    truth: SeamTruthResult | None = None
+
+
+class WeldTruthResult(_Part):
+    """Simulation only: how far the torch was from the true seam, across it, after the lead-in."""
+
+    rms: float = Field(description="[m]")
+    max: float
+
+
+class WeldResult(_Part):
+    """What the torch did."""
+
+    mode: str
+    completed: bool
+    reason: str = Field(description="Why it ended early; empty when it did not.")
+    seconds: float = Field(description="From the first cycle to the last.")
+    correction_rms: float | None = Field(
+        None, description="From the plan to the seam as it was felt, across it [m]."
+    )
+    phases: dict[str, float] = Field(description="Time in each phase of the controller [s].")
+    figures: dict[str, float]
+    truth: WeldTruthResult | None = None
+
+
+class CorrectionResult(_Part):
+    """What is wrong with where the arm says its flange is, estimated with the transforms."""
+
+    tool_offset: Vector = Field(description="The circle's centre in the flange frame [m].")
+    joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
+
+
+class StageTiming(_Part):
+    """What one step took, the steps it pulled from excluded."""
+
+    seconds: float
+    calls: int
+
+
+class Provenance(_Part):
+    """What made this result."""
+
+    versions: dict[str, str]
+    plugins: dict[str, str]
+    recipe: str
+    recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
+    input_hash: str = Field(description="Of everything the captures are made from.")
+    seed: int
+    notes: list[str] = Field(description="What the source and the solver want people to know.")
+
+
+class Result(_Part):
+    """The whole document."""
+
+    format: int = Field(1, description="Version of this contract.")
+    title: str
+    status: str = Field(description="verified, unverified (no verify step) or refused.")
+    refused: str | None = Field(None, description="Why.")
+    method: str | None = Field(None, description="The solve step.")
+    transforms: dict[str, TransformResult]
+    correction: CorrectionResult | None = Field(
+        None, description="The transforms hold for the arm so corrected; null: as it reports."
+    )
+    observations: list[ObservationResult]
+    workspace: WorkspaceResult | None = None
+    holdout: HoldoutResult | None = None
+    verifications: dict[str, VerificationResult]
+    truth: TruthResult | None = None
+    seam: SeamResult | None = None
+    weld: WeldResult | None = None
+    timing: dict[str, StageTiming]
+    provenance: Provenance

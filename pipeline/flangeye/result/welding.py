@@ -1,0 +1,68 @@
+"""The sections that tell of the seam and the weld."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.result.contract import SeamResult, SeamTruthResult, WeldResult, WeldTruthResult
+from flangeye.seamline import errors_from, torch_deviation, tube_radii
+
+
+def seam_result(seam: t.Seam | None, scan: t.WorkpieceScan | None) -> SeamResult | None:
+    """Return the section ``seam``."""
+    if seam is None:
+        return None
+    return SeamResult(
+        source=seam.source,
+        length=float(seam.arc_length[-1]),
+        points=seam.points_in_base.tolist(),
+        openings=seam.openings_in_base.tolist(),
+        covariance=seam.covariance.tolist(),
+        tube=tube_radii(seam).tolist(),
+        half_angle=seam.half_angle,
+        half_width=seam.half_width,
+        figures=dict(seam.figures),
+        notes=list(seam.notes),
+        truth=_seam_truth(seam, list(scan.truth.values())) if scan and scan.truth else None,
+    )
+
+
+def _seam_truth(seam: t.Seam, true_seams: list[t.Array]) -> SeamTruthResult:
+    """Compare with the true seam that is nearest: a workpiece may have several."""
+    errors = min((errors_from(seam, truth) for truth in true_seams), key=lambda e: float(e.max()))
+    return SeamTruthResult(
+        rms=float(np.sqrt(np.mean(errors**2))),
+        max=float(errors.max()),
+        inside=float(np.mean(errors <= tube_radii(seam))),
+    )
+
+
+def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> WeldResult | None:
+    """Return the section ``weld``."""
+    if weld is None:
+        return None
+    ticks = np.diff(weld.time, append=weld.time[-1:])
+    names = np.array(weld.phases)
+    correction = torch_deviation(weld.refined, weld.planned, weld.opening)
+    return WeldResult(
+        mode=weld.mode,
+        completed=weld.completed,
+        reason=weld.reason,
+        seconds=float(weld.time[-1]) if len(weld.time) else 0.0,
+        correction_rms=_rms(correction) if len(correction) else None,
+        phases={name: float(ticks[names == name].sum()) for name in dict.fromkeys(weld.phases)},
+        figures=dict(weld.figures),
+        truth=_weld_truth(weld, list(scan.truth.values())) if scan and scan.truth else None,
+    )
+
+
+def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
+    """Compare with the true seam that is nearest, where the torch was between its ends."""
+    found = [torch_deviation(weld.torch, truth, weld.opening) for truth in true_seams]
+    errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
+    return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))
+
+
+def _rms(values: t.Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
