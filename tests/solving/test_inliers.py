@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.geometry import rotation_exp
-from flangeye_plugins.solving.inliers import find_inliers
+from flangeye_plugins.solving.inliers import find_inliers, gate
 
 
 @pytest.mark.parametrize("count", [9, 15, 30])
@@ -15,3 +15,9 @@ def test_exact_pairs_end_in_a_moment_and_all_agree(count):
     centres = (tcps - shift) @ turn
     inliers, _ = find_inliers(centres, tcps, 1e-5)
     assert inliers.all()
+
+
+def test_the_gate_keeps_a_thousandth_of_pairs_and_a_twentieth_of_sets():
+    assert gate(8) == pytest.approx(0.999)
+    assert gate(50) == pytest.approx(0.999)
+    assert gate(500) ** 500 == pytest.approx(0.95, abs=2e-3)

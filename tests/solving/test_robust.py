@@ -350,7 +350,7 @@ def test_the_answer_is_bit_identical() -> None:
 
 @pytest.mark.parametrize(
     ("robot", "unit", "limit", "outliers"),
-    [("aubo", 1.0, 0.69, 0), ("ur5", 1e-3, 0.72, 4), ("franka", 1e-3, 0.79, 5)],
+    [("aubo", 1.0, 0.66, 2), ("ur5", 1e-3, 0.72, 5), ("franka", 1e-3, 0.79, 5)],
 )
 def test_published_centres_need_no_hand_picking(
     ancorasir: Path, robot: str, unit: float, limit: float, outliers: int
@@ -374,3 +374,9 @@ def test_published_centres_need_no_hand_picking(
     ]
     assert np.mean([f["rms"] for f in found]) <= limit * MM
     assert found[0]["outliers"] == outliers
+
+
+@pytest.mark.slow
+def test_of_twenty_sets_without_a_wrong_pose_one_loses_any() -> None:
+    lost = [not all(p.used for p in solve(simulate(50, seed)).pairs) for seed in range(400)]
+    assert np.mean(lost) <= 0.05 + 0.033  # three standard deviations of 400 sets

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flangeye import CalibrationRefused
 from flangeye.geometry import kabsch
-from flangeye.statistics import f_quantile, squared_distances
+from flangeye.statistics import f_quantile
 from flangeye_plugins.solving.equations import Fit, Noise, Rows, linearise, start_at
 from flangeye_plugins.solving.evidence import Evidence, Nuisance
 from flangeye_plugins.solving.generalised import adjust
@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 ROUNDS = 20
 FIRST_TILT = 2e-3
 """Guess of an arm's orientation noise [rad], before it is estimated."""
+TINY = 1e-9
 LARGEST_NOISE = 0.2
 """Of the poses' extent: scans that belong to other poses show noise as large as the extent."""
 LARGEST_TILT = np.radians(10.0)
@@ -82,7 +83,7 @@ def _refine(
     for _ in range(ROUNDS):
         inliers, used = agreeing, evidence.without_normals(~good_normals)
         fit = adjust(used.where(inliers), nuisance.where(inliers), start, variance)
-        distances, agreeing, good_normals = _judge(evidence, nuisance, fit)
+        distances, agreeing, good_normals = _judge(evidence, nuisance, fit, inliers, good_normals)
         settled = (agreeing == inliers).all() and (good_normals == used.has_normal).all()
         if settled or agreeing.sum() < 3:
             break
@@ -91,24 +92,66 @@ def _refine(
     return Consensus(used, inliers, distances, fit, notes if dropped else ())
 
 
-def _judge(evidence: Evidence, nuisance: Nuisance, fit: Fit) -> tuple[Floats, Mask, Mask]:
-    """Return each pose's distance in standard deviations, and whether centre and normal agree."""
-    equations = linearise(evidence, nuisance, fit)
-    noise, covariance = fit.noise, fit.covariance
-    squares = _squares(equations.centres, noise.centre_scale, noise.pose, covariance)
-    agreeing = squares <= 3 * f_quantile(gate(len(evidence)), 3, fit.freedom)
+def _judge(
+    evidence: Evidence, nuisance: Nuisance, fit: Fit, inliers: Mask, good_normals: Mask
+) -> tuple[Floats, Mask, Mask]:
+    """Return each pose's distance in standard deviations, and whether centre and normal agree.
+
+    Args:
+        evidence: All N poses.
+        nuisance: Their common errors.
+        fit: Fit to some of them.
+        inliers: (N,) the poses it was fitted to.
+        good_normals: (N,) of whose normals it was fitted to as well, if they are inliers.
+    """
+    equations, noise = linearise(evidence, nuisance, fit), fit.noise
+    weights = equations.centres.weights(noise.centre_scale, noise.pose)
+    squares, agreeing = against_others(
+        equations.centres, weights, fit.covariance, fit.freedom, inliers
+    )
     good = evidence.has_normal
     if good.any():
-        tilts = _squares(equations.normals, noise.normal_scale, noise.tilt, covariance)
-        good[good] = tilts <= 2 * f_quantile(gate(len(tilts)), 2, fit.tilt_freedom)
+        weights = equations.normals.weights(noise.normal_scale, noise.tilt)
+        fitted = (inliers & good_normals)[good]
+        _, good[good] = against_others(
+            equations.normals, weights, fit.covariance, fit.tilt_freedom, fitted
+        )
     return np.sqrt(squares), agreeing, good
 
 
-def _squares(rows: Rows, scale: float, extra: float, covariance: Floats) -> Floats:
-    """Return squared distances in units of what the noise and the fit's own error explain."""
-    fitted = rows.jacobian @ covariance @ rows.jacobian.transpose(0, 2, 1)
-    noise = np.linalg.inv(rows.weights(scale, extra))
-    return squared_distances(rows.residuals, noise + fitted)
+def against_others(
+    rows: Rows, weights: Floats, covariance: Floats, freedom: float, fitted: Mask
+) -> tuple[Floats, Mask]:
+    """Return squared distances of rows from what the others say, and which rows agree with them.
+
+    A row that was fitted has drawn fit and noise towards itself: it is compared with what both
+    would be without it, in closed form (the externally studentised residual of Cook & Weisberg
+    1982). Under normal noise either sort follows Fisher's F.
+
+    Args:
+        rows: M equations of k numbers.
+        weights: (M, k, k) inverse covariances of their noise.
+        covariance: (6 + n, 6 + n) of what was fitted.
+        freedom: Degrees of freedom the noise was estimated from.
+        fitted: (M,) which of the rows were fitted.
+    """
+    k, count = rows.residuals.shape[1], len(rows.residuals)
+    share = rows.jacobian @ covariance @ rows.jacobian.transpose(0, 2, 1)
+    spread = np.linalg.inv(weights) + np.where(fitted, -1.0, 1.0)[:, None, None] * share
+    # A row that alone says something is fitted exactly: there is nothing to compare it with.
+    inverse = np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
+    squares = np.einsum("ma,mab,mb->m", rows.residuals, inverse, rows.residuals)
+    without = freedom - k
+    if 0 < without < np.inf:
+        noise = np.maximum(freedom - squares, TINY) / without
+        squares = np.where(fitted, squares / noise, squares)
+    limits = [_limit(count, k, left) for left in (freedom, without)]
+    return squares, squares <= np.where(fitted, limits[1], limits[0])
+
+
+def _limit(count: int, k: int, freedom: float) -> float:
+    """Return the squared distance that one of so many good rows of k numbers stays below."""
+    return k * f_quantile(gate(count), k, freedom) if freedom > 0 else np.inf
 
 
 def _start(evidence: Evidence, nuisance: Nuisance, inliers: Mask, sigma: float) -> Fit:

@@ -20,17 +20,24 @@ Mask = NDArray[np.bool_]
 
 MOST_TRIPLES = 1000
 """Of 1000 random triples some 200 are free of outliers when 40 % of the pairs are wrong."""
-NONE_LOST = 0.999
-"""Probability with which a set without any wrong pair loses none."""
+OF_PAIRS, OF_SETS = 0.001, 0.05
+"""Largest share of good pairs to lose (Baarda 1968), and of sets that lose one (Pope 1976)."""
+MEDIAN_EFFICIENCY = 0.53
+"""Degrees of freedom that the median of squared distances in space is worth, to each it has.
+
+The variance of a median is 1 / (4 n f^2), f being the density there: 1.26 / n of its own square
+for chi-square of three degrees of freedom, where the mean has 2 / (3 n).
+"""
 
 
 def gate(count: int) -> float:
-    """Return the probability with which each of so many good pairs has to be kept (Bonferroni).
+    """Return the probability with which each of so many good pairs has to be kept.
 
-    A gate for single pairs would lose a good one in every twentieth set of fifty, and each loss
-    makes the noise look smaller and the next loss likelier where errors have heavy tails.
+    The level of the set is shared among its pairs (Bonferroni), so that a large one loses a good
+    pair no more often. In a small one a pair lost makes the noise look smaller, and the stated
+    covariance with it: there the level of the pairs holds.
     """
-    return 1.0 - (1.0 - NONE_LOST) / count
+    return 1.0 - min(OF_PAIRS, OF_SETS / count)
 
 
 def find_inliers(centres: Floats, tcps: Floats, finest: float) -> tuple[Mask, float]:
@@ -45,10 +52,11 @@ def find_inliers(centres: Floats, tcps: Floats, finest: float) -> tuple[Mask, fl
         return np.ones(len(centres), dtype=bool), finest
     half = least_trimmed_squares(centres, tcps)
     inliers, sigma = half, finest
+    freedom = MEDIAN_EFFICIENCY * (3 * len(centres) - 6)
+    quantile = 3 * f_quantile(gate(len(centres)), 3, freedom)
     for _ in range(10):
         sigma = max(_noise(centres, tcps, inliers), finest)
-        freedom = 3 * int(inliers.sum()) - 6
-        threshold = sigma * float(np.sqrt(3 * f_quantile(gate(len(centres)), 3, freedom)))
+        threshold = sigma * float(np.sqrt(quantile))
         found = graduated_non_convexity(centres, tcps, threshold, half)
         if (found == inliers).all():
             break

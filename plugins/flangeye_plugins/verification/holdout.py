@@ -55,7 +55,10 @@ class HoldoutParams(Params):
         0.3, ge=0, lt=1, description="Largest share of poses the solver may set aside as wrong."
     )
     gate: float = Field(
-        0.999, gt=0.5, lt=1, description="Probability with which a good pose is not an outlier."
+        0.99,
+        gt=0.5,
+        lt=1,
+        description="Probability that a good pose the solver set aside is not confirmed as wrong.",
     )
 
 
