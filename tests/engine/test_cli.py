@@ -130,6 +130,23 @@ def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path)
     assert (tmp_path / "a" / "report.html").stat().st_size > 1000
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["schema", "--out", "nowhere/schema.json"],
+        ["report", "done/run.mcap", "--out", "nowhere/report.html"],
+        ["new-plugin", "mine", "--kind", "fit", "--into", "nowhere/file"],
+    ],
+)
+def test_a_place_that_cannot_be_written_is_one_line(flangeye, toy_recipe, tmp_path, words):
+    assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
+    (tmp_path / "nowhere").write_text("a file where a folder should be")
+    code, _, err = flangeye(*words)
+    assert code == 2
+    assert err.startswith("error: nowhere/")
+    assert " cannot be " in err and err.endswith(": Not a directory\n")
+
+
 def test_version(flangeye):
     assert flangeye("--version") == (0, f"flangeye {__version__}\n", "")
 

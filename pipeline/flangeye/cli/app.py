@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, NoReturn, Optional
 
 import typer
 
@@ -63,9 +63,13 @@ def main() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:
+        if error.filename is None:  # not a file the person named
+            raise
+        _fail(FlangeyeError(f"{error.filename}: cannot be read or written: {error.strerror}"))
 
 
-def _fail(error: FlangeyeError) -> None:
+def _fail(error: FlangeyeError) -> NoReturn:
     if os.environ.get("FLANGEYE_DEBUG"):
         traceback.print_exception(error)
     for line in str(error).splitlines():
