@@ -72,21 +72,7 @@ study table2 .
 
 # --- Figure 13, simulated; the tables are in plugins/flangeye_plugins/welding ---------------------
 
-for seam in straight curved; do
-  recipe="$here/fig13_$seam.yaml"
-  gap='[{start: 90 mm, length: 20 mm}]'
-  batch "$recipe" --repeat 8 --vary seed --out "fig13_$seam"
-  batch "$recipe" --repeat 2 --vary seed --set-grid steps.5.mode=vision,as_printed \
-    --out "fig13-others_$seam"
-  batch "$recipe" --repeat 2 --vary seed --set steps.5.sensor.simulated_finger.gaps="$gap" \
-    --out "fig13-gap_$seam"
-  batch "$recipe" --repeat 2 --vary seed --set steps.5.turned=90 --out "fig13-across_$seam"
-done
-welding=$here/../../plugins/flangeye_plugins/welding
-if [ -d "$welding" ]; then
-  python -m flangeye_plugins.studies fig13 . --out "$welding"
-  python -m flangeye_plugins.studies page "$welding/README.md"
-fi
+"$here/weld.sh" .
 
 # --- beyond the paper: errors on poses that took no part --------------------------------------
 

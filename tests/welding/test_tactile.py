@@ -84,20 +84,23 @@ def test_a_force_beyond_the_limit():
 
 def test_speeds_beyond_the_limits():
     assert refused(limits={"speed": "6 mm/s"}) == (
-        "weld.tactile: speed, lateral_speed and turn_rate together move the flange at 7.07 mm/s, "
+        "weld.tactile: speed, lateral_speed and turn_rate together move the flange at 8.66 mm/s, "
         "robot.limits.speed allows 6 mm/s"
     )
 
 
 def test_a_seam_that_is_too_short():
     assert refused(planned("v-straight", end=0.015)) == (
-        "weld.tactile: the seam is 14 mm long; inset, ending and ramp alone take 18 mm"
+        "weld.tactile: the seam is 14 mm long; inset, ending and release alone take 26 mm"
     )
 
 
 def test_a_seam_outside_the_workspace():
     small = {"centre": ["600 mm", "0 mm", "400 mm"], "size": ["220 mm", "600 mm", "600 mm"]}
-    assert "the flange leaves robot.limits.box: x is" in refused(planned("v-straight"), box=small)
+    assert refused(planned("v-straight"), box=small) == (
+        "weld.tactile: 220 mm along the seam (the tip goes on beyond its end), the flange is "
+        "outside the box: x is 718 mm, allowed 490 to 710 mm (robot.limits.box)"
+    )
 
 
 def test_a_seam_out_of_reach():

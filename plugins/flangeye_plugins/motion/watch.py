@@ -74,17 +74,22 @@ class Watch:
         self.leg: Leg | None = None
         self._from = np.zeros(self._arm.n)
         self._since_ns = self._stood_ns = self._halted_ns = 0
+        self._led = False
 
     def set_off(self, leg: Leg) -> None:
         """Expect the arm to drive a leg from where it is."""
         newest = self.samples[-1]
-        self.leg, self._from = leg, newest.joints
+        self.leg, self._from, self._led = leg, newest.joints, False
         self._since_ns, self._stood_ns = newest.time_ns, 0
 
     def halted(self) -> None:
         """Expect the arm to stand, wherever it comes to rest."""
-        self.leg = None
+        self.leg, self._led = None, False
         self._halted_ns = self.samples[-1].time_ns if self.samples else 0
+
+    def led(self) -> None:
+        """Expect the arm to go where it is led from cycle to cycle, within its limits."""
+        self.leg, self._led = None, True
 
     def judge(self, state: RobotState) -> bool:
         """Take in a sample; return whether the leg under way has ended and the arm has settled.
@@ -98,10 +103,12 @@ class Watch:
             raise Doubt(f"the controller reports {state.mode}: {state.message or 'no reason'}")
         if self._by_hand:
             return self.leg is not None and state.mode == "ready"
-        if self.leg is None:
+        if self.leg is None and not self._led:
             self._keep_still(state)
             return False
         self._keep_limits(state)
+        if self.leg is None:
+            return False
         self._keep_route(state, self.leg)
         return self._settled(state, self.leg)
 

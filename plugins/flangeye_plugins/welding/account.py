@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from flangeye.types import Seam, WeldReport
 from flangeye_plugins.welding.chronicle import Chronicle, columns
+from flangeye_plugins.welding.controller import Controller
 from flangeye_plugins.welding.finger import Finger
-from flangeye_plugins.welding.follower import Controller, Follower
+from flangeye_plugins.welding.follower import Follower
 from flangeye_plugins.welding.frame import WorkPlane
 from flangeye_plugins.welding.motion import turned
 from flangeye_plugins.welding.path import Path

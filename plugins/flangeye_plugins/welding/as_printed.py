@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye_plugins.welding.follower import STILL, Phase
+from flangeye_plugins.welding.controller import STILL, Phase
 from flangeye_plugins.welding.motion import Command, ToolPose, Touch, turned
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.settings import Following

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.catalogue import RobotModel
 from flangeye.errors import StageError
-from flangeye.header import LimitsSection
-from flangeye.kinematics import Arm
 from flangeye.seamline import tube_radii
 from flangeye.types import Seam
+from flangeye_plugins.motion.limits import Limits
 from flangeye_plugins.welding.finger import Finger
-from flangeye_plugins.welding.frame import Tool
+from flangeye_plugins.welding.passage import flange_speed
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.settings import Following
 
@@ -27,9 +25,6 @@ SLOPE = np.deg2rad(10.0)
 CROOKED = np.deg2rad(60.0)
 """Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
 
-SPACING = 10e-3
-"""Poses along the seam are checked at this distance [m]."""
-
 
 def check_finger(finger: Finger, settings: Following) -> None:
     """Refuse a deflection that the finger does not stand, or a force beyond the limit.
@@ -43,13 +38,8 @@ def check_finger(finger: Finger, settings: Following) -> None:
             f"weld.tactile: a deflection of {asked * 1e3:.3g} mm is more than finger "
             f"{finger.model} stands, {finger.travel * 1e3:.3g} mm"
         )
-    calibration = finger.calibration
-    if calibration is None or calibration.lateral is None or calibration.axial is None:
-        return
-    force = np.hypot(
-        calibration.lateral * settings.deflection, calibration.axial * settings.preload
-    )
-    if force > settings.force:
+    force = finger.force(np.array([0.0, settings.deflection, settings.preload]))
+    if force is not None and force > settings.force:
         raise StageError(
             f"weld.tactile: deflection and preload press with {force:.2g} N, allowed are "
             f"{settings.force:.2g} N; lower them, or raise 'force'"
@@ -62,10 +52,11 @@ def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> N
     Raises:
         StageError: Too short, steep, curved, or uncertain.
     """
-    used = settings.inset + settings.ending + settings.speed * settings.deflection / settings.ramp
+    used = settings.inset + settings.ending
+    used += settings.speed * settings.deflection / settings.release
     if plan.length <= used:
         raise StageError(
-            f"weld.tactile: the seam is {plan.length * 1e3:.0f} mm long; inset, ending and ramp "
+            f"weld.tactile: the seam is {plan.length * 1e3:.0f} mm long; inset, ending and release "
             f"alone take {used * 1e3:.0f} mm"
         )
     mean = seam.openings_in_base.mean(axis=0)
@@ -114,46 +105,15 @@ def _chord_end(plan: Path, s: float, distance: float) -> float:
     return float(back[far[0]] if len(far) else back[-1])
 
 
-def check_speeds(finger: Finger, settings: Following, limits: LimitsSection) -> None:
+def check_speeds(finger: Finger, settings: Following, limits: Limits) -> None:
     """Refuse speeds beyond the recipe's limits.
 
     Raises:
         StageError: Which, and what is allowed.
     """
-    lever = float(np.hypot(*finger.tip[:2]))
-    fastest = float(np.hypot(settings.speed, settings.lateral_speed))
-    fastest += settings.turn_rate * lever
+    fastest = flange_speed(finger, settings)
     if fastest > limits.speed:
         raise StageError(
             f"weld.tactile: speed, lateral_speed and turn_rate together move the flange at "
             f"{fastest * 1e3:.3g} mm/s, robot.limits.speed allows {limits.speed * 1e3:.3g} mm/s"
         )
-
-
-def check_reach(
-    model: RobotModel, tool: Tool, plan: Path, finger: Finger, limits: LimitsSection
-) -> None:
-    """Refuse a seam along which the flange would leave its box, or the arm cannot reach.
-
-    The tip goes on beyond the seam's end by the torch's distance.
-
-    Raises:
-        StageError: Where.
-    """
-    arm = Arm(model)
-    centre, size = np.asarray(limits.box.centre), np.asarray(limits.box.size)
-    for s in np.arange(0.0, plan.length + finger.torch, SPACING):
-        place = plan.at(float(s))
-        angle = float(np.arctan2(place.tangent[1], place.tangent[0]))
-        pose = tool.base_T_flange(np.array([*place.point, place.height]), angle)
-        outside = np.abs(pose.translation - centre) > size / 2
-        where = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"
-        if outside.any():
-            axis = int(np.argmax(outside))
-            raise StageError(
-                f"weld.tactile: {where}, the flange leaves robot.limits.box: "
-                f"{'xyz'[axis]} is {pose.translation[axis] * 1e3:.0f} mm, allowed are "
-                f"{(centre - size / 2)[axis] * 1e3:.0f} to {(centre + size / 2)[axis] * 1e3:.0f} mm"
-            )
-        if not len(arm.inverse(pose.matrix)):
-            raise StageError(f"weld.tactile: {where}, the {model.model} cannot reach the seam")

@@ -88,14 +88,13 @@ class Chronicle:
         if self._thread:
             self._queue.put((name, value))
         else:
-            self._journal(name, value)
+            self._put(name, value)
 
     def saw(self, sight: Sight) -> int:
         """Write an image and what was felt in it; return its number."""
         number, self.sights = self.sights, self.sights + 1
         felt = sight.feeling
-        self._note_image(sight)
-        self.note("sight", {"number": number, "time_ns": sight.time_ns, "tag": felt is not None})
+        self._note_sight(number, sight)
         if felt is not None:
             self.felt[number] = felt
             self.note("feeling", felt)
@@ -103,13 +102,14 @@ class Chronicle:
 
     def before(self, sight: Sight) -> None:
         """Write an image that was looked at before anything moved; it has no number."""
-        felt = sight.feeling is not None
-        self._note_image(sight)
-        self.note("sight", {"number": -1, "time_ns": sight.time_ns, "tag": felt})
+        self._note_sight(-1, sight)
 
-    def _note_image(self, sight: Sight) -> None:
+    def _note_sight(self, number: int, sight: Sight) -> None:
+        piece = sight.piece
         if self._images:
-            self.note("image", sight.image)
+            self.note("image", piece.image)
+        told = {"number": number, "time_ns": sight.time_ns, "corner": piece.corner}
+        self.note("sight", {**told, "tag": sight.feeling is not None})
 
     def turned(self, cycle: Cycle) -> None:
         """Take in a cycle."""
@@ -120,12 +120,15 @@ class Chronicle:
 
     def _put_block(self) -> None:
         if self._block:
-            self.note("cycles", columns(self._block))
+            self.note("cycles", self._block)
             self._block = []
 
     def _write(self) -> None:
         while (item := self._queue.get()) is not None:
-            self._journal(*item)
+            self._put(*item)
+
+    def _put(self, name: str, value: Any) -> None:
+        self._journal(name, columns(value) if name == "cycles" else value)
 
 
 def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:

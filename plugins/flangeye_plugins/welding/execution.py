@@ -3,70 +3,17 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 
-import numpy as np
-
-from flangeye.devices import DeviceError, Robot, RobotState
-from flangeye.header import LimitsSection
+from flangeye.devices import DeviceError, RobotState
+from flangeye_plugins.welding.bounds import Bounds
 from flangeye_plugins.welding.chronicle import Chronicle, Cycle
-from flangeye_plugins.welding.eyes import Eyes, LatestState
-from flangeye_plugins.welding.follower import Controller
+from flangeye_plugins.welding.controller import Controller
+from flangeye_plugins.welding.drive import Drive
+from flangeye_plugins.welding.eyes import Eyes
 from flangeye_plugins.welding.frame import Tool
 from flangeye_plugins.welding.motion import Command, ToolPose, Touch
 from flangeye_plugins.welding.touch.feeling import Feeling
-
-STANDING = 1e-3
-"""An arm stands when no joint turns faster [rad/s]."""
-
-PATIENT = 10.0
-"""Longest time for an arm to come to rest [s]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """An open arm, watched in every cycle.
-
-    Attributes:
-        robot: The arm.
-        latest: Is told each of its states.
-        limits: What it must keep to.
-    """
-
-    robot: Robot
-    latest: LatestState
-    limits: LimitsSection
-
-    def tick(self) -> RobotState:
-        """Wait for the controller's next cycle and return the arm's state.
-
-        Raises:
-            DeviceError: The arm must not go on: its mode, or it has left its box.
-        """
-        self.robot.wait_cycle()
-        state = self.robot.state()
-        self.latest.tell(state)
-        if state.mode not in ("ready", "moving"):
-            raise DeviceError(f"{self.robot.name}: {state.mode}: {state.message or 'no reason'}")
-        box = self.limits.box
-        place = state.base_T_flange.translation
-        if (np.abs(place - np.asarray(box.centre)) > np.asarray(box.size) / 2).any():
-            at = ", ".join(f"{x * 1e3:.0f}" for x in place)
-            raise DeviceError(
-                f"{self.robot.name}: the flange is outside robot.limits.box, at ({at}) mm"
-            )
-        return state
-
-    def settle(self) -> RobotState:
-        """Return when the arm stands."""
-        state = self.tick()
-        began = state.time_ns
-        while state.mode == "moving" or np.abs(state.joint_speeds).max() > STANDING:
-            state = self.tick()
-            if state.time_ns - began > PATIENT * 1e9:
-                raise DeviceError(f"{self.robot.name}: does not come to rest")
-        return state
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +24,13 @@ class Cell:
         drive: The arm.
         eyes: Read the finger.
         tool: Translates between flange and plane.
+        bounds: What the tip must keep to.
     """
 
     drive: Drive
     eyes: Eyes
     tool: Tool
+    bounds: Bounds
 
 
 def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: float) -> str:
@@ -91,6 +40,7 @@ def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: fl
     """
     began: float | None = None
     last = time.perf_counter()
+    cell.drive.lead()
     try:
         while controller.phase not in ("done", "stopped"):
             state = cell.drive.tick()
@@ -104,8 +54,7 @@ def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: fl
     except DeviceError as error:
         return str(error)
     finally:
-        with suppress(DeviceError):  # an arm that is lost cannot be told anything
-            cell.drive.robot.stop()
+        cell.drive.stop()
     return controller.reason
 
 
@@ -122,6 +71,7 @@ def _turn(
     used = tuple(number for number in numbers if number in chronicle.felt)
     touches = [touch_of(chronicle.felt[number]) for number in used]
     pose = cell.tool.pose(state.base_T_flange, state.time_ns * 1e-9)
+    cell.bounds.check(pose, controller.tip, [chronicle.felt[number] for number in used])
     command = controller.step(pose, touches)
     twist = cell.tool.twist(command, state.base_T_flange)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol, Self
 
 from flangeye.devices import DeviceError, RobotState, SensorFrame, TactileSensor
 from flangeye.errors import FlangeyeError
-from flangeye.types import Image
 from flangeye_plugins.welding.finger import Finger
 from flangeye_plugins.welding.touch.feeling import Feeling, Interpreter
-from flangeye_plugins.welding.touch.tag import TagDetector
+from flangeye_plugins.welding.touch.gaze import Gaze, Piece
+from flangeye_plugins.welding.touch.tag import TagDetector, TagReading
 
 CONFIDENT = 0.3
 """Readings below this confidence are not used."""
@@ -25,12 +25,12 @@ class Sight(NamedTuple):
 
     Attributes:
         time_ns: Middle of its exposure.
-        image: As it came.
+        piece: The part of it that was read.
         feeling: None where there is no tag in it, or none to be trusted.
     """
 
     time_ns: int
-    image: Image
+    piece: Piece
     feeling: Feeling | None
 
 
@@ -44,13 +44,25 @@ class Reader:
         # The images are small: OpenCV's threads cost more than they bring, and disturb the loop.
         cv2.setNumThreads(1)
         self._detector, self._interpreter = TagDetector(finger), Interpreter(finger)
+        self._gaze = Gaze()
 
     def read(self, frame: SensorFrame) -> Sight:
         """Return what is felt in an image."""
-        reading = self._detector.find(frame.image)
+        for piece in self._gaze.pieces(frame.image):
+            reading = self._detector.find(piece.image)
+            if reading is not None:
+                break
+        self._gaze.follow(piece, None if reading is None else reading.corners)
+        return self._sight(piece, frame.time_ns, reading)
+
+    def reread(self, piece: Piece, time_ns: int) -> Sight:
+        """Return what is felt in a piece that was read before, from a log."""
+        return self._sight(piece, time_ns, self._detector.find(piece.image))
+
+    def _sight(self, piece: Piece, time_ns: int, reading: TagReading | None) -> Sight:
         if reading is None or reading.confidence < CONFIDENT:
-            return Sight(frame.time_ns, frame.image, None)
-        return Sight(frame.time_ns, frame.image, self._interpreter.feel(reading, frame.time_ns))
+            return Sight(time_ns, piece, None)
+        return Sight(time_ns, piece, self._interpreter.feel(reading, time_ns))
 
 
 class LatestState:

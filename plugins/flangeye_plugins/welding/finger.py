@@ -84,6 +84,14 @@ class Finger(Model):
         c, s = np.cos(self.direction), np.sin(self.direction)
         return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
+    def force(self, displacement: Floats) -> float | None:
+        """Return the force of a tip displaced by (3,) in the tool's axes [N], if it is known."""
+        known = self.calibration
+        if known is None or known.lateral is None or known.axial is None:
+            return None
+        stiffness = np.array([known.lateral, known.lateral, known.axial])
+        return float(np.linalg.norm(stiffness * displacement))
+
 
 def _shipped_or_beside(value: Any, info: ValidationInfo) -> Path:
     if not isinstance(value, (str, Path)):

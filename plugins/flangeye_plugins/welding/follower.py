@@ -1,15 +1,15 @@
-"""The controller: one step each cycle, measurements in, velocities out. No devices, no clock."""
+"""Following by touch: one step each cycle, measurements in, velocities out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flangeye_plugins.welding.contact import Contact
+from flangeye_plugins.welding.controller import STILL, Phase
 from flangeye_plugins.welding.motion import Command, ToolPose, Touch, Track, turned
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.refined import RefinedPath
@@ -19,12 +19,8 @@ from flangeye_plugins.welding.steering import Steering
 
 Floats = NDArray[np.float64]
 
-Phase = Literal["seeking", "following", "bridging", "ending", "done", "stopped"]
-
 BELIEF = 0.3
 """A sample is believed when contact has not been doubted for so long after it [s]."""
-
-STILL = Command(np.zeros(3), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,32 +34,6 @@ class Felt:
 
     offset: float
     height: float
-
-
-class Controller(Protocol):
-    """What moves the tool along a seam.
-
-    Attributes:
-        mode: Its name, for people.
-        side: 1 for the left wall, -1 for the right one.
-        phase: What it is doing.
-        reason: Why it stopped.
-        tip: Arc length of the tip's progress on the plan [m].
-        torch: Arc length of the torch's progress [m].
-        wanted: Deflection asked of the tip at present [m].
-    """
-
-    mode: str
-    side: float
-    phase: Phase
-    reason: str
-    tip: float
-    torch: float
-    wanted: float
-
-    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
-        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
-        ...
 
 
 class Follower:
@@ -105,6 +75,7 @@ class Follower:
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
+        self._place = plan.at(self.tip)
         self._search = Search(settings.reach)
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
@@ -193,7 +164,7 @@ class Follower:
             self._stop(f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start")
 
     def _astray(self, pose: ToolPose) -> bool:
-        below = self._plan.at(self.tip).height - float(pose.position[2])
+        below = self._place.height - float(pose.position[2])
         return self._search.over or below > self._settings.reach
 
     def _stop(self, reason: str) -> None:
@@ -203,8 +174,8 @@ class Follower:
     def _pressing_ends(self) -> float:
         """Where the wanted deflection begins to ramp down, so that it is zero at ``ending``."""
         settings = self._settings
-        ramp = settings.speed * settings.deflection / settings.ramp
-        return self._plan.length - settings.ending - ramp
+        release = settings.speed * settings.deflection / settings.release
+        return self._plan.length - settings.ending - release
 
     def _ramp(self, elapsed: float) -> None:
         """Move the wanted deflection towards what the phase asks for."""
@@ -214,14 +185,15 @@ class Follower:
             target = 0.0
         if self.phase == "seeking" and not self._search.found:
             target = 0.0
-        step = settings.ramp * elapsed
+        rate = settings.release if self.phase == "ending" else settings.ramp
+        step = rate * elapsed
         self.wanted += float(np.clip(target - self.wanted, -step, step))
 
     def _progress(self, pose: ToolPose) -> None:
         reach = self._settings.speed * 0.1
         self.tip = self._plan.advance(pose.position[:2], self.tip, reach)
-        torch = self._torch_position(pose)
-        self.torch = self._plan.advance(torch, self.torch, reach)
+        self._place = self._plan.at(self.tip)
+        self.torch = self._plan.advance(self._torch_position(pose), self.torch, reach)
 
     def _torch_position(self, pose: ToolPose) -> Floats:
         """Return P_t (2,), equation (12)."""
@@ -238,7 +210,7 @@ class Follower:
 
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
         """Return V_r (3,): along the plan; the servo (14) across it and in height."""
-        settings, place, felt = self._settings, self._plan.at(self.tip), self._seam_at_tip()
+        settings, place, felt = self._settings, self._place, self._seam_at_tip()
         deflection = self.side * (self._lateral(pose) - felt.offset)
         height = float(pose.position[2]) - place.height - felt.height
         most = settings.lateral_speed
@@ -253,7 +225,7 @@ class Follower:
 
     def _lateral(self, pose: ToolPose) -> float:
         """Return how far the end point is to the left of the plan [m]."""
-        place = self._plan.at(self.tip)
+        place = self._place
         return float((pose.position[:2] - place.point) @ place.normal)
 
     def _seam_at_tip(self) -> Felt:
@@ -262,5 +234,5 @@ class Follower:
         if felt is None:
             return Felt(0.0, 0.0)
         if self.phase in ("bridging", "ending") and not self.refined.empty:
-            return Felt(float(self.refined.offsets(np.array([self.tip]))[0]), felt.height)
+            return Felt(self.refined.offset(self.tip), felt.height)
         return felt

@@ -7,6 +7,7 @@ shifted and turned onto what was felt nearby, stands in.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +64,7 @@ class RefinedPath:
         points, tangents = plan.evaluate(self._middles)
         self._points, self._normals = points[:, :2], _left(tangents)
         self._fits: dict[int, _Fit | None] = {}
-        self._pending: list[tuple[float, float, float]] = []
+        self._pending: deque[tuple[float, float, float]] = deque()
 
     @property
     def empty(self) -> bool:
@@ -77,7 +78,7 @@ class RefinedPath:
     def confirm(self, until: float) -> None:
         """Believe what was felt up to the time ``until`` [s]."""
         while self._pending and self._pending[0][0] <= until:
-            _, s, offset = self._pending.pop(0)
+            _, s, offset = self._pending.popleft()
             index = int((s - self._start) / BIN)
             if 0 <= index < len(self._count):
                 self._sum[index] += offset
@@ -100,6 +101,10 @@ class RefinedPath:
         # One imagined sample without residual: far from every sample the plan's motion decides.
         return np.asarray(predicted + (weight @ fit.residual) / (weight.sum(axis=1) + 1.0))
 
+    def offset(self, s: float) -> float:
+        """Return the seam's offset from the plan at one arc length."""
+        return float(self.offsets(np.array([s]))[0])
+
     def frame(self, s: float) -> tuple[Floats, Floats]:
         """Return the point (2,) and the unit normal (2,) of the refined path at ``s``."""
         before, here, after = self.offsets(s + KERNEL * np.array([-1.0, 0.0, 1.0]))
@@ -116,17 +121,27 @@ class RefinedPath:
         return self._fits[index]
 
     def _fitted(self, s: float) -> _Fit | None:
-        filled = np.flatnonzero(self._count)
-        if not len(filled):
+        used = self._near(s)
+        if not len(used):
             return None
-        distance = np.abs(self._middles[filled] - s)
-        used = filled[distance <= max(WINDOW, float(distance.min()) + WINDOW / 2)]
         felt = self._sum[used] / self._count[used]
         about = self._points[used].mean(axis=0)
         rows = _rigid_rows(self._points[used] - about, self._normals[used])
         motion = _solve(rows, felt)
         residual = felt - rows @ motion
         return _Fit(about, motion, self._middles[used], self._count[used], residual)
+
+    def _near(self, s: float) -> NDArray[np.intp]:
+        """Return the filled bins that have a say at ``s``."""
+        # A piece of the seam, not all of it: a long seam costs a cycle no more than a short one.
+        low = max(int((s - WINDOW - self._start) / BIN), 0)
+        high = int((s + WINDOW - self._start) / BIN) + 1
+        near = low + np.flatnonzero(self._count[low:high])
+        if len(near):
+            return np.asarray(near)
+        filled = np.flatnonzero(self._count)  # far from all that was felt, which is rare
+        distance = np.abs(self._middles[filled] - s)
+        return np.asarray(filled[distance <= distance.min(initial=np.inf) + WINDOW / 2])
 
 
 def _left(tangents: Floats) -> Floats:

@@ -8,21 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.devices import SensorFrame
 from flangeye.errors import StageError
 from flangeye.redo import Redone
 from flangeye.runlog import Note, read_notes
 from flangeye.stage import part
+from flangeye_plugins.welding.controller import Controller
 from flangeye_plugins.welding.execution import touch_of
 from flangeye_plugins.welding.eyes import Reader
 from flangeye_plugins.welding.finger import Finger
-from flangeye_plugins.welding.follower import Controller
 from flangeye_plugins.welding.motion import ToolPose
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.settings import Following
 from flangeye_plugins.welding.tactile import controller_of
 from flangeye_plugins.welding.touch.feeling import Feeling
-from flangeye_plugins.welding.touch.recorded import image_of
+from flangeye_plugins.welding.touch.recorded import piece_of
 
 SAME = 1e-9
 """Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise."""
@@ -87,9 +86,9 @@ class Again:
     def _see(self, sight: Mapping[str, Any]) -> None:
         if self._pixels is None:
             raise StageError("the log of this weld holds no images: it ran with log_images: false")
-        image = image_of(np.asarray(self._pixels, dtype=np.uint8), self._finger)
+        piece = piece_of(np.asarray(self._pixels, dtype=np.uint8), sight["corner"], self._finger)
         self._newest = sight["number"]
-        read = self._reader.read(SensorFrame(image, sight["time_ns"]))
+        read = self._reader.reread(piece, sight["time_ns"])
         if (read.feeling is not None) != sight["tag"]:
             self._worst_feeling = np.inf
         if self._newest >= 0:  # those before the start have no number, but the detector saw them

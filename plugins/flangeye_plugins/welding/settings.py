@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from flangeye.stage import Choose, Chosen, Params
-from flangeye.units import AngularSpeed, Duration, Force, Length, Speed, param
+from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
 from flangeye_plugins.welding.finger import FingerPath
 
 Mode = Literal["tactile", "as_printed", "vision"]
@@ -50,7 +51,13 @@ class Following(Params):
     longest_gap: Length = param(
         "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
     )
+    astray: Length = param(
+        "20 mm", gt=0, description="Farther from the plan the tip stops the weld."
+    )
     ramp: Speed = param("2 mm/s", gt=0, description="At which the wanted deflection changes.")
+    release: Speed = param(
+        "0.8 mm/s", gt=0, description="At which the wanted deflection ends before the seam does."
+    )
     force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
     stale: Duration = param(
         "150 ms", gt=0, description="Older images slow the weld down until a new one comes."
@@ -82,6 +89,6 @@ class WeldTactileParams(Following):
     )
     approach_speed: Speed = param("50 mm/s", gt=0, description="Of the flange on its way there.")
     approach_joint_speed: AngularSpeed = param("20 deg/s", gt=0, description="Of the joints.")
-    turned: float = Field(
-        0.0, ge=-180, le=180, description="Start with the tool at this angle to the seam [deg]."
+    start_angle: Angle = param(
+        "0 deg", ge=-np.pi, le=np.pi, description="Of the tool to the seam, at the start."
     )

@@ -14,16 +14,21 @@ from flangeye.errors import NothingMoved
 from flangeye.header import LimitsSection
 from flangeye.stage import stage
 from flangeye.types import Journal, Seam, Seed, VerifiedHandEye, WeldReport
+from flangeye_plugins.motion.limits import limits_of
 from flangeye_plugins.welding import checks
 from flangeye_plugins.welding.account import report_of
 from flangeye_plugins.welding.approach import approach
 from flangeye_plugins.welding.as_printed import AsPrinted
+from flangeye_plugins.welding.bounds import Bounds
 from flangeye_plugins.welding.chronicle import Chronicle
-from flangeye_plugins.welding.execution import Cell, Drive, follow
+from flangeye_plugins.welding.controller import Controller
+from flangeye_plugins.welding.drive import Drive
+from flangeye_plugins.welding.execution import Cell, follow
 from flangeye_plugins.welding.eyes import Eyes, EyesBeside, EyesInStep, LatestState, Reader
 from flangeye_plugins.welding.finger import Finger
-from flangeye_plugins.welding.follower import Controller, Follower
+from flangeye_plugins.welding.follower import Follower
 from flangeye_plugins.welding.frame import Tool, WorkPlane
+from flangeye_plugins.welding.passage import Passage, Task
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.settings import Following, Mode, WeldTactileParams
 
@@ -58,10 +63,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     plan = Path(points)
     tool = Tool(finger, plane)
     reader = Reader(finger)
+    allowed = limits_of(limits, model)
     checks.check_finger(finger, params)
     checks.check_seam(seam, plan, finger, params)
-    checks.check_speeds(finger, params, limits)
-    checks.check_reach(model, tool, plan, finger, limits)
+    checks.check_speeds(finger, params, allowed)
+    passage = Passage(Task(model, allowed, finger, tool, plan, params))
     simulated = driver.name.partition(".")[2] == SIMULATED
     if not (motion.allowed or simulated):
         raise NothingMoved(_plan_text(plan, params))
@@ -73,8 +79,9 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
         chronicle = opened.enter_context(Chronicle(journal, not simulated, params.log_images))
         chronicle.note("start", start_of(points, plane, finger, params))
-        cell = Cell(Drive(robot, latest, limits), eyes, tool)
-        approach(cell, model, plan, chronicle, params)
+        drive = Drive(robot, latest, model, allowed)
+        cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
+        approach(cell, passage, chronicle, params.mode)
         longest = 60.0 + 3.0 * (plan.length + finger.torch) / params.speed
         reason = follow(cell, controller, chronicle, longest)
     return report_of(seam, plane, plan, finger, controller, chronicle, reason)

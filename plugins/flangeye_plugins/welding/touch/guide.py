@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from flangeye.catalogue import read_model
+from flangeye.catalogue import RobotModel, read_model
 from flangeye.devices import MotionAllowed, RobotDriver, TactileSensor
 from flangeye.errors import NothingMoved, StageError
 from flangeye.geometry import rigid
@@ -19,7 +19,8 @@ from flangeye.header import LimitsSection
 from flangeye.recipe import Recipe
 from flangeye.stage import part
 from flangeye.types import BASE, FLANGE, Transform
-from flangeye_plugins.welding.execution import Drive
+from flangeye_plugins.motion.limits import limits_of
+from flangeye_plugins.welding.drive import Drive
 from flangeye_plugins.welding.eyes import LatestState
 from flangeye_plugins.welding.finger import Finger
 from flangeye_plugins.welding.settings import WeldTactileParams
@@ -72,8 +73,9 @@ def guide_tactile(
         robot = opened.enter_context(driver.open())
         latest = LatestState(robot.state())
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
-        limits = recipe.context[LimitsSection]
-        readings = Readings(Drive(robot, latest, limits), sensor, finger)
+        model: RobotModel = recipe.context[RobotModel]
+        limits = limits_of(recipe.context[LimitsSection], model)
+        readings = Readings(Drive(robot, latest, model, limits), sensor, finger)
         ask(FREE)
         rest = readings.take(AT_REST)
         ask(HOLD)
@@ -136,9 +138,7 @@ class Readings:
 
     def _go(self, start: Transform, by: Floats) -> None:
         target = Transform(BASE, FLANGE, rigid(start.rotation, start.translation + by))
-        limits = self._drive.limits
-        self._drive.robot.move_linear(target, min(SPEED, limits.speed), limits.acceleration)
-        self._drive.settle()
+        self._drive.shift(target, SPEED)
 
 
 def _strokes() -> Iterator[Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Self
@@ -17,6 +17,7 @@ from flangeye.stage import Params, RecipePath, part
 from flangeye.types import Image, Seed
 from flangeye.units import Duration, param
 from flangeye_plugins.welding.finger import Finger
+from flangeye_plugins.welding.touch.gaze import Piece, shifted
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 
@@ -111,7 +112,7 @@ def _logged(path: Path, finger: Finger) -> Iterator[tuple[float, Image]]:
         if note.name == "image":
             pixels = note.value
         elif note.name == "sight" and pixels is not None:
-            yield note.value["time_ns"] * 1e-9, image_of(pixels, finger)
+            yield note.value["time_ns"] * 1e-9, _whole(pixels, note.value["corner"], finger)
 
 
 def _listed(path: Path) -> list[Path]:
@@ -142,3 +143,21 @@ def image_of(pixels: NDArray[np.uint8], finger: Finger) -> Image:
             f"{wanted[0]} x {wanted[1]}"
         )
     return Image(pixels, finger.camera.matrix, np.array(finger.camera.distortion))
+
+
+def piece_of(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> Piece:
+    """Return logged pixels (h, w) as the piece they are of an image of the finger's camera."""
+    start = (int(corner[0]), int(corner[1]))
+    matrix = shifted(finger.camera.matrix, start)
+    return Piece(Image(pixels, matrix, np.array(finger.camera.distortion)), start)
+
+
+def _whole(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> Image:
+    """Return a whole image, grey where its pixels were not logged."""
+    whole = np.full((finger.camera.height, finger.camera.width, *pixels.shape[2:]), 128, np.uint8)
+    column, row = corner
+    room = whole[row : row + pixels.shape[0], column : column + pixels.shape[1]]
+    if room.shape != pixels.shape:
+        return image_of(pixels, finger)
+    room[:] = pixels
+    return image_of(whole, finger)
