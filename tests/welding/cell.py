@@ -54,15 +54,16 @@ def planning_error(name, seed, end=None):
 
 
 def run(
-    seam, name="v-straight", *, sensor=None, seed=0, box=BOX, limits=None, driver=None, **params
-):
+    seam, name="v-straight", *, sensor=None, seed=0, box=BOX, limits=None, driver=None,
+    journal=None, **params,
+):  # fmt: skip
     """Run the stage; return its report and what it wrote into its journal."""
     simulated = SimulatedFingerParams(workpiece=name, **{"rate": 15.0, **(sensor or {})})
     chosen = Chosen(sensor_simulated_finger, simulated)
     arm = SimulatedParams(period="16 ms", joints=HOME)
     driver = driver or RobotDriver("robot.simulated", lambda: SimulatedRobot(MODEL, arm))
     kept = LimitsSection.model_validate({"box": box, **(limits or {})})
-    journal = []
+    journal = [] if journal is None else journal
     report = weld_tactile.function(
         None, seam, MODEL, driver, kept, MotionAllowed(False), seed,
         lambda what, value: journal.append((what, value)),

@@ -63,6 +63,13 @@ class Station(NamedTuple):
     pose: Transform
 
 
+class Bar(NamedTuple):
+    """Why the arm must not be in a posture, and how near it came to being allowed."""
+
+    rank: int
+    reason: str
+
+
 class Passage:
     """Postures of the arm from above the seam's start to beyond its end."""
 
@@ -140,20 +147,21 @@ class Passage:
     def _drivable(self, stations: list[Station], postures: list[Floats]) -> list[Floats]:
         """Return the chains of postures (M, n), one for each station, that can be driven."""
         found: list[Floats] = []
-        farthest, reason = -1, ""
+        refusals: list[tuple[int, Bar]] = []
         for first in postures[0]:
             chain = [first]
-            for i, station in enumerate(stations):
+            for i in range(len(stations)):
                 joints = _nearest(chain[-1], postures[i])
-                why = self._bars(chain[-1], joints)
-                if why is not None:
-                    farthest, reason = max((farthest, reason), (i, f"{station.name}, {why}"))
+                bar = self._bars(chain[-1], joints)
+                if bar is not None:
+                    refusals.append((i, bar))
                     break
                 chain.append(joints)
             else:
                 found.append(np.array(chain[1:]))
         if not found:
-            raise StageError(f"weld.tactile: {reason}")
+            farthest, bar = max(refusals)
+            raise StageError(f"weld.tactile: {stations[farthest].name}, {bar.reason}")
         return found
 
     def _turned_to(self, here: Floats, chain: Floats) -> Floats:
@@ -163,24 +171,24 @@ class Passage:
         allowed = ((chain + turns >= low) & (chain + turns <= high)).all(axis=0)
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
-    def _bars(self, before: Floats, joints: Floats) -> str | None:
+    def _bars(self, before: Floats, joints: Floats) -> Bar | None:
         """Say why a posture must not be taken after another."""
-        limits = self._task.limits
-        if np.abs(joints - before).max() > JUMP:
-            return "the arm would have to change its posture"
-        if why := limits.beyond(joints, ROOM):
-            return why
+        # The order matters: of all that was tried, what came farthest in it is told.
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):
-            return "the arm touches the table"
+            return Bar(0, "the arm touches the table")
         if not self._volume.apart(axes):
-            return "the arm touches itself"
-        fastest = self._fastest(joints)
-        if fastest > limits.joint_speed:
-            return (
+            return Bar(1, "the arm touches itself")
+        if why := self._task.limits.beyond(joints, ROOM):
+            return Bar(2, why)
+        if np.abs(joints - before).max() > JUMP:
+            return Bar(3, "the arm would have to change its posture")
+        fastest, allowed = self._fastest(joints), self._task.limits.joint_speed
+        if fastest > allowed:
+            return Bar(
+                4,
                 f"a joint may have to turn at {np.degrees(fastest):.0f} deg/s, "
-                f"robot.limits.joint_speed allows {np.degrees(limits.joint_speed):.0f} deg/s: the "
-                "arm is near a singularity"
+                f"robot.limits.joint_speed allows {np.degrees(allowed):.0f} deg/s",
             )
         return None
 
