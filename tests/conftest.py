@@ -39,8 +39,11 @@ def _registry_with(*modules: tuple[str, object]) -> Registry:
 
 
 @pytest.fixture
-def toy_registry() -> Registry:
-    """A registry that offers the toy stages alone."""
+def toy_registry(
+    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Registry:
+    """A registry that offers the toy stages alone; what is listed of it is not kept."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
     return _registry_with(("toy", toy))
 
 

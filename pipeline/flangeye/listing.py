@@ -16,8 +16,12 @@ from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from platformdirs import user_cache_path
+
+if TYPE_CHECKING:
+    from flangeye.registry import Registry
 
 ENTRY_POINTS = "flangeye"
 
@@ -28,17 +32,25 @@ def list_stages() -> str:
     Raises:
         DuplicatePluginError: Two plugins offer the same stage or part.
     """
+    known = _recall(_installed())
+    if known is not None:
+        return known
+    from flangeye.registry import load_registry
+
+    return remember(load_registry())
+
+
+def remember(registry: Registry) -> str:
+    """Return the list of the loaded plugins, and keep it for :func:`list_stages`."""
     installed = _installed()
     known = _recall(installed)
     if known is not None:
         return known
     from flangeye.catalogue_text import describe_all
-    from flangeye.registry import load_registry
 
-    registry = load_registry()
     text = describe_all(registry)
     if not registry.broken:  # what is missing may be installed any time, elsewhere
-        _remember(installed, text)
+        _keep(installed, text)
     return text
 
 
@@ -74,21 +86,21 @@ def _files(package: str) -> Iterator[Path]:
             yield from (Path(parent, name) for name in sorted(names) if name.endswith(".py"))
 
 
-def _remembered_at() -> Path:
+def _place() -> Path:
     return user_cache_path("flangeye") / "stages.json"
 
 
 def _recall(installed: str) -> str | None:
     with suppress(OSError, ValueError, LookupError, TypeError):
-        known = json.loads(_remembered_at().read_text(encoding="utf-8"))
+        known = json.loads(_place().read_text(encoding="utf-8"))
         if known["installed"] == installed:
             return str(known["list"])
     return None
 
 
-def _remember(installed: str, text: str) -> None:
+def _keep(installed: str, text: str) -> None:
     """Write the list where two commands at once leave one of two whole files."""
-    place = _remembered_at()
+    place = _place()
     with suppress(OSError):  # a home that cannot be written costs a second look, no more
         place.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(

@@ -21,7 +21,6 @@ def flangeye(monkeypatch, toy_registry, tmp_path, capsys):
     """Call the command line in an empty folder with the toy stages; return code, out, err."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "load_registry", lambda: toy_registry)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def call(*words):
         monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])

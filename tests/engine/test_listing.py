@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from flangeye import listing, registry
+from flangeye.cli.app import load_plugins
 
 PLUGIN = """
 from flangeye import part
@@ -21,7 +22,6 @@ def mine() -> float:
 @pytest.fixture
 def installed(monkeypatch, tmp_path, toy_registry):
     """One plugin `mine` in a folder of its own; count how often the plugins are loaded."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "mine.py").write_text(PLUGIN.format(summary="First."))
     plugins = [EntryPoint("mine", "mine", "flangeye")]
@@ -41,6 +41,13 @@ def test_a_second_list_loads_no_plugin(installed):
     first = listing.list_stages()
     assert "fit.toy" in first
     assert listing.list_stages() == first
+    assert len(loads) == 1
+
+
+def test_other_commands_leave_the_list_behind(installed):
+    _, loads, _ = installed
+    load_plugins()
+    assert "fit.toy" in listing.list_stages()
     assert len(loads) == 1
 
 
@@ -76,20 +83,21 @@ def test_a_plugin_that_could_not_be_loaded_is_tried_again(installed):
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"installed": 3}', "\xff"])
-def test_a_damaged_memory_is_made_anew(installed, tmp_path, content):
+def test_a_damaged_memory_is_made_anew(installed, content):
     _, loads, _ = installed
     text = listing.list_stages()
-    place = tmp_path / "cache" / "flangeye" / "stages.json"
-    place.write_bytes(content.encode("latin-1"))
+    listing.user_cache_path("flangeye").joinpath("stages.json").write_bytes(
+        content.encode("latin-1")
+    )
     assert listing.list_stages() == text
     assert len(loads) == 2
     listing.list_stages()
     assert len(loads) == 2
 
 
-def test_where_nothing_can_be_written_the_list_is_made_each_time(installed, tmp_path):
+def test_where_nothing_can_be_written_the_list_is_made_each_time(installed):
     _, loads, _ = installed
-    (tmp_path / "cache").write_text("a file where the folder should be")
+    listing.user_cache_path("flangeye").write_text("a file where the folder should be")
     assert "fit.toy" in listing.list_stages()
     assert "fit.toy" in listing.list_stages()
     assert len(loads) == 2

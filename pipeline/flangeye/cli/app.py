@@ -6,12 +6,15 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated, NoReturn, Optional
+from typing import TYPE_CHECKING, Annotated, NoReturn, Optional
 
 import typer
 
 from flangeye import __version__
 from flangeye.errors import FlangeyeError, NothingMoved
+
+if TYPE_CHECKING:
+    from flangeye.registry import Registry
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,6 +53,16 @@ def _options(
     ] = False,
 ) -> None:
     """Nothing but what stands before a command."""
+
+
+def load_plugins() -> Registry:
+    """Load every installed plugin, and leave their list for the next ``flangeye stages``."""
+    from flangeye.listing import remember
+    from flangeye.registry import load_registry
+
+    registry = load_registry()
+    remember(registry)
+    return registry
 
 
 def main() -> None:

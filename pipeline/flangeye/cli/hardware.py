@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
 
 tactile = typer.Typer(no_args_is_help=True, help="Tactile fingers: find out how one moves.")
 app.add_typer(tactile, name="tactile")
@@ -29,9 +29,8 @@ def tactile_calibrate(
     """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
     from flangeye.devices import MotionAllowed
     from flangeye.recipe import find_recipe, load_recipe
-    from flangeye.registry import load_registry
 
-    registry = load_registry()
+    registry = load_plugins()
     checked = load_recipe(find_recipe(recipe), registry, overrides or ())
 
     def ask(text: str) -> None:
@@ -71,10 +70,9 @@ def loopback(
     """Be a robot's controller on loopback, for its own driver to connect to."""
     from flangeye.catalogue import load_model
     from flangeye.loopback import LoopbackOptions, find_loopback, read_height, read_joints
-    from flangeye.registry import load_registry
 
     model = load_model("robots", robot)
-    offered = [each for some in load_registry().hooks.hook.flangeye_loopbacks() for each in some]
+    offered = [each for some in load_plugins().hooks.hook.flangeye_loopbacks() for each in some]
     options = LoopbackOptions(
         robot=model,
         host=host,

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from flangeye.cli.app import LogFile, Overrides, app
+from flangeye.cli.app import LogFile, Overrides, app, load_plugins
 
 
 @app.command()
@@ -39,10 +39,9 @@ def report(
 def replay_log(log: LogFile) -> None:
     """Make the decisions in a log again, from what was measured, and compare."""
     from flangeye.redo import redo
-    from flangeye.registry import load_registry
 
     same = True
-    for step, redone in redo(log, load_registry()):
+    for step, redone in redo(log, load_plugins()):
         typer.echo(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
         for name, value in redone.figures.items():
             typer.echo(f"  {name}: {value:.3g}")
@@ -91,9 +90,8 @@ def doctor(
 
     from flangeye.doctor import as_json, as_text, examine, open_session
     from flangeye.recipe import find_recipe, load_recipe
-    from flangeye.registry import load_registry
 
-    registry = load_registry()
+    registry = load_plugins()
     checked = load_recipe(find_recipe(recipe), registry, overrides or ()) if recipe else None
     session = open_session(archive, registry, checked)
     checks = [part for part in registry.parts.values() if part.kind == "check"]

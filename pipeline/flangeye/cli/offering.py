@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
 
 
 @app.command()
@@ -15,10 +15,9 @@ def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: every mistake, with its line; what it has to find."""
     from flangeye.configuration import Configuration
     from flangeye.recipe import find_recipe, load_recipe
-    from flangeye.registry import load_registry
 
     path = find_recipe(recipe)
-    checked = load_recipe(path, load_registry(), overrides or ())
+    checked = load_recipe(path, load_plugins(), overrides or ())
     typer.echo(f"{path}: ok, {len(checked.steps)} steps")
     typer.echo(checked.context[Configuration].describe())
 
@@ -46,17 +45,14 @@ def stages(
         typer.echo(list_stages())
         return
     from flangeye.catalogue_text import describe_one
-    from flangeye.registry import load_registry
 
-    typer.echo(describe_one(load_registry(), name))
+    typer.echo(describe_one(load_plugins(), name))
 
 
 @app.command()
 def plugins() -> None:
     """List the installed plugins, what each offers, and those that could not be loaded."""
-    from flangeye.registry import load_registry
-
-    registry = load_registry()
+    registry = load_plugins()
     for plugin, version in registry.versions().items():
         offers = sorted(n for n, owner in registry.owners.items() if owner == plugin)
         typer.echo(f"{plugin} {version}: {', '.join(offers) or 'no stages or parts'}")
@@ -72,11 +68,10 @@ def schema(
     """Print the JSON Schema of recipes, for editors that check YAML while you type."""
     import json
 
-    from flangeye.registry import load_registry
     from flangeye.result import Result
     from flangeye.schema import header_line, recipe_schema
 
-    document = Result.model_json_schema() if result else recipe_schema(load_registry())
+    document = Result.model_json_schema() if result else recipe_schema(load_plugins())
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if out is None:
         typer.echo(text)

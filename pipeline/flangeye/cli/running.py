@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
 from flangeye.errors import FlangeyeError
 
 if TYPE_CHECKING:
@@ -57,12 +57,11 @@ def run(  # noqa: PLR0913  one for each option
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
-    from flangeye.registry import load_registry
     from flangeye.runfolder import RunFolder
     from flangeye.session import Start
     from flangeye.types import ArchivePath
 
-    registry = load_registry()
+    registry = load_plugins()
     checked, earlier = _recipe_of(recipe, resume, registry, overrides or ())
     replay = _replay(checked, source, at)
     start = Start(ArchivePath(archive), replay, earlier, MotionAllowed(move))
@@ -166,14 +165,13 @@ def batch(  # noqa: PLR0913  one argument an option
     from rich.console import Console
 
     from flangeye.batch import Request, run_batch, summary_text
-    from flangeye.registry import load_registry
 
     request = Request(
         recipe, tuple(archives or ()), tuple(overrides or ()), tuple(grid or ()), repeat, vary,
         workers, scheduler, out, report,
     )  # fmt: skip
     try:
-        done = run_batch(request, load_registry(), Console(stderr=True))
+        done = run_batch(request, load_plugins(), Console(stderr=True))
     except KeyboardInterrupt:
         sys.stderr.write("stopped; the same command goes on from here\n")
         raise typer.Exit(130) from None
