@@ -22,7 +22,7 @@ from flangeye.types import BASE, FLANGE, Transform
 from flangeye_plugins.motion.limits import limits_of
 from flangeye_plugins.welding.drive import Drive
 from flangeye_plugins.welding.eyes import LatestState
-from flangeye_plugins.welding.finger import Finger
+from flangeye_plugins.welding.finger import Calibration, Finger
 from flangeye_plugins.welding.settings import WeldTactileParams
 from flangeye_plugins.welding.tactile import SIMULATED
 from flangeye_plugins.welding.touch.calibration import Held, calibrate
@@ -82,14 +82,27 @@ def guide_tactile(
         held = list(readings.held())
         name = robot.name
     found = calibrate(rest, held, f"flangeye tactile calibrate, on {name}")
-    if found.lateral is None and finger.calibration is not None:  # no force was measured
+    measured = found.lateral is not None
+    if not measured and finger.calibration is not None:
         known = finger.calibration
         found = found.model_copy(update={"lateral": known.lateral, "axial": known.axial})
     calibrated = finger.model_copy(update={"calibration": found})
     text = yaml.safe_dump(calibrated.model_dump(mode="json", exclude_none=True), sort_keys=False)
     out.write_text(text, encoding="utf-8")
+    counts = f"{len(rest)} readings at rest, {len(held)} with the tip held"
+    return "\n".join([counts, *_told(found, measured), f"{out}: weld with it: finger: {out.name}"])
+
+
+def _told(found: Calibration, measured: bool) -> list[str]:
+    """Return what was found, for people."""
     noise = ", ".join(f"{x * 1e3:.4f}" for x in found.noise)
-    return f"{out}: {len(rest)} readings at rest, {len(held)} held; noise of the tip {noise} mm"
+    rest = ", ".join(f"{x * 1e3:.3f}" for x in found.rest)
+    lines = [f"rest       tag at ({rest}) mm in the camera", f"noise      {noise} mm of the tip"]
+    if found.lateral is None or found.axial is None:
+        return [*lines, "stiffness  not known: the arm measures no force"]
+    stiffness = f"{found.lateral * 1e-3:.2f} N/mm across, {found.axial * 1e-3:.2f} N/mm along"
+    kept = "" if measured else ", as it was: the arm measures no force"
+    return [*lines, f"stiffness  {stiffness}{kept}"]
 
 
 def _weld_params(recipe: Recipe) -> WeldTactileParams:
