@@ -22,7 +22,8 @@ topic                         schema                      content
 /log                          foxglove.Log                the same for people
 ============================  ==========================  ======================================
 
-JSON messages of steps are ``{"capture": id or null, "seconds": s, "value": …}``. Attachments:
+JSON messages of steps are ``{"capture": id or null, "seconds": s, "value": …, "shapes": …}``; the
+shapes are those of the clouds' arrays, whose messages do not tell rows and columns. Attachments:
 ``recipe.yaml``, ``recipe.resolved.yaml`` and, when the run ended, ``result.json``. Every message
 is a chunk of its own and is handed to the operating system at once: a killed run loses nothing
 that was finished.
@@ -131,11 +132,16 @@ class Recorder:
         self, step: str, capture: str | None, value: Any, seconds: float
     ) -> None:
         """Log what a step gave, and a mirror of it for viewers."""
-        topic = f"/step/{step}"
-        for name, cloud in clouds_of(value).items():
+        topic, clouds = f"/step/{step}", clouds_of(value)
+        for name, cloud in clouds.items():
             xyz = cloud.xyz.reshape(-1, 3)
             self._proto(f"{topic}/{name}", foxglove.point_cloud(cloud, xyz, time.time_ns()))
-        payload = {"capture": capture, "seconds": seconds, "value": _plain(value)}
+        payload = {
+            "capture": capture,
+            "seconds": seconds,
+            "value": _plain(value),
+            "shapes": {name: list(cloud.xyz.shape) for name, cloud in clouds.items()},
+        }
         self._json(topic, type(value).__name__, payload)
         self._mirror(capture, value)
 

@@ -7,8 +7,8 @@ last whole message, and there is one way for both.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -233,19 +233,26 @@ def _take(
     elif topic == "/rejection":
         log.rejections.append(t.Rejection(**data))
     elif topic.startswith("/step/"):
-        value = _decode_value(topic, schema, data["value"], clouds)
+        held = _held(topic, data.get("shapes", {}), clouds)
+        value = _decode_value(schema, data["value"], held)
         step = topic.removeprefix("/step/")
         log.entries.append(Entry(step, data["capture"], data["seconds"], schema, value))
 
 
-def _decode_value(topic: str, schema: str, data: Any, clouds: dict[str, t.PointCloud]) -> Any:
-    cls = _TYPES.get(schema)
-    if cls is None:
-        return data
-    held = {
-        f.name: clouds[f"{topic}/{f.name}"] for f in fields(cls) if f"{topic}/{f.name}" in clouds
+def _held(
+    topic: str, shapes: Mapping[str, list[int]], clouds: Mapping[str, t.PointCloud]
+) -> dict[str, t.PointCloud]:
+    """Return the clouds of a step's value by field name, in rows and columns as they were."""
+    found = {at.rpartition("/")[2]: c for at, c in clouds.items() if at.rpartition("/")[0] == topic}
+    return {
+        name: t.PointCloud(cloud.frame, cloud.xyz.reshape(shapes.get(name, cloud.xyz.shape)))
+        for name, cloud in found.items()
     }
-    return adapter(cls).validate_python({**data, **held})
+
+
+def _decode_value(schema: str, data: Any, held: Mapping[str, t.PointCloud]) -> Any:
+    cls = _TYPES.get(schema)
+    return data if cls is None else adapter(cls).validate_python({**data, **held})
 
 
 def _decode_cloud(data: bytes) -> t.PointCloud:

@@ -202,3 +202,14 @@ except LogWriteError as error:
         f"{tmp_path / 'r.mcap'}: cannot be written: File too large; what was written so far can be "
         "read with 'flangeye show'\n"
     )
+
+
+def test_the_clouds_of_a_step_keep_their_rows_and_columns(tmp_path):
+    grid = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+    scan = t.WorkpieceScan(t.PointCloud(t.CAMERA, grid), "a scan")
+    recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "title: T"}, full_clouds=False)
+    recorder.flangeye_stage_finished("5.scan.simulated", None, scan, 0.0)
+    recorder.close()
+    back = read_run(tmp_path / "r.mcap").last(t.WorkpieceScan)
+    assert back.cloud.organised
+    np.testing.assert_array_equal(back.cloud.xyz, grid)
