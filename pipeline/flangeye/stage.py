@@ -10,6 +10,7 @@ Two sorts of plugins share one decorator each and one registry:
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import inspect
 import types as python_types
@@ -31,6 +32,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from flangeye import types as t
 from flangeye.explain import EXPLAINED, sentence
+from flangeye.shipped import shipped
 
 
 class Params(BaseModel):
@@ -294,6 +296,29 @@ RecipePath = Annotated[
     PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
 ]
 """A path in a parameter; a relative one starts at the recipe's folder."""
+
+
+def shipped_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
+    """Return the check of a parameter that names a file of ``data/FOLDER`` or one's own.
+
+    Args:
+        kind: What it is, for people: ``workpiece``.
+        folder: Where those that come with the project are: ``workpieces``.
+    """
+
+    def found(value: Any, info: ValidationInfo) -> Path:
+        if not isinstance(value, (str, Path)):
+            raise ValueError(f"a {kind} is a name or a path to a .yaml file")
+        if str(value).endswith((".yaml", ".yml")):
+            return _beside_recipe(value, info)
+        path = shipped("data") / folder / f"{value}.yaml"
+        if not path.is_file():
+            known = sorted(p.stem for p in path.parent.glob("*.yaml"))
+            near = difflib.get_close_matches(str(value), known, n=2) or known
+            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or a .yaml file")
+        return path
+
+    return found
 
 
 def stage(name: str) -> Callable[[Callable[..., Any]], Stage]:

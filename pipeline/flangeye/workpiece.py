@@ -16,20 +16,19 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from flangeye.catalogue import Model, read_model
 from flangeye.cloudfile import PER_METRE, LengthUnit
 from flangeye.errors import StageError
-from flangeye.shipped import shipped
+from flangeye.stage import shipped_file
 from flangeye.units import Angle, Length
 
 Floats = NDArray[np.float64]
@@ -103,23 +102,9 @@ class Workpiece:
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
 
-def _shipped_or_beside(value: Any, info: ValidationInfo) -> Path:
-    if not isinstance(value, (str, Path)):
-        raise ValueError("a workpiece is a name or a path to a .yaml file")
-    if str(value).endswith((".yaml", ".yml")):
-        path = Path(value).expanduser()
-        return path if info.context is None else info.context.folder / path
-    found = shipped("data") / "workpieces" / f"{value}.yaml"
-    if not found.is_file():
-        known = sorted(p.stem for p in found.parent.glob("*.yaml"))
-        near = difflib.get_close_matches(str(value), known, n=2) or known
-        raise ValueError(f"no workpiece '{value}'; known: {', '.join(near)}, or a .yaml file")
-    return found
-
-
 WorkpiecePath = Annotated[
     Path,
-    BeforeValidator(_shipped_or_beside),
+    BeforeValidator(shipped_file("workpiece", "workpieces")),
     PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
 ]
 """A parameter that names a workpiece: a shipped one, or a file beside the recipe."""

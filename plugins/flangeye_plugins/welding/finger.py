@@ -5,16 +5,15 @@ The tool's axes: x from the torch to the tip (t_d of the paper), z out of the wo
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from flangeye.catalogue import Model
-from flangeye.shipped import shipped
+from flangeye.stage import shipped_file
 from flangeye.units import Angle, Length, Stiffness, param
 
 Floats = NDArray[np.float64]
@@ -93,23 +92,9 @@ class Finger(Model):
         return float(np.linalg.norm(stiffness * displacement))
 
 
-def _shipped_or_beside(value: Any, info: ValidationInfo) -> Path:
-    if not isinstance(value, (str, Path)):
-        raise ValueError("a finger is a name or a path to a .yaml file")
-    if str(value).endswith((".yaml", ".yml")):
-        path = Path(value).expanduser()
-        return path if info.context is None else info.context.folder / path
-    found = shipped("data") / "fingers" / f"{value}.yaml"
-    if not found.is_file():
-        known = sorted(p.stem for p in found.parent.glob("*.yaml"))
-        near = difflib.get_close_matches(str(value), known, n=2) or known
-        raise ValueError(f"no finger '{value}'; known: {', '.join(near)}, or a .yaml file")
-    return found
-
-
 FingerPath = Annotated[
     Path,
-    BeforeValidator(_shipped_or_beside),
+    BeforeValidator(shipped_file("finger", "fingers")),
     PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
 ]
 """A parameter that names a finger: a shipped one, or a file beside the recipe."""
