@@ -26,6 +26,7 @@ INPUTS = {
     "acquire.simulated": "simulated cell",
     "acquire.simulated_session": "simulated scans",
     "acquire.simulated_marker": "simulated marker",
+    "acquire.simulated_images": "simulated images",
     "acquire.archive": "recorded clouds",
     "acquire.centres": "published centres",
     "acquire.live": "live, on loopback",

@@ -7,10 +7,11 @@ whoever looks at it. Lengths are those of the print [m].
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -23,6 +24,17 @@ DICTIONARIES = (
     "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11",
 )  # fmt: skip
 """Families of markers, as OpenCV names them after ``DICT_``; AprilTags are among them."""
+
+
+def _known(name: str) -> str:
+    name = name.removeprefix("DICT_")
+    if name not in DICTIONARIES:
+        raise ValueError(f"no dictionary '{name}'; known: {', '.join(DICTIONARIES)}")
+    return name
+
+
+Dictionary = Annotated[str, AfterValidator(_known)]
+"""Name of a family in a recipe."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from flangeye_plugins.acquisition.images import acquire_images
 from flangeye_plugins.acquisition.live import acquire_live
 from flangeye_plugins.acquisition.samples import acquire_samples
 from flangeye_plugins.acquisition.simulated import acquire_simulated
+from flangeye_plugins.acquisition.simulated_images import acquire_simulated_images
 from flangeye_plugins.acquisition.simulated_session import (
     acquire_simulated_marker,
     acquire_simulated_session,
@@ -84,6 +85,7 @@ def flangeye_stages() -> Iterable[Stage]:
         acquire_simulated,
         acquire_simulated_marker,
         acquire_simulated_session,
+        acquire_simulated_images,
         acquire_archive,
         acquire_live,
         acquire_centres,

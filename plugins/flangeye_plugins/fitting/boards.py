@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from flangeye import Params, stage
-from flangeye.boards import DICTIONARIES, Board
+from flangeye.boards import Board, Dictionary
 from flangeye.geometry import rotation_log
 from flangeye.types import CAMERA, TARGET, Capture, PoseFeature, Rejected, Transform
 from flangeye.units import Length, param
@@ -57,15 +57,9 @@ class TargetParams(Params):
 class DictionaryParams(TargetParams):
     """What fits of targets with markers share."""
 
-    dictionary: str = Field("4X4_50", description="Family of the markers, as OpenCV names it.")
-
-    @field_validator("dictionary")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        name = value.removeprefix("DICT_")
-        if name not in DICTIONARIES:
-            raise ValueError(f"no dictionary '{value}'; known: {', '.join(DICTIONARIES)}")
-        return name
+    dictionary: Dictionary = Field(
+        "4X4_50", description="Family of the markers, as OpenCV names it."
+    )
 
 
 class CharucoParams(DictionaryParams):

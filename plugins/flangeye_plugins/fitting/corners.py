@@ -16,6 +16,8 @@ Grey = NDArray[np.uint8]
 
 FEWEST_CHARUCO = 6
 """Corners of a ChArUco board below which too little of it is seen."""
+LEAST_CONTRAST = 0.3
+"""Between a square and those beside it, over that between black and white."""
 
 
 class Corners(NamedTuple):
@@ -34,7 +36,7 @@ def find_corners(board: Board, image: Image) -> Corners | Rejected:
     """Find a board's corners in an image."""
     grey = _grey(image)
     finders = {"charuco": _charuco, "checkerboard": _checkerboard, "marker": _marker}
-    return finders[board.kind](board, grey)
+    return finders[board.kind](board, grey, image)
 
 
 def _grey(image: Image) -> Grey:
@@ -44,7 +46,7 @@ def _grey(image: Image) -> Grey:
     return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
 
 
-def _charuco(board: Board, grey: Grey) -> Corners | Rejected:
+def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
     import cv2
 
     detector = cv2.aruco.CharucoDetector(charuco_of(board))
@@ -60,7 +62,7 @@ def _charuco(board: Board, grey: Grey) -> Corners | Rejected:
     return Corners(pixels, board.inner_corners()[np.asarray(ids).ravel()])
 
 
-def _marker(board: Board, grey: Grey) -> Corners | Rejected:
+def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
@@ -75,10 +77,10 @@ def _marker(board: Board, grey: Grey) -> Corners | Rejected:
             f"(found: {others})"
         )
     pixels = np.asarray(corners[found.index(board.marker_id)], dtype=np.float64).reshape(4, 2)
-    return Corners(corners_of_square(grey, pixels), board.outer_corners())
+    return Corners(corners_of_square(grey, pixels, image), board.outer_corners())
 
 
-def _checkerboard(board: Board, grey: Grey) -> Corners | Rejected:
+def _checkerboard(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
     import cv2
 
     pattern = (board.columns - 1, board.rows - 1)
@@ -90,7 +92,36 @@ def _checkerboard(board: Board, grey: Grey) -> Corners | Rejected:
     if not found:
         return Rejected(f"no checkerboard of {board.columns} x {board.rows} squares found")
     pixels = np.asarray(corners, dtype=np.float64).reshape(board.rows - 1, board.columns - 1, 2)
-    return Corners(_upright(pixels, grey).reshape(-1, 2), board.inner_corners())
+    upright = Corners(_upright(pixels, grey).reshape(-1, 2), board.inner_corners())
+    wrong = _wrong_squares(upright, board, grey)
+    if wrong:
+        return Rejected(
+            f"{wrong} of the {board.columns} x {board.rows} squares are not as they should be: a "
+            "part of the board is covered or cut off, or it has more squares"
+        )
+    return upright
+
+
+def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
+    """Return how many squares are not darker, or lighter, than those beside them as they should.
+
+    A grid that is found one square beside the board's own, where a part is covered, has the sheet
+    about the board in the place of its outer squares.
+    """
+    import cv2
+
+    rows, columns = np.indices((board.rows, board.columns))
+    squares = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    middles = board.place((squares + 0.5) * board.square)
+    to_image = cv2.findHomography(corners.points[:, :2], corners.pixels)[0]
+    at = cv2.perspectiveTransform(middles[None, :, :2], to_image)[0]
+    values = np.array([_value(grey, pixel) for pixel in at]).reshape(rows.shape)
+    sense = np.where((rows + columns) % 2 == 0, -1.0, 1.0)
+    around = np.pad(values, 1, constant_values=np.nan)
+    beside = [around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]]
+    contrast = float(np.ptp(np.percentile(values, [20, 80])))
+    differs = sense * (values - np.nanmean(beside, axis=0))
+    return int((differs < LEAST_CONTRAST * contrast).sum())
 
 
 def _upright(pixels: Floats, grey: Grey) -> Floats:

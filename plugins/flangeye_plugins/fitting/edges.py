@@ -1,13 +1,16 @@
 """The corners of a dark square as the intersections of its sides.
 
 A corner's own neighbourhood is rounded by the lens, which draws the corner inwards by a quarter
-of a pixel; a straight side is blurred on both sides alike.
+of a pixel; a straight side is blurred on both sides alike. Straight it is only without the lens's
+distortion: a side of 200 px away from the middle is bent by half a pixel.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flangeye.types import Image
 
 Floats = NDArray[np.float64]
 
@@ -27,29 +30,57 @@ STRAY = 0.5
 """An edge further from its side's line than this is not that side's [px]."""
 
 
-def corners_of_square(grey: NDArray[np.uint8], rough: Floats) -> Floats:
+def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> Floats:
     """Return the (4, 2) corners [px] of a dark square on white, from rough ones in order.
 
     Where a side cannot be followed the rough corners are kept.
+
+    Args:
+        grey: (H, W) values.
+        rough: (4, 2) corners, to a pixel or two.
+        image: With the camera's matrix and distortion.
     """
-    lines = [_side(grey, rough[i], rough[(i + 1) % 4]) for i in range(4)]
+    lines = [_side(grey, rough[i], rough[(i + 1) % 4], image) for i in range(4)]
     if any(line is None for line in lines):
         return rough
     crossed = [np.cross(lines[i - 1], lines[i]) for i in range(4)]  # type: ignore[arg-type]
-    corners = np.array([c[:2] / c[2] for c in crossed])
+    corners = _bent(np.array([c[:2] / c[2] for c in crossed]), image)
     near = np.linalg.norm(corners - rough, axis=1).max() < ACROSS
     return np.asarray(corners) if near else rough
 
 
-def _side(grey: NDArray[np.uint8], start: Floats, end: Floats) -> Floats | None:
-    """Return the line (3,) of a side, homogeneous; None where too few edges are found."""
+def _straight(pixels: Floats, image: Image) -> Floats:
+    """Return where pixels (N, 2) would be without the lens's distortion."""
+    import cv2
+
+    if not (len(pixels) and image.distortion.any()):
+        return pixels
+    matrix = image.camera_matrix
+    found = cv2.undistortPoints(pixels[:, None], matrix, image.distortion, P=matrix)
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _bent(pixels: Floats, image: Image) -> Floats:
+    """Return where the lens has what would be at pixels (N, 2) without its distortion."""
+    import cv2
+
+    if not image.distortion.any():
+        return pixels
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(image.camera_matrix).T
+    none = np.zeros(3)
+    found = cv2.projectPoints(rays, none, none, image.camera_matrix, image.distortion)[0]
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> Floats | None:
+    """Return the line (3,) of a side, homogeneous and undistorted; None with too few edges."""
     along = end - start
     length = float(np.linalg.norm(along))
     reach = min(ACROSS, BORDER * length)
     if reach < SHORTEST:
         return None
     across = np.array([-along[1], along[0]]) / length * reach
-    edges = _edges(grey, start, along, across)
+    edges = _straight(_edges(grey, start, along, across), image)
     for _ in range(2):
         if len(edges) < PROFILES / 3:
             return None

@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ITERATIONS, SETTLED = 60, 1e-10
+LEAST_DAMPING = 1e-12
+"""Keeps the equations solvable where the poses tell nothing of a direction, and slows nothing."""
 ROUNDS = 12
 GRADUATION = 1.4
 """Factor between the steps of graduated non-convexity: Yang et al. (2020)."""
@@ -103,7 +105,7 @@ def climb(problem: Problem, start: Unknowns, noise: Noise, shares: Floats) -> So
         small = np.abs(step).max() < SETTLED
         if better:
             here = there
-        damping = damping / 10 if better else damping * 10
+        damping = max(damping / 10, LEAST_DAMPING) if better else damping * 10
         if small or damping > 1e8:
             break
     return here

@@ -30,6 +30,7 @@ from flangeye_plugins.solving.estimates import (
 from flangeye_plugins.solving.likelihood import Problem, Solution
 from flangeye_plugins.solving.loop import ArmNoise, meaningless_turns
 from flangeye_plugins.solving.sightings import loop_of, sightings_of
+from flangeye_plugins.solving.target_size import require_size
 
 Floats = NDArray[np.float64]
 
@@ -66,6 +67,12 @@ class MaximumLikelihoodParams(Params):
         description="What to do about translations that the motion cannot show, as the height "
         "with an arm of four joints: refuse, or solve for the rest and mark them.",
     )
+    size_limit: float = Field(
+        0.005,
+        gt=0,
+        description="Share by which a marker may be larger or smaller than its fit was told, as "
+        "the arm's motion shows it; beyond, the calibration is refused.",
+    )
 
 
 @stage("solve.maximum_likelihood")
@@ -85,8 +92,8 @@ def solve_maximum_likelihood(
     Raises:
         StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose
             is missing.
-        CalibrationRefused: Fewer than half of the poses agree, or the motion leaves something
-            unknown: it says which motion is missing.
+        CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown:
+            it says which motion is missing; or a marker has another size than its fit was told.
     """
     pulled, configuration = list(observations), configuration or DEFAULT
     arm = Arm(robot) if robot else None
@@ -96,6 +103,7 @@ def solve_maximum_likelihood(
     found = find_agreement(problem)
     limits = Limits(params.rotation_limit, params.translation_limit, params.unobservable == "mark")
     weak = unobservable(problem, found, limits)
+    require_size(problem, found, params.size_limit)
     found = _without(found, weak)
     at = found.at
     transforms = transforms_of(configuration, at.x, at.y, at.z)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.configuration import Configuration, carriers_of
+from flangeye.errors import StageError
 from flangeye.geometry import basis_of_plane, hat
 from flangeye.kinematics import Arm
 from flangeye.types import BASE, Observation, PoseFeature
@@ -120,8 +121,10 @@ def sightings_of(
         normals: Whether circles' normals count.
 
     Raises:
-        StageError: A carrier's pose is missing.
+        StageError: There are no observations, or a carrier's pose is missing.
     """
+    if not observations:
+        raise StageError("no pose to solve with: every capture was set aside, each for its reason")
     carriers = carriers_of(configuration, observations, arm)
     each = [_measured(o, normals) for o in observations]
     rotations, covariances, projectors = (np.array(column) for column in zip(*each, strict=True))
