@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,10 @@ class Recipe:
 
     def resolved(self) -> str:
         """Return the recipe as YAML with every default and override written out."""
+        return self._resolved
+
+    @cached_property
+    def _resolved(self) -> str:
         data = self.header.model_dump(mode="json", exclude_none=True)
         data["steps"] = [
             {step.stage.name: step.params.model_dump(mode="json", exclude_none=True)}

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +81,12 @@ def parse_yaml(text: str, name: str) -> Document:
     Raises:
         RecipeError: Names the line and the cure.
     """
+    document = _parse(text, name)
+    return replace(document, data=deepcopy(document.data))
+
+
+@lru_cache(maxsize=64)  # a batch reads its recipe and its robot's file once a session
+def _parse(text: str, name: str) -> Document:
     try:
         _refuse_dangers(text, name)
         root = yaml.compose(text, Loader=yaml.SafeLoader)

@@ -44,6 +44,9 @@ _LOCAL = {
     "distributed.scheduler.worker-ttl": None,
     # The profiler remembers every call stack it has seen: 40 kB a session.
     "distributed.worker.profile.enabled": False,
+    # Nobody looks at the dashboard's gauges; fifty ticks a second are felt on a busy machine.
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 from flangeye import __version__
@@ -16,6 +17,12 @@ def sha256(text: str) -> str:
 
 def library_versions() -> dict[str, str]:
     """Return the versions of everything that computes."""
+    return dict(_library_versions())
+
+
+@cache
+def _library_versions() -> tuple[tuple[str, str], ...]:
+    """Read them once: each is a file to find and to parse, 5 ms together."""
     names = ("numpy", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "pydantic", "mcap")
     found = {"flangeye": __version__, "python": platform.python_version()}
     for name in names:
@@ -23,4 +30,4 @@ def library_versions() -> dict[str, str]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return tuple(found.items())

@@ -7,6 +7,7 @@ Arrays only.
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -17,9 +18,12 @@ from flangeye.statistics import chi2_quantile, f_quantile
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Motions = tuple[Floats, Floats]
 
 MOST_TRIPLES = 1000
 """Of 1000 random triples some 200 are free of outliers when 40 % of the pairs are wrong."""
+REFINED = 10
+"""Of these the best are refined, as Rousseeuw & Van Driessen do."""
 OF_PAIRS, OF_SETS = 0.001, 0.05
 """Largest share of good pairs to lose (Baarda 1968), and of sets that lose one (Pope 1976)."""
 MEDIAN_EFFICIENCY = 0.53
@@ -73,16 +77,16 @@ def least_trimmed_squares(centres: Floats, tcps: Floats) -> Mask:
     n = len(centres)
     h = (n + 3) // 2
     triples = _triples(n)
-    rotations, shifts = _fit_triples(centres[triples], tcps[triples])
-    errors = centres @ rotations.transpose(0, 2, 1) + shifts[:, None] - tcps
-    squares = np.sort(np.einsum("tni,tni->tn", errors, errors), axis=1)[:, :h].sum(axis=1)
-    refined = [
-        _concentrate(centres, tcps, (rotations[k], shifts[k]), h)
-        for k in np.argsort(squares, kind="stable")[:10]
-    ]
-    return min(refined, key=lambda half: half[1])[0]
+    motions = _fit_sets(centres[triples], tcps[triples])
+    squares = np.partition(_squares_of(centres, tcps, motions), h - 1, axis=1)[:, :h].sum(axis=1)
+    best = np.argsort(squares, kind="stable")[:REFINED]
+    halves, least = _concentrate(centres, tcps, (motions[0][best], motions[1][best]), h)
+    kept = np.zeros(n, dtype=bool)
+    kept[halves[np.argmin(least)]] = True
+    return kept
 
 
+@cache
 def _triples(n: int) -> NDArray[np.intp]:
     if n * (n - 1) * (n - 2) // 6 <= MOST_TRIPLES:
         return np.array(list(combinations(range(n), 3)))
@@ -90,33 +94,42 @@ def _triples(n: int) -> NDArray[np.intp]:
     return np.argpartition(order, 3, axis=1)[:, :3]
 
 
-def _fit_triples(centres: Floats, tcps: Floats) -> tuple[Floats, Floats]:
-    """Return R (T, 3, 3) and t (T, 3) of T rigid fits to (T, 3, 3) triples; see ``kabsch``."""
+def _fit_sets(centres: Floats, tcps: Floats) -> Motions:
+    """Return R (T, 3, 3) and t (T, 3) of T rigid fits to sets of (T, k, 3); see ``kabsch``."""
     mean_c, mean_b = centres.mean(axis=1), tcps.mean(axis=1)
-    cross = np.einsum("tki,tkj->tij", tcps - mean_b[:, None], centres - mean_c[:, None])
+    cross = (tcps - mean_b[:, None]).transpose(0, 2, 1) @ (centres - mean_c[:, None])
     u, _, vt = np.linalg.svd(cross)
     u[:, :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[:, None]
     rotations = u @ vt
-    return rotations, mean_b - np.einsum("tij,tj->ti", rotations, mean_c)
+    return rotations, mean_b - (rotations @ mean_c[:, :, None])[:, :, 0]
+
+
+def _squares_of(centres: Floats, tcps: Floats, motions: Motions) -> Floats:
+    """Return the (T, N) squared residuals of N pairs under T motions."""
+    rotations, shifts = motions
+    errors = centres @ rotations.transpose(0, 2, 1) + (shifts[:, None] - tcps)
+    return np.asarray((errors**2).sum(axis=2))
 
 
 def _concentrate(
-    centres: Floats, tcps: Floats, motion: tuple[Floats, Floats], h: int
-) -> tuple[Mask, float]:
-    """Refit to the ``h`` pairs with the smallest residuals for as long as these get smaller.
+    centres: Floats, tcps: Floats, motions: Motions, h: int
+) -> tuple[NDArray[np.intp], Floats]:
+    """Refit each motion to the ``h`` pairs it leaves least of, for as long as that gets smaller.
 
-    Exact pairs have residuals of rounding alone, which never settle on one half.
+    Exact pairs have residuals of rounding alone, which never settle on one half. Returns the
+    (T, h) halves and the (T,) squared sums they came to.
     """
-    kept, least = np.zeros(len(centres), dtype=bool), np.inf
+    halves = np.zeros((len(motions[0]), h), dtype=np.intp)
+    least = np.full(len(halves), np.inf)
     while True:
-        squares = _squares(centres, tcps, motion)
-        now = np.zeros_like(kept)
-        now[np.argsort(squares, kind="stable")[:h]] = True
-        total = float(squares[now].sum())
-        if total >= least:
-            return kept, least
-        kept, least = now, total
-        motion = kabsch(centres[kept], tcps[kept])
+        squares = _squares_of(centres, tcps, motions)
+        now = np.argsort(squares, axis=1, kind="stable")[:, :h]
+        totals = np.take_along_axis(squares, now, axis=1).sum(axis=1)
+        smaller = totals < least
+        if not smaller.any():
+            return halves, least
+        halves[smaller], least[smaller] = now[smaller], totals[smaller]
+        motions = _fit_sets(centres[halves], tcps[halves])
 
 
 def _noise(centres: Floats, tcps: Floats, kept: Mask) -> float:
