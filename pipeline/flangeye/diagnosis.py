@@ -1,15 +1,15 @@
 """What a ``check`` part takes and gives: a session as arrays, and findings about it.
 
 A check is a part ``check.<name>``, a function of a :class:`Session` (and its own parameters) that
-returns the :class:`Finding` s it can defend. ``flangeye doctor`` runs every check that is
-installed, believes the finding that explains most, mends the session as that finding says, and
-looks again.
+returns the :class:`Finding` s it can defend, or raises :class:`NotApplicable`. ``flangeye doctor``
+runs every check that is installed, believes the finding that explains most, mends the session as
+that finding says, and looks again.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -22,8 +22,18 @@ Mask = NDArray[np.bool_]
 Reader = str | Mapping[str, Any]
 """A reader as a recipe writes it: its name, or its name and parameters."""
 
+Arms = Literal["both", "first", "second"]
+"""Whose poses: where there is one arm, ``both`` is that one."""
+
+FEWEST = 4
+"""Samples below which every explanation fits."""
+
 CERTAIN = float("inf")
 """Gain of a finding that needs no statistics, such as a pose that is exactly the identity."""
+
+
+class NotApplicable(Exception):
+    """What a check looks for cannot show in this session, and why not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +49,10 @@ class Session:
         places: (N, 3) that centre in the target's own frame [m]; NaN where it is not known where
             the target is.
         times: (N,) when each was taken [s]; NaN where unknown.
-        carried: What the arm moves: the target, or the camera.
+        carried: What the arm moves: the target, or the camera; ``both`` where it moves the camera
+            and a second arm the target.
+        links: (N, 4, 4) base_T_link of the link that carries the camera [m]; None where none does.
+        seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
         place: (4, 4) of the target in the flange or base that has it, where that is known [m].
         reach: Nearest and farthest distance that the scanner sees [m].
         reader: The archive's reader, as the recipe writes it.
@@ -55,7 +68,9 @@ class Session:
     rotations: Floats
     places: Floats
     times: Floats
-    carried: Literal["target", "camera"] = "target"
+    carried: Literal["target", "camera", "both"] = "target"
+    links: Floats | None = None
+    seconds: Floats | None = None
     place: Floats = field(default_factory=lambda: np.eye(4))
     reach: tuple[float, float] = (0.05, 5.0)
     reader: Reader = "auto"
@@ -71,6 +86,35 @@ class Session:
         """(N,) where something was found."""
         return np.asarray(np.isfinite(self.centres[:, 0]))
 
+    @property
+    def arms(self) -> tuple[Arms, ...]:
+        """Whose poses may share a mistake, the likeliest first."""
+        return ("both",) if self.seconds is None else ("both", "first", "second")
+
+    @property
+    def uses_poses(self) -> bool:
+        """Whether flanges' poses matter: not to a camera on a link before a target in the base."""
+        return self.links is None or self.carried == "target"
+
+    def require_samples(self) -> None:
+        """Go on only with samples enough to tell anything from.
+
+        Raises:
+            NotApplicable: There are too few with a target in them.
+        """
+        if (seen := int(self.seen.sum())) < FEWEST:
+            raise NotApplicable(f"{seen} samples with a target in them, {FEWEST} are needed")
+
+    def require_poses(self) -> None:
+        """Go on only where a mistake in the flanges' poses would show.
+
+        Raises:
+            NotApplicable: There are too few samples, or all poses follow from joint angles.
+        """
+        self.require_samples()
+        if not self.uses_poses:
+            raise NotApplicable("the camera's link is where the joint angles say")
+
     def where(self, mask: Mask) -> Session:
         """Return the samples of a mask."""
         return replace(
@@ -82,6 +126,8 @@ class Session:
             rotations=self.rotations[mask],
             places=self.places[mask],
             times=self.times[mask],
+            links=None if self.links is None else self.links[mask],
+            seconds=None if self.seconds is None else self.seconds[mask],
         )
 
     def without(self, mask: Mask) -> Session:
@@ -94,10 +140,24 @@ class Session:
         """Return the session as the acquire step gives it with other parameters."""
         return replace(self, changes={**self.changes, **changes})
 
-    def corrected(self, poses: Floats, **correction: Any) -> Session:
-        """Return the session with other poses (N, 4, 4), as ``reader.corrected`` reads them."""
-        reader = {"corrected": {"reader": self.reader, **correction}}
-        return replace(self, poses=poses, reader=reader)
+    def read_with(self, **correction: Any) -> Session:
+        """Return the session as ``reader.corrected`` with a correction would give it."""
+        stated = {name: value for name, value in correction.items() if (name, value) != _DEFAULT}
+        return replace(self, reader={"corrected": {"reader": self.reader, **stated}})
+
+    def corrected(self, change: Change, arms: Arms = "both", **correction: Any) -> Session:
+        """Return the session with changed poses, as ``reader.corrected`` reads them.
+
+        Args:
+            change: Gives an arm's poses (N, 4, 4) as they should be.
+            arms: Whose.
+            correction: What the reader is told.
+        """
+        poses = self.poses if arms == "second" else change(self.poses)
+        given = self.seconds
+        seconds = given if given is None or arms == "first" else change(given)
+        read = self.read_with(arms=arms, **correction)
+        return replace(read, poses=poses, seconds=seconds)
 
     def with_poses(self, poses: Floats) -> Session:
         """Return the session with other poses (N, 4, 4)."""
@@ -157,6 +217,10 @@ class Finding:
 
 
 Findings = Iterable[Finding]
+Change = Callable[[Floats], Floats]
+"""Gives poses (N, 4, 4) as they should be."""
+
+_DEFAULT = ("arms", "both")
 
 _NAME = re.compile(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*")
 _QUANTITY = re.compile(r"-?[\d.]+ [A-Za-z]+")

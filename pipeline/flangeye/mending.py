@@ -83,10 +83,22 @@ def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
         by: A sample's pose is the one recorded so many samples later.
         start: Index of the first sample that is shifted; those before keep their own.
     """
-    samples = np.arange(len(poses))
+    source, kept = sources(len(poses), by, start)
+    return poses[source], kept
+
+
+def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask]:
+    """Return (N,) from which sample each gets its pose, its own if from none, and which get one.
+
+    Args:
+        count: Samples there are.
+        by: A sample's pose is the one recorded so many samples later.
+        start: Index of the first sample that is shifted; those before keep their own.
+    """
+    samples = np.arange(count)
     source = np.where(samples < start, samples, samples + by)
-    kept = (source >= 0) & (source < len(poses)) & ((samples < start) | (source >= start))
-    return poses[np.where(kept, source, samples)], kept
+    kept = (source >= 0) & (source < count) & ((samples < start) | (source >= start))
+    return np.where(kept, source, samples), kept
 
 
 def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:

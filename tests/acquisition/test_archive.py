@@ -230,12 +230,13 @@ def test_a_distance_that_fits_neither_unit_is_refused(refused, archive):
     _scale(archive, "check", 20.0)
     assert re.fullmatch(
         re.escape(f"{archive}/check.pcd: median distance 15.")
-        + r"\d fits neither m nor mm: phoxi-s sees 0\.384 to 0\.520 m; state unit: m or unit: mm, "
+        + r"\d fits neither m nor mm: phoxi-s sees 0\.384 to 0\.520 m; state unit: in, which fits, "
         "or the right scanner",
         refused(),
     )
-    _scale(archive, "check", 30.0)
-    assert "unit m, but phoxi-s sees 0.384 to 0.520 m; and 0.0" in refused(unit="m")
+    assert refused(unit="m").endswith("these look like inches: set unit: in")
+    _scale(archive, "check", 2e4)
+    assert "unit m, but phoxi-s sees 0.384 to 0.520 m; and 15." in refused(unit="m")
     assert refused(unit="m").endswith("m with unit mm does not fit either; is it this scanner?")
 
 

@@ -227,7 +227,8 @@ def test_noise_that_is_not_stated_is_found():
     assert 0.4 < beyond < 0.65
 
 
-REGIONS = {6: 12.592, 12: 21.026, 18: 28.869}
+OF_95_PERCENT = 12.592
+"""Chi-square quantile of six degrees of freedom."""
 
 
 @pytest.mark.slow
@@ -236,16 +237,17 @@ REGIONS = {6: 12.592, 12: 21.026, 18: 28.869}
     ("name", "feature"),
     [
         ("eye-in-hand, marker", "pose"), ("eye-on-base, flange", "normal"),
-        ("two arms, flange", "centre"), ("two arms, marker", "pose"),
+        ("eye-on-arm 1, marker", "pose"), ("two arms, flange", "centre"),
+        ("two arms, marker", "pose"),
     ],
 )  # fmt: skip
 def test_a_95_percent_region_holds_its_share(name, feature, stated):
+    """A share of 95 % varies by 0.6 % in 1,350 draws: nothing is added to 93 to 97 % for them."""
     rng, inside = np.random.default_rng(16), []
-    for _ in range(400):
+    params = STATED if stated else MaximumLikelihoodParams()
+    for _ in range(1350):
         made = session(CONFIGURATIONS[name], rng, feature=feature)
-        params = STATED if stated else MaximumLikelihoodParams()
         found = solve_maximum_likelihood(made.stream(), params, made.configuration, ROBOT).camera
         error = errors(found, made.truth[found.transform.name])
-        inside.append(error @ np.linalg.solve(found.covariance, error) < REGIONS[6])
-    # Three standard deviations of 400 draws beside the 93 to 97 % that are wanted.
-    assert 0.93 - 0.01 < np.mean(inside) < 0.985
+        inside.append(error @ np.linalg.solve(found.covariance, error) < OF_95_PERCENT)
+    assert 0.93 <= np.mean(inside) <= 0.97

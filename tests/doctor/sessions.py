@@ -11,16 +11,20 @@ KINDS = ("flange", "centres", "marker", "point")
 """Circles with normals; ready-made centres; markers at an unknown place; points at one."""
 
 
+CARRIED = ("target", "camera", "arm-1", "arm-2", "both")
+"""What the arm carries; eye-on-arm, case 1 and 2; two arms."""
+
+
 def clean(rng, n=20, kind="flange", carried="target", noise=0.1e-3, turn=0.3, box=(0.3, 0.3, 0.2)):
     """Return a session without a mistake."""
     poses = np.array([_pose(rng, turn, box) for _ in range(n)])
-    mounts = poses if carried == "target" else np.linalg.inv(poses)
     known = kind in ("flange", "centres")
     target = (
         np.eye(4) if known else rigid(rotation_exp(rng.normal(0, 0.5, 3)), rng.normal(0, 0.06, 3))
     )
     camera = _camera(rng, carried)
-    seen = np.linalg.inv(camera) @ mounts @ target
+    carriers, mounts, arms = _carriers(rng, carried, poses, lambda: _pose(rng, turn, box))
+    seen = np.linalg.inv(carriers @ camera) @ mounts @ target
     turned = np.array([m[:3, :3] @ rotation_exp(rng.normal(0, 1e-3, 3)) for m in seen])
     nothing = np.full((n, 3), np.nan)
     return Session(
@@ -31,8 +35,23 @@ def clean(rng, n=20, kind="flange", carried="target", noise=0.1e-3, turn=0.3, bo
         rotations=turned if kind == "marker" else np.full((n, 3, 3), np.nan),
         places=np.zeros((n, 3)) if known else nothing,
         times=np.arange(n) * 5.0,
-        carried=carried,
+        carried={"arm-1": "target", "arm-2": "camera"}.get(carried, carried),
+        **arms,
     )  # fmt: skip
+
+
+def _carriers(rng, carried, poses, drawn):
+    """Return what carries the camera and the target, and what else is reported of the arms."""
+    eye = np.tile(np.eye(4), (len(poses), 1, 1))
+    others = np.array([drawn() for _ in poses]) if carried in ("arm-1", "arm-2", "both") else None
+    if carried == "both":
+        base = rigid(rotation_exp(np.array([0.0, 0.1, 2.0])), np.array([1.2, 0.3, 0.0]))
+        return poses, base @ others, {"seconds": others}
+    if carried == "arm-1":
+        return others, poses, {"links": others}
+    if carried == "arm-2":
+        return others, eye, {"links": others}
+    return (eye, poses, {}) if carried == "target" else (poses, eye, {})
 
 
 def in_motion(rng, n=40, **changes):
@@ -69,6 +88,6 @@ def _pose(rng, turn, box):
 
 
 def _camera(rng, carried):
-    if carried == "camera":
+    if carried != "target":
         return rigid(rotation_exp(rng.normal(0, 0.5, 3)), np.array([0.05, -0.03, 0.1]))
     return rigid(rotation_from_rpy(np.pi, 0.1, rng.uniform(-3, 3)), np.array([0.6, -0.1, 1.0]))

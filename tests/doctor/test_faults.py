@@ -291,7 +291,9 @@ def test_no_false_alarm_in_two_hundred_clean_sessions():
 
 
 def test_too_few_samples_are_refused():
-    with pytest.raises(Exception, match="3 samples with a target in them; at least 4 are needed"):
+    with pytest.raises(
+        Exception, match="3 of 3 samples have a target in them; at least 4 are needed"
+    ):
         examine(session_of(n=3), CHECKS)
 
 

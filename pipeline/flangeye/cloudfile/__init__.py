@@ -32,8 +32,8 @@ __all__ = [
     "write_cloud",
 ]
 
-LengthUnit = Literal["m", "mm"]
-PER_METRE: Mapping[LengthUnit, int] = {"m": 1, "mm": 1000}
+LengthUnit = Literal["m", "mm", "in"]
+PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
 """How many of a unit are in a metre."""
 
 _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {

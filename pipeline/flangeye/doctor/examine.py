@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from flangeye.diagnosis import Finding, Session
+from flangeye.diagnosis import FEWEST, Finding, NotApplicable, Session
 from flangeye.errors import StageError
 from flangeye.stage import Chosen, Part
 
@@ -13,8 +13,6 @@ FALSE_ALARM = 1e-3
 """Probability of any finding at all about a session without a mistake."""
 MOST_MISTAKES = 8
 """One session has no more; a guard against checks that undo each other."""
-FEWEST = 4
-"""Samples below which every explanation fits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +24,14 @@ class Diagnosis:
         findings: In the order they were found, each with those before it mended.
         notes: What is no mistake, but worth knowing.
         checks: Names of the checks.
+        idle: Those that do not apply to this session, by name, and why.
     """
 
     session: Session
     findings: tuple[Finding, ...]
     notes: tuple[Finding, ...]
     checks: tuple[str, ...]
+    idle: Mapping[str, str]
 
 
 def examine(session: Session, checks: Iterable[Part]) -> Diagnosis:
@@ -44,33 +44,39 @@ def examine(session: Session, checks: Iterable[Part]) -> Diagnosis:
         StageError: There are too few samples to tell anything.
     """
     bound = [check.bind() for check in checks]
-    found = list(session.remarks)
-    current = session
-    while True:
-        offered = list(_offered(current, bound))
-        mendable = [f for f in offered if f.mended is not None and not f.note]
-        if not mendable or len(found) == MOST_MISTAKES:
-            break
+    found, current = list(session.remarks), session
+    _require_enough(session)
+    offered, idle = _offered(current, bound)
+    while mendable := [f for f in offered if f.mended is not None and not f.note]:
         found.append(max(mendable, key=lambda finding: finding.gain))
         current = found[-1].mended or current
+        offered = []
+        if len(found) == MOST_MISTAKES or current.seen.sum() < FEWEST:
+            break
+        offered, _ = _offered(current, bound)
     found += [f for f in offered if f.mended is None and not f.note]
     notes = tuple(f for f in offered if f.note)
-    return Diagnosis(session, tuple(found), notes, tuple(check.part.name for check in bound))
+    return Diagnosis(session, tuple(found), notes, tuple(check.part.name for check in bound), idle)
 
 
-def _offered(session: Session, checks: Sequence[Chosen]) -> Iterator[Finding]:
-    """Give the findings that hold against the number of checks."""
-    _require_enough(session)
+def _offered(session: Session, checks: Sequence[Chosen]) -> tuple[list[Finding], dict[str, str]]:
+    """Return the findings that hold against the number of checks, and which do not apply."""
+    found: list[Finding] = []
+    idle: dict[str, str] = {}
     for check in checks:
-        for finding in check(session):
-            if finding.probability * len(checks) < FALSE_ALARM:
-                yield finding
+        try:
+            findings = list(check(session))
+        except NotApplicable as why:
+            idle[check.part.name] = str(why)
+            continue
+        found += [f for f in findings if f.probability * len(checks) < FALSE_ALARM]
+    return found, idle
 
 
 def _require_enough(session: Session) -> None:
     seen = int(session.seen.sum())
     if seen < FEWEST:
         raise StageError(
-            f"{seen} samples with a target in them; at least {FEWEST} are needed to tell a "
-            "mistake from noise"
+            f"{seen} of {len(session)} samples have a target in them; at least {FEWEST} are needed "
+            "to tell a mistake from noise"
         )

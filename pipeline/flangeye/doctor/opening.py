@@ -1,8 +1,6 @@
 """From an archive, and the recipe that would run on it, to the arrays that checks look at.
 
-The reader's poses are taken as they are, whatever is wrong with them. What is seen in the scans
-does not depend on them, so the recipe's own steps find it with stand-in poses that no step can
-object to.
+The reader's poses are taken as they are, whatever is wrong with them.
 """
 
 from __future__ import annotations
@@ -10,26 +8,24 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from flangeye import types as t
 from flangeye.archive import Archive, Recording, check_ids
-from flangeye.catalogue import ScannerModel
+from flangeye.catalogue import RobotModel, ScannerModel
 from flangeye.configuration import DEFAULT, Configuration
 from flangeye.diagnosis import Finding, Floats, Reader, Session
+from flangeye.doctor.carrying import State, in_configuration
+from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
-from flangeye.geometry import rigid
+from flangeye.kinematics import Arm
 from flangeye.recipe import Recipe, parse_recipe
 from flangeye.registry import Registry
 from flangeye.runlog import read_run
-from flangeye.runner import Runner
-from flangeye.stage import Chosen, Params, Part
+from flangeye.stage import Chosen, Params
 from flangeye.steps import Step
-
-APART = 0.01
-"""Between two stand-in poses [m]."""
 
 
 def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> Session:
@@ -64,7 +60,16 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> Session:
     poses = {meta["id"]: np.array(meta["base_T_flange"]["matrix"]) for meta in calibration}
     times = {meta["id"]: int(meta["time_ns"]) for meta in calibration}
     session = _session({**given, **poses}, found, times)
-    return session if recipe is None else _as_recipe(session, recipe)
+    states = {meta["id"]: _state_of(meta) for meta in calibration}
+    return session if recipe is None else _as_recipe(session, recipe, states)
+
+
+def _state_of(meta: Mapping[str, Any]) -> State:
+    joints, second = meta["joints"], meta.get("base2_T_flange2")
+    return State(
+        None if joints is None else np.array(joints),
+        None if second is None else np.array(second["matrix"]),
+    )
 
 
 def _of_centres(path: Path, registry: Registry) -> Session:
@@ -87,55 +92,22 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> Session:
         )
     archive: Archive = reader(path)
     check_ids(archive)
-    found, refused = _found(archive, first, recipe, registry)
-    session = _as_recipe(_of_archive(_kept(archive, first), found), recipe)
-    return session if refused is None else _in_other_unit(session, refused)
+    found, remark = found_in(archive, first, recipe, registry)
+    kept = _kept(archive, first)
+    states = {r.id: State(r.joints, r.base2_T_flange2) for r in kept.recordings}
+    session = _as_recipe(_of_archive(kept, found), recipe, states)
+    return session if remark is None else _in_other_unit(session, *remark)
 
 
-def _in_other_unit(session: Session, refused: StageError) -> Session:
-    """Return the session with the remark that the stated unit of the clouds was refused."""
-    mended = session.with_changes(unit="auto")
-    remark = Finding("unit", str(refused), mended.step())
-    return replace(mended, remarks=(remark,))
+def _in_other_unit(session: Session, unit: str, why: str) -> Session:
+    """Return the session with the remark that the clouds are in another unit than was said."""
+    mended = session.with_changes(unit=unit)
+    return replace(mended, remarks=(Finding("unit", why, mended.step()),))
 
 
 def _kept(archive: Archive, first: Step) -> Archive:
     left_out = getattr(first.params, "leave_out", ())
     return replace(archive, recordings=[r for r in archive.recordings if r.id not in left_out])
-
-
-def _found(
-    archive: Archive, first: Step, recipe: Recipe, registry: Registry
-) -> tuple[dict[str, t.Feature], StageError | None]:
-    """Return what the recipe's steps find in the scans, and why not in the unit that it states."""
-    try:
-        return _found_by(archive, first, recipe, registry), None
-    except StageError as error:
-        if first.params is None or getattr(first.params, "unit", "auto") == "auto":
-            raise
-        any_unit = replace(first, params=first.params.model_copy(update={"unit": "auto"}))
-        return _found_by(archive, any_unit, recipe, registry), error
-
-
-def _found_by(
-    archive: Archive, first: Step, recipe: Recipe, registry: Registry
-) -> dict[str, t.Feature]:
-    """Return what the recipe's own steps find in the archive's scans, by id."""
-    stand_in = Chosen(
-        Part("reader.stand_in", lambda _: _with_stand_in_poses(archive), None, {}, (Archive,)), None
-    )
-    params = first.params.model_copy(update={"reader": stand_in}) if first.params else None
-    steps = (replace(first, params=params), *recipe.steps[1:])
-    runner = Runner(replace(recipe, steps=steps), registry, t.ArchivePath(archive.root))
-    return {o.id: o.feature for o in runner.observe()}
-
-
-def _with_stand_in_poses(archive: Archive) -> Archive:
-    recordings = [
-        replace(recording, base_T_flange=rigid(np.eye(3), np.array([APART * (i % 1000), 0.0, 0.5])))
-        for i, recording in enumerate(archive.recordings)
-    ]
-    return replace(archive, recordings=recordings)
 
 
 def _ready_made(archive: Archive) -> dict[str, t.Feature]:
@@ -193,39 +165,17 @@ def _rotations(features: Iterable[t.Feature | None]) -> Floats:
     ).reshape(-1, 3, 3)
 
 
-def _in_configuration(session: Session, configuration: Configuration) -> Session:
-    """Add who carries what, and where the target is in what carries it.
-
-    Raises:
-        StageError: More than one arm, or a link, carries something.
-    """
-    carried: dict[str, Literal["target", "camera"]] = {
-        "eye-on-base": "target", "eye-in-hand": "camera",
-    }  # fmt: skip
-    if configuration.name not in carried:
-        raise StageError(
-            f"the doctor knows {' and '.join(carried)}, not {configuration.name}; give it the "
-            "recording of one arm as one of these"
-        )
-    known = configuration.place
-    places = session.places if known is not None else np.full_like(session.places, np.nan)
-    return replace(
-        session,
-        carried=carried[configuration.name],
-        place=np.eye(4) if known is None else known,
-        places=places,
-    )
-
-
-def _as_recipe(session: Session, recipe: Recipe) -> Session:
+def _as_recipe(session: Session, recipe: Recipe, states: Mapping[str, State]) -> Session:
     """Add what the recipe says of the cell and of how the archive is read."""
     first = recipe.steps[0]
     scanner: ScannerModel | None = recipe.context.get(ScannerModel)
+    robot: RobotModel | None = recipe.context.get(RobotModel)
     reach = session.reach if scanner is None else (scanner.near, scanner.far)
     reader = _written(getattr(first.params, "reader", None))
     configuration: Configuration = recipe.context.get(Configuration) or DEFAULT
+    arm = Arm(robot) if robot else None
     return replace(
-        _in_configuration(session, configuration),
+        in_configuration(session, configuration, arm, states),
         reach=reach,
         reader=reader,
         acquire=first.stage.name,

@@ -17,7 +17,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     """Return what was found, a few lines for each finding."""
     session = diagnosis.session
     head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
-    lines = [f"{head}; {len(diagnosis.checks)} checks"]
+    lines = [f"{head}; {len(diagnosis.checks)} checks", *_idle(diagnosis)]
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
     for note in diagnosis.notes:
@@ -25,6 +25,14 @@ def as_text(diagnosis: Diagnosis) -> str:
     if not diagnosis.findings:
         lines += ["", "nothing found"]
     return "\n".join(lines)
+
+
+def _idle(diagnosis: Diagnosis) -> list[str]:
+    """Return a line for each reason why checks do not apply, with their names."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in diagnosis.idle.items():
+        reasons.setdefault(why, []).append(name.partition(".")[2])
+    return [f"not applicable: {', '.join(names)} ({why})" for why, names in reasons.items()]
 
 
 def _details(finding: Finding) -> list[str]:
@@ -45,6 +53,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "samples": len(diagnosis.session),
         "seen": int(diagnosis.session.seen.sum()),
         "checks": list(diagnosis.checks),
+        "not_applicable": dict(diagnosis.idle),
         "findings": [_plain(finding) for finding in diagnosis.findings],
         "notes": [_plain(note) for note in diagnosis.notes],
     }

@@ -40,7 +40,7 @@ from flangeye_plugins.readers.cloudunit import (
     unit_note,
 )
 
-StatedUnit = Literal["auto", "m", "mm"]
+StatedUnit = Literal["auto", "m", "mm", "in"]
 
 
 class ArchiveParams(OpeningParams):
@@ -48,8 +48,8 @@ class ArchiveParams(OpeningParams):
 
     unit: StatedUnit = Field(
         "auto",
-        description="Unit of the clouds. auto: what the layout says, else what fits the scanner's "
-        "range; either is reported.",
+        description="Unit of the clouds. auto: what the layout says, else metres or millimetres, "
+        "whichever fits the scanner's range; either is reported.",
     )
     unreadable: Literal["refuse", "reject"] = Field(
         "refuse",

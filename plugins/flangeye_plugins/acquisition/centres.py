@@ -15,8 +15,8 @@ from flangeye.units import Length, param
 from flangeye_plugins.acquisition.opening import (
     OpeningParams,
     archive_path,
-    base_T_flange,
     log_source,
+    observation_of,
     open_archive,
     skipped_note,
 )
@@ -87,7 +87,7 @@ def _observations(
     for recording in usable:
         if recording.centre_in_camera is not None:
             circle = _circle(recording.centre_in_camera, noise, behind)
-            yield Observation(recording.id, circle, base_T_flange(recording), recording.joints)
+            yield observation_of(recording, circle)
 
 
 def _circle(centre: Floats, noise: float, behind: float) -> CircleFeature:

@@ -12,7 +12,15 @@ from pydantic import Field
 from flangeye import Choose, Chosen, Params, RecipePath, StageError
 from flangeye.archive import Archive, Recording, check_ids, check_poses, digests_of, fingerprint_of
 from flangeye.runlog import RunLog
-from flangeye.types import BASE2, FLANGE2, ArchivePath, Source, Transform
+from flangeye.types import (
+    BASE2,
+    FLANGE2,
+    ArchivePath,
+    Feature,
+    Observation,
+    Source,
+    Transform,
+)
 from flangeye.units import param
 from flangeye_plugins.readers.scans import with_companion
 
@@ -90,6 +98,17 @@ def second_arm(recording: Recording) -> Transform | None:
     """Return the second arm's pose, if the archive has one, as the value stages see."""
     pose = recording.base2_T_flange2
     return None if pose is None else Transform(BASE2, FLANGE2, pose)
+
+
+def observation_of(recording: Recording, feature: Feature) -> Observation:
+    """Return a ready-made feature with all that the recording says of the arms."""
+    return Observation(
+        recording.id,
+        feature,
+        base_T_flange(recording),
+        recording.joints,
+        second_arm(recording),
+    )
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording]) -> Source:

@@ -22,7 +22,7 @@ from flangeye.units import Angle, Length, param
 from flangeye_plugins.acquisition.opening import (
     OpeningParams,
     archive_path,
-    base_T_flange,
+    observation_of,
     open_archive,
     skipped_note,
 )
@@ -68,4 +68,4 @@ def _observations(usable: Sequence[Recording], params: SamplesParams) -> Iterato
         if recording.camera_T_target is not None:
             seen = Transform(CAMERA, TARGET, recording.camera_T_target)
             feature = PoseFeature(seen, covariance)
-            yield Observation(recording.id, feature, base_T_flange(recording), recording.joints)
+            yield observation_of(recording, feature)

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flangeye.diagnosis import Session
-from flangeye_plugins.doctoring.equations import Equations, equations_of, mounts_of
+from flangeye.diagnosis import Arms, Session
+from flangeye_plugins.doctoring.equations import equations_of
 from flangeye_plugins.doctoring.fitting import Fit, fit
-
-Floats = NDArray[np.float64]
 
 
 @lru_cache(maxsize=2)
@@ -20,6 +15,8 @@ def fit_of(session: Session) -> Fit:
     return fit(equations_of(session))
 
 
-def variants(session: Session, poses: Floats) -> Equations:
-    """Return the session with other robot poses (K, N, 4, 4)."""
-    return equations_of(session).with_mounts(mounts_of(session, poses))
+def named(arms: Arms, session: Session) -> str:
+    """Return whose poses, as messages call them."""
+    if session.seconds is None:
+        return "the robot's"
+    return {"both": "both arms'", "first": "the first arm's", "second": "the second arm's"}[arms]

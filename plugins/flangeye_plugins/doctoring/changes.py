@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.diagnosis import Finding, Findings, Floats, Session
+from flangeye.diagnosis import Finding, Findings, Floats, NotApplicable, Session
 from flangeye.mending import without_tool
 from flangeye_plugins.doctoring.asis import fit_of
 from flangeye_plugins.doctoring.equations import equations_of
 from flangeye_plugins.doctoring.fitting import Fit, fit
 from flangeye_plugins.doctoring.significance import Evidence, best_of, exceedance
 
-FEWEST = 4
-"""Samples on each side of a move."""
+SPARE = 2
+"""Samples on each side of a move beyond those that a calibration takes up."""
 OFFSET = 1e-3
 """A seen circle further than this from where the arm has it is a mistake [m]."""
 
@@ -23,11 +23,13 @@ OFFSET = 1e-3
 @part("check.moved")
 def moved(session: Session) -> Findings:
     """The camera or the target was moved part way through."""
-    seen = np.flatnonzero(session.seen)
-    starts = seen[FEWEST : len(seen) - FEWEST + 1]
-    if not len(starts):
-        return
+    session.require_samples()
     null = fit_of(session)
+    seen = np.flatnonzero(session.seen)
+    each = SPARE + int(np.ceil(null.parameters * len(seen) / null.count[0]))
+    starts = seen[each : len(seen) - each + 1]
+    if not len(starts):
+        raise NotApplicable(f"{len(seen)} samples are too few for two calibrations")
     after = np.arange(len(session)) >= starts[:, None]
     equations = equations_of(session)
     halves = fit(equations.without(after)), fit(equations.without(~after))
@@ -67,12 +69,10 @@ def _moved_finding(session: Session, evidence: Evidence, start: int) -> Finding:
 @part("check.tool")
 def tool(session: Session) -> Findings:
     """The poses are those of a tool: what is seen is off by a constant in the flange's frame."""
-    if not np.isfinite(session.places).all() or session.carried == "camera":
-        return
+    _require_known_place(session)
     null = fit_of(session)
-    free = replace(equations_of(session), places=np.full_like(session.places[None], np.nan))
-    found = fit(free)
-    offset = found.unknowns.place[0, 0] - session.places[0]
+    found = fit(equations_of(session).with_free_place())
+    offset = session.place[:3, :3] @ (found.unknowns.place[0, 0] - session.places[0])
     length = float(np.linalg.norm(offset))
     evidence = best_of(null, found, 3)
     freedom = float(null.count[0]) - found.parameters
@@ -85,9 +85,26 @@ def tool(session: Session) -> Findings:
         f"the seen target is {length * 1e3:.1f} mm from where the arm carries it, constantly: "
         "the poses are probably those of a tool set in the controller"
     )
-    mended = session.corrected(without_tool(session.poses, -offset), target_offset=listed)
+    mended = session.corrected(
+        lambda poses: without_tool(poses, -offset),
+        "both" if session.seconds is None else "second",
+        target_offset=listed,
+    )
     yield Finding("tool offset", what, mended.step(), (), evidence.before, evidence.after, p,
                   evidence.gain, mended)  # fmt: skip
+
+
+def _require_known_place(session: Session) -> None:
+    """Go on only where it is known where the arm has the target.
+
+    Raises:
+        NotApplicable: It is not, or no arm has it.
+    """
+    session.require_samples()
+    if session.carried == "camera":
+        raise NotApplicable("a constant offset of what carries the camera is part of the answer")
+    if not np.isfinite(session.places).all():
+        raise NotApplicable("the target's place on the arm is not known, an offset is part of it")
 
 
 def _known(found: Fit, offset: Floats) -> bool:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
+from collections.abc import Iterator, Mapping
 
 from flangeye import part
 from flangeye.conventions import CONVENTIONS, EULER_ORDERS
-from flangeye.diagnosis import Finding, Findings, Session
+from flangeye.diagnosis import Arms, Change, Finding, Findings, Floats, Session
 from flangeye.mending import inverted, reread, transposed
-from flangeye_plugins.doctoring.asis import fit_of, variants
+from flangeye_plugins.doctoring.asis import fit_of, named
+from flangeye_plugins.doctoring.equations import equations_of
 from flangeye_plugins.doctoring.fitting import fit
 from flangeye_plugins.doctoring.significance import best_of
 
@@ -29,14 +28,23 @@ NAMES = {
 @part("check.convention")
 def convention(session: Session) -> Findings:
     """The rotations fit far better when their numbers are read in another convention."""
-    pairs = list(_readings(session))
-    poses = np.stack([reread(session.poses, *pair) for pair in pairs])
-    evidence = best_of(fit_of(session), fit(variants(session, poses)))
+    session.require_poses()
+    tried = [(arms, *pair) for arms in session.arms for pair in _readings(session)]
+    others = [_reread(session, *each) for each in tried]
+    evidence = best_of(fit_of(session), fit(equations_of(*others)))
     if evidence.probability < 1:
-        read_as, written_as = pairs[evidence.which]
-        what = f"the rotations were read as {_name(read_as)}, and fit as {_name(written_as)}"
-        mended = session.corrected(poses[evidence.which], read_as=read_as, written_as=written_as)
+        arms, read_as, written_as = tried[evidence.which]
+        whose = "the" if session.seconds is None else named(arms, session)
+        what = f"{whose} rotations were read as {_name(read_as)}, and fit as {_name(written_as)}"
+        mended = others[evidence.which]
         yield Finding("pose convention", what, mended.step(), (), *evidence[1:], mended)
+
+
+def _reread(session: Session, arms: Arms, read_as: str, written_as: str) -> Session:
+    def change(poses: Floats) -> Floats:
+        return reread(poses, read_as, written_as)
+
+    return session.corrected(change, arms, read_as=read_as, written_as=written_as)
 
 
 def _readings(session: Session) -> Iterator[tuple[str, str]]:
@@ -70,13 +78,26 @@ def _name(rotation: str) -> str:
 @part("check.direction")
 def direction(session: Session) -> Findings:
     """The poses are those of the base in the flange, not of the flange in the base."""
-    poses = np.stack([inverted(session.poses), transposed(session.poses)])
-    evidence = best_of(fit_of(session), fit(variants(session, poses)))
+    session.require_poses()
+    tried = [(arms, way) for arms in session.arms for way in _WAYS]
+    others = [session.corrected(_WAYS[way][0], arms, **{way: True}) for arms, way in tried]
+    evidence = best_of(fit_of(session), fit(equations_of(*others)))
     if evidence.probability == 1:
         return
-    what, correction = (
-        ("the poses are flange_T_base (or the camera is carried the other way round)", "inverted"),
-        ("the rotations are transposed: matrices were stored column by column", "transposed"),
-    )[evidence.which]
-    mended = session.corrected(poses[evidence.which], **{correction: True})
+    arms, way = tried[evidence.which]
+    whose = "the" if session.seconds is None else named(arms, session)
+    what = f"{whose} {_WAYS[way][1]}"
+    mended = others[evidence.which]
     yield Finding("pose direction", what, mended.step(), (), *evidence[1:], mended)
+
+
+_WAYS: Mapping[str, tuple[Change, str]] = {
+    "inverted": (
+        inverted,
+        "poses are flange_T_base (or the camera is carried the other way round)",
+    ),
+    "transposed": (
+        transposed,
+        "rotations are transposed: matrices were stored column by column",
+    ),
+}

@@ -8,6 +8,7 @@ expectation-maximisation (Lange, Little & Taylor 1989), a Gauss-Newton step each
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -47,7 +48,7 @@ class Fit:
     """The best calibration of each of K variants.
 
     Attributes:
-        likelihood: (K,) logarithm.
+        likelihood: (K,) logarithm; minus infinity where no fit was found.
         residuals: (K, N, 3) of each kind of error, the centres' first [m, rad]; NaN where nothing
             was seen. In the carrier.
         scales: (K, B) standard deviation of each kind of error per coordinate [m, rad].
@@ -93,8 +94,8 @@ def fit(equations: Equations) -> Fit:
 def _blocks(equations: Equations, unknowns: Unknowns) -> list[Block]:
     """Return every kind of error and how the parameters move it.
 
-    Parameters: rotation and position of the camera (left perturbation); then, where the target's
-    place is not known, its position, and its rotation if it has one.
+    Parameters: rotation and position of the camera (left perturbation); where the target's place
+    is not known, its position, and its rotation if it has one; the second arm's base, if any.
     """
     blocks = [_centre_block(equations, unknowns)]
     if equations.has_rotations:
@@ -106,7 +107,7 @@ def _blocks(equations: Equations, unknowns: Unknowns) -> list[Block]:
 
 def _centre_block(equations: Equations, unknowns: Unknowns) -> Block:
     turned = equations.centres @ unknowns.rotation.swapaxes(-1, -2)
-    mounts = equations.mounts
+    mounts = equations.carried(unknowns.other)
     expected = (mounts[..., :3, :3] @ unknowns.place[..., None])[..., 0] + mounts[..., :3, 3]
     residuals = turned + unknowns.position[:, None] - expected
     parts = [-hat(turned), np.broadcast_to(np.eye(3), (*turned.shape, 3))]
@@ -114,27 +115,45 @@ def _centre_block(equations: Equations, unknowns: Unknowns) -> Block:
         parts.append(-np.broadcast_to(mounts[..., :3, :3], (*turned.shape, 3)))
     if unknowns.free_turn:
         parts.append(np.zeros((*turned.shape, 3)))
-    return Block(residuals, np.concatenate(parts, axis=-1), 3, FINEST)
+    if equations.bases is not None:
+        turns = equations.bases[..., :3, :3]
+        arm = turns.swapaxes(-1, -2) @ (expected - equations.bases[..., :3, 3])[..., None]
+        lever = arm[..., 0] - unknowns.other[:, None, :3, 3]
+        parts += [turns @ hat(lever), -turns]
+    return _block(residuals, parts, 3, FINEST)
 
 
 def _rotation_block(equations: Equations, unknowns: Unknowns) -> Block:
-    turns = equations.mounts[..., :3, :3]
+    turns = equations.carried(unknowns.other)[..., :3, :3]
     expected = turns @ unknowns.turn[:, None]
     seen = unknowns.rotation[:, None] @ equations.rotations
     residuals = log_of(seen @ expected.swapaxes(-1, -2))
     eye = np.broadcast_to(np.eye(3), (*residuals.shape, 3))
     zero = np.zeros_like(eye)
     parts = [eye, zero, *([zero] if unknowns.free_place else [])]
-    parts += [-np.broadcast_to(turns, eye.shape)] if unknowns.free_turn else []
-    return Block(residuals, np.concatenate(parts, axis=-1), 3, FINEST_ANGLE)
+    parts += [-turns] if unknowns.free_turn else []
+    if equations.bases is not None:
+        parts += [-equations.bases[..., :3, :3], zero]
+    return _block(residuals, parts, 3, FINEST_ANGLE)
 
 
 def _normal_block(equations: Equations, unknowns: Unknowns) -> Block:
     turned = equations.normals @ unknowns.rotation.swapaxes(-1, -2)
-    residuals = turned - equations.mounts[..., :3, 2]
+    expected = equations.carried(unknowns.other)[..., :3, 2]
+    residuals = turned - expected
     zero = np.zeros((*turned.shape, 3))
     parts = [-hat(turned), zero, *([zero] if unknowns.free_place else [])]
-    return Block(residuals, np.concatenate(parts, axis=-1), 2, FINEST_ANGLE)
+    if equations.bases is not None:
+        turns = equations.bases[..., :3, :3]
+        lever = turns.swapaxes(-1, -2) @ expected[..., None]
+        parts += [turns @ hat(lever[..., 0]), zero]
+    return _block(residuals, parts, 2, FINEST_ANGLE)
+
+
+def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: float) -> Block:
+    """Return errors with what each group of parameters does to them."""
+    alike = [np.broadcast_to(part, (*residuals.shape, 3)) for part in parts]
+    return Block(residuals, np.concatenate(alike, axis=-1), dimension, finest)
 
 
 def _squares(block: Block) -> Floats:
@@ -189,9 +208,21 @@ def _moved(unknowns: Unknowns, step: Floats) -> Unknowns:
         place = place + step[:, None, 6:9]
     if unknowns.free_turn:
         turn = exp_of(step[:, 9:12]) @ turn
+    other = _moved_base(unknowns.other, step[:, -6:]) if unknowns.free_other else unknowns.other
     return unknowns._replace(
-        rotation=turned, position=unknowns.position + step[:, 3:6], place=place, turn=turn
+        rotation=turned,
+        position=unknowns.position + step[:, 3:6],
+        place=place,
+        turn=turn,
+        other=other,
     )
+
+
+def _moved_base(other: Floats, step: Floats) -> Floats:
+    out = np.array(np.broadcast_to(other, (len(step), 4, 4)))
+    out[:, :3, :3] = exp_of(step[:, :3]) @ out[:, :3, :3]
+    out[:, :3, 3] += step[:, 3:]
+    return out
 
 
 def _told(
@@ -205,7 +236,7 @@ def _told(
         likelihood = likelihood - d * seen * np.log(scale) - 0.5 * (TAILS + d) * tails
         count = count + d * seen
     return Fit(
-        likelihood,
+        np.nan_to_num(likelihood, nan=-np.inf),
         tuple(block.residuals for block in blocks),
         np.stack(scales, axis=-1),
         count,

@@ -25,6 +25,7 @@ OFFSET = 1e-3
 @part("check.motion")
 def motion(session: Session) -> Findings:
     """The poses leave the camera's place open: too little rotation, or all on a line."""
+    session.require_samples()
     null = fit_of(session)
     turn, shift = _uncertainty(session, null)
     if turn < TURN and shift < SHIFT:
@@ -83,8 +84,17 @@ def _covariance(information: Floats) -> Floats:
 
 
 def _rotations(session: Session) -> tuple[float, float]:
-    """Return the largest turn between two poses, and the largest about a second axis [rad]."""
-    turns = session.poses[session.seen][:, :3, :3]
+    """Return the largest turn between two poses, and the largest about a second axis [rad].
+
+    Of target and camera against each other; of two arms that which turned less.
+    """
+    if session.seconds is not None:
+        return min(_turns(p[session.seen]) for p in (session.poses, session.seconds))
+    return _turns(equations_of(session).mounts[0, session.seen])
+
+
+def _turns(poses: Floats) -> tuple[float, float]:
+    turns = poses[:, :3, :3]
     between = log_of(turns[:, None].swapaxes(-1, -2) @ turns[None]).reshape(-1, 3)
     _, _, axes = np.linalg.svd(between, full_matrices=False)
     along = np.abs(between @ axes.T).max(axis=0)
@@ -95,13 +105,7 @@ def _offset_unknown(session: Session) -> Findings:
     """Note where a constant offset of the target could not be seen."""
     if not np.isfinite(session.places).all() or session.carried == "camera":
         return
-    equations = equations_of(session)
-    free = fit(
-        type(equations)(
-            equations.mounts, equations.centres, equations.normals, equations.rotations,
-            np.full_like(equations.places, np.nan),
-        )
-    )  # fmt: skip
+    free = fit(equations_of(session).with_free_place())
     known = float(np.sqrt(np.linalg.eigvalsh(_covariance(free.information[0])[6:9, 6:9])[-1]))
     if known < OFFSET:
         return

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flangeye import part
-from flangeye.diagnosis import Finding, Findings, Floats, Mask, Session
+from flangeye.diagnosis import Arms, Finding, Findings, Floats, Mask, NotApplicable, Session
 from flangeye.mending import delayed, shifted
-from flangeye_plugins.doctoring.asis import variants
 from flangeye_plugins.doctoring.equations import equations_of
 from flangeye_plugins.doctoring.fitting import fit
 from flangeye_plugins.doctoring.significance import Evidence, best_of
@@ -21,67 +22,114 @@ DELAYS = 24
 """Delays tried on each side of none, up to the time between samples three times over."""
 
 
+Change = Callable[[Floats], tuple[Floats, Mask]]
+"""Gives poses (N, 4, 4), and the samples (N,) that have one."""
+
+
+class Alternative(NamedTuple):
+    """Poses of other moments: the session with them, and the samples that have one."""
+
+    session: Session
+    known: Mask
+    arms: Arms
+
+
 @part("check.order")
 def order(session: Session) -> Findings:
     """Each scan belongs to the pose before or after its own, from the start or from some scan."""
+    session.require_samples()
     tried = list(_shifts(session))
-    evidence = _evidence(session, [shifted(session.poses, *each) for each in tried])
+    others = [_shifted(session, *each) for each in tried]
+    evidence = _evidence(session, others)
     if evidence is None or evidence.probability == 1:
         return
-    by, start = tried[evidence.which]
+    arms, by, start = tried[evidence.which]
     which = "later" if by > 0 else "earlier"
     since = f" from '{session.ids[start]}' on" if start else ""
-    what = f"each scan belongs to the pose {abs(by)} {which}{since}"
-    where = {"shift_from": session.ids[start]} if start else {}
-    poses, known = shifted(session.poses, by, start)
-    mended = session.corrected(poses, shift=by, **where).where(known)
+    of = "" if session.seconds is None else f" of {_OF[arms]}"
+    what = f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
+    mended = others[evidence.which].session.where(others[evidence.which].known)
     yield Finding("shifted poses", what, mended.step(), (), *evidence[1:], mended)
 
 
-def _shifts(session: Session) -> Iterator[tuple[int, int]]:
-    """Give (by, start)."""
-    yield from ((by, 0) for by in SHIFTS)
-    yield from ((by, start) for by in (1, -1) for start in range(1, len(session) - 1))
+_OF: dict[Arms, str] = {
+    "both": "both arms", "first": "the first arm", "second": "the second arm",
+}  # fmt: skip
+
+
+def _shifts(session: Session) -> Iterator[tuple[Arms, int, int]]:
+    """Give (arms, by, start)."""
+    yield from ((arms, by, 0) for arms in session.arms for by in SHIFTS)
+    yield from (("both", by, start) for by in (1, -1) for start in range(1, len(session) - 1))
+
+
+def _shifted(session: Session, arms: Arms, by: int, start: int) -> Alternative:
+    where = {"shift_from": session.ids[start]} if start else {}
+
+    def change(poses: Floats) -> tuple[Floats, Mask]:
+        return shifted(poses, by, start)
+
+    return _at_other_times(session, change, arms, shift=by, **where)
+
+
+def _at_other_times(session: Session, change: Change, arms: Arms, **correction: Any) -> Alternative:
+    """Return the session with what the controllers said at other times, the links with it."""
+    moved, known = change(session.poses)
+
+    def alike(poses: Floats) -> Floats:
+        return moved if poses is session.poses else change(poses)[0]
+
+    read = session.corrected(alike, arms, **correction)
+    if session.links is not None:
+        read = replace(read, links=alike(session.links))
+    return Alternative(read, known, arms)
 
 
 @part("check.clock")
 def clock(session: Session) -> Findings:
     """The poses were taken some time before or after the scans, while the arm moved."""
+    session.require_samples()
     times = session.times
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        return
+        raise NotApplicable("the samples have no times, or these do not rise")
     step = float(np.median(np.diff(times)))
     coarse = step * 3 * np.linspace(-1, 1, 2 * DELAYS)
-    found = _delays(session, coarse)
+    found = _evidence(session, _delays(session, coarse, session.arms), further=1)
     if found is None:
         return
-    near = coarse[found.which] + np.linspace(-1, 1, 17) * step * 3 / DELAYS
-    finer = _delays(session, near)
+    arms, middle = session.arms[found.which // len(coarse)], coarse[found.which % len(coarse)]
+    near = middle + np.linspace(-1, 1, 17) * step * 3 / DELAYS
+    others = _delays(session, near, [arms])
+    finer = _evidence(session, others, further=1)
     if finer is None or finer.probability == 1:
         return
     delay = float(near[finer.which])
     which = "after" if delay > 0 else "before"
-    what = f"the arm was at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
-    poses, known = delayed(session.poses, times, delay)
-    mended = session.corrected(poses, delay=f"{delay * 1e3:.1f} ms").where(known)
+    whose = "the arm was" if session.seconds is None else f"{_OF[arms]} was"
+    what = f"{whose} at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
+    mended = others[finer.which].session.where(others[finer.which].known)
     yield Finding("time offset", what, mended.step(), (), *finer[1:], mended)
 
 
-def _delays(session: Session, delays: Floats) -> Evidence | None:
-    poses = [delayed(session.poses, session.times, float(delay)) for delay in delays]
-    return _evidence(session, poses, further=1)
+def _delays(session: Session, delays: Floats, arms: Sequence[Arms]) -> list[Alternative]:
+    return [_delayed(session, each, float(delay)) for each in arms for delay in delays]
 
 
-def _evidence(
-    session: Session, others: Sequence[tuple[Floats, Mask]], further: int = 0
-) -> Evidence | None:
-    """Hold other poses against those given, on the samples that have both."""
-    known = np.array([mask for _, mask in others])
+def _delayed(session: Session, arms: Arms, delay: float) -> Alternative:
+    def change(poses: Floats) -> tuple[Floats, Mask]:
+        return delayed(poses, session.times, delay)
+
+    return _at_other_times(session, change, arms, delay=f"{delay * 1e3:.1f} ms")
+
+
+def _evidence(session: Session, others: Sequence[Alternative], further: int = 0) -> Evidence | None:
+    """Hold poses of other moments against those given, on the samples that have both."""
+    known = np.array([other.known for other in others])
     enough = (known & session.seen).sum(axis=1) >= FEWEST
     if not enough.any():
         return None
-    poses = np.array([poses for poses, _ in others])
     # Those with too few samples are put in as the session is, which is no better than itself.
-    poses[~enough], known[~enough] = session.poses, True
+    known[~enough] = True
+    tried = [o.session if kept else session for o, kept in zip(others, enough, strict=True)]
     given = equations_of(session).without(~known)
-    return best_of(fit(given), fit(variants(session, poses).without(~known)), further)
+    return best_of(fit(given), fit(equations_of(*tried).without(~known)), further)

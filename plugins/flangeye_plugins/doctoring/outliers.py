@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.diagnosis import Finding, Findings, Floats, Session
+from flangeye.diagnosis import Finding, Findings, Floats, NotApplicable, Session
 from flangeye.geometry import rotation_exp
 from flangeye_plugins.doctoring.asis import fit_of
 from flangeye_plugins.doctoring.equations import equations_of
@@ -30,6 +30,7 @@ MOST = 0.5
 @part("check.outlier")
 def outlier(session: Session) -> Findings:
     """One sample is far off where the others agree."""
+    session.require_samples()
     null = fit_of(session)
     distances = ((null.lengths[0] / null.scales[0]) ** 2).sum(axis=-1)
     index = int(np.nanargmax(distances))
@@ -68,8 +69,9 @@ def _dimensions(null: Fit) -> Floats:
 @part("check.flips")
 def flips(session: Session) -> Findings:
     """Some targets were seen turned over, as a symmetric or frontal one may be."""
+    session.require_samples()
     if not np.isfinite(session.rotations).any():
-        return
+        raise NotApplicable("no marker's whole pose was measured")
     null = fit_of(session)
     which = _flipped(session, null)
     if not (which >= 0).any() or (which >= 0).sum() > MOST * session.seen.sum():
@@ -93,7 +95,7 @@ def flips(session: Session) -> Findings:
 def _flipped(session: Session, null: Fit) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
     """Return (N,) which flip each sample shows, -1 for none."""
     unknowns = null.unknowns
-    mounts = equations_of(session).mounts[0, :, :3, :3]
+    mounts = equations_of(session).carried(unknowns.other)[0, :, :3, :3]
     expected = mounts @ unknowns.turn[0]
     seen = unknowns.rotation[0] @ session.rotations
     apart = seen.swapaxes(-1, -2) @ expected

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.diagnosis import Finding, Findings, Floats, Session
+from flangeye.diagnosis import Finding, Findings, NotApplicable, Session
 from flangeye_plugins.doctoring.asis import fit_of
+from flangeye_plugins.doctoring.equations import equations_of
+from flangeye_plugins.doctoring.fitting import Fit
 from flangeye_plugins.doctoring.significance import best_of, exceedance
 
 NEGLIGIBLE_SCALE = 5e-3
@@ -18,10 +20,11 @@ NEGLIGIBLE_SCALE = 5e-3
 @part("check.size")
 def size(session: Session) -> Findings:
     """The marker's distances are all too long or too short by one factor: its size is wrong."""
+    session.require_samples()
     if not np.isfinite(session.rotations).any():
-        return
+        raise NotApplicable("no marker's whole pose was measured")
     null = fit_of(session)
-    factor = _factor(session, null.unknowns.rotation[0])
+    factor = _factor(session, null)
     if not 0.2 < factor < 5:
         return
     mended = replace(session, centres=session.centres * factor)
@@ -37,13 +40,17 @@ def size(session: Session) -> Findings:
                       evidence.gain, mended)  # fmt: skip
 
 
-def _factor(session: Session, rotation: Floats) -> float:
-    """Return by how much the marker's positions must grow; linear once the rotation is known."""
-    from flangeye_plugins.doctoring.equations import mounts_of
-
-    seen = session.seen
-    mounts = mounts_of(session, session.poses)[seen]
-    turned = session.centres[seen] @ rotation.T
+def _factor(session: Session, null: Fit) -> float:
+    """Return by how much the marker's positions must grow; linear once the rotations are known."""
+    seen, equations = session.seen, equations_of(session)
+    turned = session.centres[seen] @ null.unknowns.rotation[0].T
+    mounts = equations.carried(null.unknowns.other)[0][seen]
     eye = np.broadcast_to(np.eye(3), (len(turned), 3, 3))
-    rows = np.concatenate([turned[..., None], eye, -mounts[:, :3, :3]], axis=-1).reshape(-1, 7)
-    return float(np.linalg.lstsq(rows, mounts[:, :3, 3].ravel(), rcond=1e-10)[0][0])
+    parts, right = [turned[..., None], eye, -mounts[:, :3, :3]], mounts[:, :3, 3]
+    if equations.bases is not None:
+        # The second arm's base moves too: what it is now comes off, and is found again.
+        bases = equations.bases[0, seen, :3, :3]
+        parts.append(-bases)
+        right = right - (bases @ null.unknowns.other[0, :3, 3])
+    rows = np.concatenate(parts, axis=-1).reshape(len(right) * 3, -1)
+    return float(np.linalg.lstsq(rows, right.ravel(), rcond=1e-10)[0][0])

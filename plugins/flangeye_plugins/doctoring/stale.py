@@ -19,13 +19,24 @@ MOVED = 1e-3
 @part("check.identity")
 def identity(session: Session) -> Findings:
     """A driver that had nothing to give gave the identity: for a robot pose, or for a marker's."""
-    robot = np.abs(session.poses - np.eye(4)).max(axis=(1, 2)) < SAME
+    for whose, poses in _reported(session):
+        robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
+        if robot.any():
+            yield _left_out(session, robot, "identity matrices", _robots(session, robot, whose))
     marker = _is_identity(session)
-    if robot.any():
-        yield _left_out(session, robot, "identity matrices", _robots(session, robot))
     if marker.any():
         what = f"{marker.sum()} of {len(session)} markers are at the camera itself, not turned"
         yield _left_out(session, marker, "identity matrices", f"{what}: nothing was detected there")
+
+
+def _reported(session: Session) -> Iterator[tuple[str, Floats]]:
+    """Give the poses (N, 4, 4) that the controllers reported, and what to call them."""
+    if session.uses_poses:
+        yield "robot", session.poses
+    if session.links is not None:
+        yield "link", session.links
+    if session.seconds is not None:
+        yield "second arm's", session.seconds
 
 
 def _is_identity(session: Session) -> Mask:
@@ -34,9 +45,9 @@ def _is_identity(session: Session) -> Mask:
     return np.asarray(at_camera & ~(turned > SAME))
 
 
-def _robots(session: Session, wrong: Mask) -> str:
+def _robots(session: Session, wrong: Mask, whose: str) -> str:
     return (
-        f"{wrong.sum()} of {len(session)} robot poses are the identity: the flange cannot be in "
+        f"{wrong.sum()} of {len(session)} {whose} poses are the identity: the flange cannot be in "
         "the base; the driver had no pose to give"
     )
 
@@ -44,16 +55,15 @@ def _robots(session: Session, wrong: Mask) -> str:
 @part("check.repeated")
 def repeated(session: Session) -> Findings:
     """A pose or a detection came twice, while the other side shows that the arm had moved."""
-    yield from _repeats(
-        session, session.poses[:, :3].reshape(-1, 12), session.centres, "robot pose"
-    )
-    places = session.poses[:, :3, 3]
+    reported = [poses[:, :3].reshape(len(poses), 12) for _, poses in _reported(session)]
+    yield from _repeats(session, np.concatenate(reported, axis=1), session.centres, "robot pose")
+    places = np.concatenate([poses[:, :3, 3] for _, poses in _reported(session)], axis=1)
     yield from _repeats(session, session.centres, places, "detection")
 
 
 def _repeats(session: Session, numbers: Floats, others: Floats, what: str) -> Iterator[Finding]:
     """Find rows that repeat an earlier one to the last digit although the others moved on."""
-    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
+    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2, initial=0.0)
     moved = np.linalg.norm(others[:, None] - others[None], axis=2) > MOVED
     wrong = np.tril((apart < SAME) & moved, k=-1).any(axis=1)
     if wrong.any() and not _all_identity(session, wrong):
@@ -67,7 +77,7 @@ def _repeats(session: Session, numbers: Floats, others: Floats, what: str) -> It
 
 
 def _all_identity(session: Session, wrong: Mask) -> bool:
-    return bool((np.abs(session.poses[wrong] - np.eye(4)) < SAME).all())
+    return any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
 
 
 def _left_out(session: Session, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:

@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 from flangeye_plugins.doctoring.equations import Equations
 from flangeye_plugins.doctoring.rotations import nearest_rotation
+from flangeye_plugins.doctoring.twoarms import (
+    positions,
+    rotations_of_circles,
+    rotations_of_poses,
+)
 
 Floats = NDArray[np.float64]
 
@@ -25,8 +30,10 @@ class Unknowns(NamedTuple):
         position: (K, 3) of the camera in the carrier [m].
         place: (K, N or 1, 3) of the target in the mount [m].
         turn: (K, 3, 3) ``mount_R_target``.
+        other: (K, 4, 4) ``base_T_base2`` [m]; the identity where there is no second arm.
         free_place: Whether the place has to be found.
         free_turn: Whether the turn has to be found.
+        free_other: Whether the second arm's base has to be found.
     """
 
     rotation: Floats
@@ -35,15 +42,32 @@ class Unknowns(NamedTuple):
     turn: Floats
     free_place: bool
     free_turn: bool
+    other: Floats = np.eye(4)[None]
+    free_other: bool = False
 
 
 def start_of(equations: Equations) -> Unknowns:
-    """Return a closed-form solution of each variant."""
+    """Return a closed-form solution of each variant; of two arms one from random rotations."""
+    if equations.bases is not None:
+        return _of_two_arms(equations)
     if equations.has_rotations:
         return _from_poses(equations)
     if equations.knows_place:
         return _from_known_places(equations)
     return _from_centres(equations)
+
+
+def _of_two_arms(equations: Equations) -> Unknowns:
+    """Find the rotations first, then the positions, which are linear."""
+    seen = equations.has_rotations
+    rotations = (rotations_of_poses if seen else rotations_of_circles)(equations)
+    position, base, place = positions(equations, rotations)
+    other = np.zeros((len(base), 4, 4))
+    other[:, :3, :3], other[:, :3, 3], other[:, 3, 3] = rotations[1], base, 1.0
+    return Unknowns(
+        rotations[0], position, place[:, None], rotations[2],
+        not equations.knows_place, seen, other, True,
+    )  # fmt: skip
 
 
 def _from_known_places(equations: Equations) -> Unknowns:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from flangeye import part
-from flangeye.diagnosis import Finding, Findings, Floats, Session
+from flangeye.diagnosis import Arms, Finding, Findings, Floats, Session
 from flangeye.mending import scaled
-from flangeye_plugins.doctoring.asis import fit_of, variants
+from flangeye_plugins.doctoring.asis import fit_of, named
+from flangeye_plugins.doctoring.equations import equations_of
 from flangeye_plugins.doctoring.fitting import fit
 from flangeye_plugins.doctoring.significance import Evidence, best_of
 
@@ -18,63 +20,115 @@ UNITS: Mapping[str, float] = {
     "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
 }  # fmt: skip
 """In metres."""
+_METRES: Mapping[str, float] = {"m": 1.0, **UNITS}
 STANDING = 1e-9
 """With so small positions the target does not move: no unit, if that explains samples better."""
 ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
+class Alternative(NamedTuple):
+    """Another unit of some of the lengths.
+
+    Attributes:
+        session: As it would be.
+        said: Unit they were read in.
+        meant: Unit they may be in.
+        arms: Whose positions; None for the target's.
+    """
+
+    session: Session
+    said: str
+    meant: str
+    arms: Arms | None
+
+
 @part("check.units")
 def units(session: Session) -> Findings:
     """Positions of the arm or of the target are in another unit than was said."""
-    if not session.seen.any():
-        return
-    names, factors = _ratios()
-    poses = np.stack([scaled(session.poses, factor) for factor in [*factors, STANDING]])
-    evidence = best_of(fit_of(session), fit(variants(session, poses)))
-    if evidence.probability < 1 and evidence.which < len(names):
-        said, meant = names[evidence.which]
-        yield _of_one_side(session, said, meant, evidence)
-    elif (both := _both(session)) is not None:
+    session.require_samples()
+    tried = list(_alternatives(session))
+    evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
+    if evidence.probability < 1 and tried[evidence.which].said:
+        yield _finding(session, tried[evidence.which], evidence)
+    elif session.uses_poses and (both := _both(session)) is not None:
         yield both
 
 
-def _ratios() -> tuple[list[tuple[str, str]], Floats]:
-    """Return (as read, as meant) of the arm's unit, and what its positions are multiplied with."""
-    sizes = {"m": 1.0, **UNITS}
-    pairs = {
-        round(sizes[meant] / sizes[said], 12): (said, meant)
-        for said, meant in (
-            *(("m", unit) for unit in UNITS), *((unit, "m") for unit in UNITS),
-            ("mm", "inches"), ("inches", "mm"),
-        )
-    }  # fmt: skip
-    return list(pairs.values()), np.array(list(pairs))
+def _alternatives(session: Session) -> Iterator[Alternative]:
+    """Give other units of the arms' positions, and of the target's where that is not the same.
+
+    A link's place follows from the arm's model, in metres: then it is not.
+    """
+    for said, meant, factor in _ratios():
+        if session.uses_poses:
+            for arms in session.arms:
+                yield Alternative(_of_arm(session, arms, factor), said, meant, arms)
+        if session.links is not None:
+            yield Alternative(_of_target(session, factor, meant), said, meant, None)
+    if session.uses_poses:
+        yield Alternative(_of_arm(session, "both", STANDING), "", "", "both")
 
 
-def _of_one_side(session: Session, said: str, meant: str, evidence: Evidence) -> Finding:
-    """Say whose lengths are wrong: of arm and target, the one that they make more plausible."""
-    sizes = {"m": 1.0, **UNITS}
-    factor = sizes[meant] / sizes[said]
+def _of_arm(session: Session, arms: Arms, factor: float) -> Session:
+    def change(poses: Floats) -> Floats:
+        return scaled(poses, factor)
+
+    return session.corrected(change, arms, scale=_number(factor))
+
+
+def _ratios() -> Iterator[tuple[str, str, float]]:
+    """Give (as read, as meant) of a unit, and what lengths are then multiplied with."""
+    given = set[float]()
+    for said, meant in (
+        *(("m", unit) for unit in UNITS), *((unit, "m") for unit in UNITS),
+        ("mm", "inches"), ("inches", "mm"),
+    ):  # fmt: skip
+        factor = round(_METRES[meant] / _METRES[said], 12)
+        if factor not in given:
+            yield said, meant, factor
+        given.add(factor)
+
+
+def _finding(session: Session, found: Alternative, evidence: Evidence) -> Finding:
+    said, meant = found.said, found.meant
+    if found.arms is None or (found.arms == "both" and _rather_target(session, said, meant)):
+        return _of_targets_unit(session, found, evidence)
+    whose = named(found.arms, session)
+    factor = _METRES[meant] / _METRES[said]
+    what = f"{whose} positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
+    mended = found.session
+    after = fit_of(mended).misfit()
+    return Finding("unit", what, mended.step(), (), evidence.before, after,
+                   evidence.probability, evidence.gain, mended)  # fmt: skip
+
+
+def _of_targets_unit(session: Session, found: Alternative, evidence: Evidence) -> Finding:
+    """Say that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
+    said, meant = found.said, found.meant
+    if found.arms is not None:
+        said, meant = meant, said
+    factor = _METRES[meant] / _METRES[said]
+    mended = _of_target(session, factor, meant)
+    what = f"the target's positions were read in {said} and are in {meant}"
+    after = fit_of(mended).misfit()
+    return Finding("unit", f"{what} (a factor of {factor:.6g})", mended.step(), (),
+                   evidence.before, after, evidence.probability, evidence.gain,
+                   mended)  # fmt: skip
+
+
+def _rather_target(session: Session, said: str, meant: str) -> bool:
+    """Return whose lengths are wrong: of arm and target, the one that they make more plausible."""
+    if session.links is not None:
+        return False
+    factor = _METRES[meant] / _METRES[said]
     arm = _outside(_distance_of_arm(session) * factor, ARMS) + _outside(
         _distance_of_target(session), session.reach
     )
     target = _outside(_distance_of_arm(session), ARMS) + _outside(
         _distance_of_target(session) / factor, session.reach
     )
-    times = factor
-    if arm <= target:
-        mended = session.corrected(scaled(session.poses, factor), scale=_number(factor))
-        what = f"the robot's positions were read in {said} and are in {meant}"
-    else:
-        times = 1 / factor
-        mended = _of_target(session, times, said)
-        what = f"the target's positions were read in {meant} and are in {said}"
-    after = fit_of(mended).misfit()
-    return Finding(
-        "unit", f"{what} (a factor of {times:.6g})", mended.step(), (),
-        evidence.before, after, evidence.probability, evidence.gain, mended,
-    )  # fmt: skip
+    return target < arm
 
 
 def _of_target(session: Session, factor: float, unit: str) -> Session:
@@ -82,7 +136,7 @@ def _of_target(session: Session, factor: float, unit: str) -> Session:
     mended = replace(session, centres=session.centres * factor)
     if session.acquire == "acquire.archive" and unit in ("m", "mm"):
         return mended.with_changes(unit=unit)
-    return mended.corrected(session.poses, target_scale=_number(factor))
+    return mended.read_with(target_scale=_number(factor))
 
 
 def _both(session: Session) -> Finding | None:
@@ -96,7 +150,7 @@ def _both(session: Session) -> Finding | None:
     if _outside(distance * factor, ARMS) > 0:
         return None
     mended = replace(session, centres=session.centres * factor).corrected(
-        scaled(session.poses, factor), scale=_number(factor), target_scale=_number(factor)
+        lambda poses: scaled(poses, factor), scale=_number(factor), target_scale=_number(factor)
     )
     what = (
         f"robot and target agree, but the flange is {distance:.4g} m from the base and the target "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,7 @@ DETECTED_LIMIT = 5.0
 SAMPLE = 50_000
 """Points the median is taken of."""
 
-NAMES = {"m": "metres", "mm": "millimetres"}
-OTHER: dict[LengthUnit, LengthUnit] = {"m": "mm", "mm": "m"}
+NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "inches"}
 
 
 def median_distance(cloud: PointCloud) -> float:
@@ -52,19 +52,23 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerMo
     """
     if not times_outside(distance, scanner) > STATED_LIMIT:
         return
-    other = OTHER[unit]
-    metres = distance * PER_METRE[unit] / PER_METRE[other]
+    raw = distance * PER_METRE[unit]
+    others: list[LengthUnit] = [other for other in NAMES if other != unit]
+    best = min(others, key=lambda other: times_outside(raw / PER_METRE[other], scanner))
+    metres = raw / PER_METRE[best]
     if times_outside(metres, scanner) <= DETECTED_LIMIT:
-        cure = f"these look like {NAMES[other]}: set unit: {other}"
+        cure = f"these look like {NAMES[best]}: set unit: {best}"
     else:
-        cure = f"and {metres:.3g} m with unit {other} does not fit either; is it this scanner?"
+        cure = f"and {metres:.3g} m with unit {best} does not fit either; is it this scanner?"
     raise StageError(
         f"{path}: median distance {distance:.3g} m with unit {unit}, but {_range(scanner)}; {cure}"
     )
 
 
 def detect_unit(path: Path, raw: float, scanner: ScannerModel) -> LengthUnit:
-    """Return the unit in which a median distance fits the scanner's range.
+    """Return the unit in which a median distance fits the scanner's range: metres or millimetres.
+
+    Inches are only between the two, and few record in them: they have to be stated.
 
     Args:
         path: The cloud's file.
@@ -78,9 +82,11 @@ def detect_unit(path: Path, raw: float, scanner: ScannerModel) -> LengthUnit:
     outside = {unit: times_outside(raw / PER_METRE[unit], scanner) for unit in units}
     unit = min(units, key=lambda u: outside[u])
     if outside[unit] > DETECTED_LIMIT:
+        inches = times_outside(raw / PER_METRE["in"], scanner) <= DETECTED_LIMIT
+        cure = "unit: in, which fits," if inches else "unit: m or unit: mm,"
         raise StageError(
             f"{path}: median distance {raw:.3g} fits neither m nor mm: {_range(scanner)}; state "
-            "unit: m or unit: mm, or the right scanner"
+            f"{cure} or the right scanner"
         )
     return unit
 

@@ -18,13 +18,14 @@ from pydantic import Field, field_validator, model_validator
 from flangeye import Choose, Chosen, Params, StageError, part
 from flangeye.archive import Archive, Floats, Recording
 from flangeye.conventions import EULER_ORDERS
+from flangeye.diagnosis import Arms
 from flangeye.mending import (
     Mask,
     delayed,
     inverted,
     reread,
     scaled,
-    shifted,
+    sources,
     transposed,
     without_tool,
 )
@@ -40,6 +41,9 @@ class CorrectedParams(Params):
 
     reader: Annotated[Chosen, Choose("reader")] = param(
         description="Reads the archive as it was recorded."
+    )
+    arms: Arms = Field(
+        "both", description="Whose poses, where there are two arms; one arm alone is 'both'."
     )
     read_as: str | None = Field(None, description="How that reader read the rotations.")
     written_as: str | None = Field(
@@ -83,31 +87,39 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
     if params.shift:
         recordings = _shift(archive, recordings, params)
     if params.delay:
-        recordings = _delay(archive, recordings, params.delay)
+        recordings = _delay(archive, recordings, params)
     note = "poses corrected as the recipe says"
     return replace(archive, recordings=recordings, notes=(*archive.notes, note))
 
 
 def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     """Undo what concerns each pose by itself."""
-    pose = recording.base_T_flange[None]
-    if params.read_as and params.written_as:
-        pose = reread(pose, params.read_as, params.written_as)
-    if params.transposed:
-        pose = transposed(pose)
-    pose = scaled(pose, params.scale)
-    if params.inverted:
-        pose = inverted(pose)
-    pose = without_tool(pose, -np.array(params.target_offset))
-    centre = recording.centre_in_camera
-    if centre is not None:
-        centre = centre * params.target_scale
-    target = recording.camera_T_target
-    if target is not None:
-        target = scaled(target, params.target_scale)
+    first, second = recording.base_T_flange, recording.base2_T_flange2
+    if params.arms != "second":
+        first = _corrected(first, params)
+    if second is not None and params.arms != "first":
+        second = _corrected(second, params)
+    centre, target = recording.centre_in_camera, recording.camera_T_target
     return replace(
-        recording, base_T_flange=pose[0], centre_in_camera=centre, camera_T_target=target
+        recording,
+        base_T_flange=first,
+        base2_T_flange2=second,
+        centre_in_camera=None if centre is None else centre * params.target_scale,
+        camera_T_target=None if target is None else scaled(target, params.target_scale),
     )
+
+
+def _corrected(pose: Floats, params: CorrectedParams) -> Floats:
+    """Return one arm's pose (4, 4) as it should be."""
+    poses = pose[None]
+    if params.read_as and params.written_as:
+        poses = reread(poses, params.read_as, params.written_as)
+    if params.transposed:
+        poses = transposed(poses)
+    poses = scaled(poses, params.scale)
+    if params.inverted:
+        poses = inverted(poses)
+    return np.asarray(without_tool(poses, -np.array(params.target_offset))[0])
 
 
 def _shift(
@@ -117,25 +129,50 @@ def _shift(
     if params.shift_from is not None and params.shift_from not in names:
         raise StageError(f"{archive.root}: shift_from: there is no pose '{params.shift_from}'")
     start = names.index(params.shift_from) if params.shift_from else 0
-    return _replaced(recordings, lambda poses: shifted(poses, params.shift, start))
+    source, kept = sources(len(names), params.shift, start)
+
+    def at_source(rows: Floats) -> Floats:
+        return rows[source]
+
+    return _replaced(recordings, at_source, kept, params.arms)
 
 
-def _delay(archive: Archive, recordings: Sequence[Recording], delay: float) -> list[Recording]:
+def _delay(
+    archive: Archive, recordings: Sequence[Recording], params: CorrectedParams
+) -> list[Recording]:
     times = np.array([r.time_ns for r in recordings if r.role == "calibration"]) * 1e-9
     if (np.diff(times) <= 0).any():
         raise StageError(f"{archive.root}: delay: the poses' times do not rise")
-    return _replaced(recordings, lambda poses: delayed(poses, times, delay))
+    wanted = times + params.delay
+    kept = (wanted >= times[0]) & (wanted <= times[-1])
+
+    def later(rows: Floats) -> Floats:
+        if rows.ndim == 3:
+            return delayed(rows, times, params.delay)[0]
+        return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
+
+    return _replaced(recordings, later, kept, params.arms)
 
 
 def _replaced(
-    recordings: Sequence[Recording], change: Callable[[Floats], tuple[Floats, Mask]]
+    recordings: Sequence[Recording], change: Callable[[Floats], Floats], kept: Mask, arms: Arms
 ) -> list[Recording]:
-    """Change the poses to calibrate with, in their order; those without a pose are left out."""
+    """Change what the arms reported, in its order; samples that get nothing are left out.
+
+    Args:
+        recordings: Those to calibrate with are changed.
+        change: Gives poses (N, 4, 4), or joints (N, n), of other moments.
+        kept: (N,) which of them have one.
+        arms: Whose.
+    """
     calibration = [r for r in recordings if r.role == "calibration"]
-    poses, known = change(np.array([r.base_T_flange for r in calibration]))
-    changed = [
-        replace(recording, base_T_flange=pose)
-        for recording, pose, kept in zip(calibration, poses, known, strict=True)
-        if kept
+    changed = calibration
+    first, second = ("base_T_flange", "joints"), ("base2_T_flange2",)
+    for name in {"both": first + second, "first": first, "second": second}[arms]:
+        given = [getattr(recording, name) for recording in calibration]
+        if all(rows is not None for rows in given):
+            moved = change(np.array(given))
+            changed = [replace(r, **{name: m}) for r, m in zip(changed, moved, strict=True)]
+    return [r for r in recordings if r.role != "calibration"] + [
+        recording for recording, has in zip(changed, kept, strict=True) if has
     ]
-    return [r for r in recordings if r.role != "calibration"] + changed

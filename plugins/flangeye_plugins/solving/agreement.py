@@ -83,7 +83,7 @@ def _distances(problem: Problem, at: Unknowns) -> Floats:
 
 def _first_noise(problem: Problem, at: Unknowns) -> Noise:
     """Return the noise that the better half of the residuals at a start speaks for."""
-    if problem.arms is not None:
+    if problem.stated:
         return Noise(pose=0.0, tilt=0.0)
     r = linearise(problem.sightings, problem.loop, at, None).residuals
     turns, shifts = ((r[:, k : k + 3] ** 2).sum(axis=1) for k in (0, 3))

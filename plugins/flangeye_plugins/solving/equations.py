@@ -29,12 +29,14 @@ class Noise:
         tilt: Variance of each component of the arm's axis [rad^2].
         centre_scale: Factor on the centres' covariances, at most 1.
         normal_scale: Factor on the normals' covariances, at most 1.
+        arms: Factor on the covariances that are taken for the arms' poses.
     """
 
     pose: float
     tilt: float
     centre_scale: float = 1.0
     normal_scale: float = 1.0
+    arms: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

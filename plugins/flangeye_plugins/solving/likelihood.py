@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.statistics import f_quantile
+from flangeye_plugins.solving.components import Residuals, noise_of
 from flangeye_plugins.solving.equations import FINEST, Noise
 from flangeye_plugins.solving.inliers import gate, truncated_weights
 from flangeye_plugins.solving.loop import (
@@ -42,14 +43,17 @@ class Problem:
     Attributes:
         sightings: N of them.
         loop: What is unknown.
-        arms: Noise of the arms' reported poses where it is stated; else it is estimated.
+        arms: Noise of the arms' reported poses; None where nothing is known of it.
         tilt: Standard deviation of a tilt common to all normals [rad], or None.
+        stated: Whether that is all the noise there is beside the sightings' own; else more is
+            estimated, or all of it scaled down.
     """
 
     sightings: Sightings
     loop: Loop
     arms: ArmNoise | None
     tilt: float | None
+    stated: bool = False
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
         """Return the problem of some of the sightings."""
@@ -195,15 +199,15 @@ def _graduate(problem: Problem, start: Solution, noise: Noise) -> Solution:
 def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solution:
     """Return the solution with the noise its inliers show, where none was stated.
 
-    Variance components after Helmert, as in ``generalised.py``: one of rotation, one of
-    translation; each added to the stated covariances, or these scaled down.
+    Variance components after Helmert, as in ``components.py``: added to the stated covariances, or
+    these scaled down.
 
     Args:
         problem: What is given.
         found: A solution.
         refit: Whether the unknowns follow the weights; else they stay.
     """
-    if problem.arms is not None:
+    if problem.stated:
         return found
     shares, freedom = found.inliers.astype(float), np.inf
     solve = climb if refit else weigh
@@ -217,42 +221,23 @@ def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solutio
 
 
 def _components(problem: Problem, found: Solution) -> tuple[Noise, float]:
+    """Return the noise that the residuals show, and its degrees of freedom."""
     kept = found.inliers
-    own = problem.sightings.covariances[kept] + found.linear.of_arms[kept]
-    p = problem.sightings.projectors[kept]
+    turned, shifted = (_residuals(problem, found, at) for at in (slice(0, 3), slice(3, 6)))
+    own, arms = problem.sightings.covariances[kept], found.linear.of_arms[kept]
+    return noise_of(turned, shifted, own, arms), max(min(turned.freedom, shifted.freedom), 1.0)
+
+
+def _residuals(problem: Problem, found: Solution, at: slice) -> Residuals:
+    """Return the rotations', or the translations', of those that agree."""
+    kept, p = found.inliers, problem.sightings.projectors[found.inliers]
     of_fit = found.linear.jacobian[kept] @ found.covariance
     of_fit = of_fit @ found.linear.jacobian[kept].transpose(0, 2, 1)
-    # Numbers less their share in the fit, apart for rotations and translations.
-    shares = np.einsum("nab,nba->na", found.weights[kept], of_fit)
-    measured = np.diagonal(p, axis1=1, axis2=2)
-    parts, freedoms = [], []
-    for at in (slice(0, 3), slice(3, 6)):
-        freedom = float(measured[:, at].sum() - shares[:, at].sum())
-        r = found.linear.residuals[kept][:, at]
-        parts.append(_component(r, own[:, at, at], p[:, at, at], max(freedom, 1.0)))
-        freedoms.append(freedom if measured[:, at].any() else np.inf)
-    (tilt, normal_scale), (pose, centre_scale) = parts
-    return Noise(pose, tilt, centre_scale, normal_scale), max(min(freedoms), 1.0)
-
-
-def _component(residuals: Floats, own: Floats, p: Floats, freedom: float) -> tuple[float, float]:
-    """Return the variance to add, and the scale of the stated covariances."""
-    if not p.any():
-        return 0.0, 1.0
-
-    def squares(extra: float) -> float:
-        covariance = p @ (own + (extra + FINEST**2) * np.eye(3)) @ p + (np.eye(3) - p)
-        solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
-        return float((residuals * solved).sum())
-
-    explained = squares(0.0)
-    if explained <= freedom:
-        return 0.0, max(explained / freedom, 1e-6)
-    low, high = 0.0, float((residuals**2).sum())
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if squares(middle) > freedom else (low, middle)
-    return high, 1.0
+    # Numbers less their share in the fit.
+    shares = np.einsum("nab,nba->na", found.weights[kept], of_fit)[:, at]
+    measured = np.diagonal(p, axis1=1, axis2=2)[:, at]
+    freedom = float(measured.sum() - shares.sum()) if measured.any() else np.inf
+    return Residuals(found.linear.residuals[kept][:, at], p[:, at, at], freedom)
 
 
 def _close(first: Noise, second: Noise) -> bool:
@@ -261,5 +246,6 @@ def _close(first: Noise, second: Noise) -> bool:
         (first.tilt + FINEST**2, second.tilt + FINEST**2),
         (first.centre_scale, second.centre_scale),
         (first.normal_scale, second.normal_scale),
+        (first.arms, second.arms),
     ]
-    return all(abs(a - b) <= 1e-4 * max(a, b) for a, b in of)
+    return all(abs(a - b) <= 1e-4 * max(a, b) + 1e-12 for a, b in of)

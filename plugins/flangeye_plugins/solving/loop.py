@@ -198,7 +198,8 @@ def weights_of(sightings: Sightings, linear: Linear, noise: Noise) -> Floats:
     """Return the (N, 6, 6) inverse covariances, zero across what was not measured."""
     scale = np.repeat(np.sqrt([noise.normal_scale, noise.centre_scale]), 3)
     extra = np.diag(np.repeat([noise.tilt + FINEST**2, noise.pose + FINEST**2], 3))
-    covariance = sightings.covariances * np.outer(scale, scale) + linear.of_arms + extra
+    own = sightings.covariances + noise.arms * linear.of_arms
+    covariance = own * np.outer(scale, scale) + extra
     p = sightings.projectors
     return np.asarray(p @ np.linalg.inv(p @ covariance @ p + (np.eye(6) - p)) @ p)
 

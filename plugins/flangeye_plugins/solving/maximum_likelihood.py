@@ -47,8 +47,8 @@ class MaximumLikelihoodParams(Params):
 
     robot_noise: RobotNoise | None = Field(
         None,
-        description="Noise of the poses the arm reports, where it is known; by default whatever "
-        "noise there is beyond the features' covariances is estimated from the residuals.",
+        description="Noise of the poses the arm reports, where it is known; by default a typical "
+        "arm's, and what noise the residuals show beyond that and the features' own.",
     )
     normals: Literal["auto", "off"] = Field(
         "auto", description="Use the circles' measured normals where there are any."
@@ -131,12 +131,13 @@ def _problem(
     arm: Arm | None,
     params: MaximumLikelihoodParams,
 ) -> Problem:
-    stated = params.robot_noise
+    noise = params.robot_noise or RobotNoise()
     return Problem(
         sightings_of(pulled, configuration, arm, normals=params.normals == "auto"),
         loop_of(configuration),
-        None if stated is None else ArmNoise(stated.rotation, stated.position),
+        ArmNoise(noise.rotation, noise.position),
         params.normal_bias,
+        stated=params.robot_noise is not None,
     )
 
 
@@ -167,12 +168,22 @@ def _reasons(found: Solution) -> list[str | None]:
 
 def _notes(found: Solution, problem: Problem, weak: Floats) -> list[str]:
     notes = []
-    if problem.arms is None:
-        pose, tilt = np.sqrt(found.noise.pose) * 1e3, np.degrees(np.sqrt(found.noise.tilt))
-        notes.append(f"noise beyond the features' own: {pose:.3f} mm and {tilt:.3f} deg per axis")
+    if not problem.stated:
+        pose, tilt = np.sqrt(_beyond(found))
+        told = f"{pose * 1e3:.3f} mm and {np.degrees(tilt):.3f} deg per axis"
+        notes.append(f"noise beyond the features' own: {told}")
     if weak.shape[1]:
         notes.append(
             f"not observable from these poses, and set to zero: {weak.shape[1]} translation"
             f"{'s' if weak.shape[1] > 1 else ''} along which the arm's axes do not tilt"
         )
     return notes
+
+
+def _beyond(found: Solution) -> tuple[float, float]:
+    """Return the variances beyond the features' own, of position and of angle [m^2, rad^2]."""
+    of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
+    return (
+        float(of_arms[3:].mean() + found.noise.pose),
+        float(of_arms[:3].mean() + found.noise.tilt),
+    )

@@ -68,7 +68,7 @@ class PublishedView(VerificationView):
         flange_T_shape: (4, 4).
     """
 
-    per_metre: int
+    per_metre: float
     measured: Floats
     shape: Floats
     flange_T_shape: Floats
@@ -123,7 +123,7 @@ def _views(archive: Archive) -> Iterator[PublishedView]:
 
 
 def _view(
-    recording: Recording, cloud: Path, per_metre: int, cad: CadFile, shape: Floats
+    recording: Recording, cloud: Path, per_metre: float, cad: CadFile, shape: Floats
 ) -> PublishedView:
     measured = read_cloud(cloud).points().astype(np.float64)
     centre = measured.mean(axis=0) / per_metre
