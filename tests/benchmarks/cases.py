@@ -1,5 +1,6 @@
 """The stages and their baselines, on one simulated PhoXi M scan of 3.2 M points."""
 
+import itertools
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -234,6 +235,34 @@ def finger() -> tuple[Work, Work]:
     )
 
 
+def cycle() -> tuple[Work, Work]:
+    """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
+    from flangeye_plugins.welding.follower import Follower
+    from flangeye_plugins.welding.motion import ToolPose, Touch
+    from flangeye_plugins.welding.path import Path as Plan
+    from flangeye_plugins.welding.settings import Following
+
+    x = np.linspace(0.0, 2.0, 2000)
+    plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))
+    follower, clock = Follower(plan, 40e-3, Following()), itertools.count()
+
+    def turn() -> None:
+        time = next(clock) * 2e-3
+        at = plan.at(5e-3 + 5e-3 * max(time - 1.0, 0.0))
+        position = np.array([*(at.point + 2e-3 * at.normal), at.height - 1.5e-3])
+        angle = float(np.arctan2(at.tangent[1], at.tangent[0]))
+        assert follower.phase in ("seeking", "following"), follower.reason
+        follower.step(ToolPose(time, position, angle), [Touch(time, np.array([0, -2e-3, 1.5e-3]))])
+
+    for _ in range(6000):  # until the torch has what was felt on both of its sides
+        turn()
+    square = np.random.default_rng(0).normal(size=(40, 40))
+    return (
+        Work(turn, "a cycle of the controller"),
+        Work(lambda: np.linalg.inv(square), "the inverse of a 40 x 40 matrix"),
+    )
+
+
 CASES = {
     "acquire.simulated": acquire,
     "segment.flange": segment,
@@ -245,4 +274,5 @@ CASES = {
     "read_cloud": read,
     "log": record,
     "finger": finger,
+    "cycle": cycle,
 }

@@ -107,6 +107,16 @@ def test_what_is_not_confirmed_is_not_believed():
     np.testing.assert_array_equal(refined.offsets(np.array([0.01])), [0.0])
 
 
+def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one():
+    refined = RefinedPath(Path(straight(5.0)), 0.05)
+    for s in np.arange(0.0, 4.0, 4e-4):
+        refined.add(0.0, float(s), 1e-3)
+    refined.confirm(1.0)
+    assert len(refined._near(0.01)) <= len(refined._near(2.0)) <= 2 * 60e-3 / 0.5e-3 + 2
+    assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
+    assert refined.offset(4.5) == pytest.approx(1e-3, abs=1e-5)  # half a metre beyond
+
+
 # --- contact --------------------------------------------------------------------------------------
 
 
@@ -190,10 +200,8 @@ def test_the_tip_takes_the_place_of_least_energy_between_the_walls(across, up):
     found = contact.settle(rest)
     y = np.linspace(-5e-3, 5e-3, 2001)
     floor = SEAT + np.abs(y) / np.tan(SECTION.half_angle)
-    least = min(
-        energy(tip, np.array([0.0, a, max(b, rest[2])]), np.array([0.0, *rest[1:]]))
-        for a, b in zip(y, floor, strict=True)
-    )
+    height = np.maximum(floor, rest[2])
+    least = (tip.lateral * (y - rest[1]) ** 2 + tip.axial * (height - rest[2]) ** 2).min()
     assert found[2] >= SEAT + abs(found[1]) / np.tan(SECTION.half_angle) - 1e-9
     assert energy(tip, found, rest) <= least + 1e-9
 

@@ -58,7 +58,12 @@ class Drive:
         Raises:
             DeviceError: The arm must not go on; it was told to stop.
         """
-        return self._cycle()[0]
+        self.robot.wait_cycle()
+        return self.read()
+
+    def read(self) -> RobotState:
+        """Return the arm's state in this cycle, judged; raises as :meth:`tick` does."""
+        return self._judged()[0]
 
     def follow(self, route: Route) -> None:
         """Drive a checked route and return when the arm has settled at its end.
@@ -69,8 +74,9 @@ class Drive:
         for leg in route.legs:
             self._watch.set_off(leg)
             self.robot.move_joints(leg.joints, leg.speed, leg.acceleration)
-            while not self._cycle()[1]:
-                pass
+            self.robot.wait_cycle()
+            while not self._judged()[1]:
+                self.robot.wait_cycle()
         self._watch.halted()
 
     def lead(self) -> None:
@@ -98,9 +104,8 @@ class Drive:
         with suppress(DeviceError):
             self.robot.stop()
 
-    def _cycle(self) -> tuple[RobotState, bool]:
-        """Return the next state, and whether the leg under way has ended."""
-        self.robot.wait_cycle()
+    def _judged(self) -> tuple[RobotState, bool]:
+        """Return the newest state, and whether the leg under way has ended."""
         state = self.robot.state()
         self.latest.tell(state)
         try:

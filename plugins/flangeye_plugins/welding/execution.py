@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from flangeye.devices import DeviceError, RobotState
@@ -39,18 +42,19 @@ def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: fl
     Whatever happens the arm is told to stop, and the chronicle holds all up to then.
     """
     began: float | None = None
-    last = time.perf_counter()
     cell.drive.lead()
     try:
-        while controller.phase not in ("done", "stopped"):
-            state = cell.drive.tick()
-            started = time.perf_counter()
-            seconds = state.time_ns * 1e-9
-            began = seconds if began is None else began
-            if seconds - began > longest:
-                return f"it did not come to its end within {longest:.0f} s"
-            _turn(cell, controller, chronicle, state, (started, started - last))
-            last = started
+        with _undisturbed():
+            clock = Clock()
+            while controller.phase not in ("done", "stopped"):
+                cell.drive.robot.wait_cycle()
+                clock.start()
+                state = cell.drive.read()
+                seconds = state.time_ns * 1e-9
+                began = seconds if began is None else began
+                if seconds - began > longest:
+                    return f"it did not come to its end within {longest:.0f} s"
+                _turn(cell, controller, chronicle, state, clock)
     except DeviceError as error:
         return str(error)
     finally:
@@ -58,25 +62,65 @@ def follow(cell: Cell, controller: Controller, chronicle: Chronicle, longest: fl
     return controller.reason
 
 
+class Clock:
+    """How long a cycle takes: by this computer's clock, and by this thread's processor time.
+
+    Attributes:
+        period: Between the starts of the last two cycles [s].
+    """
+
+    def __init__(self) -> None:
+        self.period = 0.0
+        self._started = time.perf_counter()
+        self._began = self._aside = 0.0
+
+    def start(self) -> None:
+        """Begin a cycle."""
+        now = time.perf_counter()
+        self.period, self._started = now - self._started, now
+        self._began, self._aside = time.thread_time(), 0.0
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Leave out what is done meanwhile."""
+        began = time.thread_time()
+        yield
+        self._aside += time.thread_time() - began
+
+    @property
+    def computing(self) -> float:
+        """Processor time of this cycle so far [s]."""
+        return time.thread_time() - self._began - self._aside
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Collect garbage before and after, and not in a cycle: that takes tens of milliseconds."""
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def _turn(
-    cell: Cell,
-    controller: Controller,
-    chronicle: Chronicle,
-    state: RobotState,
-    clock: tuple[float, float],
+    cell: Cell, controller: Controller, chronicle: Chronicle, state: RobotState, clock: Clock
 ) -> None:
     """One cycle: read, decide, command, log."""
-    numbers = [chronicle.saw(sight) for sight in cell.eyes.seen()]
-    began = time.thread_time()
+    with clock.aside():  # in simulated time images are read, and logged, right here
+        numbers = [chronicle.saw(sight) for sight in cell.eyes.seen()]
     used = tuple(number for number in numbers if number in chronicle.felt)
-    touches = [touch_of(chronicle.felt[number]) for number in used]
+    felt = [chronicle.felt[number] for number in used]
     pose = cell.tool.pose(state.base_T_flange, state.time_ns * 1e-9)
-    cell.bounds.check(pose, controller.tip, [chronicle.felt[number] for number in used])
-    command = controller.step(pose, touches)
+    cell.bounds.check(pose, controller.tip, felt)
+    command = controller.step(pose, [touch_of(feeling) for feeling in felt])
     twist = cell.tool.twist(command, state.base_T_flange)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
-    computing = time.thread_time() - began
-    chronicle.turned(cycle_of(pose, used, command, controller, (computing, clock[1])))
+    took = (clock.computing, clock.period)
+    chronicle.turned(cycle_of(pose, used, command, controller, took))
 
 
 def touch_of(feeling: Feeling) -> Touch:

@@ -59,10 +59,12 @@ class Path:
         inside = min(max(s, 0.0), self.length)
         index = min(int(inside / self.step), len(self._rows) - 2)
         share = inside / self.step - index
-        x, y, z, tx, ty = (
-            a + share * (b - a)
-            for a, b in zip(self._rows[index], self._rows[index + 1], strict=True)
-        )
+        before, after = self._rows[index], self._rows[index + 1]
+        x = before[0] + share * (after[0] - before[0])
+        y = before[1] + share * (after[1] - before[1])
+        z = before[2] + share * (after[2] - before[2])
+        tx = before[3] + share * (after[3] - before[3])
+        ty = before[4] + share * (after[4] - before[4])
         norm, beyond = math.hypot(tx, ty), s - inside
         tx, ty = tx / norm, ty / norm
         point = np.array([x + beyond * tx, y + beyond * ty])
