@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flangeye.report.facts import Facts
 from flangeye.report.plot import CIRCLE, HELD_OUT, TRUTH, UNUSED, USED, Figure, Trace, packed
 from flangeye.report.units import millimetres
-from flangeye.types import WeldReport
+from flangeye.types import WeldReport, WorkpieceScan
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +28,7 @@ class WeldDrawing:
         summary: In words.
         paths: In the plane of the work.
         offsets: From the plan, along it.
+        deviation: Of the torch, from the seam as felt, and from the true one in a simulation.
         contact: Deflection over time, with the controller's phases.
         speeds: Over time.
         loop: How the loop kept time: name, value with unit.
@@ -37,6 +38,7 @@ class WeldDrawing:
     summary: str
     paths: Figure
     offsets: Figure
+    deviation: Figure
     contact: Figure
     speeds: Figure
     loop: tuple[tuple[str, str], ...]
@@ -49,8 +51,8 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
         return None
     seen = _View(weld)
     return WeldDrawing(
-        weld, _summary(facts, weld), _paths(seen), _offsets(seen), _contact(weld), _speeds(weld),
-        tuple(_loop(weld)),
+        weld, _summary(facts, weld), _paths(seen), _offsets(seen), _deviation(seen, _truth(facts)),
+        _contact(weld), _speeds(weld), tuple(_loop(weld)),
     )  # fmt: skip
 
 
@@ -72,19 +74,33 @@ class _View:
 
     def off_plan(self, points: Floats) -> tuple[Floats, Floats]:
         """Return where along the plan points are, and how far to its left [m]."""
-        at = self.flat(points)
-        start, step = self.planned[:-1], np.diff(self.planned, axis=0)
-        length = np.linalg.norm(step, axis=1)
-        unit = step / length[:, None]
-        away = at[:, None] - start
-        along = np.einsum("nmi,mi->nm", away, unit)
-        inside = np.clip(along, 0.0, length)
-        nearest = np.linalg.norm(away - inside[:, :, None] * unit, axis=2).argmin(axis=1)
-        rows = np.arange(len(at))
-        from_start, u = away[rows, nearest], unit[nearest]
-        across = u[:, 0] * from_start[:, 1] - u[:, 1] * from_start[:, 0]
-        before = np.concatenate([[0.0], np.cumsum(length)])[nearest]
-        return before + along[rows, nearest], across
+        return off_line(self.planned, self.flat(points))
+
+
+def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Return where along a line (M, 2) points (N, 2) are, and how far to its left [m].
+
+    The line goes on straight beyond its ends.
+    """
+    start, step = line[:-1], np.diff(line, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    unit = step / length[:, None]
+    away = points[:, None] - start
+    along = np.einsum("nmi,mi->nm", away, unit)
+    inside = np.clip(along, 0.0, length)
+    nearest = np.linalg.norm(away - inside[:, :, None] * unit, axis=2).argmin(axis=1)
+    rows = np.arange(len(points))
+    from_start, u = away[rows, nearest], unit[nearest]
+    across = u[:, 0] * from_start[:, 1] - u[:, 1] * from_start[:, 0]
+    before = np.concatenate([[0.0], np.cumsum(length)])[nearest]
+    return before + along[rows, nearest], across
+
+
+def _truth(facts: Facts) -> Floats | None:
+    """Return the true seam (M, 3) of a simulation, where it has one."""
+    scan = facts.log.last(WorkpieceScan)
+    lines = list(scan.truth.values()) if scan else []
+    return np.asarray(lines[0]) if len(lines) == 1 else None
 
 
 def _summary(facts: Facts, weld: WeldReport) -> str:
@@ -137,6 +153,23 @@ def _offsets(view: _View) -> Figure:
         traces.append(_line(along * 1e3, across * 1e3, name, colour))
     layout = _layout("along the plan [mm]", "left of the plan [mm]")
     return {"data": traces, "layout": layout}
+
+
+def _deviation(view: _View, truth: Floats | None) -> Figure:
+    torch = view.flat(view.weld.torch)
+    traces = []
+    for name, line, colour in (
+        ("from the seam as felt", view.weld.refined, CIRCLE),
+        ("from the true seam", truth, TRUTH),
+    ):
+        if line is None or len(line) < 2:
+            continue
+        seam = view.flat(line)
+        length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
+        along, across = off_line(seam, torch)
+        beside = (along >= 0.0) & (along <= length)
+        traces.append(_line(along[beside] * 1e3, across[beside] * 1e3, name, colour))
+    return {"data": traces, "layout": _layout("along the seam [mm]", "torch to the left [mm]")}
 
 
 def _contact(weld: WeldReport) -> Figure:

@@ -1,0 +1,130 @@
+"""The weld in the report: what is drawn is what was done."""
+
+import base64
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye import types as t
+from flangeye.record import Recorder
+from flangeye.report.page import render
+from flangeye.report.weld import off_line, weld_drawing
+from flangeye.runlog import read_run
+
+TIME = np.linspace(0.0, 40.0, 401)
+LINE = np.column_stack([np.linspace(0.5, 0.7, 201), np.zeros(201), np.full(201, 0.27)])
+PHASES = ("seeking",) * 50 + ("following",) * 150 + ("bridging",) * 50 + ("ending",) * 151
+
+
+def path(start, off):
+    """Along x from ``start`` on at 5 mm/s, so far to the left [m]."""
+    return np.column_stack([start + 5e-3 * TIME, np.full(401, off), np.full(401, 0.27)])
+
+
+WELD = t.WeldReport(
+    mode="tactile", completed=True, reason="", planned=LINE, refined=LINE + [0.0, 1e-3, 0.0],
+    opening=np.array([0.0, 0.0, 1.0]), time=TIME, tip=path(0.5, 1e-3), torch=path(0.46, 1.2e-3),
+    robot=path(0.5, 3e-3), deflection=np.full(401, 2e-3), wanted=np.full(401, 2e-3),
+    speed=np.full(401, 5e-3), turn=np.full(401, 0.1), along=5e-3 * TIME - 0.04, phases=PHASES,
+    figures={"images": 600.0, "images_with_tag": 590.0},
+    loop={"cycles": 20000.0, "computing_median": 2e-4, "computing_p99": 4.2e-4,
+          "period_median": 2e-3, "period_p99": 2.3e-3},
+)  # fmt: skip
+SCAN = t.WorkpieceScan(
+    t.PointCloud(t.CAMERA, np.float32(LINE)), "a scan", (), {"groove": LINE + [0.0, 1.1e-3, 0.0]}
+)
+
+
+class Facts:
+    """Of a log alone."""
+
+    def __init__(self, log):
+        self.log = log
+        self.result = type("Result", (), {"weld": None})
+
+
+@pytest.fixture
+def logged(tmp_path):
+    def write(weld, scan=SCAN):
+        recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
+        recorder.flangeye_run_started(source=t.Source("hash"), total=0)
+        for step, value in (("5.scan.file", scan), ("7.weld.tactile", weld)):
+            if value is not None:
+                recorder.flangeye_stage_finished(step=step, capture=None, value=value, seconds=0.1)
+        recorder.close()
+        return read_run(tmp_path / "run.mcap")
+
+    return write
+
+
+def numbers(packed):
+    """The array that a trace carries."""
+    return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
+
+
+def traces(figure):
+    return {trace["name"]: (numbers(trace["x"]), numbers(trace["y"])) for trace in figure["data"]}
+
+
+def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
+    drawn = traces(weld_drawing(Facts(logged(WELD))).paths)
+    assert list(drawn) == ["planned", "felt (refined)", "robot", "tip", "torch"]
+    x, y = drawn["torch"]
+    np.testing.assert_allclose([x[0], x[-1]], [-40.0, 160.0], atol=1e-3)
+    np.testing.assert_allclose(y, 1.2, atol=1e-3)
+    np.testing.assert_allclose(drawn["robot"][1], 3.0, atol=1e-3)
+
+
+def test_the_deviation_is_the_torch_s_beside_the_seam(logged):
+    drawn = traces(weld_drawing(Facts(logged(WELD))).deviation)
+    x, y = drawn["from the seam as felt"]
+    assert x.min() >= 0.0
+    np.testing.assert_allclose(y, 0.2, atol=1e-3)
+    np.testing.assert_allclose(drawn["from the true seam"][1], 0.1, atol=1e-3)
+    alone = traces(weld_drawing(Facts(logged(WELD, scan=None))).deviation)
+    assert list(alone) == ["from the seam as felt"]
+
+
+def test_the_phases_are_bands_over_the_deflection(logged):
+    layout = weld_drawing(Facts(logged(WELD))).contact["layout"]
+    assert [note["text"] for note in layout["annotations"]] == ["seeking", "bridging", "ending"]
+    seeking, bridging, ending = [(band["x0"], band["x1"]) for band in layout["shapes"]]
+    assert seeking == pytest.approx((0.0, 5.0))
+    assert bridging == pytest.approx((20.0, 25.0))
+    assert ending == pytest.approx((25.0, 40.0))
+
+
+def test_speeds_and_the_loop_are_told_in_people_s_units(logged):
+    drawing = weld_drawing(Facts(logged(WELD)))
+    speeds = traces(drawing.speeds)
+    np.testing.assert_allclose(speeds["robot [mm/s]"][1], 5.0, rtol=1e-5)
+    np.testing.assert_allclose(speeds["turning [deg/s]"][1], 5.73, rtol=1e-3)
+    assert ("computing, 99 % below", "0.42 ms") in drawing.loop
+    assert ("with the tag", "590") in drawing.loop
+
+
+def test_the_page_says_why_a_weld_was_stopped(logged):
+    stopped = replace(WELD, completed=False, reason="no tag was seen for 500 ms")
+    page = render(logged(stopped))
+    assert "The weld was stopped: no tag was seen for 500 ms." in page
+    for name in ("paths", "offsets", "deviation", "contact", "speeds"):
+        assert f"figure-weld-{name}" in page
+
+
+def test_a_weld_that_felt_nothing_is_still_drawn(logged):
+    nothing = replace(WELD, refined=np.zeros((0, 3)), mode="vision", loop={})
+    drawing = weld_drawing(Facts(logged(nothing)))
+    assert list(traces(drawing.deviation)) == ["from the true seam"]
+    assert [name for name, _ in drawing.loop] == ["images read", "with the tag"]
+
+
+def test_a_run_without_a_weld(logged):
+    assert weld_drawing(Facts(logged(None))) is None
+
+
+def test_a_line_goes_on_beyond_its_ends():
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    along, across = off_line(corner, np.array([[-0.5, 0.1], [0.5, -0.2], [0.9, 0.5], [1.1, 1.5]]))
+    np.testing.assert_allclose(along, [-0.5, 0.5, 1.5, 2.5])
+    np.testing.assert_allclose(across, [0.1, -0.2, 0.1, -0.1])
