@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from flangeye.report import write_report
+from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
 from flangeye.report.plot import box_edges, figure3d, joined, packed, plain, round_up, scatter3d
 from flangeye.report.residuals import errors_of, residual_figure
-from flangeye.report.space import cell_drawing, workspace_drawing
+from flangeye.report.space import workspace_drawing
 from flangeye.runlog import RunLog
 
 Make = Callable[..., RunLog]

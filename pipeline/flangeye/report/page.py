@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 from flangeye import __version__
 from flangeye.errors import StageError
 from flangeye.report.account import provenance_of, set_aside_of, timings_of
+from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.facts import Facts, facts_of
+from flangeye.report.images import image_view
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
-from flangeye.report.space import cell_drawing, workspace_drawing
+from flangeye.report.space import workspace_drawing
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.report.units import degrees, millimetres, percent
 from flangeye.report.weld import weld_drawing
@@ -62,6 +64,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "residuals": residual_figure(errors),
         "workspace": workspace_drawing(facts),
         "panels": cloud_panels(facts),
+        "image": image_view(facts),
         "cell": cell_drawing(facts),
         "seam": seam_view(facts),
         "weld": weld_drawing(facts),

@@ -1,4 +1,4 @@
-"""The two views of the whole cell: the error over the workspace, and everything in the base."""
+"""The error over the workspace, in the frame that carries the camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.foxglove import circle_lines
 from flangeye.geometry import covariance_at
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
@@ -16,19 +15,15 @@ from flangeye.report.plot import (
     NEUTRAL,
     TRUTH,
     UNUSED,
-    USED,
     Floats,
     Trace,
     box_edges,
     figure3d,
-    frame,
     lines,
     packed,
     plain,
-    points,
     round_up,
     scatter3d,
-    thinned,
 )
 from flangeye.report.units import millimetres
 
@@ -40,24 +35,27 @@ GRID = 5
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure for plotly and what it shows in words."""
+    """A figure for plotly, the frame it is in, and what it shows in words."""
 
     figure: dict[str, Any]
+    frame: str
     summary: str
 
 
 def workspace_drawing(facts: Facts) -> Drawing | None:
     """Return the error to expect at every place of the workspace, and the true one if known."""
-    box, estimate = facts.result.workspace, facts.result.transforms.get("base_T_camera")
-    if box is None or estimate is None:
+    box, found = facts.result.workspace, facts.estimate
+    if box is None or found is None:
         return None
+    name, estimate = found
+    frame = name.partition("_T_")[0]
     grid = t.Box(box.centre, box.size).grid(GRID)  # type: ignore[arg-type]
     covariances = covariance_at(np.array(estimate.covariance), np.array(estimate.about), grid)
     sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     traces = [
         _predicted(grid, sigma),
         lines(box_edges(np.array(box.centre), np.array(box.size)), NEUTRAL, 2, name="workspace"),
-        *_flange_centres(facts, size=4),
+        *target_centres(facts, frame, np.array(estimate.matrix), size=4),
     ]
     low, high = millimetres(float(sigma.min())), millimetres(float(sigma.max()))
     summary = (
@@ -68,7 +66,7 @@ def workspace_drawing(facts: Facts) -> Drawing | None:
         arrows, scale, size = _true_errors(facts, grid, max(box.size))
         traces.append(arrows)
         summary += f" The true error, drawn {scale:g} times too long, is at most {size} mm there."
-    return Drawing(figure3d(traces), summary)
+    return Drawing(figure3d(traces), in_words(frame), summary)
 
 
 def _predicted(grid: Floats, sigma: Floats) -> Trace:
@@ -87,85 +85,59 @@ def _predicted(grid: Floats, sigma: Floats) -> Trace:
     )  # fmt: skip
 
 
-def _flange_centres(facts: Facts, size: float) -> list[Trace]:
+def in_words(frame: str) -> str:
+    """Return what a page calls a frame."""
+    return "the robot's base" if frame == t.BASE else f"the frame {frame}"
+
+
+def target_centres(facts: Facts, frame: str, pose: Floats | None, size: float) -> list[Trace]:
+    """Return where the target was, by whether it was used.
+
+    In the base that is where the robot reports its flange; elsewhere where the camera saw it.
+
+    Args:
+        facts: The run.
+        frame: What the drawing is in.
+        pose: (4, 4) of the camera in it.
+        size: Of the symbols.
+    """
+    what = "flange" if frame == t.BASE else "target"
     groups = []
-    unused = "flange, not used" if facts.estimate else "flange"
-    for used, colour, name in ((True, CIRCLE, "flange, used"), (False, UNUSED, unused)):
+    unused = f"{what}, not used" if facts.estimate else what
+    for used, colour, name in ((True, CIRCLE, f"{what}, used"), (False, UNUSED, unused)):
         group = [o for o in facts.measured if o.used is used and o.tcp_in_base]
-        if group:
-            at = np.array([o.tcp_in_base for o in group])
-            label = [plain(o.id, 60) for o in group]
-            marker = {"size": size, "color": colour, "symbol": "diamond"}
-            groups.append(
-                scatter3d(
-                    at, "markers", marker=marker, hoverinfo="text", hovertext=label, name=name
-                )
-            )
+        if not group:
+            continue
+        at = np.array([o.tcp_in_base for o in group])
+        if frame != t.BASE and pose is not None:
+            at = mapped(pose, [o.centre_in_camera for o in group])
+        label = [plain(o.id, 60) for o in group]
+        marker = {"size": size, "color": colour, "symbol": "diamond"}
+        groups.append(
+            scatter3d(at, "markers", marker=marker, hoverinfo="text", hovertext=label, name=name)
+        )
     return groups
+
+
+def mapped(pose: Floats, xyz: Any) -> Floats:
+    """Return positions (..., 3) in the parent of a (4, 4) pose."""
+    return np.asarray(np.asarray(xyz, dtype=np.float64) @ pose[:3, :3].T + pose[:3, 3])
 
 
 def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, float, str]:
     """Return the true error at each point as lines, how much too long, and the largest."""
-    truth, estimate = facts.result.truth, facts.base_T_camera
-    if truth is None or estimate is None:
+    truth, found = facts.result.truth, facts.estimate
+    if truth is None or found is None:
         raise ValueError("there is no truth to compare with")
-    error = estimate @ np.linalg.inv(np.array(truth.base_T_camera))
-    shift = grid @ error[:3, :3].T + error[:3, 3] - grid
+    name, estimate = found
+    true = truth.transforms.get(name) or truth.base_T_camera
+    error = np.array(estimate.matrix) @ np.linalg.inv(np.array(true))
+    shift = mapped(error, grid) - grid
+    free = np.reshape(estimate.unobservable or [], (-1, 6))[:, 3:]
+    shift = shift - shift @ free.T @ free
     largest = float(np.linalg.norm(shift, axis=1).max())
     # The longest comes to about a fifth of the distance between neighbours and box edge.
     scale = 0.5 * round_up(0.2 * max(extent, 0.05) / max(largest, 1e-9))
     segments = [np.stack([p, p + scale * d]) for p, d in zip(grid, shift, strict=True)]
     trace = lines(segments, TRUTH, 4, name=f"true error × {scale:g}")
     return trace, scale, millimetres(largest)
-
-
-def cell_drawing(facts: Facts) -> Drawing | None:
-    """Return the flanges, the first scan, the workspace and both frames, all in the base."""
-    traces = _flange_centres(facts, size=2.5)
-    shown = ["the flange's centre as the robot reports it"] if traces else []
-    pose = facts.base_T_camera
-    if pose is not None:
-        circles = _circles(facts, pose)
-        clouds = _flanges(facts, pose) + _first_scan(facts, pose)
-        traces += [*clouds, *circles]
-        shown += [str(x["name"]) for x in clouds + circles]
-    if not traces:
-        return None
-    if box := facts.result.workspace:
-        edges = box_edges(np.array(box.centre), np.array(box.size))
-        traces.append(lines(edges, NEUTRAL, 2, name="workspace"))
-    traces += frame(np.eye(4), t.BASE, 0.2)
-    if pose is not None:
-        traces += frame(pose, t.CAMERA, 0.2)
-    axes = "Axes are 200 mm long, x red, y green, z blue."
-    summary = f"In the robot's base: {', '.join(shown)}. {axes}"
-    return Drawing(figure3d(traces), summary)
-
-
-def _circles(facts: Facts, pose: Floats) -> list[Trace]:
-    fitted = [e.value for e in facts.log.of_kind("fit") if isinstance(e.value, t.CircleFeature)]
-    rings = [_mapped(pose, line) for circle in fitted for line in circle_lines(circle, 36)]
-    return [lines(rings, CIRCLE, 2, name="fitted circles")] if rings else []
-
-
-def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
-    entries = [e.value for e in facts.log.of_kind("segment") if isinstance(e.value, t.FlangeCloud)]
-    if not entries:
-        return []
-    each = max(1, FLANGE_POINTS // len(entries))
-    xyz = np.concatenate([thinned(flange.cloud.xyz, each) for flange in entries])
-    return [points(_mapped(pose, xyz), USED, 1.5, name="flange clouds")]
-
-
-def _first_scan(facts: Facts, pose: Floats) -> list[Trace]:
-    """Return the first scan, thinned: the arm must be where the arm is, the table level."""
-    first = next(facts.log.captures(), None)
-    if first is None:
-        return []
-    xyz = thinned(first.cloud.points(), SCAN_POINTS)
-    name = f"scan {plain(first.id, 40)}"
-    return [points(_mapped(pose, xyz), NEUTRAL, 1.2, name=name)] if len(xyz) else []
-
-
-def _mapped(pose: Floats, xyz: Any) -> Floats:
-    return np.asarray(np.asarray(xyz, dtype=np.float64) @ pose[:3, :3].T + pose[:3, 3])

@@ -58,14 +58,19 @@ class PoseFeature:
         covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in
             ``camera``, the translation taken at the target's origin.
         figures: What the fit has to tell of its quality, by name, in SI units and pixels.
+        corners: (N, 4) the target's corners in the image, right and down, and what has to be
+            added to come to where the pose has them [px]; none where it was found otherwise.
     """
 
     camera_T_target: Transform
     covariance: Array
     figures: Mapping[str, float] = field(default_factory=dict)
+    corners: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     def __post_init__(self) -> None:
-        freeze(self, covariance=(6, 6))
+        corners = np.reshape(self.corners, (-1, 4))  # JSON does not tell (0, 4) from (0,)
+        object.__setattr__(self, "corners", corners)
+        freeze(self, covariance=(6, 6), corners=corners.shape)
 
     @property
     def centre(self) -> NDArray[np.float64]:

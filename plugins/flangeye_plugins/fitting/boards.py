@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flangeye import Params, stage
 from flangeye.boards import Board, Dictionary
 from flangeye.geometry import rotation_log
-from flangeye.types import CAMERA, TARGET, Capture, PoseFeature, Rejected, Transform
+from flangeye.types import CAMERA, TARGET, Capture, Image, PoseFeature, Rejected, Transform
 from flangeye.units import Length, param
 from flangeye_plugins.fitting.corners import Corners, find_corners
 from flangeye_plugins.fitting.planar import (
@@ -19,6 +19,7 @@ from flangeye_plugins.fitting.planar import (
     points_of,
     pose_from_points,
     poses_from_pixels,
+    reprojection,
     scale_of,
 )
 
@@ -152,9 +153,12 @@ def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeatu
     if by_depth is None and params.depth == "only":
         return Rejected("the cloud has no depth at the corners; it must be organised as the image")
     if by_depth is not None and params.depth == "only":
-        return _feature(by_depth, corners, by_depth=True)
+        return _feature(by_depth, corners, capture.image, by_depth=True)
     poses = poses_from_pixels(corners, capture.image, params.corner_noise)
-    return _better(poses, by_depth, corners, params)
+    chosen = _better(poses, by_depth, corners, params)
+    if isinstance(chosen, Rejected):
+        return chosen
+    return _feature(chosen, corners, capture.image, by_depth=chosen is by_depth)
 
 
 def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | Rejected | None:
@@ -178,7 +182,7 @@ def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | 
 
 def _better(
     poses: list[PlanarPose], by_depth: PlanarPose | None, corners: Corners, params: TargetParams
-) -> PoseFeature | Rejected:
+) -> PlanarPose | Rejected:
     """Return the pose with the smaller expected error over the target's corners."""
     best = poses[0]
     if best.noise > params.max_error:
@@ -189,10 +193,9 @@ def _better(
     if by_depth is not None:
         best = min(poses, key=lambda pose: _apart(pose, by_depth))
         if by_depth.error_at(corners.points) < best.error_at(corners.points):
-            return _feature(by_depth, corners, by_depth=True)
-        return _feature(best, corners, by_depth=False)
-    ambiguous = _ambiguity(poses)
-    return ambiguous or _feature(best, corners, by_depth=False)
+            return by_depth
+        return best
+    return _ambiguity(poses) or best
 
 
 def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
@@ -219,7 +222,17 @@ def _apart(first: PlanarPose, second: PlanarPose) -> float:
     return float(np.linalg.norm(rotation_log(turn)))
 
 
-def _feature(pose: PlanarPose, corners: Corners, by_depth: bool) -> PoseFeature:
-    figures = {"corners": float(len(corners.pixels)), "by_depth": float(by_depth)}
-    figures["corner_noise_m" if by_depth else "corner_noise_px"] = pose.noise
-    return PoseFeature(Transform(CAMERA, TARGET, pose.matrix), pose.covariance, figures)
+def _feature(pose: PlanarPose, corners: Corners, image: Image, by_depth: bool) -> PoseFeature:
+    misses = reprojection(corners, image, pose.matrix)[0].reshape(-1, 2)
+    figures = {
+        "corners": float(len(corners.pixels)),
+        "by_depth": float(by_depth),
+        "corner_noise_m" if by_depth else "corner_noise_px": pose.noise,
+        "reprojection_px": float(np.sqrt((misses**2).mean())),
+    }
+    return PoseFeature(
+        Transform(CAMERA, TARGET, pose.matrix),
+        pose.covariance,
+        figures,
+        np.hstack([corners.pixels, misses]),
+    )

@@ -95,10 +95,10 @@ def _least_squares(corners: Corners, image: Image, start: Floats, expected: floa
     """Refine a pose by Gauss-Newton on the reprojection errors."""
     pose = start
     for _ in range(STEPS):
-        errors, jacobian = _reprojection(corners, image, pose)
+        errors, jacobian = reprojection(corners, image, pose)
         step = np.asarray(-np.linalg.lstsq(jacobian, errors, rcond=None)[0], dtype=np.float64)
         pose = rigid(rotation_exp(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
-    errors, jacobian = _reprojection(corners, image, pose)
+    errors, jacobian = reprojection(corners, image, pose)
     misfit, freedom = float(errors @ errors), len(errors) - 6
     variance = (misfit + PRIOR_FREEDOM * expected**2) / (freedom + PRIOR_FREEDOM)
     covariance = variance * np.linalg.inv(jacobian.T @ jacobian)
@@ -107,8 +107,11 @@ def _least_squares(corners: Corners, image: Image, start: Floats, expected: floa
     return PlanarPose(pose, 0.5 * (covariance + covariance.T), float(np.sqrt(variance)), misfit)
 
 
-def _reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, Floats]:
-    """Return errors (2N,) [px] and their derivatives (2N, 6) to rotation and translation."""
+def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, Floats]:
+    """Return errors (2N,) [px] and their derivatives (2N, 6) to rotation and translation.
+
+    An error is where the pose (4, 4) has a corner, minus where it was detected.
+    """
     import cv2
 
     turned = corners.points @ pose[:3, :3].T

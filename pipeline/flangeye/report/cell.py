@@ -1,0 +1,147 @@
+"""The cell as the calibration has it: arm, camera, and what the camera saw, in one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.foxglove import circle_lines
+from flangeye.report.facts import Facts
+from flangeye.report.plot import (
+    AXES as COLOURS,
+)
+from flangeye.report.plot import (
+    CIRCLE,
+    NEUTRAL,
+    USED,
+    Floats,
+    Trace,
+    box_edges,
+    figure3d,
+    frame,
+    lines,
+    plain,
+    points,
+    thinned,
+)
+from flangeye.report.space import Drawing, in_words, mapped, target_centres
+
+FLANGE_POINTS = 3_000
+SCAN_POINTS = 3_000
+AXES = 0.2
+"""Length of the axes of base and camera [m]."""
+TARGET_AXES = 0.06
+"""Of those of a marker, drawn at every pose [m]."""
+
+
+def cell_drawing(facts: Facts) -> Drawing | None:
+    """Return what was seen, the workspace and the frames.
+
+    In the base where the camera stands there. Where an arm's flange carries the camera also in
+    the base, each capture from where the camera was: what stands still must then lie in one place.
+    On a link, whose place the log does not tell, in the link's frame.
+    """
+    found = facts.estimate
+    carrier = found[0].partition("_T_")[0] if found else t.BASE
+    if carrier == t.FLANGE:
+        return _from_moving_camera(facts)
+    pose = np.array(found[1].matrix) if found else None
+    traces = target_centres(facts, carrier, pose, size=2.5)
+    seen = "as the robot reports it" if carrier == t.BASE else "as the camera saw it"
+    shown = [f"the {'flange' if carrier == t.BASE else 'target'}'s centre {seen}"] if traces else []
+    if pose is not None:
+        drawn = [
+            *_flanges(facts, pose),
+            *_first_scan(facts, pose),
+            *_circles(facts, pose),
+            *_targets([pose @ m for m in _marker_poses(facts).values()]),
+        ]
+        traces += drawn
+        shown += list(dict.fromkeys(str(x["name"]) for x in drawn))
+    if not traces:
+        return None
+    if box := facts.result.workspace:
+        edges = box_edges(np.array(box.centre), np.array(box.size))
+        traces.append(lines(edges, NEUTRAL, 2, name="workspace"))
+    traces += frame(np.eye(4), carrier, AXES)
+    if pose is not None:
+        traces += frame(pose, t.CAMERA, AXES)
+    return _drawing(traces, shown, carrier)
+
+
+def _from_moving_camera(facts: Facts) -> Drawing | None:
+    """Return the base with the camera and what it saw at every capture."""
+    if facts.estimate is None:
+        return None
+    eye = np.array(facts.estimate[1].matrix)
+    cameras = {o.id: o.base_T_flange.matrix @ eye for o in facts.log.observations()}
+    if not cameras:
+        return None
+    markers = _marker_poses(facts)
+    centres = [
+        mapped(cameras[o.id], o.centre_in_camera)
+        for o in facts.measured
+        if o.id in cameras and o.centre_in_camera
+    ]
+    at = np.array([m[:3, 3] for m in cameras.values()])
+    drawn = [
+        points(at, USED, 3, name="the camera at every capture"),
+        points(centres, CIRCLE, 3, name="the target's centre as the camera saw it from each"),
+        *_targets([cameras[k] @ m for k, m in markers.items() if k in cameras]),
+        *_first_scan(facts, next(iter(cameras.values()))),
+    ]
+    traces = [*drawn, *frame(np.eye(4), t.BASE, AXES)]
+    traces += frame(next(iter(cameras.values())), t.CAMERA, AXES / 2)
+    return _drawing(traces, list(dict.fromkeys(str(x["name"]) for x in drawn)), t.BASE)
+
+
+def _drawing(traces: list[Trace], shown: list[str], name: str) -> Drawing:
+    words = in_words(name)
+    axes = "Axes are x red, y green, z blue."
+    return Drawing(figure3d(traces), words, f"In {words}: {', '.join(shown)}. {axes}")
+
+
+def _marker_poses(facts: Facts) -> dict[str, Floats]:
+    """Return camera_T_target (4, 4) of each capture whose target has a whole pose."""
+    return {
+        o.id: o.feature.camera_T_target.matrix
+        for o in facts.log.observations()
+        if isinstance(o.feature, t.PoseFeature)
+    }
+
+
+def _targets(poses: list[Floats]) -> list[Trace]:
+    """Return the axes of a target at every pose, small; the first axis names them."""
+    axes = [
+        [np.stack([m[:3, 3], m[:3, 3] + TARGET_AXES * m[:3, i]]) for m in poses] for i in range(3)
+    ]
+    named = [
+        lines(parts, colour, 2, name="its axes", showlegend=i == 0)
+        for i, (parts, colour) in enumerate(zip(axes, COLOURS, strict=True))
+    ]
+    return named if poses else []
+
+
+def _circles(facts: Facts, pose: Floats) -> list[Trace]:
+    fitted = [e.value for e in facts.log.of_kind("fit") if isinstance(e.value, t.CircleFeature)]
+    rings = [mapped(pose, line) for circle in fitted for line in circle_lines(circle, 36)]
+    return [lines(rings, CIRCLE, 2, name="fitted circles")] if rings else []
+
+
+def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
+    entries = [e.value for e in facts.log.of_kind("segment") if isinstance(e.value, t.FlangeCloud)]
+    if not entries:
+        return []
+    each = max(1, FLANGE_POINTS // len(entries))
+    xyz = np.concatenate([thinned(flange.cloud.xyz, each) for flange in entries])
+    return [points(mapped(pose, xyz), USED, 1.5, name="flange clouds")]
+
+
+def _first_scan(facts: Facts, pose: Floats) -> list[Trace]:
+    """Return the first scan, thinned: the arm must be where the arm is, the table level."""
+    first = next(facts.log.captures(), None)
+    if first is None:
+        return []
+    xyz = thinned(first.cloud.points(), SCAN_POINTS)
+    name = f"scan {plain(first.id, 40)}"
+    return [points(mapped(pose, xyz), NEUTRAL, 1.2, name=name)] if len(xyz) else []
