@@ -1,0 +1,143 @@
+"""The line that a finding gives, put into the recipe, cures: the calibration is as if nothing was."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from flangeye.diagnosis import Session
+from flangeye.doctor import examine, open_session
+from flangeye.errors import FlangeyeError
+from flangeye.geometry import rotation_exp, rotation_log
+from flangeye.mending import inverted, reread, scaled, shifted, transposed
+from flangeye.recipe import load_recipe
+from flangeye.registry import load_registry
+from flangeye.runner import Runner
+from flangeye.types import ArchivePath
+from flangeye_plugins.doctoring import CHECKS
+from tests.doctor.sessions import clean
+
+REGISTRY = load_registry()
+N = 24
+
+RECIPE = {
+    "title": "Samples",
+    "robot": {"model": "ur5e"},
+    "configuration": {"name": "eye-on-base", "place": "unknown"},
+    "steps": [
+        {"acquire.samples": {"reader": "moveit", "position_noise": "0.3 mm"}},
+        "solve.maximum_likelihood",
+    ],
+}
+
+
+def on_poses(change):
+    return lambda session: session.with_poses(change(session.poses))
+
+
+def on_rows(rows, **changes):
+    """Change what was seen, or reported, in some rows."""
+
+    def plant(session):
+        given = {name: np.array(getattr(session, name)) for name in changes}
+        for name, change in changes.items():
+            given[name][rows] = change(given[name][rows])
+        return replace(session, **given)
+
+    return plant
+
+
+def late(session):
+    poses, known = shifted(session.poses, 1)
+    return session.with_poses(poses).where(known)
+
+
+def late_from_the_middle(session):
+    poses, known = shifted(session.poses, 1, N // 2)
+    return session.with_poses(poses).where(known)
+
+
+HALF_TURN = rotation_exp(np.array([np.pi, 0.0, 0.0]))
+FAULTS = {
+    "metres as millimetres": ("unit", on_poses(lambda p: scaled(p, 1e-3))),
+    "millimetres as metres": ("unit", on_poses(lambda p: scaled(p, 1e3))),
+    "inches as metres": ("unit", on_poses(lambda p: scaled(p, 1 / 25.4e-3))),
+    "the marker in inches": ("unit", lambda s: replace(s, centres=s.centres / 25.4e-3)),
+    "wxyz as xyzw": ("pose convention", on_poses(lambda p: reread(p, "wxyz", "xyzw"))),
+    "ZYX as xyz": ("pose convention", on_poses(lambda p: reread(p, "ZYX", "xyz"))),
+    "vectors as ZYX": ("pose convention", on_poses(lambda p: reread(p, "vector", "ZYX"))),
+    "the base in the flange": ("pose direction", on_poses(inverted)),
+    "transposed": ("pose direction", on_poses(transposed)),
+    "shifted by one": ("shifted poses", late),
+    "shifted from the middle": ("shifted poses", late_from_the_middle),
+    "flips": ("target flips", on_rows([3, 9, 15], rotations=lambda r: r @ HALF_TURN)),
+    "an outlier": ("outlier", on_rows([7], centres=lambda c: c + 0.05)),
+    "identities of the robot": ("identity matrices", on_rows([2, 5], poses=lambda p: 0 * p + np.eye(4))),
+    "identities of the marker": (
+        "identity matrices",
+        on_rows([2, 5], centres=lambda c: 0 * c, rotations=lambda r: 0 * r + np.eye(3)),
+    ),
+    "a moved target": (
+        "moved target", on_rows(np.arange(14, N), centres=lambda c: c + [0.02, 0.0, 0.01]),
+    ),
+}  # fmt: skip
+HARMLESS = {"identities of the marker", "identities of the robot", "an outlier", "flips"}
+"""Those that the solver sets aside by itself."""
+
+
+def write(path, session: Session):
+    """Write samples as MoveIt does, not a number of them rounded."""
+    path.mkdir()
+    seen = np.tile(np.eye(4), (len(session), 1, 1))
+    seen[:, :3, :3], seen[:, :3, 3] = session.rotations, session.centres
+    samples = [
+        {"effector_wrt_world": p.ravel().tolist(), "object_wrt_sensor": s.ravel().tolist()}
+        for p, s in zip(session.poses, seen, strict=True)
+    ]
+    (path / "samples.yaml").write_text(yaml.safe_dump(samples))
+    return path
+
+
+def recipe_with(path, step):
+    path.write_text(yaml.safe_dump({**RECIPE, "steps": [step, RECIPE["steps"][1]]}))
+    return load_recipe(path, REGISTRY)
+
+
+def calibrated(recipe, archive):
+    """Return base_T_camera, None where it is refused."""
+    try:
+        result = Runner(recipe, REGISTRY, ArchivePath(archive)).run()
+    except FlangeyeError:
+        return None
+    found = result.transforms.get("base_T_camera")
+    return None if found is None else np.array(found.matrix)
+
+
+def apart(first, second):
+    """Return the distance of two camera poses [m, rad]; infinite where there is none."""
+    if first is None or second is None:
+        return np.inf, np.inf
+    turned = np.linalg.norm(rotation_log(first[:3, :3].T @ second[:3, :3]))
+    return np.linalg.norm(first[:3, 3] - second[:3, 3]), turned
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_line_cures(tmp_path, fault):
+    name, plant = FAULTS[fault]
+    session = clean(np.random.default_rng(5), N, "marker", turn=0.4)
+    recipe = recipe_with(tmp_path / "recipe.yaml", RECIPE["steps"][0])
+    truth = calibrated(recipe, write(tmp_path / "good", session))
+    archive = write(tmp_path / "bad", plant(session))
+
+    found = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
+    assert [finding.name for finding in found] == [name]
+    (step,) = yaml.safe_load(found[-1].fix)
+    mended = recipe_with(tmp_path / "mended.yaml", step)
+
+    shift, turn = apart(calibrated(mended, archive), truth)
+    assert shift < 2e-3
+    assert turn < np.radians(0.15)
+    assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
+    before = apart(calibrated(recipe, archive), truth)
+    assert fault in HARMLESS or before[0] > 5 * shift
