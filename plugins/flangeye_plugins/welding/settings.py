@@ -82,7 +82,7 @@ class WeldTactileParams(Following):
         "(the plan alone, nothing is touched).",
     )
     log_images: bool = Field(
-        True, description="Log every image, which replaying needs: 1 MB a second and more."
+        True, description="Log what was read of every image, 17 kB each; replaying needs it."
     )
     clearance: Length = param(
         "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
