@@ -1,5 +1,6 @@
 """The arm while it welds: its way is checked before, and it is watched in every cycle."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from flangeye.catalogue import read_model
 from flangeye.devices import DeviceError, RobotDriver
-from flangeye.errors import StageError
+from flangeye.errors import RunStopped, StageError
 from flangeye.shipped import shipped
 from flangeye_plugins.drivers.robots.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.welding.bounds import Bounds
@@ -183,6 +184,19 @@ def test_beyond_the_bounds(displacement, lateral, told):
     with pytest.raises(DeviceError) as error:
         check(displacement, lateral)
     assert str(error.value) == told
+
+
+def test_the_space_bar_stops_the_arm():
+    robot, (ours, theirs) = StandIn(), os.pipe()
+    drive = Drive(robot, LatestState(robot.state()), STAND_IN, LIMITS, ours)
+    drive.lead()
+    os.write(theirs, b"x")
+    drive.tick()
+    os.write(theirs, b" ")
+    with pytest.raises(RunStopped) as told:
+        drive.tick()
+    assert str(told.value) == "the operator stopped the arm (the space bar)"
+    assert "stop" in robot.commands()
 
 
 def test_an_arm_that_moves_unasked_is_stopped():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from flangeye.catalogue import RobotModel
 from flangeye.devices import PATIENCE, DeviceError, RobotDriver, RobotState
 from flangeye.errors import RunStopped
 from flangeye_plugins.motion.guard import Charge, Report, guard, guard_in_process
+from flangeye_plugins.motion.keyboard import keys
 from flangeye_plugins.motion.limits import Limits
 from flangeye_plugins.motion.route import Route
 from flangeye_plugins.motion.watch import Sample
@@ -159,7 +159,7 @@ def _in_thread(ours: Connection, theirs: Connection, charge: Charge) -> Iterator
 def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterator[None]:
     spawn = multiprocessing.get_context("spawn")
     heard, alarm = multiprocessing.Pipe(duplex=False)
-    with _keys() as keyboard, _alarmed(alarm):
+    with keys() as keyboard, _alarmed(alarm):
         process = spawn.Process(
             target=guard_in_process,
             args=(theirs, charge._replace(keyboard=keyboard), heard),
@@ -191,21 +191,3 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
             yield
         finally:
             signal.set_wakeup_fd(before)
-
-
-@contextmanager
-def _keys() -> Iterator[int | None]:
-    """Let single keys be read from the terminal, if there is one."""
-    if not sys.stdin.isatty():
-        yield None
-        return
-    import termios
-    import tty
-
-    keyboard = sys.stdin.fileno()
-    before = termios.tcgetattr(keyboard)
-    tty.setcbreak(keyboard)
-    try:
-        yield keyboard
-    finally:
-        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)

@@ -8,7 +8,9 @@ import numpy as np
 
 from flangeye.catalogue import RobotModel
 from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
+from flangeye.errors import RunStopped
 from flangeye.types import Transform
+from flangeye_plugins.motion.keyboard import space_pressed
 from flangeye_plugins.motion.limits import Limits
 from flangeye_plugins.motion.route import Route
 from flangeye_plugins.motion.watch import STANDING, Doubt, Watch
@@ -32,9 +34,14 @@ class Drive:
     """
 
     def __init__(
-        self, robot: Robot, latest: LatestState, model: RobotModel, limits: Limits
+        self,
+        robot: Robot,
+        latest: LatestState,
+        model: RobotModel,
+        limits: Limits,
+        keyboard: int | None = None,
     ) -> None:
-        """Begin to watch an open arm.
+        """Begin to watch an open arm; the space bar of ``keyboard``, a descriptor, stops it.
 
         Raises:
             DeviceError: It is not the model's, has a tool set that nobody knows of, or is moved by
@@ -43,7 +50,7 @@ class Drive:
         if isinstance(robot, MovedByHand):
             raise DeviceError(f"{robot.name}: is moved by hand; a weld needs an arm that drives")
         self.robot, self.latest, self.limits = robot, latest, limits
-        self._watch = Watch(model, limits)
+        self._watch, self._keyboard = Watch(model, limits), keyboard
         state = robot.state()
         latest.tell(state)
         try:
@@ -57,6 +64,7 @@ class Drive:
 
         Raises:
             DeviceError: The arm must not go on; it was told to stop.
+            RunStopped: The operator stopped it.
         """
         self.robot.wait_cycle()
         return self.read()
@@ -106,6 +114,9 @@ class Drive:
 
     def _judged(self) -> tuple[RobotState, bool]:
         """Return the newest state, and whether the leg under way has ended."""
+        if space_pressed(self._keyboard):
+            self.stop()
+            raise RunStopped("the operator stopped the arm (the space bar)")
         state = self.robot.state()
         self.latest.tell(state)
         try:

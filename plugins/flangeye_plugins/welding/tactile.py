@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from flangeye.errors import NothingMoved
 from flangeye.header import LimitsSection
 from flangeye.stage import stage
 from flangeye.types import Journal, Seam, Seed, VerifiedHandEye, WeldReport
+from flangeye_plugins.motion.keyboard import keys
 from flangeye_plugins.motion.limits import limits_of
 from flangeye_plugins.welding import checks
 from flangeye_plugins.welding.account import report_of
@@ -56,6 +57,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         StageError: The seam, the finger or the limits do not allow it; nothing has moved.
         NothingMoved: Motion was not asked for; the message is the plan.
         DeviceError: Arm or finger cannot be opened, or are lost on the way to the seam.
+        RunStopped: The operator stopped the arm.
     """
     finger: Finger = read_model(params.finger, Finger)
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
@@ -79,7 +81,8 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
         chronicle = opened.enter_context(Chronicle(journal, not simulated, params.log_images))
         chronicle.note("start", start_of(points, plane, finger, params))
-        drive = Drive(robot, latest, model, allowed)
+        keyboard = opened.enter_context(nullcontext() if simulated else keys())
+        drive = Drive(robot, latest, model, allowed, keyboard)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
         approach(cell, passage, chronicle, params.mode)
         longest = 60.0 + 3.0 * (plan.length + finger.torch) / params.speed
