@@ -124,7 +124,7 @@ def _draw(rows: Sequence[Row]) -> Any:
     page.panels[0].plot(noise, np.array(all_data) * GROWTH, ":", color=PRINTED.colour)
     page.panels[0].annotate(
         "one seventh, says the paper", (10, all_data[-1] * GROWTH), fontsize=7, ha="right",
-        xytext=(0, -18), textcoords="offset points", color=PRINTED.colour,
+        xytext=(0, -32), textcoords="offset points", color=PRINTED.colour,
     )  # fmt: skip
     _lines(page.panels[4], gross, "workspace_rms", "workspace_bound")
     logarithmic(page.panels[4], 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50)

@@ -130,5 +130,6 @@ def _draw(path: Sequence[Session]) -> Any:
         panel.plot([5], [value], "D", color=PRINTED.colour, label="Table 1, where theirs stopped")
         panel.set_xscale("log")
         dress(panel, f"{axis} of the Aubo's verification", "steps of ICP", f"{axis} [mm]")
+    page.panels[0].set_ylim(bottom=-0.95)  # room for the key below the lines
     legend(page.panels[0], loc="lower right")
     return page

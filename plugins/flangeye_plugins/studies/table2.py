@@ -120,6 +120,7 @@ def _draw(trials: Sequence[Trials]) -> Any:
     titles = ("translation at the camera's origin, as printed", "at the work: over the workspace")
     for panel, title in zip(page.panels, titles, strict=True):
         panel.set_xticks(range(3), names)
+        panel.set_xlim(-0.5, 2.5)
         logarithmic(panel, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
         dress(panel, title, "", "error [mm]")
     legend(page.panels[0], loc="upper right")
