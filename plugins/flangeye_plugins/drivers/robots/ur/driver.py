@@ -95,6 +95,7 @@ class UrRobot:
         self.name, self.period = name, period
         self._host, self._link = host, link
         self._seen = self._commanded = 0
+        self._posed: tuple[int, Floats] = (-1, np.eye(4))
         self.offset = POSE.matrix(self._link.request("tool"))
         self._tool_T_flange = np.linalg.inv(self.offset)
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
@@ -103,7 +104,7 @@ class UrRobot:
         """Return the newest sample, tool taken off."""
         sample = self._fresh()
         condition = condition_of(sample, sample.number <= self._commanded)
-        base_T_tool = POSE.matrix(sample.tool_pose)
+        base_T_tool = self._base_T_tool(sample)
         base_T_flange = base_T_tool @ self._tool_T_flange
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, base_T_flange),
@@ -129,7 +130,7 @@ class UrRobot:
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Go on at a twist (6,) of the flange; the controller is told the tool's."""
-        base_T_tool = POSE.matrix(self._require_able().tool_pose)
+        base_T_tool = self._base_T_tool(self._require_able())
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
         self._command("move_velocity", twist=at_tool, acceleration=acceleration)
 
@@ -166,6 +167,12 @@ class UrRobot:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _base_T_tool(self, sample: Sample) -> Floats:
+        """Return the tool's pose (4, 4); a cycle asks twice for that of one sample."""
+        if self._posed[0] != sample.number:
+            self._posed = sample.number, POSE.matrix(sample.tool_pose)
+        return self._posed[1]
 
     def _fresh(self) -> Sample:
         """Return the newest sample; wait for one where this computer was too busy to take it."""
