@@ -2,7 +2,8 @@
 # Everything on this page again: ./reproduce.sh PUBLISHED_FOLDER [FOLDER_FOR_BATCHES [PART...]]
 #
 # The published folder is github.com/ancorasir/flange_handeye_calibration. It takes about an hour of
-# one core, a third of it for figure 11; a batch that was broken off goes on where it stopped.
+# one core, a third of it for figure 11, and half an hour more for figure 13; a batch that was broken
+# off goes on where it stopped.
 # Parts: simulated table1 figure11 table2 figure13 heldout; all of them without one.
 # WORKERS=1 leaves the other cores to others.
 set -eu
