@@ -122,7 +122,7 @@ def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
             what = "stored (bands) and run again (lines)" if column == 0 else "stored"
             dress(panel, f"{ROBOTS[robot]}, {what}", "poses", f"mean ± deviation [{unit}]")
             panel.set_xlim(5, 45)
-            panel.set_ylim((-2, 2) if row == 0 else (-1, 1))
+            panel.set_ylim((-2, 2) if row == 0 else (-0.7, 0.7))
             if column == 2:
                 legend(panel, loc="upper right", ncols=3)
     return page
