@@ -1,6 +1,7 @@
 """The command on real recordings: as they are, and with mistakes planted in copies of them."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import yaml
 
 from flangeye import cli
+from flangeye.cloudfile import read_cloud, write_cloud
 from flangeye.diagnosis import Session
 from flangeye.doctor import examine, open_session
 from flangeye.mending import inverted, scaled, shifted, without_tool
@@ -112,6 +114,22 @@ def test_clouds_in_another_unit_than_the_recipe_states():
     assert finding.name == "unit"
     assert "these look like metres: set unit: m" in finding.what
     assert "unit: auto" in finding.fix
+
+
+def test_clouds_in_inches(tmp_path):
+    """The sample that comes with the project, its clouds written in inches; the line cures."""
+    path = recipe_names()["ur5_phoxi-m_sample"]
+    archive = tmp_path / "inches"
+    given = load_recipe(path, REGISTRY)
+    shutil.copytree(given.steps[0].params.path, archive)
+    for cloud in archive.glob("*.pcd"):
+        write_cloud(cloud, read_cloud(cloud), "in")
+    (finding,) = examine(open_session(archive, REGISTRY, given), CHECKS).findings
+    assert finding.name == "unit"
+    assert finding.what.endswith("0 of 8 scans show a target with unit: auto, 8 do with unit: in")
+    (step,) = yaml.safe_load(finding.fix)
+    mended = load_recipe(path, REGISTRY, [f"steps.0.unit={step['acquire.archive']['unit']}"])
+    assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
 
 
 def test_a_log_of_ours_needs_no_recipe(tmp_path, monkeypatch, capsys):
