@@ -58,6 +58,7 @@ class Session:
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
         changes: Parameters of that step that differ from the recipe's, by what was mended.
+        marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
     """
 
@@ -76,6 +77,7 @@ class Session:
     reader: Reader = "auto"
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
+    marks_open: bool = False
     remarks: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:

@@ -177,6 +177,7 @@ def _as_recipe(session: Session, recipe: Recipe, states: Mapping[str, State]) ->
     return replace(
         in_configuration(session, configuration, arm, states),
         reach=reach,
+        marks_open=any(getattr(s.params, "unobservable", None) == "mark" for s in recipe.steps),
         reader=reader,
         acquire=first.stage.name,
         changes={} if first.params is None else _given(first.params, {"reader", "path"}),

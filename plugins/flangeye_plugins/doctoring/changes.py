@@ -58,9 +58,10 @@ def _together(first: Fit, second: Fit) -> Fit:
 def _moved_finding(session: Session, evidence: Evidence, start: int) -> Finding:
     later = np.arange(len(session)) >= start
     shorter = later if later.sum() <= len(session) / 2 else ~later
+    name = session.ids[start]
     what = (
-        f"the camera or what it looks at moved before '{session.ids[start]}': the samples before "
-        "and from there on fit two calibrations"
+        f"the camera or what it looks at moved before '{name}', or the poses are written another "
+        "way from there on: the samples before and after fit two calibrations"
     )
     kept = session.without(shorter)
     return Finding("moved target", what, kept.step(), (session.ids[start],), *evidence[1:], kept)

@@ -35,7 +35,10 @@ def motion(session: Session) -> Findings:
     needs = not np.isfinite(session.places).all()
     name = "too little rotation" if needs else "too little motion"
     what = f"{_left_open(turn, shift)}: {_missing(session, needs, spread, axes)}"
-    yield Finding(name, what, _advice(needs))
+    if session.marks_open and turn < TURN:
+        yield Finding(name, what, "none needed: the recipe marks what stays open", note=True)
+        return
+    yield Finding(name, what, _advice(needs, axes < LITTLE <= spread))
 
 
 def _left_open(turn: float, shift: float) -> str:
@@ -56,13 +59,16 @@ def _missing(session: Session, needs: bool, spread: float, axes: float) -> str:
     if needs and spread < LITTLE:
         return f"the poses turn by {np.degrees(spread):.2g} deg at most"
     if needs and axes < LITTLE:
-        return f"all turns are about one axis, others are {np.degrees(axes):.2g} deg at most"
+        return f"all turns are about one axis, others are {np.degrees(axes):.2f} deg at most"
     return f"the {int(session.seen.sum())} places of the target are nearly on a line"
 
 
-def _advice(needs: bool) -> str:
+def _advice(needs: bool, one_axis: bool) -> str:
     if needs:
-        return "record again: turn the flange by 20 deg and more about two axes between samples"
+        four = ", or, with an arm of four joints, set unobservable: mark in the solver"
+        return "record again: turn the flange by 20 deg and more about two axes between samples" + (
+            four if one_axis else ""
+        )
     return "record again: move the target through the workspace, not along one line"
 
 
