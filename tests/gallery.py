@@ -5,6 +5,7 @@ from pathlib import Path
 
 from flangeye.recipe import load_recipe, recipe_names
 from flangeye.registry import load_registry
+from tests.outcomes import outcomes
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "recipes" / "README.md"
@@ -78,14 +79,16 @@ def configurations() -> str:
 
 
 def _links(key: str, marker: bool, how: str) -> list[str]:
-    found = []
+    found, known = [], outcomes()
     for name in recipe_names():
         folder, _, rest = name.partition("/")
         words = rest.split("_")
         if folder != "configurations" or words[0] != key or words[2] != how:
             continue
         if words[1].startswith("marker") is marker:
-            found.append(f"[{words[1]}](recipes/{name}.yaml)")
+            row = known[name]
+            error = f"{row['held_out_mm']} ({row['true_mm']})"
+            found.append(f"[{words[1]}](recipes/{name}.yaml) {error}")
     return found
 
 

@@ -14,6 +14,7 @@ from flangeye.runlog import read_run
 from flangeye.schema import recipe_schema
 from flangeye.session import Start, record_run
 from flangeye.yamlfile import read_yaml
+from tests.outcomes import outcome, outcomes, run
 
 NAMES = list(recipe_names())
 
@@ -100,6 +101,17 @@ def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
         assert seam["truth"]["inside"] > 0.9
         assert seam["truth"]["rms"] < 0.3e-3
         assert max(seam["tube"]) < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_the_table_says_what_came_of_a_configuration(name, tmp_path):
+    told, got = outcomes()[name], outcome(name, run(name, tmp_path))
+    assert (got["captures"], got["used"]) == (told["captures"], told["used"])
+    for figure in ("held_out_mm", "predicted_mm", "true_mm"):
+        assert float(got[figure]) == pytest.approx(float(told[figure]), rel=0.02, abs=0.002), (
+            "python -m tests.outcomes and python -m tests.gallery renew the table"
+        )
 
 
 def test_the_published_aubo_clouds_reach_the_target(ancorasir, tmp_path):

@@ -16,7 +16,7 @@ from flangeye_plugins.fitting.boards import (
     fit_charuco,
     fit_checkerboard,
 )
-from flangeye_plugins.simulation.board_image import BoardCamera, render_board, scan_board
+from flangeye_plugins.simulation.board_image import BoardCamera, Cover, render_board, scan_board
 
 CAMERA_MATRIX = np.array([[1000.0, 0, 400], [0, 1000, 300], [0, 0, 1]])
 LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
@@ -81,6 +81,40 @@ def test_no_target_is_taken_for_itself_upside_down(kind, yaw):
 def test_the_axes_are_right_up_and_towards_the_camera():
     feature = fit_charuco(capture(CHARUCO, looking(tilt=0.0, yaw=0.0)), OF_CHARUCO)
     assert np.allclose(feature.camera_T_target.rotation, np.diag([1, -1, -1]), atol=5e-3)
+
+
+def test_a_markers_sides_are_not_taken_for_straight_where_the_lens_bends_them():
+    camera = BoardCamera(CAMERA_MATRIX, (800, 600), np.array([-0.2, 0.0, 0.0, 0.0]), noise=0.5)
+    pose = looking(0.5)
+    pose[:3, 3] = [0.1, 0.07, 0.5]  # a side is bent by half a pixel out there
+    off = error(fit_aruco(capture(MARKER, pose, camera), OF_MARKER), pose)
+    assert np.linalg.norm(off[3:]) < 0.08e-3
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.1
+
+
+def test_a_checkerboard_is_not_taken_one_square_beside_itself():
+    """Where a side is covered, the sheet about the board can stand in for its outer squares."""
+    matrix = np.array([[1400.0, 0, 639.5], [0, 1400, 511.5], [0, 0, 1]])
+    lens = np.array([-0.12, 0.08, 0.0005, -0.0003, 0.0])
+    camera = BoardCamera(matrix, (1280, 1024), lens, shade=0.4)
+    turn = np.array(
+        [[0.978590, 0.194829, -0.066359], [0.195266, -0.980750, 0.000093],
+         [-0.065063, -0.013048, -0.997796]]
+    )  # fmt: skip
+    pose = rigid(turn, np.array([-0.06487, -0.097677, 0.674374]))
+    cover = Cover(1.67357, 0.026487)
+    for seed in range(3):
+        image = render_board(CHECKER, pose, camera, np.random.default_rng(seed), cover)
+        nothing = PointCloud(CAMERA, np.zeros((0, 3)))
+        found = fit_checkerboard(Capture("0", nothing, POSE, image=image), OF_CHECKER)
+        assert isinstance(found, Rejected)
+
+
+def test_the_corners_come_with_what_the_pose_misses():
+    feature = fit_charuco(capture(CHARUCO, looking()), OF_CHARUCO)
+    assert feature.corners.shape == (24, 4)
+    assert np.sqrt((feature.corners[:, 2:] ** 2).mean()) == feature.figures["reprojection_px"]
+    assert feature.figures["reprojection_px"] < 0.1
 
 
 def test_a_small_marker_seen_frontally_has_two_poses_and_is_set_aside():
