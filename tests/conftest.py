@@ -16,7 +16,8 @@ from tests import toy
 collect_ignore = ["vendor_example"]
 
 # What flangeye remembers for its user is not the tests' to change, nor to read.
-os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="flangeye-tests-")
+_CACHE = tempfile.TemporaryDirectory(prefix="flangeye-tests-")
+os.environ["XDG_CACHE_HOME"] = _CACHE.name
 
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 
