@@ -11,7 +11,9 @@ from flangeye import cli
 from flangeye.boards import Board
 from flangeye.conventions import PoseConvention
 from flangeye.geometry import quaternion_from_rotation, rigid, rotation_exp, rotation_log
-from flangeye_plugins.simulation.board_image import BoardCamera, render_board
+from flangeye.types import Capture, Transform
+from flangeye_plugins.readers.folder import write_folder
+from flangeye_plugins.simulation.board_image import BoardCamera, render_board, scan_board
 
 CAMERA = BoardCamera(np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), (640, 480))
 FLANGE_T_CAMERA = rigid(rotation_exp(np.array([0.02, -0.03, 0.5])), np.array([0.06, 0.01, 0.04]))
@@ -138,3 +140,26 @@ def test_a_folder_of_images_with_kuka_poses_is_calibrated(tmp_path, monkeypatch)
     wrong = path.read_text().replace("rotation: kuka", "rotation: fanuc")
     path.write_text(wrong)
     assert flangeye(monkeypatch, "doctor", folder, "--recipe", path) == 1
+
+
+def test_organised_clouds_with_images_beside_them_need_no_camera_matrix(tmp_path, monkeypatch):
+    rng = np.random.default_rng(4)
+    folder, robot, captures = tmp_path / "archive", poses(8), []
+    for i, (pose, target) in enumerate(zip(robot, targets(robot), strict=True)):
+        cloud = scan_board(BOARD, target, CAMERA, rng)
+        captures.append(Capture(f"{i}", cloud, Transform("base", "flange", pose)))
+    write_folder(folder, captures)
+    for i, target in enumerate(targets(robot)):
+        cv2.imwrite(str(folder / f"{i}.png"), render_board(BOARD, target, CAMERA, rng).pixels)
+    path = tmp_path / "recipe.yaml"
+    path.write_text(
+        HEADER.replace("configuration", "scanner: {model: phoxi-m}\nconfiguration")
+        + "  - acquire.archive\n"
+        "  - fit.charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}\n"
+        "  - solve.maximum_likelihood\n"
+    )
+    assert flangeye(monkeypatch, "run", path, "--archive", folder, "--out", tmp_path / "o") == 0
+    check_result(tmp_path / "o", 0.1, 0.6e-3)
+    result = json.loads((tmp_path / "o" / "result.json").read_text())
+    (told,) = [n for n in result["provenance"]["notes"] if n.startswith("camera of the images")]
+    assert "focal length 700.0, 700.0 px, principal point 320.0, 240.0 px" in told

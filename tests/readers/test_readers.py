@@ -277,6 +277,7 @@ def test_images_come_with_the_cameras_matrix(tmp_path):
     write_images(tmp_path)
     convention = convention_of("kuka", "mm", "deg")
     rows = [convention.numbers(pose).tolist() for pose in POSES]
+    write_cloud(tmp_path / "s0.pcd", PointCloud("camera", np.ones((1, 3))))
     (tmp_path / "poses.csv").write_text(
         "".join(f"s{i}.png," + ",".join(map(repr, r)) + "\n" for i, r in enumerate(rows))
     )
@@ -296,4 +297,5 @@ def test_images_come_with_the_cameras_matrix(tmp_path):
     assert [int(c.image.pixels[0, 0]) for c in captures] == [0, 1, 2, 3, 4]
     assert captures[0].image.camera_matrix[1, 1] == 1001
     assert len(captures[0].image.distortion) == 4
-    assert len(captures[0].cloud.points()) == 0
+    assert len(captures[0].cloud.points()) == 1  # that of its name
+    assert len(captures[1].cloud.points()) == 0
