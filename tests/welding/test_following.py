@@ -75,6 +75,15 @@ def test_the_end_of_the_seam_makes_no_step():
         assert abs(lateral[12:] - lateral[:-12]).max() < 0.1e-3
 
 
+@pytest.mark.parametrize("start", [0.085, 0.095, 0.1, 0.105])
+def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start):
+    true = curved()
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    done = weld(true, planning_error(true, seed=0), gaps=(Gap(start, length, 1),))
+    assert done.controller.phase == "done"
+    assert abs(done.deviation()).max() < 0.4e-3
+
+
 def test_a_plan_that_starts_away_from_the_groove_is_refused():
     true = straight(0.06)
     done = weld(true, misplaced(true, (0.0, 15e-3, 0.0)))

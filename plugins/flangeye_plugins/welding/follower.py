@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye_plugins.welding.contact import Contact
+from flangeye_plugins.welding.contact import LOST, Contact
 from flangeye_plugins.welding.controller import STILL, Phase
-from flangeye_plugins.welding.motion import Command, ToolPose, Touch, Track, turned
+from flangeye_plugins.welding.motion import Command, Felt, ToolPose, Touch, Track, turned
 from flangeye_plugins.welding.path import Path
 from flangeye_plugins.welding.refined import RefinedPath
 from flangeye_plugins.welding.search import Search
@@ -22,18 +21,8 @@ Floats = NDArray[np.float64]
 BELIEF = 0.3
 """A sample is believed when contact has not been doubted for so long after it [s]."""
 
-
-@dataclass(frozen=True, eq=False)
-class Felt:
-    """The seam at the tip: measured while it touches, predicted while it does not.
-
-    Attributes:
-        offset: To the left of the plan [m].
-        height: Above the planned height [m].
-    """
-
-    offset: float
-    height: float
+LEANING = 0.1e-3
+"""A tip that must be deflected by more, and is not, has lost its wall at the seam's end [m]."""
 
 
 class Follower:
@@ -75,6 +64,7 @@ class Follower:
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
+        self._loose = False
         self._place = plan.at(self.tip)
         self._search = Search(settings.reach)
 
@@ -121,6 +111,10 @@ class Follower:
 
     def _believe(self, time: float, s: float, felt: Felt, deflection: float) -> None:
         """Keep what the tip felt, unless contact is doubtful."""
+        if self.phase == "ending":
+            self._notice_loss(s, felt, deflection)
+            if self._loose:
+                return
         if self.phase == "ending" or (self.phase == "following" and self.contact.state == "held"):
             if self.phase == "following" and self.contact.doubted(deflection, self.wanted):
                 return
@@ -129,6 +123,18 @@ class Follower:
                 self._felt = felt
                 self.refined.add(time, s, felt.offset)
             self.refined.confirm(time - BELIEF)
+
+    def _notice_loss(self, s: float, felt: Felt, deflection: float) -> None:
+        """Notice that the wall is gone while the tip is let go of: it then goes with the robot.
+
+        What it should be deflected by follows from where the robot is and what was felt before.
+        """
+        if self.refined.empty:
+            return
+        expected = deflection + self.side * (felt.offset - self.refined.offset(s))
+        if expected > LEANING and deflection < LOST * expected:
+            self._loose = True
+            self.refined.forget_pending()
 
     # --- what follows from it -------------------------------------------------------------------
 
@@ -150,6 +156,7 @@ class Follower:
         self._refuse(pose, settings)
 
     def _enter(self, phase: Phase) -> None:
+        self._loose = phase == "ending" and self.phase == "bridging"
         self.phase = phase
 
     def _refuse(self, pose: ToolPose, settings: Following) -> None:

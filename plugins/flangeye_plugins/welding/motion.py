@@ -47,6 +47,19 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False)
+class Felt:
+    """The seam at the tip: measured while it touches, predicted while it does not.
+
+    Attributes:
+        offset: To the left of the plan [m].
+        height: Above the planned height [m].
+    """
+
+    offset: float
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
 class Command:
     """What the robot shall do until the next cycle.
 
