@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import os
+import signal
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,9 @@ collect_ignore = ["vendor_example"]
 # What flangeye remembers for its user is not the tests' to change, nor to read.
 _CACHE = tempfile.TemporaryDirectory(prefix="flangeye-tests-")
 os.environ["XDG_CACHE_HOME"] = _CACHE.name
+
+# A suite in the background of a script ignores Ctrl-C, and so would every process it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from statistics import median
 
 import pytest
 
@@ -40,8 +41,12 @@ def test_a_recipe_checks_and_resolves(name):
 
 
 def _marked(name):
-    live = name.endswith("_loopback")
-    return pytest.param(name, marks=pytest.mark.realtime) if live else name
+    """Simulating scans takes time: the fast tests do with one cell, a weld, and the archives."""
+    marks = [pytest.mark.realtime] if name.endswith("_loopback") else []
+    simulates = name.endswith(("_simulated", "_loopback"))
+    if simulates and name not in ("ur5_phoxi-m_simulated", "ur10e_phoxi-m_weld_simulated"):
+        marks.append(pytest.mark.slow)
+    return pytest.param(name, marks=marks)
 
 
 # Those of recipes/paper are studies; tests/studies runs them.
@@ -120,18 +125,33 @@ def test_the_table_says_what_came_of_a_configuration(name, tmp_path):
         )
 
 
-def test_the_published_aubo_clouds_reach_the_target(ancorasir, tmp_path):
-    told = flangeye(
-        "run", "aubo-i5_phoxi-s_archive", "--archive", ancorasir, "--out", "run", cwd=tmp_path
-    )
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
-    residuals = sorted(o["residual"] for o in result["observations"])
-    rms = (sum(r * r for r in residuals) / len(residuals)) ** 0.5
+def archived(recipe, recordings, folder):
+    told = flangeye("run", recipe, "--archive", recordings, "--out", "run", cwd=folder)
     assert told.returncode == 0
+    return json.loads((folder / "run" / "result.json").read_text())
+
+
+def rms(values):
+    return (sum(value * value for value in values) / len(values)) ** 0.5
+
+
+def test_the_published_aubo_clouds_reach_the_target_with_every_pose(ancorasir, tmp_path):
+    result = archived("aubo-i5_phoxi-s_svd_archive", ancorasir, tmp_path)
+    residuals = [pose["residual"] for pose in result["observations"]]
     assert len(residuals) == 30
-    assert rms <= 0.42e-3
-    assert (residuals[14] + residuals[15]) / 2 <= 0.24e-3
+    assert rms(residuals) <= 0.42e-3
+    assert median(residuals) <= 0.24e-3
     assert result["holdout"]["rms"] <= 0.44e-3
+
+
+def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(ancorasir, tmp_path):
+    result = archived("aubo-i5_phoxi-s_archive", ancorasir, tmp_path)
+    poses = result["observations"]
+    assert len(poses) == 30
+    assert rms([pose["residual"] for pose in poses if pose["used"]]) <= 0.42e-3
+    assert median(pose["residual"] for pose in poses) <= 0.24e-3
+    assert result["holdout"]["figures"]["rms_all"] <= 0.44e-3
+    assert result["holdout"]["rms"] <= 0.32e-3
 
 
 @pytest.mark.parametrize("name", NAMES)
