@@ -99,7 +99,13 @@ COARSER = {
 """A quarter of the pixels, or fewer; as they are shipped a slow test runs them."""
 
 
-@pytest.mark.parametrize("name", CONFIGURATIONS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if "closed-form" in name else ())
+        for name in CONFIGURATIONS
+    ],
+)
 def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
     registry = load_registry()
     checked = load_recipe(recipe_names()[name], registry, COARSER[first_step(name)])

@@ -78,7 +78,7 @@ def test_the_base_in_the_flange(carried):
 
 
 @pytest.mark.parametrize("carried", REPORTED)
-@pytest.mark.parametrize("factor", [1e3, 1 / 25.4e-3])
+@pytest.mark.parametrize("factor", [1e3, pytest.param(1 / 25.4e-3, marks=pytest.mark.slow)])
 def test_positions_in_another_unit(carried, factor):
     session = with_arms(session_of(carried, "marker"), lambda poses: scaled(poses, factor))
     finding = only(session)
@@ -101,7 +101,7 @@ def test_rotations_read_in_another_convention(carried):
     assert np.allclose(finding.mended.poses, session.poses, atol=1e-6)
 
 
-@pytest.mark.parametrize("arms", ["first", "second"])
+@pytest.mark.parametrize("arms", [pytest.param("first", marks=pytest.mark.slow), "second"])
 def test_a_mistake_of_one_of_two_arms(arms):
     finding = only(with_arms(session_of("both", "marker"), inverted, arms))
     assert finding.what.startswith(f"the {arms} arm's poses are flange_T_base")

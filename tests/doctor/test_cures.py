@@ -122,7 +122,12 @@ def apart(first, second):
     return np.linalg.norm(first[:3, 3] - second[:3, 3]), turned
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+QUICK = ("metres as millimetres", "vectors as ZYX", "the base in the flange", "an outlier")
+
+
+@pytest.mark.parametrize(
+    "fault", [pytest.param(f, marks=() if f in QUICK else pytest.mark.slow) for f in FAULTS]
+)
 def test_the_line_cures(tmp_path, fault):
     name, plant = FAULTS[fault]
     session = clean(np.random.default_rng(5), N, "marker", turn=0.4)

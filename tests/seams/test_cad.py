@@ -125,7 +125,7 @@ def test_a_part_that_is_not_there_is_refused():
     assert "poor fit" in told or "nowhere in the scan" in told
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_part_that_could_lie_either_way_is_refused(tmp_path, seed):
     path = write_plate(tmp_path, 0.0)
     told = refused(scanned(path, seed=seed)[0], path)
