@@ -72,9 +72,9 @@ figure11() {
 # Table 2, simulated
 table2() {
   for target in flange sphere; do
-    batch "$here/table2_$target.yaml" --repeat 6 --vary seed \
+    batch "$here/table2_$target.yaml" --repeat 12 --vary seed \
       --set-grid steps.0.poses.grid.counts='[2, 2, 1],[4, 2, 2]' --out "table2_$target"
-    batch "$here/table2_$target.yaml" --repeat 6 --vary seed \
+    batch "$here/table2_$target.yaml" --repeat 12 --vary seed \
       --set steps.0.poses.grid.counts='[4, 2, 2]' \
       --set steps.0.poses.grid.size='[60 mm, 60 mm, 40 mm]' --out "table2-narrow_$target"
   done
