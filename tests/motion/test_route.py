@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flangeye.kinematics import Arm
@@ -16,6 +16,7 @@ ROUTER = Router(MODEL, LIMITS, HOME)
 
 
 @given(st.lists(st.floats(-0.6, 0.6), min_size=6, max_size=6))
+@example([0.0, 0.25, 0.0, 0.5, 0.5, 0.0])
 @settings(max_examples=20, deadline=None)
 def test_flange_and_joints_stay_below_their_speeds(turns):
     goal = HOME + np.array(turns)
