@@ -94,12 +94,17 @@ class RefinedPath:
         fit = self._fit(float(s[len(s) // 2]))
         if fit is None:
             return np.zeros(len(s))
-        points, tangents = self._plan.evaluate(s)
-        predicted = _rigid_rows(points[:, :2] - fit.about, _left(tangents)) @ fit.motion
+        predicted = np.array([self._moved(fit, x) for x in s.tolist()])
         distance = (s[:, None] - fit.middles) / KERNEL
         weight = np.exp(-0.5 * distance**2) * fit.counts
         # One imagined sample without residual: far from every sample the plan's motion decides.
         return np.asarray(predicted + (weight @ fit.residual) / (weight.sum(axis=1) + 1.0))
+
+    def _moved(self, fit: _Fit, s: float) -> float:
+        """Return how far a fit moves the plan along its normal at ``s``: a row of _rigid_rows."""
+        place = self._plan.at(s)
+        lever, (nx, ny), (x, y, turn) = place.point - fit.about, place.normal, fit.motion
+        return float(nx * x + ny * y + turn * (ny * lever[0] - nx * lever[1]))
 
     def offset(self, s: float) -> float:
         """Return the seam's offset from the plan at one arc length."""
