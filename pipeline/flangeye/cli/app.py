@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, Optional
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -29,7 +29,7 @@ app = typer.Typer(
 
 RecipeName = Annotated[str, typer.Argument(help="A recipe file, or the name of a shipped recipe.")]
 Overrides = Annotated[
-    Optional[list[str]],  # noqa: UP045  typer reads the annotation at run time
+    list[str] | None,
     typer.Option(
         "--set", metavar="PATH=VALUE", help="Override one value: steps.2.inlier='0.2 mm'."
     ),

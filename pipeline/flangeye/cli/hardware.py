@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -47,7 +47,7 @@ def loopback(
     robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     faults: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--fault",
             metavar="NAME[=DURATION][@WHEN]",
@@ -55,15 +55,15 @@ def loopback(
         ),
     ] = None,
     floor: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(help="Height of a surface to touch, for example '100 mm'."),
     ] = None,
     joints: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(help="Where the arm starts, for example '0 -90 90 -90 -90 0 deg'."),
     ] = None,
     seed: Annotated[
-        Optional[int],  # noqa: UP045
+        int | None,
         typer.Option(help="Give the arm errors of its joints' zeros, drawn with this seed."),
     ] = None,
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -53,11 +53,11 @@ def replay_log(log: LogFile) -> None:
 @app.command()
 def watch(
     run: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Argument(metavar="[RUN]", help="A run's folder or log; the newest in ./runs."),
     ] = None,
     foxglove: Annotated[
-        Optional[int],  # noqa: UP045
+        int | None,
         typer.Option(metavar="PORT", help="Serve Foxglove on this port too, 8765 by custom."),
     ] = None,
     patience: Annotated[
@@ -76,7 +76,7 @@ def watch(
 def doctor(
     archive: Annotated[Path, typer.Argument(help="A run.mcap, or recordings that a reader knows.")],
     recipe: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(help="The recipe that would run on it: a file, or the name of a shipped one."),
     ] = None,
     overrides: Overrides = None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -63,7 +63,7 @@ def plugins() -> None:
 @app.command()
 def schema(
     result: Annotated[bool, typer.Option("--result", help="The schema of result.json.")] = False,
-    out: Annotated[Optional[Path], typer.Option(help="File to write instead of printing.")] = None,  # noqa: UP045
+    out: Annotated[Path | None, typer.Option(help="File to write instead of printing.")] = None,
 ) -> None:
     """Print the JSON Schema of recipes, for editors that check YAML while you type."""
     import json

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
 @app.command()
 def run(  # noqa: PLR0913  one for each option
     recipe: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Argument(help="A recipe file, or the name of a shipped recipe."),
     ] = None,
     archive: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(help="Recordings to run on, for recipes that start with acquire.archive."),
     ] = None,
     overrides: Overrides = None,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(help="Folder for the run's files; default runs/<time>_<recipe>."),
     ] = None,
     source: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."
         ),
     ] = None,
     at: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
     ] = None,
     move: Annotated[
@@ -51,7 +51,7 @@ def run(  # noqa: PLR0913  one for each option
         typer.Option("--move", help="Move the arm; without it the plan is checked and shown."),
     ] = False,
     resume: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="RUN", help="Go on with a run that ended early: its folder or log."),
     ] = None,
 ) -> None:
@@ -129,28 +129,28 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
 def batch(  # noqa: PLR0913  one argument an option
     recipe: RecipeName,
     archives: Annotated[
-        Optional[list[Path]],  # noqa: UP045
+        list[Path] | None,
         typer.Argument(help="Recordings, a session each; none for recipes that simulate."),
     ] = None,
     overrides: Overrides = None,
     grid: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option(
             "--set-grid", metavar="PATH=A,B,C", help="Run with each value; may be repeated."
         ),
     ] = None,
-    repeat: Annotated[Optional[int], typer.Option(min=1, help="Run with so many seeds.")] = None,  # noqa: UP045
+    repeat: Annotated[int | None, typer.Option(min=1, help="Run with so many seeds.")] = None,
     vary: Annotated[str, typer.Option(help="What --repeat counts up.")] = "seed",
     workers: Annotated[
-        Optional[int],  # noqa: UP045
+        int | None,
         typer.Option(min=1, help="Processes on this machine; default one for each core."),
     ] = None,
     scheduler: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="A running dask scheduler to use instead."),
     ] = None,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(help="Folder for everything; default batches/<recipe>."),
     ] = None,
     report: Annotated[
