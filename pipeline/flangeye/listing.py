@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 
 from platformdirs import user_cache_path
 
+from flangeye.hookspecs import NAME
+
 if TYPE_CHECKING:
     from flangeye.registry import Registry
-
-ENTRY_POINTS = "flangeye"
 
 
 def list_stages() -> str:
@@ -56,12 +56,12 @@ def remember(registry: Registry) -> str:
 
 def _installed() -> str:
     """Return a digest of what could change the list: each plugin, its version and its files."""
-    plugins = sorted(entry_points(group=ENTRY_POINTS), key=lambda plugin: plugin.name)
+    plugins = sorted(entry_points(group=NAME), key=lambda plugin: plugin.name)
     digest = hashlib.sha256(sys.version.encode())
     for plugin in plugins:
         version = plugin.dist.version if plugin.dist else None
         digest.update(repr((plugin.name, plugin.value, version)).encode())
-    for package in sorted({ENTRY_POINTS, *map(_package, plugins)}):
+    for package in sorted({"flangeye", *map(_package, plugins)}):
         for file in _files(package):
             at = file.stat()
             digest.update(f"{file}:{at.st_mtime_ns}:{at.st_size}\n".encode())
