@@ -4,14 +4,16 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: help demo test test-all check bench clean
+.PHONY: help demo test test-all check docs bench flame clean
 
 help:
 	@echo "make demo   install what is missing and calibrate a simulated UR5 + PhoXi M cell"
 	@echo "make test   run the tests"
 	@echo "make test-all   the same with the long studies"
 	@echo "make check  formatting, lint, types, imports"
-	@echo "make bench  what each stage costs"
+	@echo "make docs   build the documentation into site/, strictly"
+	@echo "make bench  what each stage costs, beside its yardstick and what it was"
+	@echo "make flame  a flame graph of RECIPE=…, flame.svg"
 
 demo: $(VENV)/.run
 	$(BIN)/flangeye run ur5_phoxi-m_simulated
@@ -30,8 +32,16 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(VENV)/.dev
+	$(BIN)/python -m mkdocs build --strict --quiet
+
 bench: $(VENV)/.dev
 	$(BIN)/python -m tests.benchmarks
+
+# A flame graph of a run, flame.svg: make flame RECIPE=ur5_phoxi-m_simulated
+RECIPE ?= ur5_phoxi-m_simulated
+flame: $(VENV)/.dev
+	$(BIN)/py-spy record --rate 200 --output flame.svg -- $(BIN)/python -m flangeye.cli run $(RECIPE)
 
 $(VENV)/.run: pyproject.toml .ci/system-packages
 	PYTHON=$(PYTHON) ./.ci/system-packages run
@@ -39,10 +49,10 @@ $(VENV)/.run: pyproject.toml .ci/system-packages
 	$(PIP) --editable .
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/.run
+$(VENV)/.dev: $(VENV)/.run plugins/flangeye_paper/pyproject.toml
 	PYTHON=$(PYTHON) ./.ci/system-packages test
-	$(PIP) --editable '.[dev]'
+	$(PIP) --editable '.[dev]' --editable plugins/flangeye_paper
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis

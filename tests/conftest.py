@@ -9,8 +9,8 @@ from pathlib import Path
 import pluggy
 import pytest
 
-from flangeye import hookspecs
-from flangeye.registry import Registry
+from flangeye.plugin import hookspecs
+from flangeye.plugin.registry import Registry
 from tests import toy
 
 # Installed and run as a vendor would: test_wheel.py.
@@ -49,6 +49,11 @@ def toy_registry(
 ) -> Registry:
     """A registry that offers the toy stages alone; what is listed of it is not kept."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+    return toy_plugins()
+
+
+def toy_plugins() -> Registry:
+    """Return a registry that offers the toy stages alone."""
     return _registry_with(("toy", toy))
 
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from flangeye.cloudfile import write_cloud
+from flangeye.files.clouds import write_cloud
 from flangeye.types import CAMERA, PointCloud
 
 RECIPE = """\
@@ -132,8 +132,10 @@ def test_a_disk_that_is_full(tmp_path, ancorasir):
         cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert told.returncode == 2
-    assert [x for x in told.stderr.splitlines() if x][-2:] == [
+    assert [x for x in told.stderr.splitlines() if x][-3:] == [
         "what was gathered is in full/run.mcap",
+        "with other parameters: flangeye run aubo-i5_phoxi-s_archive --from full/run.mcap --at "
+        "fit.rim --set PATH=VALUE (to do segment.flange again, record with --set log.clouds=full)",
         "error: full/run.mcap: cannot be written: File too large; what was written so far can be "
         "read with 'flangeye show'",
     ]

@@ -1,11 +1,19 @@
 """What the documents say is what the project does."""
 
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests import gallery
+from flangeye.maths.kinematics import Arm
+from flangeye.models.model import read_model
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import Plugin
+from tools import gallery
 
 ROOT = Path(__file__).parents[1]
 QUOTE = re.compile(r"<!-- begin (\S+) -->\n(.*?)<!-- end -->", re.S)
@@ -35,5 +43,73 @@ def test_links_lead_somewhere(document):
 def test_the_gallery_shows_the_recipes():
     for path in (gallery.README, gallery.FRONT):
         page = path.read_text()
-        assert gallery.renewed(page) == page, "python -m tests.gallery renews it"
+        assert gallery.renewed(page) == page, "python -m tools.gallery renews it"
     assert page.count("](") > 15
+
+
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```", re.S | re.M)
+
+
+def blocks(page):
+    return [(m[1], m[2], m[3]) for m in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+
+
+def _named(page):
+    return page.relative_to(ROOT / "docs").as_posix()
+
+
+def _runnable():
+    """Pages with commands; those that simulate scans take long."""
+    for page in PAGES:
+        commands = [text for language, _, text in blocks(page) if language == "sh"]
+        if commands:
+            slow = pytest.mark.slow if "_simulated" in "".join(commands) else ()
+            yield pytest.param(page, marks=slow, id=_named(page))
+
+
+@pytest.mark.parametrize("page", list(_runnable()))
+def test_commands_of_a_page_run(page, tmp_path, monkeypatch):
+    """Files with a title are written, then every command is run, in the order of the page."""
+    shared = ROOT.parent / "shared"
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    Path("data").symlink_to(ROOT / "data")
+    if shared.exists():
+        (tmp_path / "shared").symlink_to(shared)
+    for language, title, text in blocks(page):
+        if title:
+            Path(title).write_text(text, encoding="utf-8")
+        for line in text.replace("\\\n", " ").splitlines() if language == "sh" else ():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["flangeye"] and (shared.exists() or "../shared" not in line):
+                told = subprocess.run(
+                    [sys.executable, "-P", "-m", "flangeye.cli", *words[1:]],
+                    capture_output=True, text=True, timeout=300,
+                )  # fmt: skip
+                assert told.returncode in (0, 1), f"{line}\n{told.stderr}"
+
+
+WALKS = ROOT / "docs" / "how-to" / "add-a-plugin.md"
+
+
+@pytest.mark.parametrize(
+    ("title", "text"), [(t, x) for language, t, x in blocks(WALKS) if language == "python"]
+)
+def test_a_walk_is_short_and_its_plugin_is_accepted(title, text):
+    assert len(text.splitlines()) <= 40
+    given = {}
+    exec(compile(text, title, "exec"), given)
+    assert [name for name in given if isinstance(given[name], Plugin)]
+
+
+def test_the_rail_of_the_walk_is_an_arm(tmp_path):
+    ((title, text),) = [(t, x) for language, t, x in blocks(WALKS) if language == "yaml"]
+    (tmp_path / title).write_text(text)
+    robot = read_model(tmp_path / title, RobotModel)
+    arm = Arm(robot)
+    there = arm.flange(np.array([1.5, 0, -1, 1, 0, 0, 0]))
+    here = arm.flange(np.array([0.5, 0, -1, 1, 0, 0, 0]))
+    assert np.linalg.norm(there[:3, 3] - here[:3, 3]) == pytest.approx(1.0)
+    assert np.allclose(there[:3, :3], here[:3, :3])

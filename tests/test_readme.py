@@ -2,20 +2,20 @@
 
 import pytest
 
-from tests.readme import output_of, same, shown
+from tools.readme import output_of, same, shown
 
 
 def test_the_real_recordings(ancorasir):
     (command,) = [c for c in shown() if "aubo" in c]
     quoted, printed = shown()[command], output_of(command)
-    assert same(quoted, printed), f"python -m tests.readme renews it; it printed:\n{printed}"
+    assert same(quoted, printed), f"python -m tools.readme renews it; it printed:\n{printed}"
 
 
 @pytest.mark.slow
 def test_the_demo():
     (command,) = [c for c in shown() if "simulated" in c]
     quoted, printed = shown()[command], output_of(command)
-    assert same(quoted, printed), f"python -m tests.readme renews it; it printed:\n{printed}"
+    assert same(quoted, printed), f"python -m tools.readme renews it; it printed:\n{printed}"
 
 
 def test_a_changed_word_or_a_changed_figure_is_seen():

@@ -1,4 +1,4 @@
-"""Every shipped recipe is checked and run."""
+"""Every bundled recipe is checked and run."""
 
 import json
 import subprocess
@@ -7,15 +7,15 @@ from statistics import median
 
 import pytest
 
-from flangeye.configuration import Configuration
-from flangeye.recipe import load_recipe, recipe_names
-from flangeye.registry import load_registry
-from flangeye.runfolder import RunFolder
-from flangeye.runlog import read_run
-from flangeye.schema import recipe_schema
-from flangeye.session import Start, record_run
-from flangeye.yamlfile import read_yaml
-from tests.outcomes import outcome, outcomes, run
+from flangeye.files.yaml_lines import read_yaml
+from flangeye.log.read import read_run
+from flangeye.models.configuration import Configuration
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye.recipe.schema import recipe_schema
+from flangeye.run.folder import RunFolder
+from flangeye.run.session import Start, record_run
+from tools.outcomes import outcome, outcomes, run
 
 NAMES = list(recipe_names())
 
@@ -49,7 +49,7 @@ def _marked(name):
     return pytest.param(name, marks=marks)
 
 
-# Those of recipes/paper are studies; tests/studies runs them.
+# Those of recipes/paper are studies; tests/paper runs them.
 CALIBRATIONS = [name for name in NAMES if "/" not in name]
 
 
@@ -66,8 +66,12 @@ def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
     elif name.endswith("_loopback"):
         words += ["--move"]
     told = flangeye(*words, cwd=tmp_path)
-    assert told.returncode == 0, told.stderr
     result = json.loads((tmp_path / "run" / "result.json").read_text())
+    if "2019-sample" in name:  # six poses nearly in line
+        assert (told.returncode, result["status"]) == (1, "refused")
+        assert "centres lie on a line" in result["refused"]
+        return
+    assert told.returncode == 0, told.stderr
     assert result["status"] == "verified"
     if result["weld"]:
         assert result["weld"]["completed"]
@@ -127,7 +131,7 @@ def test_the_table_says_what_came_of_a_configuration(name, tmp_path):
     assert (got["captures"], got["used"]) == (told["captures"], told["used"])
     for figure in ("held_out_mm", "predicted_mm", "true_mm"):
         assert float(got[figure]) == pytest.approx(float(told[figure]), rel=0.02, abs=0.002), (
-            "python -m tests.outcomes and python -m tests.gallery renew the table"
+            "python -m tools.outcomes and python -m tools.gallery renew the table"
         )
 
 
@@ -156,8 +160,8 @@ def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(an
     assert len(poses) == 30
     assert rms([pose["residual"] for pose in poses if pose["used"]]) <= 0.42e-3
     assert median(pose["residual"] for pose in poses) <= 0.24e-3
-    assert result["holdout"]["figures"]["rms_all"] <= 0.44e-3
-    assert result["holdout"]["rms"] <= 0.32e-3
+    assert result["holdout"]["rms"] <= 0.44e-3
+    assert result["holdout"]["figures"]["corrected_rms_inliers"] <= 0.25e-3
 
 
 @pytest.mark.parametrize("name", NAMES)

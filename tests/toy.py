@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from flangeye import Choose, Chosen, Params, StageError, hookimpl, part, stage
-from flangeye.geometry import kabsch, rigid, rotation_from_rpy
+from flangeye import BoundPart, Choose, Params, StageError, hookimpl, part, stage
+from flangeye.maths.geometry import kabsch, rigid, rotation_from_rpy
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -23,6 +23,7 @@ from flangeye.types import (
     Observations,
     Pair,
     PointCloud,
+    PoseError,
     Rejected,
     Seam,
     Seed,
@@ -36,6 +37,7 @@ from flangeye.types import (
     Views,
     WeldReport,
     WorkpieceScan,
+    by_frame,
 )  # fmt: skip
 from flangeye.units import Length
 
@@ -65,7 +67,7 @@ def acquire(seed: Seed, params: AcquireParams) -> Captures:
             xyz = np.full((4, 3), np.nan) if i < params.bad else centre + CROSS
             role = "verification" if i < params.verification else "calibration"
             flange = Transform(BASE, FLANGE, pose)
-            yield Capture(f"{i:03d}", PointCloud(CAMERA, xyz), flange, None, i, role)
+            yield Capture(f"{i:03d}", PointCloud(CAMERA, xyz), by_frame(flange), None, i, role)
 
     source = Source(
         "toy", ("made of four points",), Box(np.zeros(3), np.full(3, 0.4)), Truth(BASE_T_CAMERA)
@@ -101,9 +103,9 @@ def fit(cloud: FlangeCloud, params: FitParams) -> CircleFeature:
 
 
 @part("cost.toy")
-def toy_cost(value: float) -> float:
-    """Return the value itself."""
-    return value
+def toy_cost(error: PoseError) -> float:
+    """Return the shift of the origin."""
+    return float(np.linalg.norm(error.motion[:3, 3]))
 
 
 class ScaledParams(Params):
@@ -111,14 +113,14 @@ class ScaledParams(Params):
 
 
 @part("cost.scaled")
-def scaled_cost(value: float, params: ScaledParams) -> float:
-    """Scale the value by the work radius."""
-    return value * params.radius
+def scaled_cost(error: PoseError, params: ScaledParams) -> float:
+    """Scale the shift of the origin by the work radius."""
+    return float(np.linalg.norm(error.motion[:3, 3])) * params.radius
 
 
 class SolveParams(Params):
     at_most: int = Field(100, description="Stop pulling after so many.")
-    cost: Annotated[Chosen, Choose("cost")] = Field({"toy": {}}, description="What to minimise.")
+    cost: Annotated[BoundPart, Choose("cost")] = Field({"toy": {}}, description="What to minimise.")
 
 
 @stage("solve.toy")

@@ -1,17 +1,23 @@
 """flangeye: hand-eye calibration from the robot's own flange.
 
-The names a plugin needs are here; everything else is internal.
+The names a plugin needs are here; everything else is internal. Each is imported when it is asked
+for: a command that answers at once must not wait for what it does not use.
 """
 
-from flangeye.errors import CalibrationRefused, FlangeyeError, RecipeError, StageError
-from flangeye.hookspecs import hookimpl
-from flangeye.stage import Choose, Chosen, Params, RecipePath, part, stage
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from flangeye.errors import CalibrationRefused, FlangeyeError, RecipeError, StageError
+    from flangeye.files.bundled import VERSION as __version__  # noqa: N811
+    from flangeye.files.paths import RecipePath
+    from flangeye.plugin.hookspecs import hookimpl
+    from flangeye.plugin.stage import BoundPart, Choose, Params, part, stage
+
 __all__ = [
+    "BoundPart",
     "CalibrationRefused",
     "Choose",
-    "Chosen",
     "FlangeyeError",
     "Params",
     "RecipeError",
@@ -22,3 +28,18 @@ __all__ = [
     "part",
     "stage",
 ]
+
+_PLACES = {
+    **dict.fromkeys(["CalibrationRefused", "FlangeyeError", "RecipeError", "StageError"], "errors"),
+    **dict.fromkeys(["BoundPart", "Choose", "Params", "part", "stage"], "plugin.stage"),
+    "RecipePath": "files.paths",
+    "hookimpl": "plugin.hookspecs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("flangeye.files.bundled").VERSION
+    if name not in _PLACES:
+        raise AttributeError(f"module 'flangeye' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"flangeye.{_PLACES[name]}"), name)

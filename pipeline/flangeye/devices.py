@@ -5,7 +5,7 @@ recipe's model and its own parameters and returns an open device. It imports its
 called and raises :class:`DeviceError` in one line where SDK, device or permission is missing.
 
 No method of a driver moves anything by itself, waits for a motion to end, or blocks for longer
-than :data:`PATIENCE`: whoever commands a motion watches it (``flangeye_plugins.motion``), so that
+than :data:`PATIENCE`: whoever commands a motion watches it (``flangeye.motion``), so that
 every arm stops for the same reasons. SI units; a twist is (linear, angular), about the flange's
 origin, along the base's axes.
 """
@@ -14,15 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, Self, TypeVar, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Literal, Protocol, Self, runtime_checkable
 
 from flangeye.errors import StageError
-from flangeye.types import Array, Image, PointCloud, Transform, Truth
-
-Floats = NDArray[np.float64]
+from flangeye.types import Array, Floats, Image, PointCloud, Transform, Truth
 
 PATIENCE = 3.0
 """Longest time any method of a driver takes, whatever happened to the device [s]."""
@@ -50,7 +45,7 @@ class RobotState:
         joints: (n,) angles [rad].
         joint_speeds: (n,) [rad/s].
         time_ns: When the controller sampled it, on this computer's clock.
-        mode: What the controller is able to do; anything but ready and moving is a doubt.
+        mode: What the controller is able to do; anything but ready and moving is a safety fault.
         force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
         message: What the controller says of a mode that is not ready, for people.
     """
@@ -198,6 +193,15 @@ class KnowsTruth(Protocol):
     truth: Truth
 
 
+@runtime_checkable
+class KnowsTorch(Protocol):
+    """What a simulated finger tells once a weld is over, for it to be scored; no stage can ask."""
+
+    def true_torch(self) -> tuple[Floats, Floats]:
+        """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
+        ...
+
+
 class StateSource(Protocol):
     """Where an arm is, and when: all that a tactile sensor may know of it."""
 
@@ -250,15 +254,6 @@ class TactileSensor(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
-
-
-def asks_the_person(function: AnyFunction) -> AnyFunction:
-    """Mark a driver's function: it needs the terminal, and nothing it does is urgent."""
-    function.in_this_process = True  # type: ignore[attr-defined]
-    return function
-
-
 @dataclass(frozen=True)
 class RobotDriver:
     """The recipe's ``robot.driver``, not yet opened.
@@ -267,12 +262,15 @@ class RobotDriver:
         name: Name of the part.
         open: Connects; raises DeviceError where it cannot.
         in_this_process: Whether it must run in the process that owns the terminal, because it
-            talks to a person; see :func:`asks_the_person`.
+            talks to a person.
+        simulated: Whether its arm moves nothing, so that no permission is needed and experiments
+            that must not run on an arm may.
     """
 
     name: str
     open: Callable[[], Robot] = field(compare=False, repr=False)
     in_this_process: bool = False
+    simulated: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ _DEGREE = Decimal(math.pi) / 180
 _UNITS: dict[str, dict[str, Decimal]] = {
     "length": {"mm": Decimal("1e-3"), "m": Decimal(1), "um": Decimal("1e-6")},
     "angle": {"deg": _DEGREE, "rad": Decimal(1), "mrad": Decimal("1e-3")},
+    "joint position": {"deg": _DEGREE, "rad": Decimal(1), "mm": Decimal("1e-3"), "m": Decimal(1)},
     "duration": {"ms": Decimal("1e-3"), "s": Decimal(1), "min": Decimal(60)},
     "speed": {"mm/s": Decimal("1e-3"), "m/s": Decimal(1)},
     "acceleration": {"mm/s^2": Decimal("1e-3"), "m/s^2": Decimal(1)},
@@ -26,6 +27,7 @@ _UNITS: dict[str, dict[str, Decimal]] = {
 _EXAMPLES = {
     "length": "31.5 mm",
     "angle": "17 deg",
+    "joint position": "170 deg",
     "duration": "500 ms",
     "speed": "50 mm/s",
     "acceleration": "200 mm/s^2",
@@ -56,9 +58,12 @@ def parse_quantity(value: object, kind: str) -> float:
         other = next((k for k, table in _UNITS.items() if unit in table), None)
         what = f"is no {kind}, it has a unit of {other}" if other else "has an unknown unit"
         raise ValueError(f"'{value}' {what}: a {kind} needs {allowed}")
-    si = float(Decimal(number) * units[unit])
+    try:
+        si = float(Decimal(number) * units[unit])
+    except ArithmeticError:  # an exponent of more digits than decimals have
+        si = math.inf
     if not math.isfinite(si):
-        raise ValueError(f"'{value}' is too large")
+        raise ValueError(f"'{value}' is out of any range")
     return si
 
 
@@ -108,6 +113,7 @@ class SI:
 
 Length = Annotated[float, *_quantity("length")]
 Angle = Annotated[float, *_quantity("angle")]
+JointPosition = Annotated[float, *_quantity("joint position")]
 Duration = Annotated[float, *_quantity("duration")]
 Speed = Annotated[float, *_quantity("speed")]
 Acceleration = Annotated[float, *_quantity("acceleration")]

@@ -1,170 +1,134 @@
-"""The built-in plugins, offered to the engine through the same door as a vendor's."""
+"""The built-in plugins, one folder a kind; offered through the same door as a vendor's.
 
-from collections.abc import Iterable
+By name and place: a module is imported when a recipe uses what is in it.
+"""
+
+from collections.abc import Mapping
 
 from flangeye import hookimpl
-from flangeye.stage import Part, Stage
-from flangeye_plugins.acquisition.archive import acquire_archive
-from flangeye_plugins.acquisition.centres import acquire_centres
-from flangeye_plugins.acquisition.images import acquire_images
-from flangeye_plugins.acquisition.live import acquire_live
-from flangeye_plugins.acquisition.samples import acquire_samples
-from flangeye_plugins.acquisition.simulated import acquire_simulated
-from flangeye_plugins.acquisition.simulated_images import acquire_simulated_images
-from flangeye_plugins.acquisition.simulated_session import (
-    acquire_simulated_marker,
-    acquire_simulated_session,
-)
-from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
-from flangeye_plugins.doctoring import CHECKS
-from flangeye_plugins.drivers.robots.aubo.driver import robot_aubo
-from flangeye_plugins.drivers.robots.franky.driver import robot_franky
-from flangeye_plugins.drivers.robots.loopback import robot_loopback
-from flangeye_plugins.drivers.robots.manual.driver import robot_manual
-from flangeye_plugins.drivers.robots.simulated import robot_simulated
-from flangeye_plugins.drivers.robots.ur.driver import robot_ur_rtde
-from flangeye_plugins.drivers.scanners.azure_kinect import scanner_azure_kinect
-from flangeye_plugins.drivers.scanners.genicam import scanner_genicam
-from flangeye_plugins.drivers.scanners.loopback import scanner_loopback
-from flangeye_plugins.drivers.scanners.mech_eye import scanner_mech_eye
-from flangeye_plugins.drivers.scanners.realsense import scanner_realsense
-from flangeye_plugins.drivers.scanners.watched_folder import scanner_watched_folder
-from flangeye_plugins.drivers.scanners.zivid import scanner_zivid
-from flangeye_plugins.fitting.boards import fit_aruco, fit_charuco, fit_checkerboard
-from flangeye_plugins.fitting.ransac import fit_ransac_circle
-from flangeye_plugins.fitting.rim import fit_rim
-from flangeye_plugins.fitting.sphere import fit_sphere
-from flangeye_plugins.planning.guess import view_guess, view_shown
-from flangeye_plugins.planning.next_best import next_best
-from flangeye_plugins.planning.plans import grid
-from flangeye_plugins.readers.ancorasir import ancorasir
-from flangeye_plugins.readers.auto import auto
-from flangeye_plugins.readers.corrected import corrected
-from flangeye_plugins.readers.easy_handeye import easy_handeye
-from flangeye_plugins.readers.folder import folder
-from flangeye_plugins.readers.moveit import moveit
-from flangeye_plugins.readers.table import table
-from flangeye_plugins.readers.zivid import zivid
-from flangeye_plugins.refining.compensate import refine_compensate
-from flangeye_plugins.seams.cad import seam_cad
-from flangeye_plugins.seams.groove import seam_groove
-from flangeye_plugins.seams.scanning import scan_file, scan_live, scan_simulated
-from flangeye_plugins.segmentation.flange import segment_flange
-from flangeye_plugins.segmentation.sphere import segment_sphere
-from flangeye_plugins.solving.iterative import solve_iterative
-from flangeye_plugins.solving.maximum_likelihood import solve_maximum_likelihood
-from flangeye_plugins.solving.named import CLOSED_FORMS
-from flangeye_plugins.solving.robust import solve_robust
-from flangeye_plugins.solving.svd import solve_svd
-from flangeye_plugins.studies.by_iteration import verify_by_iteration
-from flangeye_plugins.studies.icp_as_in_paper import (
-    error_icp_as_in_paper,
-    verify_icp_as_in_paper,
-)
-from flangeye_plugins.studies.oracle import error_oracle
-from flangeye_plugins.studies.points import acquire_points
-from flangeye_plugins.studies.published import acquire_published_centres
-from flangeye_plugins.studies.realisations import verify_realisations
-from flangeye_plugins.studies.stored_results import verify_stored_results
-from flangeye_plugins.studies.weld import scan_as_laid, seam_misplanned
-from flangeye_plugins.verification.errors import error_holdout, error_icp
-from flangeye_plugins.verification.holdout import verify_holdout
-from flangeye_plugins.verification.icp import verify_icp
-from flangeye_plugins.welding.replay import replay_tactile
-from flangeye_plugins.welding.simulated.sensor import sensor_simulated_finger
-from flangeye_plugins.welding.tactile import weld_tactile
-from flangeye_plugins.welding.touch.guide import guide_tactile
-from flangeye_plugins.welding.touch.opencv import sensor_opencv
-from flangeye_plugins.welding.touch.recorded import sensor_image_folder, sensor_mcap
+
+STAGES = {
+    "acquire.archive": "flangeye_plugins.acquire.archive:acquire_archive",
+    "acquire.live": "flangeye_plugins.acquire.live:acquire_live",
+    "acquire.centres": "flangeye_plugins.acquire.centres:acquire_centres",
+    "acquire.images": "flangeye_plugins.acquire.images:acquire_images",
+    "acquire.samples": "flangeye_plugins.acquire.samples:acquire_samples",
+    "segment.flange": "flangeye_plugins.segment.flange:segment_flange",
+    "fit.rim": "flangeye_plugins.fit.rim:fit_rim",
+    "fit.ransac_circle": "flangeye_plugins.fit.ransac:fit_ransac_circle",
+    "fit.charuco": "flangeye_plugins.fit.boards:fit_charuco",
+    "fit.checkerboard": "flangeye_plugins.fit.boards:fit_checkerboard",
+    "fit.aruco": "flangeye_plugins.fit.boards:fit_aruco",
+    "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
+    "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",
+    "solve.robust": "flangeye_plugins.solve.robust:solve_robust",
+    "solve.svd": "flangeye_plugins.solve.svd:solve_svd",
+    "solve.iterative": "flangeye_plugins.solve.iterative:solve_iterative",
+    "solve.maximum_likelihood": "flangeye_plugins.solve.maximum_likelihood:"
+    "solve_maximum_likelihood",
+    "solve.tsai_lenz": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.park_martin": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.horaud_dornaika": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.andreff": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.daniilidis": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.shah": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.li": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.kronecker": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.two_steps": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "solve.linear": "flangeye_plugins.solve.named:CLOSED_FORMS",
+    "refine.arm": "flangeye_plugins.refine.arm:refine_arm",
+    "refine.compensate": "flangeye_plugins.refine.compensate:refine_compensate",
+    "verify.drift": "flangeye_plugins.verify.drift:verify_drift",
+    "verify.holdout": "flangeye_plugins.verify.holdout:verify_holdout",
+    "verify.icp": "flangeye_plugins.verify.icp:verify_icp",
+    "verify.sphere": "flangeye_plugins.verify.sphere:verify_sphere",
+    "verify.stitch": "flangeye_plugins.verify.stitch:verify_stitch",
+    "verify.touch": "flangeye_plugins.verify.touch:verify_touch",
+    "export.ros2_command": "flangeye_plugins.export.ros2:export_ros2_command",
+    "export.ros2_launch": "flangeye_plugins.export.ros2:export_ros2_launch",
+    "export.urdf": "flangeye_plugins.export.urdf:export_urdf",
+    "export.moveit": "flangeye_plugins.export.moveit:export_moveit",
+    "export.easy_handeye2": "flangeye_plugins.export.easy_handeye2:export_easy_handeye2",
+    "export.opencv": "flangeye_plugins.export.opencv:export_opencv",
+    "export.ur": "flangeye_plugins.export.universal_robots:export_ur",
+    "export.kuka": "flangeye_plugins.export.kuka:export_kuka",
+    "export.abb": "flangeye_plugins.export.abb:export_abb",
+    "export.fanuc": "flangeye_plugins.export.fanuc:export_fanuc",
+    "export.yaskawa": "flangeye_plugins.export.yaskawa:export_yaskawa",
+    "export.staubli": "flangeye_plugins.export.staubli:export_staubli",
+    "export.doosan": "flangeye_plugins.export.doosan:export_doosan",
+    "export.zivid": "flangeye_plugins.export.zivid:export_zivid",
+    "export.mech_mind": "flangeye_plugins.export.mech_mind:export_mech_mind",
+    "export.halcon": "flangeye_plugins.export.halcon:export_halcon",
+    "export.robodk": "flangeye_plugins.export.robodk:export_robodk",
+    "export.robot": "flangeye_plugins.export.robot:export_robot",
+    "export.matrix": "flangeye_plugins.export.matrix:export_matrix",
+    "scan.file": "flangeye_plugins.scan.scans:scan_file",
+    "scan.live": "flangeye_plugins.scan.scans:scan_live",
+    "seam.cad": "flangeye_plugins.seam.cad:seam_cad",
+    "seam.groove": "flangeye_plugins.seam.groove:seam_groove",
+    "weld.tactile": "flangeye_plugins.weld.tactile:weld_tactile",
+}
+
+PARTS = {
+    "reader.ancorasir": "flangeye_plugins.reader.ancorasir:ancorasir",
+    "reader.auto": "flangeye_plugins.reader.auto:auto",
+    "reader.corrected": "flangeye_plugins.reader.corrected:corrected",
+    "reader.easy_handeye": "flangeye_plugins.reader.easy_handeye:easy_handeye",
+    "reader.folder": "flangeye_plugins.reader.folder:folder",
+    "reader.matrices": "flangeye_plugins.reader.matrices:matrices",
+    "reader.moveit": "flangeye_plugins.reader.moveit:moveit",
+    "reader.ros2_bag": "flangeye_plugins.reader.ros2_bag:ros2_bag",
+    "reader.table": "flangeye_plugins.reader.table:table",
+    "reader.visp": "flangeye_plugins.reader.visp:visp",
+    "reader.zivid": "flangeye_plugins.reader.zivid:zivid",
+    "plan.grid": "flangeye_plugins.plan.grid:grid",
+    "plan.next_best": "flangeye_plugins.plan.next_best:next_best",
+    "view.guess": "flangeye_plugins.view.guess:view_guess",
+    "view.shown": "flangeye_plugins.view.guess:view_shown",
+    "cost.translation": "flangeye_plugins.cost.costs:cost_translation",
+    "cost.axes": "flangeye_plugins.cost.costs:cost_axes",
+    "cost.work_radius": "flangeye_plugins.cost.costs:cost_work_radius",
+    "error.icp": "flangeye_plugins.error.errors:error_icp",
+    "error.holdout": "flangeye_plugins.error.errors:error_holdout",
+    "check.identity": "flangeye_plugins.check.stale:identity",
+    "check.repeated": "flangeye_plugins.check.stale:repeated",
+    "check.units": "flangeye_plugins.check.units:units",
+    "check.direction": "flangeye_plugins.check.pose_conventions:direction",
+    "check.convention": "flangeye_plugins.check.pose_conventions:convention",
+    "check.order": "flangeye_plugins.check.order:order",
+    "check.clock": "flangeye_plugins.check.order:clock",
+    "check.flips": "flangeye_plugins.check.outliers:flips",
+    "check.outlier": "flangeye_plugins.check.outliers:outlier",
+    "check.moved": "flangeye_plugins.check.changes:moved",
+    "check.tool": "flangeye_plugins.check.changes:tool",
+    "check.size": "flangeye_plugins.check.size:size",
+    "check.motion": "flangeye_plugins.check.motion:motion",
+    "robot.aubo": "flangeye_plugins.robot.aubo.driver:robot_aubo",
+    "robot.franky": "flangeye_plugins.robot.franky.driver:robot_franky",
+    "robot.manual": "flangeye_plugins.robot.manual.driver:robot_manual",
+    "robot.ur_rtde": "flangeye_plugins.robot.ur.driver:robot_ur_rtde",
+    "scanner.genicam": "flangeye_plugins.scanner.genicam:scanner_genicam",
+    "scanner.azure_kinect": "flangeye_plugins.scanner.azure_kinect:scanner_azure_kinect",
+    "scanner.realsense": "flangeye_plugins.scanner.realsense:scanner_realsense",
+    "scanner.zivid": "flangeye_plugins.scanner.zivid:scanner_zivid",
+    "scanner.mech_eye": "flangeye_plugins.scanner.mech_eye:scanner_mech_eye",
+    "scanner.watched_folder": "flangeye_plugins.scanner.watched_folder:scanner_watched_folder",
+    "replay.tactile": "flangeye_plugins.replay.tactile:replay_tactile",
+    "guide.tactile": "flangeye_plugins.guide.tactile:guide_tactile",
+    "sensor.opencv": "flangeye_plugins.sensor.opencv:sensor_opencv",
+    "sensor.image_folder": "flangeye_plugins.sensor.recorded:sensor_image_folder",
+    "sensor.mcap": "flangeye_plugins.sensor.recorded:sensor_mcap",
+}
 
 
 @hookimpl
-def flangeye_stages() -> Iterable[Stage]:
+def flangeye_stages() -> Mapping[str, str]:
     """Offer the built-in stages."""
-    return (
-        acquire_simulated,
-        acquire_simulated_marker,
-        acquire_simulated_session,
-        acquire_simulated_images,
-        acquire_archive,
-        acquire_live,
-        acquire_centres,
-        acquire_images,
-        acquire_samples,
-        segment_flange,
-        fit_rim,
-        fit_ransac_circle,
-        fit_charuco,
-        fit_checkerboard,
-        fit_aruco,
-        segment_sphere,
-        fit_sphere,
-        solve_robust,
-        solve_svd,
-        solve_iterative,
-        solve_maximum_likelihood,
-        *CLOSED_FORMS,
-        refine_compensate,
-        verify_holdout,
-        verify_icp,
-        scan_simulated,
-        scan_file,
-        scan_live,
-        seam_cad,
-        seam_groove,
-        acquire_points,
-        acquire_published_centres,
-        verify_realisations,
-        verify_icp_as_in_paper,
-        verify_by_iteration,
-        verify_stored_results,
-        weld_tactile,
-        scan_as_laid,
-        seam_misplanned,
-    )
+    return STAGES
 
 
 @hookimpl
-def flangeye_parts() -> Iterable[Part]:
+def flangeye_parts() -> Mapping[str, str]:
     """Offer the built-in parts."""
-    return (
-        ancorasir,
-        auto,
-        corrected,
-        easy_handeye,
-        folder,
-        moveit,
-        table,
-        zivid,
-        grid,
-        next_best,
-        view_guess,
-        view_shown,
-        cost_translation,
-        cost_axes,
-        cost_work_radius,
-        error_icp,
-        error_holdout,
-        error_oracle,
-        error_icp_as_in_paper,
-        *CHECKS,
-        scanner_loopback,
-        robot_aubo,
-        robot_franky,
-        robot_manual,
-        robot_loopback,
-        robot_simulated,
-        robot_ur_rtde,
-        scanner_genicam,
-        scanner_azure_kinect,
-        scanner_realsense,
-        scanner_zivid,
-        scanner_mech_eye,
-        scanner_watched_folder,
-        replay_tactile,
-        guide_tactile,
-        sensor_simulated_finger,
-        sensor_opencv,
-        sensor_image_folder,
-        sensor_mcap,
-    )
+    return PARTS

@@ -15,7 +15,7 @@ mkdir -p "$out"
 cd "$out"
 
 batch() { flangeye batch "$@" --no-report ${WORKERS:+--workers "$WORKERS"}; }
-study() { python -m flangeye_plugins.studies "$@" --out "$here"; }
+study() { python -m flangeye_paper "$@" --out "$here"; }
 
 # Section 3.1, simulated point by point
 simulated() {
@@ -81,7 +81,7 @@ table2() {
   study table2 .
 }
 
-# Figure 13, simulated; the tables are in plugins/flangeye_plugins/welding
+# Figure 13, simulated; the tables are in plugins/flangeye_plugins/weld
 figure13() {
   "$here/weld.sh" .
 }
@@ -105,4 +105,4 @@ heldout() {
 }
 
 for part in "$@"; do "$part"; done
-python -m flangeye_plugins.studies page "$here/README.md"
+python -m flangeye_paper page "$here/README.md"

@@ -1,5 +1,5 @@
 #!/bin/sh
-# The welds of figure 13 and the table in plugins/flangeye_plugins/welding again:
+# The welds of figure 13 and the table in plugins/flangeye_plugins/weld again:
 #   ./weld.sh [FOLDER_FOR_BATCHES]
 #
 # By touch each workpiece is welded with half of a hundred seeds; fewer with SEEDS=5. It takes about
@@ -24,8 +24,8 @@ for seam in straight curved; do
   batch "$here/fig13_$seam.yaml" --repeat "${SEEDS:-50}" --out "fig13_$seam"
 done
 
-welding=$here/../../plugins/flangeye_plugins/welding
+welding=$here/../../plugins/flangeye_plugins/weld
 if [ -d "$welding" ]; then
-  python -m flangeye_plugins.studies fig13 . --out "$welding"
-  python -m flangeye_plugins.studies page "$welding/README.md"
+  python -m flangeye_paper fig13 . --out "$welding"
+  python -m flangeye_paper page "$welding/README.md"
 fi

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from flangeye.batch import Request, run_batch
-from flangeye.registry import load_registry
+from flangeye.plugin.registry import load_registry
 
 ROOT = Path(__file__).parents[2]
 SITE = Path(__file__).parent / "site"

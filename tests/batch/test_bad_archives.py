@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flangeye.cloudfile import write_cloud
+from flangeye.files.clouds import write_cloud
 from flangeye.types import CAMERA, PointCloud
 
 RECIPE = """\

@@ -100,7 +100,8 @@ def test_without_the_extra_it_says_what_to_install(flangeye, recipe, monkeypatch
     code, _, err = flangeye("batch", recipe)
     assert code == 2
     assert err == (
-        "error: flangeye batch needs pyarrow; install with: pip install 'flangeye[batch]'\n"
+        f"error: flangeye batch needs pyarrow; install with: {sys.executable} -m pip install "
+        "'flangeye[batch]'\n"
     )
 
 
@@ -240,3 +241,30 @@ def test_500_sessions_keep_memory_flat(recipe, registry, tmp_path):
                 memory.append((resident(), worker))
     for early, late in zip(*memory, strict=True):
         assert late - early < 10e6
+
+
+def test_files_for_tls_go_together_and_exist(batch, tmp_path):
+    from flangeye.batch.request import Tls
+
+    missing = Tls(tmp_path / "ca.pem", tmp_path / "cert.pem", tmp_path / "key.pem")
+    with pytest.raises(
+        BatchError, match=r"ca.pem: no such file; --tls-ca, --tls-cert and --tls-key"
+    ):
+        batch(scheduler="tls://127.0.0.1:9", tls=missing)
+    with pytest.raises(BatchError, match=r"--tls-… is for a scheduler"):
+        batch(tls=missing)
+
+
+def test_nobody_without_its_key_speaks_to_the_local_cluster():
+    from distributed import Client
+
+    from flangeye.batch.cluster import local_client
+
+    with local_client(1) as client:
+        address = client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        assert client.submit(os.getpid).result(PATIENCE) > 0
+        with pytest.raises((OSError, TypeError)):
+            Client(address, timeout=1)
+        with pytest.raises(OSError):
+            Client(address.replace("tls", "tcp"), timeout=1)

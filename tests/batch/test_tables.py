@@ -11,21 +11,21 @@ import pyarrow.parquet as pq
 import pytest
 
 from flangeye.batch.figures import drawings_of
-from flangeye.batch.outcome import Outcome
+from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.page import render, write_page
-from flangeye.batch.plan import Session
+from flangeye.batch.plan import BatchSession
 from flangeye.batch.tables import table_of, write_tables
 
 EVIL = "<script>alert(1)</script>"
 
 
 def session(i, archive=None, **varied):
-    return Session(f"toy_{i:012d}", str(i), Path("/r/toy.yaml"), archive, (), varied, i)
+    return BatchSession(f"toy_{i:012d}", str(i), Path("/r/toy.yaml"), archive, (), varied, i)
 
 
 def outcome(rms=3e-4, **more):
     report = more.pop("report", "toy_000000000000/report.html")
-    return Outcome("verified", None, 5, 6, rms, rms, 2 * rms, rms, 2 * rms, seconds=1.5,
+    return SessionOutcome("verified", None, 5, 6, rms, rms, 2 * rms, rms, 2 * rms, seconds=1.5,
                    report=report, **more)  # fmt: skip
 
 
@@ -35,7 +35,7 @@ def entries():
         (session(0, **{"steps.0.noise": "0.1 mm", "steps.0.count": "5"}), outcome(1e-4)),
         (session(1, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}), outcome(2e-4)),
         (session(2, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}),
-         Outcome("failed", f"bad, {EVIL}", seconds=0.1)),
+         SessionOutcome("failed", f"bad, {EVIL}", seconds=0.1)),
     ]  # fmt: skip
 
 
@@ -115,7 +115,7 @@ def test_variants_are_summed_up_when_repeated(entries):
 
 
 def test_nothing_accepted_still_makes_a_page():
-    entries = [(session(0), Outcome("crashed", "no"))]
+    entries = [(session(0), SessionOutcome("crashed", "no"))]
     page = render(table_of(entries))
     assert "1 sessions" not in page
     assert "1 session of toy" in page

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from flangeye.batch.outcome import MARKER, Outcome, finished_outcome
+from flangeye.batch.outcome import MARKER, SessionOutcome, finished_outcome
 from flangeye.batch.plan import plan
 from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
@@ -115,7 +115,7 @@ def test_a_recipe_that_changed_meanwhile(work, recipe):
     (work.folder / MARKER).unlink()
     recipe.write_text(recipe.read_text().replace("2 mm", "3 mm"))
     outcome = run_session(work.job, work.session)
-    assert outcome == Outcome(
+    assert outcome == SessionOutcome(
         "failed",
         f"{recipe}: has changed since the batch was started; start it again",
         seconds=outcome.seconds,

@@ -17,20 +17,20 @@ import sys
 
 import numpy as np
 
-from flangeye.configuration import Configuration
-from flangeye.geometry import rotation_log
-from flangeye_plugins.solving.closed import daniilidis, robot_world, separable
-from flangeye_plugins.solving.closed.comanipulation import alternate, random_rotations
-from flangeye_plugins.solving.closed.motions import motions_of
-from flangeye_plugins.solving.equations import Noise as Extra
-from flangeye_plugins.solving.likelihood import Problem, weigh
-from flangeye_plugins.solving.loop import ArmNoise, Unknowns
-from flangeye_plugins.solving.maximum_likelihood import (
-    MaximumLikelihoodParams,
-    solve_maximum_likelihood,
+from flangeye.handeye.closed import daniilidis, robot_world, separable
+from flangeye.handeye.closed.comanipulation import alternate, random_rotations
+from flangeye.handeye.closed.motions import motions_of
+from flangeye.handeye.components import Noise as Extra
+from flangeye.handeye.likelihood import Problem, weigh
+from flangeye.handeye.loop import ArmNoise, Unknowns
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.maths.geometry import rotation_log
+from flangeye.models.configuration import Configuration
+from flangeye_plugins.solve.robust import (
+    RobustParams,
+    solve_robust,
 )
-from flangeye_plugins.solving.sightings import loop_of, sightings_of
-from tests.configurations.cells import CONFIGURATIONS, session
+from tests.handeye.cells import CONFIGURATIONS, session
 
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
 CASES = {"n=15, 17 deg": (15, np.radians(17)), "n=8, 30 deg": (8, np.radians(30))}
@@ -42,7 +42,7 @@ BY_MOTIONS = {
     "daniilidis": daniilidis.daniilidis,
 }
 BY_BOTH = {"shah": robot_world.shah, "li": robot_world.li}
-STATED = MaximumLikelihoodParams(robot_noise={"rotation": "0.2 mrad", "position": "0.05 mm"})
+STATED = RobustParams(robot_noise={"rotation": "0.2 mrad", "position": "0.05 mm"})
 
 
 def sessions(case: str, count: int) -> list:
@@ -68,7 +68,7 @@ def closed(name: str, made) -> np.ndarray:
 
 def most_likely(made) -> np.ndarray:
     """Return X (4, 4) by maximum likelihood, the noise being stated."""
-    found = solve_maximum_likelihood(made.stream(), STATED, made.configuration)
+    found = solve_robust(made.stream(), STATED, configuration=made.configuration)
     return found.camera.transform.matrix
 
 
@@ -86,7 +86,7 @@ def bound(made: list) -> tuple[float, float]:
     traces = []
     for m in made:
         problem = Problem(
-            sightings_of(m.observations, MARKER, None), loop_of(Configuration("eye-in-hand", "flange", "base")),
+            measurements_of(m.observations, MARKER, None), loop_of(Configuration("eye-in-hand", "flange", "base")),
             ArmNoise(2e-4, 5e-5), None,
         )  # fmt: skip
         at = Unknowns(m.truth["flange_T_camera"], np.eye(4), m.truth["base_T_target"], np.zeros(2))
@@ -103,7 +103,7 @@ def converged(count: int) -> int:
         made = session(CONFIGURATIONS["two arms, marker"], rng)
         first = np.array([o.base_T_flange.rotation for o in made.observations])
         seen = np.array([o.feature.camera_T_target.rotation for o in made.observations])
-        second = np.array([o.base2_T_flange2.rotation for o in made.observations])
+        second = np.array([o.poses["flange2"].rotation for o in made.observations])
         (x, _, _), _ = alternate((first, seen, second), random_rotations(rng))
         true = made.truth["flange_T_camera"][:3, :3]
         good += bool(np.linalg.norm(rotation_log(x @ true.T)) < np.radians(1.0))

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.diagnosis import Session
-from flangeye.geometry import rigid, rotation_exp, rotation_from_rpy
+from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
 
 KINDS = ("flange", "centres", "marker", "point")
 """Circles with normals; ready-made centres; markers at an unknown place; points at one."""
@@ -27,7 +27,7 @@ def clean(rng, n=20, kind="flange", carried="target", noise=0.1e-3, turn=0.3, bo
     seen = np.linalg.inv(carriers @ camera) @ mounts @ target
     turned = np.array([m[:3, :3] @ rotation_exp(rng.normal(0, 1e-3, 3)) for m in seen])
     nothing = np.full((n, 3), np.nan)
-    return Session(
+    return RecordedSession(
         ids=tuple(f"{i:03}" for i in range(n)),
         poses=poses,
         centres=seen[:, :3, 3] + rng.normal(0, noise, (n, 3)),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flangeye.doctor import examine
-from flangeye.geometry import rigid, rotation_exp
-from flangeye.mending import inverted, reread, scaled, shifted, without_tool
-from flangeye_plugins.doctoring import CHECKS
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.pose_corrections import inverted, reread, scaled, shifted, without_tool
+from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
 
 FURTHER = ("arm-1", "arm-2", "both")
@@ -98,7 +98,7 @@ def test_rotations_read_in_another_convention(carried):
     session = session_of(carried, "marker", turn=0.4)
     finding = only(with_arms(session, lambda poses: reread(poses, "ZYX", "xyz")))
     assert finding.name == "pose convention"
-    assert np.allclose(finding.mended.poses, session.poses, atol=1e-6)
+    assert np.allclose(finding.corrected_session.poses, session.poses, atol=1e-6)
 
 
 @pytest.mark.parametrize("arms", [pytest.param("first", marks=pytest.mark.slow), "second"])
@@ -115,7 +115,7 @@ def test_a_tool_on_the_second_arm():
     finding = only(wrong)
     assert finding.name == "tool offset"
     assert "arms: second, target_offset: " in finding.fix
-    assert np.allclose(finding.mended.seconds, session.seconds, atol=5e-4)
+    assert np.allclose(finding.corrected_session.seconds, session.seconds, atol=5e-4)
 
 
 @pytest.mark.parametrize("carried", REPORTED)

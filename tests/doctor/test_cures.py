@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import yaml
 
-from flangeye.diagnosis import Session
 from flangeye.doctor import examine, open_session
+from flangeye.doctor.diagnosis import RecordedSession
 from flangeye.errors import FlangeyeError
-from flangeye.geometry import rotation_exp, rotation_log
-from flangeye.mending import inverted, reread, scaled, shifted, transposed
-from flangeye.recipe import load_recipe
-from flangeye.registry import load_registry
-from flangeye.runner import Runner
+from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.pose_corrections import inverted, reread, scaled, shifted, transposed
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
-from flangeye_plugins.doctoring import CHECKS
+from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
 
 REGISTRY = load_registry()
@@ -86,7 +86,7 @@ HARMLESS = {"identities of the marker", "identities of the robot", "an outlier",
 """Those that the solver sets aside by itself."""
 
 
-def write(path, session: Session):
+def write(path, session: RecordedSession):
     """Write samples as MoveIt does, not a number of them rounded."""
     path.mkdir()
     seen = np.tile(np.eye(4), (len(session), 1, 1))
@@ -138,11 +138,11 @@ def test_the_line_cures(tmp_path, fault):
     found = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
     assert [finding.name for finding in found] == [name]
     (step,) = yaml.safe_load(found[-1].fix)
-    mended = recipe_with(tmp_path / "mended.yaml", step)
+    corrected_session = recipe_with(tmp_path / "mended.yaml", step)
 
-    shift, turn = apart(calibrated(mended, archive), truth)
+    shift, turn = apart(calibrated(corrected_session, archive), truth)
     assert shift < 2e-3
     assert turn < np.radians(0.15)
-    assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
+    assert examine(open_session(archive, REGISTRY, corrected_session), CHECKS).findings == ()
     before = apart(calibrated(recipe, archive), truth)
     assert fault in HARMLESS or before[0] > 5 * shift

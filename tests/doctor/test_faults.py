@@ -5,11 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.diagnosis import Session
 from flangeye.doctor import examine
-from flangeye.geometry import rigid, rotation_exp
-from flangeye.mending import delayed, inverted, reread, scaled, shifted, transposed, without_tool
-from flangeye_plugins.doctoring import CHECKS
+from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.pose_corrections import (
+    delayed,
+    inverted,
+    reread,
+    scaled,
+    shifted,
+    transposed,
+    without_tool,
+)
+from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import CARRIED, KINDS, bent, clean, in_motion
 
 CONFIGURATIONS = [(kind, carried) for kind in KINDS for carried in ("target", "camera")]
@@ -106,7 +114,7 @@ def test_rotations_read_in_another_convention(kind, carried, read_as, written_as
     finding = only(session.with_poses(reread(session.poses, written_as, read_as)))
     assert finding.name == "pose convention"
     assert finding.after.position < 0.3e-3
-    assert np.allclose(finding.mended.poses, session.poses, atol=1e-6)
+    assert np.allclose(finding.corrected_session.poses, session.poses, atol=1e-6)
 
 
 def test_a_stated_convention_is_the_one_that_is_corrected():
@@ -209,7 +217,7 @@ def test_the_poses_of_a_tool(kind):
     offset = np.array([0.002, -0.003, 0.001])
     finding = only(session.with_poses(without_tool(session.poses, -offset)))
     assert finding.name == "tool offset"
-    assert np.allclose(finding.mended.poses, session.poses, atol=3e-4)
+    assert np.allclose(finding.corrected_session.poses, session.poses, atol=3e-4)
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])
@@ -311,6 +319,6 @@ def test_a_check_never_changes_the_session():
     session = session_of()
     before = {name: np.array(getattr(session, name)) for name in ("poses", "centres", "normals")}
     examine(session, CHECKS)
-    assert isinstance(session, Session)
+    assert isinstance(session, RecordedSession)
     for name, array in before.items():
         assert np.array_equal(getattr(session, name), array)

@@ -9,18 +9,18 @@ import pytest
 import yaml
 
 from flangeye import cli
-from flangeye.cloudfile import read_cloud, write_cloud
-from flangeye.diagnosis import Session
 from flangeye.doctor import examine, open_session
-from flangeye.mending import inverted, scaled, shifted, without_tool
-from flangeye.recipe import load_recipe, recipe_names
-from flangeye.registry import load_registry
-from flangeye_plugins.doctoring import CHECKS
+from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.files.clouds import read_cloud, write_cloud
+from flangeye.maths.pose_corrections import inverted, scaled, shifted, without_tool
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
 
 REGISTRY = load_registry()
 OUTLIERS = {"ur5": {"36", "54", "21", "45"}, "franka": {"72"}, "aubo": set()}
-"""What is wrong with the recordings as published: tests/studies and data/README.md agree."""
+"""What is wrong with the recordings as published: tests/paper and data/README.md agree."""
 
 
 def named(session):
@@ -28,7 +28,7 @@ def named(session):
 
 
 @pytest.fixture(params=["aubo", "ur5", "franka"])
-def recorded(request, ancorasir) -> Session:
+def recorded(request, ancorasir) -> RecordedSession:
     """A recording without its known outliers."""
     session = open_session(ancorasir / "data" / request.param, REGISTRY)
     wrong = np.array([name in OUTLIERS[request.param] for name in session.ids])
@@ -79,7 +79,7 @@ def test_a_recorded_outlier(recorded):
     session = recorded.where(recorded.seen)
     centres = np.array(session.centres)
     centres[5] += [0.0, 0.05, 0.0]
-    found = examine(Session(**{**vars(session), "centres": centres}), CHECKS).findings
+    found = examine(RecordedSession(**{**vars(session), "centres": centres}), CHECKS).findings
     assert [(f.name, f.samples) for f in found] == [("outlier", (session.ids[5],))]
 
 
@@ -93,7 +93,7 @@ def test_a_camera_that_was_moved_half_way(recorded):
     session = recorded.where(recorded.seen)
     centres = np.array(session.centres)
     centres[len(centres) // 2 :] += [0.01, 0.0, 0.004]
-    moved = Session(**{**vars(session), "centres": centres})
+    moved = RecordedSession(**{**vars(session), "centres": centres})
     assert named(moved) == ["moved target"]
 
 
@@ -128,8 +128,10 @@ def test_clouds_in_inches(tmp_path):
     assert finding.name == "unit"
     assert finding.what.endswith("0 of 8 scans show a target with unit: auto, 8 do with unit: in")
     (step,) = yaml.safe_load(finding.fix)
-    mended = load_recipe(path, REGISTRY, [f"steps.0.unit={step['acquire.archive']['unit']}"])
-    assert examine(open_session(archive, REGISTRY, mended), CHECKS).findings == ()
+    corrected_session = load_recipe(
+        path, REGISTRY, [f"steps.0.unit={step['acquire.archive']['unit']}"]
+    )
+    assert examine(open_session(archive, REGISTRY, corrected_session), CHECKS).findings == ()
 
 
 def test_a_log_of_ours_needs_no_recipe(tmp_path, monkeypatch, capsys):
@@ -168,7 +170,7 @@ def folder(tmp_path):
 
 
 def _vector(pose):
-    from flangeye.geometry import rotation_log
+    from flangeye.maths.geometry import rotation_log
 
     return rotation_log(pose[:3, :3])
 
@@ -211,9 +213,9 @@ def test_a_finding_is_exit_code_one_and_its_line_mends_it(monkeypatch, capsys, f
         "- acquire.centres: {reader: {corrected: {reader: ancorasir, inverted: true}}, "
         "centre_noise: 0.2 mm}"
     )
-    mended = yaml.safe_load(RECIPE)
-    mended["steps"][0] = yaml.safe_load(line)[0]
-    recipe.write_text(yaml.safe_dump(mended))
+    corrected_session = yaml.safe_load(RECIPE)
+    corrected_session["steps"][0] = yaml.safe_load(line)[0]
+    recipe.write_text(yaml.safe_dump(corrected_session))
     assert run(monkeypatch, capsys, archive, "--recipe", recipe)[0] == 0
 
 

@@ -6,8 +6,8 @@ import sys
 import time
 
 from flangeye.errors import StageError
-from flangeye.runlog import read_run
-from tests.loopback.process import Process
+from flangeye.log.read import read_run
+from tests.emulators.controllers.process import Process
 
 START = "180 -90 90 -90 -90 0 deg"
 
@@ -23,7 +23,7 @@ robot:
     joint_speed: 100 deg/s
 scanner:
   model: phoxi-m
-  driver: {{loopback: {{host: {host}, robot: ur5e, resolution: 0.2, {scanner}}}}}
+  driver: {{emulator: {{host: {host}, robot: ur5e, resolution: 0.2, {scanner}}}}}
 steps:
   - acquire.live:
       view: {{guess: {{position: [620 mm, 0 mm, 980 mm]}}}}

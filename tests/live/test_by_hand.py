@@ -7,14 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from flangeye.catalogue import load_model
-from flangeye.cloudfile import write_cloud
-from flangeye.conventions import CONVENTIONS
-from flangeye.kinematics import Arm
-from flangeye.runlog import read_run
+from flangeye.files.clouds import write_cloud
+from flangeye.log.read import read_run
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, PointCloud
-from flangeye_plugins.simulation.eye import CameraPose, eye_of
-from flangeye_plugins.simulation.studio import Stance, Studio
+from flangeye_emulators.world.scanner import CameraPose, scanner_of
+from flangeye_emulators.world.scene import CellScene, Stance
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
@@ -51,8 +51,8 @@ class Person:
         self.folder = folder / "exports"
         self.folder.mkdir()
         camera = CameraPose().base_T_camera
-        eye = eye_of(SCANNER, 0.2, 1.0, np.random.default_rng(0))
-        self.studio = Studio(ROBOT, eye, camera, np.array([0.3, 0.3, 0.2]))
+        eye = scanner_of(SCANNER, 0.2, 1.0, np.random.default_rng(0))
+        self.studio = CellScene(ROBOT, eye, camera, np.array([0.3, 0.3, 0.2]))
         self.arm, self.joints, self.count = Arm(ROBOT), START, 0
 
     def move(self, asked):

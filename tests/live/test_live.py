@@ -42,8 +42,10 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell):
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130
     assert time.monotonic() - sent < 20
-    assert err.splitlines()[-3:] == [
+    assert err.splitlines()[-4:] == [
         "what was gathered is in run/run.mcap",
+        "with other parameters: flangeye run cell --from run/run.mcap --at fit.rim --set PATH=VALUE "
+        "(to do segment.flange again, record with --set log.clouds=full)",
         "go on with it: flangeye run --resume run --move",
         "error: stopped by Ctrl-C",
     ]

@@ -4,12 +4,12 @@ from functools import partial
 
 import numpy as np
 
-from flangeye.catalogue import load_model
 from flangeye.devices import DeviceError, RobotDriver
-from flangeye.header import LimitsSection
+from flangeye.models.loading import load_model
+from flangeye.motion.limits import limits_of
+from flangeye.recipe.header import LimitsSection
 from flangeye.types import BASE, FLANGE, Transform
-from flangeye_plugins.drivers.robots.simulated import SimulatedParams, SimulatedRobot
-from flangeye_plugins.motion.limits import limits_of
+from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 
 MODEL = load_model("robots", "ur5e")
 BOX = {"centre": ["0 mm", "0 mm", "400 mm"], "size": ["2 m", "2 m", "1.4 m"]}

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flangeye.catalogue import load_model
-from flangeye.kinematics import Arm
-from flangeye_plugins.motion.clearance import ArmVolume, segment_distance
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.motion.clearance import ArmVolume, segment_distance
 
 coordinates = st.lists(st.floats(-1, 1), min_size=12, max_size=12)
 

@@ -9,10 +9,10 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.errors import RunStopped
-from flangeye_plugins.motion import guard as guard_module
-from flangeye_plugins.motion.arm import guarded
-from flangeye_plugins.motion.guard import Charge, Guard
-from flangeye_plugins.motion.route import Router
+from flangeye.motion import watchdog as guard_module
+from flangeye.motion.arm import watched
+from flangeye.motion.route import Router
+from flangeye.motion.watchdog import Charge, Watchdog
 from tests.motion.stand_in import (
     LIMITS,
     MODEL,
@@ -31,7 +31,7 @@ def way_to(arm, **turns):
 
 def test_it_drives_there_and_has_settled():
     robot, told = StandIn(), []
-    with guarded(driver_of(robot), MODEL, LIMITS, told.append) as arm:
+    with watched(driver_of(robot), MODEL, LIMITS, told.append) as arm:
         goal = turned(arm.state.joints, j1=0.3)
         arm.go(way_to(arm, j1=0.3))
         state = arm.wait()
@@ -43,7 +43,7 @@ def test_it_drives_there_and_has_settled():
 
 
 def test_it_knows_where_the_arm_was():
-    with guarded(driver_of(StandIn()), MODEL, LIMITS) as arm:
+    with watched(driver_of(StandIn()), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.1))
         end = arm.wait().time_ns
         samples = arm.during(end // 2, end)
@@ -94,20 +94,20 @@ def protected(robot, state):
 )
 def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
     robot = StandIn(under_way(misbehaviour))
-    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+    with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError) as error:
             arm.wait()
         assert str(error.value).startswith(line)
         assert "stop" in robot.commands()
         arm.go(way_to(arm, j1=0.1))
-    assert robot.commands().count("move") == 1  # a doubt is not outlived
+    assert robot.commands().count("move") == 1  # a safety fault is not outlived
 
 
 def test_an_arm_that_does_not_set_off_is_noticed():
     robot = StandIn()
     robot.arm.step = lambda: None
-    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+    with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError, match="has not set off 1 s after it was told to"):
             arm.wait()
@@ -117,7 +117,7 @@ def test_an_arm_that_never_arrives_is_noticed():
     robot = StandIn()
     move = StandIn.move_joints
     robot.move_joints = lambda q, v, a: move(robot, robot.arm.stance.joints + 0.5 * (q - robot.arm.stance.joints), v, a)  # fmt: skip
-    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+    with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.3))
         with pytest.raises(DeviceError, match="the arm is not there after"):
             arm.wait()
@@ -130,7 +130,7 @@ def pushed(robot, state):
 def test_an_arm_that_moves_untold_is_noticed():
     robot = StandIn(pushed)
     with (
-        guarded(driver_of(robot), MODEL, LIMITS) as arm,
+        watched(driver_of(robot), MODEL, LIMITS) as arm,
         pytest.raises(DeviceError, match="the arm moves, and was not told to"),
     ):
         arm.wait()
@@ -146,7 +146,7 @@ def test_an_arm_that_moves_untold_is_noticed():
     ],
 )  # fmt: skip
 def test_another_arm_than_the_model_is_refused(change, line):
-    with pytest.raises(DeviceError) as error, guarded(driver_of(StandIn(change)), MODEL, LIMITS):
+    with pytest.raises(DeviceError) as error, watched(driver_of(StandIn(change)), MODEL, LIMITS):
         pass
     assert str(error.value) == line
 
@@ -154,7 +154,7 @@ def test_another_arm_than_the_model_is_refused(change, line):
 def test_a_driver_that_cannot_open_says_so():
     with (
         pytest.raises(DeviceError, match=r"^robot.nowhere: nobody answers at 10.0.0.1$"),
-        guarded(opened_nowhere(), MODEL, LIMITS),
+        watched(opened_nowhere(), MODEL, LIMITS),
     ):
         pass
 
@@ -164,7 +164,7 @@ def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go():
         raise ZeroDivisionError("division by zero")
 
     robot = StandIn(under_way(broken))
-    with guarded(driver_of(robot), MODEL, LIMITS) as arm:
+    with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError, match="the driver failed with ZeroDivisionError: division"):
             arm.wait()
@@ -197,7 +197,7 @@ def test_the_operator_stops_it_within_one_cycle(key):
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
     wire = Wire(robot, [(0, ("go", way)), (2000, ("close", None))])
-    guard = Guard(robot, wire, Charge(lambda: robot, MODEL, LIMITS, **{key: reading}))
+    guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, **{key: reading}))
     wait = robot.wait_cycle
 
     def pressed():
@@ -222,10 +222,10 @@ def test_the_person_reads_who_stopped_it():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "flangeye_plugins.motion.arm.guard",
+            "flangeye.motion.arm.guard",
             lambda wire, charge: open_guard(wire, charge._replace(alarm=reading)),
         )
-        with guarded(driver, MODEL, LIMITS) as arm:
+        with watched(driver, MODEL, LIMITS) as arm:
             arm.go(way_to(arm, j1=0.8))
             os.write(writing, b"\x02")
             with pytest.raises(RunStopped, match=r"^the operator stopped the arm \(Ctrl-C\)$"):

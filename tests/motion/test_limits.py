@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.header import LimitsSection
-from flangeye_plugins.motion.limits import limits_of
+from flangeye.motion.limits import limits_of
+from flangeye.recipe.header import LimitsSection
 from tests.motion.stand_in import BOX, LIMITS, MODEL
 
 
@@ -57,3 +57,28 @@ def test_limits_for_another_arm_are_refused(joints, line):
     with pytest.raises(StageError) as error:
         limits_of(section(joints=joints), MODEL)
     assert str(error.value) == line
+
+
+LOOPBACK = "ur5e_phoxi-m_loopback"
+
+
+@pytest.mark.parametrize(
+    "override, said",
+    [
+        ("robot.limits.joint_speed=3000 deg/s", "at most 180 deg/s for a ur5e, not 3000 deg/s"),
+        ("robot.limits.joint_speed=181 deg/s", "at most 180 deg/s for a ur5e, not 181 deg/s"),
+        ("robot.limits.box.size=[-1 m, 1 m, 1 m]", "must be greater than 0"),
+        ("robot.limits.box.size=[0 m, 1 m, 1 m]", "must be greater than 0"),
+        ("robot.limits.box.size=[1e300 m, 1 m, 1 m]", "is no box for a ur5e, which reaches"),
+        ("robot.limits.box.centre=[50 m, 0 m, 0 m]", "is no box for a ur5e, which reaches"),
+    ],
+)
+def test_limits_are_held_against_what_the_arm_can_do(override, said):
+    from flangeye.errors import RecipeError
+    from flangeye.plugin.registry import load_registry
+    from flangeye.recipe.load import find_recipe, load_recipe
+
+    with pytest.raises(RecipeError) as error:
+        load_recipe(find_recipe(LOOPBACK), load_registry(), [override])
+    assert said in str(error.value)
+    load_recipe(find_recipe(LOOPBACK), load_registry(), ["robot.limits.joint_speed=180 deg/s"])

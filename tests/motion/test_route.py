@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from flangeye.kinematics import Arm
-from flangeye_plugins.motion.route import Barred, Route, Router
+from flangeye.maths.kinematics import Arm
+from flangeye.motion.route import Barred, Route, Router
 from tests.motion.stand_in import LIMITS, MODEL, turned
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])

@@ -12,9 +12,15 @@ import pytest
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.geometry import basis_of_plane, kabsch, kabsch_covariance, rigid, rotation_from_rpy
-from flangeye.record import Recorder
-from flangeye.runlog import RunLog, read_run
+from flangeye.log.read import RunLog, read_run
+from flangeye.log.record import Recorder
+from flangeye.maths.geometry import (
+    basis_of_plane,
+    kabsch,
+    kabsch_covariance,
+    rigid,
+    rotation_from_rpy,
+)
 
 RIM, BORE = 0.0305, 0.0164
 TRUTH = t.Transform(
@@ -76,7 +82,9 @@ def _captures(script: Script, recorder: Recorder) -> tuple[list[t.Observation], 
         circle, cloud = _seen(pose, rng, script.points)
         if capture_id in script.outliers:
             circle = _moved(circle, [0.0, 0.04, 0.0])
-        capture = t.Capture(capture_id, _scan(cloud, rng), pose, time_ns=10**18 + i * 10**9)
+        capture = t.Capture(
+            capture_id, _scan(cloud, rng), t.by_frame(pose), time_ns=10**18 + i * 10**9
+        )
         if script.clouds:
             recorder.flangeye_captured(step="0.acquire.simulated", capture=capture, seconds=0.1)
         if capture_id in script.rejected:
@@ -84,7 +92,7 @@ def _captures(script: Script, recorder: Recorder) -> tuple[list[t.Observation], 
             rejections.append(t.Rejection(capture_id, stage, reason))
             recorder.flangeye_capture_rejected(rejection=rejections[-1])
         else:
-            observations.append(t.Observation(capture_id, circle, pose))
+            observations.append(t.Observation(capture_id, circle, t.by_frame(pose)))
             _log_observation(script, recorder, observations[-1], cloud)
         recorder.flangeye_capture_finished(capture=capture_id)
     return observations, rejections

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
+from flangeye.log.read import RunLog
 from flangeye.report import write_report
-from flangeye.runlog import RunLog
+from flangeye_plugins.export import EXPORTS
 
 FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
@@ -96,3 +97,22 @@ def test_a_narrow_screen_is_not_scrolled_sideways_and_the_matrix_can_be_copied(
     page.get_by_role("button", name="Copied").wait_for()
     assert len(page.evaluate("window.copied").split()) == 16
     page.close()
+
+
+def test_a_telephone_scrolls_down_only(
+    browser: Any, make_run: Callable[..., RunLog], tmp_path: Path
+) -> None:
+    path = tmp_path / "report.html"
+    library = tmp_path / "plotly.js"
+    log = make_run(outliers={"tool0_15450164880_870971918106": "too far"}, points=1000)
+    write_report(log, path, EXPORTS, library)
+    assert path.stat().st_size < 1_000_000  # plotly.js is beside it
+    page = browser.new_page(viewport={"width": 420, "height": 900})
+    page.goto(path.as_uri())
+    page.wait_for_selector("html[data-drawn]", timeout=60_000)
+    assert page.evaluate("document.documentElement.scrollWidth") == 420
+    page.get_by_text("The same for other programs").click()
+    page.get_by_role("tab", name="kuka").click()
+    assert "BASE_DATA[1]={X " in page.locator("#text-kuka").inner_text()
+    assert not page.locator("#text-abb").is_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") == 420

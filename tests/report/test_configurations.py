@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.geometry import invert, rigid, rotation_from_rpy
-from flangeye.record import Recorder
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
+from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.report import page
 from flangeye.report.cell import cell_drawing
 from flangeye.report.facts import facts_of
 from flangeye.report.images import image_view
 from flangeye.report.space import workspace_drawing
-from flangeye.runlog import read_run
 from flangeye.types import Pair
 
 EYE = rigid(rotation_from_rpy(0.1, -0.2, 1.5), np.array([0.06, 0.01, 0.04]))
@@ -32,13 +32,13 @@ def logged(path, carrier=t.FLANGE, solved=True):
         pose = rigid(rotation_from_rpy(np.pi, *rng.uniform(-0.3, 0.3, 2)), rng.uniform(0.2, 0.6, 3))
         flange = t.Transform(t.BASE, t.FLANGE, pose)
         image = t.Image(np.full((240, 320), 10 * i, np.uint8), np.diag([500.0, 500.0, 1.0]))
-        capture = t.Capture(f"{i}", NOTHING, flange, image=image)
+        capture = t.Capture(f"{i}", NOTHING, t.by_frame(flange), image=image)
         seen = t.Transform(t.CAMERA, t.TARGET, invert(pose @ EYE) @ TARGET)
         feature = t.PoseFeature(seen, 1e-8 * np.eye(6), {}, CORNERS)
         recorder.flangeye_captured(step="0.acquire.x", capture=capture, seconds=0.1)
         given = {"capture": f"{i}", "seconds": 0.1}
         recorder.flangeye_stage_finished(step="1.fit.x", value=feature, **given)
-        pairs.append(Pair(t.Observation(f"{i}", feature, flange), np.zeros(3), i > 0))
+        pairs.append(Pair(t.Observation(f"{i}", feature, t.by_frame(flange)), np.zeros(3), i > 0))
     if solved:
         found = t.TransformEstimate(
             t.Transform(carrier, t.CAMERA, EYE), 1e-8 * np.eye(6), np.zeros(3)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from flangeye.log.read import RunLog
 from flangeye.report import write_report
 from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
@@ -20,7 +21,6 @@ from flangeye.report.page import render
 from flangeye.report.plot import box_edges, figure3d, joined, packed, plain, round_up, scatter3d
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.space import workspace_drawing
-from flangeye.runlog import RunLog
 
 Make = Callable[..., RunLog]
 
@@ -97,7 +97,7 @@ def test_long_ids_that_start_alike_keep_labels_of_their_own(make_run: Make) -> N
 
 
 def test_predicted_errors_are_those_of_the_covariance(make_run: Make) -> None:
-    from flangeye.geometry import covariance_at
+    from flangeye.maths.geometry import covariance_at
 
     facts = facts_of(make_run())
     drawing = workspace_drawing(facts)

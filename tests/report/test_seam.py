@@ -9,12 +9,12 @@ from rich.console import Console
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.record import Recorder
+from flangeye.cli.terminal import print_result
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
 from flangeye.report.page import render
 from flangeye.report.seam import seam_view
 from flangeye.result import seam_result
-from flangeye.runlog import read_run
-from flangeye.terminal import print_result
 
 LINE = np.column_stack([np.linspace(0.5, 0.7, 41), np.zeros(41), np.full(41, 0.27)])
 SEAM = t.Seam(

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from flangeye import FlangeyeError
+from flangeye.log.read import RunLog, read_run
 from flangeye.report import write_report
 from flangeye.report.account import set_aside_of, timings_of, without_numbers
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.report.units import degrees, duration, millimetres
-from flangeye.runlog import RunLog, read_run
 
 Make = Callable[..., RunLog]
 
@@ -241,10 +241,11 @@ def _texts(node: Any) -> list[str]:
 
 
 def test_a_file_that_cannot_be_written_is_said_in_one_line(make_run: Make, tmp_path: Path) -> None:
+    (tmp_path / "missing").write_text("a file where a folder is meant")
     path = tmp_path / "missing" / "report.html"
     with pytest.raises(FlangeyeError) as error:
         write_report(make_run(), path)
-    assert str(error.value) == f"{path}: cannot be written: No such file or directory"
+    assert str(error.value) == f"{path}: cannot be written: Not a directory"
 
 
 def test_numbers_for_people() -> None:

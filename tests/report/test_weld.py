@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.record import Recorder
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
 from flangeye.report.page import render
 from flangeye.report.weld import off_line, weld_drawing
-from flangeye.runlog import read_run
 
 TIME = np.linspace(0.0, 40.0, 401)
 LINE = np.column_stack([np.linspace(0.5, 0.7, 201), np.zeros(201), np.full(201, 0.27)])

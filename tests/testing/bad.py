@@ -1,7 +1,7 @@
 """Plugins that are wrong in one way each, for the kit to find."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,17 +9,30 @@ import numpy as np
 
 from flangeye import Params, StageError, part, stage
 from flangeye import types as t
-from flangeye.archive import Archive, Recording
-from flangeye.catalogue import Flange, RobotModel, ScannerModel
-from flangeye.devices import DeviceError, Robot, Scan, Scanner, SensorFrame, TactileSensor
-from flangeye.diagnosis import Finding, Session
-from flangeye.kinematics import Arm
-from flangeye.redo import Redone
+from flangeye.devices import (
+    DeviceError,
+    Robot,
+    Scan,
+    Scanner,
+    SensorFrame,
+    StateSource,
+    TactileSensor,
+)
+from flangeye.doctor.diagnosis import Finding, RecordedSession
+from flangeye.files.recording import Archive, Recording
+from flangeye.maths.kinematics import Arm
+from flangeye.models.finger import Finger
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.models.targets import Flange
+from flangeye.motion.planning import Plan, Site
+from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
-from flangeye_plugins.drivers.robots.simulated import SimulatedParams, SimulatedRobot
-from flangeye_plugins.fitting.rim import RimParams, fit_rim
-from flangeye_plugins.planning.plans import GridParams, Plan, Site, grid
-from flangeye_plugins.segmentation.flange import SegmentParams, segment_flange
+from flangeye.types import FLANGE
+from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_plugins.fit.rim import RimParams, fit_rim
+from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 
 noise = np.random.default_rng()
 
@@ -123,6 +136,17 @@ def judged(passed, value, reason="rms 1 mm, limit 2 mm", figure=None):
     return t.Verification(passed, reason, {"rms": value if figure is None else figure})
 
 
+def export(text):
+    """An export that writes what ``text`` makes of the pose."""
+
+    @stage("export.bad")
+    def export_bad(pose: t.CalibratedPose) -> t.ExportedFile:
+        """Write badly."""
+        return t.ExportedFile("pose.txt", text(pose))
+
+    return export_bad
+
+
 def cost(function):
     @part("cost.bad")
     def cost_bad(error: t.PoseError) -> float:
@@ -138,7 +162,10 @@ def error(shift):
 
     @part("error.bad")
     def error_bad(
-        base_T_camera: t.Transform, kept: list, views: t.Views, flange: Flange | None
+        base_T_camera: t.Transform,
+        kept: Sequence[t.Observation],
+        views: t.Views,
+        flange: Flange | None,
     ) -> t.PoseError | None:
         """Measure badly."""
         measured = np.array([o.feature.centre for o in kept]).reshape(-1, 3)
@@ -164,7 +191,9 @@ def acquire(change=lambda i, capture: capture, fingerprint=lambda: "same", total
             pose = np.eye(4)
             pose[:3, 3] = [0.5, 0.1 * i, 0.4]
             cloud = t.PointCloud(t.CAMERA, np.full((4, 5, 3), 0.7, np.float32))
-            yield change(i, t.Capture(f"{i}", cloud, t.Transform(t.BASE, t.FLANGE, pose)))
+            yield change(
+                i, t.Capture(f"{i}", cloud, t.by_frame(t.Transform(t.BASE, t.FLANGE, pose)))
+            )
 
     return acquire_bad
 
@@ -179,7 +208,7 @@ def reader(change=lambda recordings: recordings, guard=True):
         """Read badly."""
         if guard and not (path / "poses.csv").is_file():
             raise StageError(f"{path}: no poses.csv")
-        recordings = [Recording(str(i), np.eye(4)) for i in range(3)]
+        recordings = [Recording(str(i), {FLANGE: np.eye(4)}) for i in range(3)]
         return Archive("bad", path, change(recordings), [])
 
     return reader_bad
@@ -329,7 +358,7 @@ def sensor(**methods):
     made = type("Bad", (Eye,), methods)
 
     @part("sensor.bad")
-    def sensor_bad() -> TactileSensor:
+    def sensor_bad(finger: Finger, robot: StateSource, seed: t.Seed) -> TactileSensor:
         """Feel badly."""
         return made()
 
@@ -347,7 +376,7 @@ def gone(*_, **__):
 
 def check(find):
     @part("check.bad")
-    def check_bad(session: Session) -> Iterable[Finding]:
+    def check_bad(session: RecordedSession) -> Iterable[Finding]:
         """Look badly."""
         return find(session)
 
@@ -359,6 +388,6 @@ def finding(what="all is lost"):
 
 
 @part("replay.bad")
-def replay_bad(log: Path, step: str) -> Redone:
+def replay_bad(log: Path, step: str) -> ReplayedStep:
     """Decide badly."""
-    return Redone(log.read_text(), True)
+    return ReplayedStep(log.read_text(), True)

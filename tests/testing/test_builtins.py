@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flangeye.cloudfile import write_cloud
-from flangeye.registry import load_registry
+from flangeye.files.clouds import write_cloud
+from flangeye.plugin.registry import load_registry
 from flangeye.testing import (
     AcquireConformance,
     CheckConformance,
@@ -36,33 +36,34 @@ from flangeye.types import (
     Transform,
     VerificationView,
     Views,
+    by_frame,
 )
 from flangeye.units import SI
-from flangeye_plugins.acquisition.archive import ArchiveParams, acquire_archive
-from flangeye_plugins.acquisition.simulated import SimulatedParams, acquire_simulated
-from flangeye_plugins.costs.costs import cost_axes, cost_translation, cost_work_radius
-from flangeye_plugins.drivers.robots.simulated import robot_simulated
-from flangeye_plugins.drivers.scanners.watched_folder import (
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
+from flangeye_emulators.robot.simulated import robot_simulated
+from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
+from flangeye_plugins.cost.costs import cost_axes, cost_translation, cost_work_radius
+from flangeye_plugins.error.errors import error_holdout
+from flangeye_plugins.fit.ransac import fit_ransac_circle
+from flangeye_plugins.fit.rim import fit_rim
+from flangeye_plugins.fit.sphere import fit_sphere
+from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.reader.folder import FolderParams, folder
+from flangeye_plugins.refine.compensate import refine_compensate
+from flangeye_plugins.scanner.watched_folder import (
     WatchedFolderParams,
     scanner_watched_folder,
 )
-from flangeye_plugins.fitting.ransac import fit_ransac_circle
-from flangeye_plugins.fitting.rim import fit_rim
-from flangeye_plugins.fitting.sphere import fit_sphere
-from flangeye_plugins.planning.guess import GuessParams, view_guess
-from flangeye_plugins.planning.plans import GridParams, grid
-from flangeye_plugins.readers.folder import FolderParams, folder
-from flangeye_plugins.refining.compensate import refine_compensate
-from flangeye_plugins.segmentation.flange import SegmentParams, segment_flange
-from flangeye_plugins.segmentation.sphere import segment_sphere
-from flangeye_plugins.simulation.structured_light import StructuredLight
-from flangeye_plugins.solving.iterative import solve_iterative
-from flangeye_plugins.solving.robust import solve_robust
-from flangeye_plugins.solving.svd import solve_svd
-from flangeye_plugins.verification.errors import error_holdout
-from flangeye_plugins.verification.holdout import verify_holdout
-from flangeye_plugins.verification.icp import verify_icp
-from tests.simulation.bench import facing, flange_scene, zoomed
+from flangeye_plugins.segment.flange import SegmentParams, segment_flange
+from flangeye_plugins.segment.sphere import segment_sphere
+from flangeye_plugins.solve.iterative import solve_iterative
+from flangeye_plugins.solve.robust import solve_robust
+from flangeye_plugins.solve.svd import solve_svd
+from flangeye_plugins.verify.holdout import verify_holdout
+from flangeye_plugins.verify.icp import verify_icp
+from flangeye_plugins.view.guess import GuessParams, view_guess
+from tests.emulators.world.bench import facing, flange_scene, zoomed
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
 
@@ -111,7 +112,7 @@ def simulated_views(flange, motion):
     camera_T_flange = facing(0.3)
     xyz = StructuredLight(zoomed(), 1.0, 0.0, rng).scan(flange_scene(camera_T_flange, "ur5e"), rng)
     pose = Transform(BASE, FLANGE, motion @ KIT_CAMERA @ camera_T_flange)
-    capture = Capture("view", PointCloud(CAMERA, xyz), pose)
+    capture = Capture("view", PointCloud(CAMERA, xyz), by_frame(pose))
     found = segment_flange(capture, flange, SegmentParams())
     return Views([VerificationView("view", found, pose)])
 

@@ -9,11 +9,11 @@ import pytest
 
 from flangeye import StageError
 from flangeye import types as t
-from flangeye.archive import Recording
+from flangeye.files.recording import Recording
 from flangeye.testing import KITS
-from flangeye.types import CAMERA, PointCloud
-from flangeye_plugins.costs.costs import cost_translation
-from flangeye_plugins.fitting.rim import fit_rim
+from flangeye.types import CAMERA, FLANGE, PointCloud
+from flangeye_plugins.cost.costs import cost_translation
+from flangeye_plugins.fit.rim import fit_rim
 from tests.testing import bad
 
 K = KITS
@@ -445,7 +445,7 @@ CASES = [
     (
         "reader",
         "test_its_recordings_are_complete",
-        bad.reader(lambda r: [Recording("0", pose_at(500.0, 0, 0))]),
+        bad.reader(lambda r: [Recording("0", {FLANGE: pose_at(500.0, 0, 0)})]),
         "not in metres",
         {"archive": Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"},
     ),
@@ -657,6 +657,21 @@ CASES = [
         "test_a_log_that_is_none_is_refused",
         bad.replay_bad,
         "must be refused with StageError in one line, not FileNotFoundError",
+        {},
+    ),
+    ("export", "test_it_writes_a_file", bad.export(lambda p: ""), "the file is empty", {}),
+    (
+        "export",
+        "test_the_pose_is_in_it",
+        bad.export(lambda p: "always the same"),
+        "two poses give one text",
+        {},
+    ),
+    (
+        "export",
+        "test_its_remarks_are_in_it",
+        bad.export(lambda p: str(p.transform.matrix.tolist())),
+        "the file does not say",
         {},
     ),
     ("sensor", "test_asking_does_not_wait", bad.sensor(frame=bad.sleepy), "frame\\(\\) took", {}),

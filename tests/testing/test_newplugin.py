@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from flangeye.cli import app
 from flangeye.errors import StageError
-from flangeye.newplugin import kinds, write_plugin
-from flangeye.stage import KINDS, PARTS
+from flangeye.plugin.scaffold import kinds, write_plugin
+from flangeye.plugin.stage import KINDS, PARTS
 from flangeye.testing import KITS
 
 

@@ -6,22 +6,28 @@ import asyncio
 import logging
 import os
 import signal
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
+from itertools import islice
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
 
-from flangeye.batch.outcome import Outcome
-from flangeye.batch.plan import Session
-from flangeye.batch.request import BatchError
+from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.plan import BatchSession
+from flangeye.batch.request import BatchError, Tls
 from flangeye.batch.work import WORKER_DIED, Job, run_session
+from flangeye.files.children import keep_current_folder_out
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, Security
 
 CONNECT_SECONDS = 5.0
 """How long to wait for a scheduler that was given by address."""
+
+WINDOW = 1000
+"""Sessions that the scheduler knows of at most, or four for each worker if that is more."""
 
 SINGLE_THREADED = {
     name: 1
@@ -60,7 +66,7 @@ def check_installed() -> None:
     if missing:
         raise BatchError(
             f"flangeye batch needs {' and '.join(missing)}; install with: "
-            "pip install 'flangeye[batch]'"
+            f"{sys.executable} -m pip install 'flangeye[batch]'"
         )
 
 
@@ -73,7 +79,9 @@ def cores() -> int:
 def local_client(workers: int) -> Iterator[Client]:
     """Start workers here, one process and one thread each, and stop them at the end."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client, LocalCluster, Security
+
+    keep_current_folder_out()
 
     with dask.config.set(_LOCAL), ExitStack() as stack:
         with _interrupts_kept_here():
@@ -81,8 +89,11 @@ def local_client(workers: int) -> Iterator[Client]:
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="127.0.0.1:0",  # any free port
+                dashboard_address="127.0.0.1:0",  # any free port; without the pages themselves
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
+                protocol="tls://",
+                security=Security.temporary(),  # nobody else on this machine has its key
             )
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))
@@ -104,8 +115,8 @@ def _interrupts_kept_here() -> Iterator[None]:
 
 
 @contextmanager
-def remote_client(address: str) -> Iterator[Client]:
-    """Connect to a running scheduler, and leave it running.
+def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
+    """Connect to a running scheduler, encrypted if files are given, and leave it running.
 
     Raises:
         BatchError: No scheduler answers there.
@@ -113,8 +124,9 @@ def remote_client(address: str) -> Iterator[Client]:
     from distributed import Client
 
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # rows say it
+    security = _security(tls)
     try:
-        kind = asyncio.run(_kind_of_server(address))
+        kind = asyncio.run(_kind_of_server(address, security))
     except OSError:  # a timeout is one too
         kind = f"no answer within {CONNECT_SECONDS:g} s"
     except Exception as error:  # what answers may be anything
@@ -124,15 +136,32 @@ def remote_client(address: str) -> Iterator[Client]:
             f"--scheduler {address}: no dask scheduler answers there ({kind}); the address is "
             "what 'dask scheduler' prints, such as tcp://host:8786"
         )
-    with Client(address, timeout=CONNECT_SECONDS) as client:
+    with Client(address, timeout=CONNECT_SECONDS, security=security) as client:
         yield client
 
 
-async def _kind_of_server(address: str) -> str:
-    """Return what a dask server says it is; a Client that cannot connect lingers for seconds."""
-    from distributed import Security, rpc
+def _security(tls: Tls | None) -> Security:
+    """Return dask's own settings, or what the command line gives instead."""
+    from distributed import Security
 
-    arguments = Security().get_connection_args("client")
+    if tls is None:
+        return Security()
+    for file in (tls.ca, tls.cert, tls.key):
+        if not file.is_file():
+            raise BatchError(f"{file}: no such file; --tls-ca, --tls-cert and --tls-key name PEM")
+    return Security(
+        require_encryption=True,
+        tls_ca_file=str(tls.ca),
+        tls_client_cert=str(tls.cert),
+        tls_client_key=str(tls.key),
+    )
+
+
+async def _kind_of_server(address: str, security: Security) -> str:
+    """Return what a dask server says it is; a Client that cannot connect lingers for seconds."""
+    from distributed import rpc
+
+    arguments = security.get_connection_args("client")
     async with rpc(address, timeout=CONNECT_SECONDS, connection_args=arguments) as server:
         identity = await asyncio.wait_for(server.identity(), CONNECT_SECONDS)
     return str(identity["type"])
@@ -144,30 +173,44 @@ def worker_count(client: Client) -> int:
 
 
 def run_all(
-    client: Client, job: Job, sessions: Sequence[Session]
-) -> Iterator[tuple[Session, Outcome]]:
-    """Yield each session with its outcome as it ends."""
+    client: Client, job: Job, sessions: Sequence[BatchSession]
+) -> Iterator[tuple[BatchSession, SessionOutcome]]:
+    """Yield each session with its outcome as it ends.
+
+    They are submitted as others end: what client and scheduler hold does not grow with their
+    number.
+    """
     from distributed import as_completed
 
-    futures = client.map(run_session, [job] * len(sessions), sessions, pure=False)
-    waiting = dict(zip((future.key for future in futures), sessions, strict=True))
-    done = as_completed(futures)
-    del futures  # so that each is forgotten, with its outcome, once it was told
+    waiting: dict[str, BatchSession] = {}
+    rest = iter(sessions)
+    half = max(WINDOW // 2, 2 * worker_count(client))
+
+    def submit(count: int) -> list[Future]:
+        some = list(islice(rest, count))
+        futures = client.map(run_session, [job] * len(some), some, pure=False)
+        waiting.update(zip((future.key for future in futures), some, strict=True))
+        return list(futures)
+
+    done = as_completed(submit(2 * half))
     for future in done:
-        yield waiting.pop(future.key), _outcome(future)
-        future.release()
+        session = waiting.pop(future.key)
+        if len(waiting) <= half:
+            done.update(submit(half))
+        yield session, _outcome(future)
+        future.release()  # so that each is forgotten, with its outcome, once it was told
 
 
-def _outcome(future: Future) -> Outcome:
+def _outcome(future: Future) -> SessionOutcome:
     """Return what the worker gave, or why it could give nothing."""
     if future.cancelled():
-        return Outcome("crashed", "the connection to the scheduler was lost before it ended")
+        return SessionOutcome("crashed", "the connection to the scheduler was lost before it ended")
     try:
-        outcome: Outcome = future.result()
+        outcome: SessionOutcome = future.result()
     except Exception as error:  # of dask: the worker's own are in the outcome
         if type(error).__name__ == "KilledWorker":
-            return Outcome("crashed", WORKER_DIED)
-        return Outcome("crashed", _told(error))
+            return SessionOutcome("crashed", WORKER_DIED)
+        return SessionOutcome("crashed", _told(error))
     return outcome
 
 

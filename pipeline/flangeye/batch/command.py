@@ -15,9 +15,9 @@ from flangeye.batch.cluster import (
     run_all,
     worker_count,
 )
-from flangeye.batch.outcome import Batch, Outcome, finished_outcome
+from flangeye.batch.outcome import Batch, SessionOutcome, finished_outcome
 from flangeye.batch.page import write_page
-from flangeye.batch.plan import Session, plan
+from flangeye.batch.plan import BatchSession, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
 from flangeye.batch.software import software_of
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from distributed import Client
     from rich.console import Console
 
-    from flangeye.registry import Registry
+    from flangeye.plugin.registry import Registry
 
 
 def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
@@ -64,22 +64,24 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     return batch
 
 
-def _out(request: Request, sessions: list[Session]) -> Path:
+def _out(request: Request, sessions: list[BatchSession]) -> Path:
     """Return the folder; it has no time in its name, so that a second start finds it."""
     return request.out or Path("batches") / sessions[0].recipe.stem
 
 
-def _finished_earlier(job: Job, sessions: list[Session]) -> dict[str, Outcome]:
+def _finished_earlier(job: Job, sessions: list[BatchSession]) -> dict[str, SessionOutcome]:
     found = {s.id: finished_outcome(job.out / s.id, s.key, job.report) for s in sessions}
     return {session: outcome for session, outcome in found.items() if outcome}
 
 
 def _client(request: Request, todo: int) -> AbstractContextManager[Client]:
     if request.scheduler is None:
+        if request.tls is not None:
+            raise BatchError("--tls-… is for a scheduler; give --scheduler tls://HOST:PORT too")
         return local_client(min(request.workers or cores(), todo))
     if request.workers is not None:
         raise BatchError("--workers starts workers here, --scheduler uses others; give one")
-    return remote_client(request.scheduler)
+    return remote_client(request.scheduler, request.tls)
 
 
 def _prepare(out: Path) -> None:
@@ -91,7 +93,9 @@ def _prepare(out: Path) -> None:
         raise BatchError(f"{out}: cannot be made: {error.strerror or error}") from None
 
 
-def _run(client: Client, job: Job, todo: list[Session], batch: Batch, console: Console) -> None:
+def _run(
+    client: Client, job: Job, todo: list[BatchSession], batch: Batch, console: Console
+) -> None:
     with BatchProgress(console, len(todo)) as progress:
         if not worker_count(client):
             progress.note("note: the scheduler has no workers yet; sessions wait for them")
@@ -100,7 +104,7 @@ def _run(client: Client, job: Job, todo: list[Session], batch: Batch, console: C
             progress.finished(session, outcome)
 
 
-def _tell(sessions: list[Session], batch: Batch) -> None:
+def _tell(sessions: list[BatchSession], batch: Batch) -> None:
     """Write the tables and the page."""
     table = table_of([(s, batch.outcomes[s.id]) for s in sessions if s.id in batch.outcomes])
     if not table.rows:

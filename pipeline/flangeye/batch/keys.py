@@ -13,9 +13,9 @@ from typing import Any
 
 from flangeye import types as t
 from flangeye.batch.software import Software
-from flangeye.recipe import Recipe
+from flangeye.plugin.stage import BoundPart, Params
+from flangeye.recipe.load import Recipe
 from flangeye.result import sha256
-from flangeye.stage import Chosen, Params
 
 SMALL = 65_536
 """Files up to so many bytes are told apart by content, larger ones by size and time of change."""
@@ -64,7 +64,7 @@ def _fingerprint(path: Path) -> str:
 def _paths(value: Any) -> Iterator[Path]:
     if isinstance(value, Path):
         yield value
-    elif isinstance(value, Chosen):
+    elif isinstance(value, BoundPart):
         yield from _paths(value.params)
     elif isinstance(value, Params):
         for _, inner in value:

@@ -19,7 +19,7 @@ MARKER = "session.json"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SessionOutcome:
     """What became of one session; SI units.
 
     Attributes:
@@ -67,7 +67,7 @@ class Batch:
     """
 
     out: Path
-    outcomes: dict[str, Outcome]
+    outcomes: dict[str, SessionOutcome]
     known: int
 
     @property
@@ -76,10 +76,10 @@ class Batch:
         return all(outcome.status in ACCEPTED for outcome in self.outcomes.values())
 
 
-def outcome_of(result: Result) -> Outcome:
+def outcome_of(result: Result) -> SessionOutcome:
     """Return the headline figures of a result."""
     holdout, workspace, truth = result.holdout, result.workspace, result.truth
-    return Outcome(
+    return SessionOutcome(
         status=result.status,  # type: ignore[arg-type]
         reason=result.refused,
         used=sum(o.used for o in result.observations),
@@ -95,14 +95,14 @@ def outcome_of(result: Result) -> Outcome:
     )
 
 
-def mark_finished(folder: Path, key: str, outcome: Outcome) -> None:
+def mark_finished(folder: Path, key: str, outcome: SessionOutcome) -> None:
     """Leave the outcome in a session's folder, whole or not at all."""
     draft = folder / f"{MARKER}.part"
     draft.write_text(json.dumps({"key": key, **asdict(outcome)}, indent=2) + "\n", encoding="utf-8")
     draft.replace(folder / MARKER)
 
 
-def finished_outcome(folder: Path, key: str, report: bool) -> Outcome | None:
+def finished_outcome(folder: Path, key: str, report: bool) -> SessionOutcome | None:
     """Return what :func:`mark_finished` left; None when the session has to run.
 
     Args:
@@ -114,6 +114,6 @@ def finished_outcome(folder: Path, key: str, report: bool) -> Outcome | None:
         data = json.loads((folder / MARKER).read_text(encoding="utf-8"))
         if data.pop("key") != key or (report and not data["report"]):
             return None
-        return Outcome(**data)
+        return SessionOutcome(**data)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None  # not there, or not ours

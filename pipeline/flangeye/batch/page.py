@@ -11,12 +11,13 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from flangeye import __version__
 from flangeye import report as run_report
 from flangeye.batch.figures import drawings_of
 from flangeye.batch.outcome import ACCEPTED, STATUSES
 from flangeye.batch.request import BatchError
 from flangeye.batch.tables import Row, Table
+from flangeye.files.bundled import VERSION
+from flangeye.files.written import write_whole
 from flangeye.report.units import degrees, duration, millimetres
 
 if TYPE_CHECKING:
@@ -68,10 +69,7 @@ def write_page(table: Table, path: Path) -> None:
     Raises:
         BatchError: The file cannot be written.
     """
-    try:
-        path.write_bytes(render(table).encode("utf-8", "replace"))
-    except OSError as error:
-        raise BatchError(f"{path}: cannot be written: {error.strerror or error}") from None
+    write_whole(path, render(table), BatchError)
 
 
 def render(table: Table) -> str:
@@ -92,7 +90,7 @@ def render(table: Table) -> str:
         drawings=drawings,
         seconds=duration(sum(row["seconds"] for row in table.rows)),
         plotly_js=get_plotlyjs() if drawings else "",
-        version=__version__,
+        version=VERSION,
     )  # fmt: skip
 
 

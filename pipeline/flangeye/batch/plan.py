@@ -13,12 +13,12 @@ from flangeye.batch.request import SEED, BatchError, Request
 from flangeye.batch.software import Software
 from flangeye.batch.variants import variants
 from flangeye.errors import RecipeError
-from flangeye.recipe import Recipe, find_recipe, load_recipe
-from flangeye.registry import Registry
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe, find_recipe, load_recipe
 
 
 @dataclass(frozen=True)
-class Session:
+class BatchSession:
     """One run of the batch.
 
     Attributes:
@@ -40,7 +40,7 @@ class Session:
     seed: int
 
 
-def plan(request: Request, registry: Registry, software: Software) -> list[Session]:
+def plan(request: Request, registry: Registry, software: Software) -> list[BatchSession]:
     """Return the sessions of a batch, each with its recipe checked.
 
     Raises:
@@ -59,7 +59,9 @@ def plan(request: Request, registry: Registry, software: Software) -> list[Sessi
             key = session_key(recipe, archive, software, prints)
             name = _session_id(recipe.name, archive, key)
             shown = {k: v for k, v in varied.items() if k != SEED}
-            sessions.append(Session(name, key, path, archive, overrides, shown, recipe.header.seed))
+            sessions.append(
+                BatchSession(name, key, path, archive, overrides, shown, recipe.header.seed)
+            )
     _check_distinct(sessions)
     return sessions
 
@@ -84,8 +86,8 @@ def _session_id(recipe: str, archive: Path | None, key: str) -> str:
     return f"{re.sub(r'[^A-Za-z0-9._=-]+', '-', name)[:80].lstrip('.-')}_{key[:12]}"
 
 
-def _check_distinct(sessions: Sequence[Session]) -> None:
-    seen: dict[str, Session] = {}
+def _check_distinct(sessions: Sequence[BatchSession]) -> None:
+    seen: dict[str, BatchSession] = {}
     for session in sessions:
         other = seen.setdefault(session.key, session)
         if other is not session:
@@ -94,6 +96,6 @@ def _check_distinct(sessions: Sequence[Session]) -> None:
             )
 
 
-def _told(session: Session) -> str:
+def _told(session: BatchSession) -> str:
     words = [f"{path}={value}" for path, value in session.varied.items()]
     return " ".join([str(session.archive or session.recipe.name), *words])

@@ -7,12 +7,13 @@ from collections.abc import Iterable
 from statistics import median
 from typing import TYPE_CHECKING
 
-from flangeye.batch.outcome import ACCEPTED, STATUSES, Batch, Outcome
+from flangeye.batch.outcome import ACCEPTED, STATUSES, Batch, SessionOutcome
+from flangeye.files.printable import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flangeye.batch.plan import Session
+    from flangeye.batch.plan import BatchSession
 
 
 TOLD_AT_MOST = 10
@@ -54,16 +55,16 @@ class BatchProgress:
 
     def note(self, line: str) -> None:
         """Say a line above the bar."""
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
-    def finished(self, session: Session, outcome: Outcome) -> None:
+    def finished(self, session: BatchSession, outcome: SessionOutcome) -> None:
         """Count a session, and say what was wrong with it."""
         self._counts[outcome.status] += 1
         if outcome.status not in ACCEPTED:
             self._tell(session, outcome)
         self._progress.update(self._task, advance=1, description=count_text(self._counts))
 
-    def _tell(self, session: Session, outcome: Outcome) -> None:
+    def _tell(self, session: BatchSession, outcome: SessionOutcome) -> None:
         told = self._counts.total() - sum(self._counts[status] for status in ACCEPTED)
         if told <= TOLD_AT_MOST:
             self.note(f"{outcome.status} {session.id}: {outcome.reason}")

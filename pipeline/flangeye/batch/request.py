@@ -15,11 +15,26 @@ class BatchError(FlangeyeError):
 
 
 @dataclass(frozen=True)
+class Tls:
+    """Files for an encrypted connection in which both sides are known.
+
+    Attributes:
+        ca: Certificate of the authority that signed the others, PEM.
+        cert: Our certificate, PEM.
+        key: Its private key, PEM: who has it may run code on every worker.
+    """
+
+    ca: Path
+    cert: Path
+    key: Path
+
+
+@dataclass(frozen=True)
 class Request:
     """What the command line asks for.
 
     Attributes:
-        recipe: File, or name of a shipped recipe.
+        recipe: File, or name of a bundled recipe.
         archives: Recordings to run on; none for recipes that simulate.
         overrides: ``PATH=VALUE``, the same in every session.
         grid: ``PATH=a,b,c``: every combination is run.
@@ -27,6 +42,7 @@ class Request:
         vary: What ``repeat`` counts up; only ``seed`` can be.
         workers: Worker processes on this machine; None for one per core.
         scheduler: Address of a running dask scheduler, instead of workers here.
+        tls: What proves to that scheduler who we are, and to us that it is the one.
         out: Folder of the batch; None for ``batches/<recipe>``.
         report: Make each session's ``report.html``.
     """
@@ -39,5 +55,6 @@ class Request:
     vary: str = SEED
     workers: int | None = None
     scheduler: str | None = None
+    tls: Tls | None = None
     out: Path | None = None
     report: bool = True

@@ -31,7 +31,9 @@ def cluster() -> SLURMCluster:
         interface=None,  # the network that the nodes share, such as "ib0"
         local_directory="/tmp",
         log_directory="slurm-logs",
-        scheduler_options={"dashboard_address": ":0"},  # any free port
+        scheduler_options={"dashboard": False},
+        # On nodes that others use too, add protocol="tls://" and security=distributed.Security(…):
+        # who reaches the scheduler's port without a key may run code as you.
         job_script_prologue=[
             "export OMP_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1",
             # A paused worker never goes on, and the profiler keeps 40 kB a session.

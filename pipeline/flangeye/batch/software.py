@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from flangeye import __version__
 from flangeye.errors import StageError
-from flangeye.registry import Registry
+from flangeye.files.bundled import VERSION
+from flangeye.plugin.registry import Registry
 
 
 class Software(NamedTuple):
@@ -24,7 +24,7 @@ class Software(NamedTuple):
 def software_of(registry: Registry) -> Software:
     """Return the versions in this process."""
     plugins = sorted(f"{name} {version}" for name, version in registry.versions().items())
-    return Software(__version__, tuple(plugins))
+    return Software(VERSION, tuple(plugins))
 
 
 def check_software(expected: Software, here: Software, host: str) -> None:

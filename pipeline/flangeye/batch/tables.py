@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flangeye.batch.outcome import Outcome
-from flangeye.batch.plan import Session
+from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.plan import BatchSession
 from flangeye.batch.request import BatchError
-from flangeye.yamlfile import parse_value
+from flangeye.files.yaml_lines import parse_value
 
 Row = dict[str, Any]
 
@@ -34,7 +34,7 @@ class Table:
     rows: Sequence[Row]
 
 
-def table_of(entries: Sequence[tuple[Session, Outcome]]) -> Table:
+def table_of(entries: Sequence[tuple[BatchSession, SessionOutcome]]) -> Table:
     """Return the table of a batch."""
     rows = [_row(session, outcome) for session, outcome in entries]
     varied = tuple(entries[0][0].varied) if entries else ()
@@ -63,7 +63,7 @@ def write_tables(table: Table, out: Path) -> None:
         raise BatchError(f"{out}: cannot be written: {error.strerror or error}") from None
 
 
-def _row(session: Session, outcome: Outcome) -> Row:
+def _row(session: BatchSession, outcome: SessionOutcome) -> Row:
     return {
         "session": session.id,
         "recipe": session.recipe.stem,

@@ -10,14 +10,20 @@ from functools import cache
 from pathlib import Path
 
 from flangeye.batch.keys import Fingerprints, session_key
-from flangeye.batch.outcome import FINISHED, Outcome, finished_outcome, mark_finished, outcome_of
-from flangeye.batch.plan import Session
+from flangeye.batch.outcome import (
+    FINISHED,
+    SessionOutcome,
+    finished_outcome,
+    mark_finished,
+    outcome_of,
+)
+from flangeye.batch.plan import BatchSession
 from flangeye.batch.software import Software, check_software, software_of
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.recipe import Recipe, load_recipe
-from flangeye.registry import Registry, load_registry
-from flangeye.runfolder import RunFolder
-from flangeye.session import Start, record_run
+from flangeye.plugin.registry import Registry, load_registry
+from flangeye.recipe.load import Recipe, load_recipe
+from flangeye.run.folder import RunFolder
+from flangeye.run.session import Start, record_run
 from flangeye.types import ArchivePath
 
 MAX_STARTS = 2
@@ -46,7 +52,7 @@ class Job:
     software: Software
 
 
-def run_session(job: Job, session: Session) -> Outcome:
+def run_session(job: Job, session: BatchSession) -> SessionOutcome:
     """Run one session into its folder; whatever goes wrong is in the outcome."""
     known = finished_outcome(job.out / session.id, session.key, job.report)
     if known:  # by a worker that was lost before it could tell
@@ -55,14 +61,14 @@ def run_session(job: Job, session: Session) -> Outcome:
     try:
         outcome = _started(job, session)
     except FlangeyeError as error:
-        outcome = Outcome("failed", "; ".join(str(error).splitlines()))
+        outcome = SessionOutcome("failed", "; ".join(str(error).splitlines()))
     except (Exception, SystemExit) as error:  # nothing may reach the other sessions
-        outcome = Outcome("crashed", f"{type(error).__name__}: {error}")
+        outcome = SessionOutcome("crashed", f"{type(error).__name__}: {error}")
     outcome = replace(outcome, seconds=time.perf_counter() - begun)
     return _finished(job, session, outcome)
 
 
-def _started(job: Job, session: Session) -> Outcome:
+def _started(job: Job, session: BatchSession) -> SessionOutcome:
     registry = _registry()
     _check_worker(job, registry)
     starts = job.out / STARTS / session.id
@@ -70,24 +76,24 @@ def _started(job: Job, session: Session) -> Outcome:
         file.write(b".")
         count = file.tell()
     if count > MAX_STARTS:
-        return Outcome("crashed", WORKER_DIED)
+        return SessionOutcome("crashed", WORKER_DIED)
     return _calibrated(job, session, registry)
 
 
-def _calibrated(job: Job, session: Session, registry: Registry) -> Outcome:
+def _calibrated(job: Job, session: BatchSession, registry: Registry) -> SessionOutcome:
     recipe = load_recipe(session.recipe, registry, session.overrides)
     _check_unchanged(job, session, recipe)
     path = job.out / session.id
     shutil.rmtree(path, ignore_errors=True)  # the rest of a start that came to no end
     folder = RunFolder.create(recipe.name, path)
     result = record_run(
-        recipe, registry, folder, Start(ArchivePath(session.archive)), report=job.report
+        recipe, registry, folder, Start(ArchivePath(session.archive)), job.report, job.out / LIBRARY
     )
     report = f"{session.id}/report.html" if job.report else None
     return replace(outcome_of(result), report=report)
 
 
-def _finished(job: Job, session: Session, outcome: Outcome) -> Outcome:
+def _finished(job: Job, session: BatchSession, outcome: SessionOutcome) -> SessionOutcome:
     """Mark the folder and forget the starts."""
     try:
         if outcome.status in FINISHED:
@@ -95,8 +101,12 @@ def _finished(job: Job, session: Session, outcome: Outcome) -> Outcome:
         (job.out / STARTS / session.id).unlink(missing_ok=True)
     except OSError as error:
         reason = f"{error.filename}: cannot be written: {error.strerror or error}"
-        return Outcome("failed", reason, seconds=outcome.seconds)
+        return SessionOutcome("failed", reason, seconds=outcome.seconds)
     return outcome
+
+
+LIBRARY = "plotly.js"
+"""What all reports of a batch share, beside their folders."""
 
 
 @cache
@@ -115,7 +125,7 @@ def _check_worker(job: Job, registry: Registry) -> None:
     check_software(job.software, software_of(registry), host)
 
 
-def _check_unchanged(job: Job, session: Session, recipe: Recipe) -> None:
+def _check_unchanged(job: Job, session: BatchSession, recipe: Recipe) -> None:
     if session_key(recipe, session.archive, job.software, Fingerprints()) != session.key:
         changed = " or ".join(str(path) for path in (session.recipe, session.archive) if path)
         raise StageError(f"{changed}: has changed since the batch was started; start it again")

@@ -4,7 +4,19 @@ Modules are imported inside the commands, so that ``--help`` answers at once. Co
 in the order in which they are declared: running first.
 """
 
-from flangeye.cli import running, offering, logs, hardware  # noqa: I001
+from flangeye.cli import running, page, offering, catalogue  # noqa: I001
+from flangeye.cli import logs, watching, exporting, hardware
 from flangeye.cli.app import app, main
 
-__all__ = ["app", "hardware", "logs", "main", "offering", "running"]
+__all__ = [
+    "app",
+    "catalogue",
+    "exporting",
+    "hardware",
+    "logs",
+    "main",
+    "offering",
+    "page",
+    "running",
+    "watching",
+]

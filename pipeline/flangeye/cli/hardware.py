@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
 
 tactile = typer.Typer(no_args_is_help=True, help="Tactile fingers: find out how one moves.")
 app.add_typer(tactile, name="tactile")
@@ -28,22 +28,22 @@ def tactile_calibrate(
 ) -> None:
     """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
     from flangeye.devices import MotionAllowed
-    from flangeye.recipe import find_recipe, load_recipe
 
     registry = load_plugins()
-    checked = load_recipe(find_recipe(recipe), registry, overrides or ())
+    checked = read_recipe(recipe, registry, overrides)
 
     def ask(text: str) -> None:
-        typer.echo(text)
+        say(text)
         if not yes:
             typer.prompt("then press Enter", default="", show_default=False)
 
     guide = registry.part("guide.tactile")
-    typer.echo(guide(checked, MotionAllowed(move), ask, out))
+    say(guide(checked, MotionAllowed(move), ask, out))
 
 
 @app.command()
-def loopback(
+@app.command("loopback", hidden=True)  # its former name
+def emulator(
     robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     faults: Annotated[
@@ -64,16 +64,16 @@ def loopback(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(help="Give the arm errors of its joints' zeros, drawn with this seed."),
+        typer.Option(min=0, help="Give the arm errors of its joints' zeros, drawn with this seed."),
     ] = None,
 ) -> None:
     """Be a robot's controller on loopback, for its own driver to connect to."""
-    from flangeye.catalogue import load_model
-    from flangeye.loopback import LoopbackOptions, find_loopback, read_height, read_joints
+    from flangeye.models.emulator import EmulatorOptions, find_emulator, read_height, read_joints
+    from flangeye.models.loading import load_model
 
     model = load_model("robots", robot)
-    offered = [each for some in load_plugins().hooks.hook.flangeye_loopbacks() for each in some]
-    options = LoopbackOptions(
+    offered = [each for some in load_plugins().hooks.hook.flangeye_emulators() for each in some]
+    options = EmulatorOptions(
         robot=model,
         host=host,
         joints=read_joints(joints) if joints is not None else None,
@@ -81,4 +81,4 @@ def loopback(
         faults=tuple(faults or ()),
         seed=seed,
     )
-    find_loopback(offered, model).serve(options)
+    find_emulator(offered, model).serve(options)

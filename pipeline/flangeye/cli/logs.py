@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import LogFile, Overrides, app, load_plugins
+from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe, say
+
+if TYPE_CHECKING:
+    from flangeye.log.read import RunLog
 
 
 @app.command()
@@ -15,10 +20,12 @@ def show(log: LogFile) -> None:
     """Say what happened in a run, step by step; also for a run that was killed."""
     from rich.console import Console
 
-    from flangeye.runlog import read_run
-    from flangeye.terminal import print_log
+    from flangeye.cli.terminal import print_log
+    from flangeye.log.read import read_run
 
-    print_log(Console(), read_run(log))
+    read = read_run(log)
+    print_log(Console(), read)
+    _name_damage(read)
 
 
 @app.command()
@@ -27,24 +34,109 @@ def report(
     out: Annotated[Path | None, typer.Option(help="Default: report.html beside the log.")] = None,
 ) -> None:
     """Make the HTML report of a run from its log alone."""
+    from flangeye.log.read import read_run
     from flangeye.report import write_report
-    from flangeye.runlog import read_run
 
-    path = out or log.parent / "report.html"
-    write_report(read_run(log), path)
-    typer.echo(path)
+    read = read_run(log)
+    path = out or read.path.parent / "report.html"
+    _require_gathered(read)
+    exports = load_plugins().exports()
+    with of_foreign(read.path, "no report can be made of it"):
+        write_report(read, path, exports)
+    say(path)
+    _name_damage(read)
+
+
+@app.command()
+def certificate(  # noqa: PLR0913  one argument an option
+    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Default: certificate.html beside the log.")
+    ] = None,
+    temperature: Annotated[
+        float | None, typer.Option(metavar="DEGC", help="Of the air, in degrees Celsius.")
+    ] = None,
+    spread: Annotated[
+        float | None,
+        typer.Option(metavar="KELVIN", min=0.0, help="From the coldest to the warmest in use."),
+    ] = None,
+    place: Annotated[str, typer.Option(help="Where it was done.")] = "",
+    operator: Annotated[str, typer.Option(help="Who did it.")] = "",
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Print it with Chromium.")] = True,
+) -> None:
+    """State a calibration and its uncertainty after the GUM, on a page to print and sign."""
+    from flangeye.report.certificate import Conditions, print_pdf, write_certificate
+
+    conditions = Conditions(temperature, spread, place, operator)
+    page = write_certificate(run, out, conditions)
+    say(page)
+    if pdf and (printed := print_pdf(page)):
+        say(printed)
+
+
+def _name_damage(log: RunLog) -> None:
+    """Name every damaged part, and end as for bad input."""
+    for note in log.notes:
+        say(f"note: {note}", err=True)
+    log.require_sound()
+
+
+def _require_gathered(log: RunLog) -> None:
+    from flangeye.errors import StageError
+
+    if not log.gathered:
+        log.require_sound()
+        raise StageError(f"{log.path}: the run ended early; nothing was gathered yet")
+
+
+@contextmanager
+def of_foreign(path: Path, what: str) -> Iterator[None]:
+    """Take any failure for the fault of a log that others may have written."""
+    from flangeye.errors import FlangeyeError, StageError
+    from flangeye.log.records import reason_of
+
+    try:
+        yield
+    except FlangeyeError:
+        raise
+    except Exception as error:
+        raise StageError(f"{path}: {what}: {reason_of(error)}") from error
+
+
+@app.command()
+def layout(
+    viewer: Annotated[str, typer.Argument(help="foxglove (Lichtblick too) or rerun.")],
+    out: Annotated[
+        Path | None, typer.Option(help="File; flangeye.json or flangeye.rbl if not given.")
+    ] = None,
+) -> None:
+    """Write a layout with which another viewer shows a run.mcap: the cell, images, messages."""
+    from flangeye.errors import StageError
+    from flangeye.log.layouts import foxglove_layout, write_rerun_blueprint
+
+    if viewer not in ("foxglove", "rerun"):
+        raise StageError(f"no layout for '{viewer}'; known: foxglove, rerun")
+    path = out or Path("flangeye.json" if viewer == "foxglove" else "flangeye.rbl")
+    if viewer == "foxglove":
+        path.write_text(foxglove_layout(), encoding="utf-8")
+        say(f"{path}: in Foxglove, Layouts, Import from file; then open the run.mcap")
+    else:
+        write_rerun_blueprint(path)
+        say(f"{path}: rerun run.mcap {path}")
 
 
 @app.command("replay")
 def replay_log(log: LogFile) -> None:
     """Make the decisions in a log again, from what was measured, and compare."""
-    from flangeye.redo import redo
+    from flangeye.run.replay import replay_steps
 
     same = True
-    for step, redone in redo(log, load_plugins()):
-        typer.echo(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
+    with of_foreign(log, "its decisions cannot be made again"):
+        redone_steps = list(replay_steps(log, load_plugins()))
+    for step, redone in redone_steps:
+        say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
         for name, value in redone.figures.items():
-            typer.echo(f"  {name}: {value:.3g}")
+            say(f"  {name}: {value:.3g}")
         same = same and redone.same
     if not same:
         raise typer.Exit(1)
@@ -67,7 +159,7 @@ def watch(
     """Watch a run as it goes: arm, captures, uncertainty so far."""
     from rich.console import Console
 
-    from flangeye.watch import watch_run
+    from flangeye.log.watch import watch_run
 
     watch_run(run, foxglove, Console(), patience)
 
@@ -77,7 +169,7 @@ def doctor(
     archive: Annotated[Path, typer.Argument(help="A run.mcap, or recordings that a reader knows.")],
     recipe: Annotated[
         str | None,
-        typer.Option(help="The recipe that would run on it: a file, or the name of a shipped one."),
+        typer.Option(help="The recipe that would run on it: a file, or the name of a bundled one."),
     ] = None,
     overrides: Overrides = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
@@ -89,13 +181,13 @@ def doctor(
     import json
 
     from flangeye.doctor import as_json, as_text, examine, open_session
-    from flangeye.recipe import find_recipe, load_recipe
 
     registry = load_plugins()
-    checked = load_recipe(find_recipe(recipe), registry, overrides or ()) if recipe else None
-    session = open_session(archive, registry, checked)
-    checks = [part for part in registry.parts.values() if part.kind == "check"]
-    diagnosis = examine(session, checks)
-    typer.echo(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
+    checked = read_recipe(recipe, registry, overrides) if recipe else None
+    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
+    with of_foreign(archive, "it cannot be examined"):
+        session = open_session(archive, registry, checked)
+        diagnosis = examine(session, checks)
+    say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
     if diagnosis.findings:
         raise typer.Exit(1)

@@ -7,57 +7,59 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
 
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: every mistake, with its line; what it has to find."""
-    from flangeye.configuration import Configuration
-    from flangeye.recipe import find_recipe, load_recipe
+    from flangeye.models.configuration import Configuration
+    from flangeye.recipe.load import find_recipe
 
-    path = find_recipe(recipe)
-    checked = load_recipe(path, load_plugins(), overrides or ())
-    typer.echo(f"{path}: ok, {len(checked.steps)} steps")
-    typer.echo(checked.context[Configuration].describe())
+    checked = read_recipe(recipe, load_plugins(), overrides)
+    say(f"{find_recipe(recipe)}: ok, {len(checked.steps)} steps")
+    say(checked.context[Configuration].describe())
 
 
 @app.command()
 def recipes() -> None:
-    """List the shipped recipes."""
-    from flangeye.recipe import recipe_names
-    from flangeye.yamlfile import read_yaml
+    """List the bundled recipes."""
+    from flangeye.files.yaml_lines import read_yaml
+    from flangeye.recipe.load import recipe_names
 
     names = recipe_names()
     width = max(map(len, names), default=0)
     for name, path in names.items():
-        typer.echo(f"{name:{width}}  {read_yaml(path).data.get('title', '')}")
+        say(f"{name:{width}}  {read_yaml(path).data.get('title', '')}")
 
 
 @app.command()
 def stages(
-    name: Annotated[str | None, typer.Argument(help="A stage or part, for its parameters.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="A stage or part, or a kind such as solve.")
+    ] = None,
 ) -> None:
-    """List stages and parts; with NAME its parameters, units, defaults and meaning."""
+    """List stages and parts, or those of a kind; with NAME parameters, units, defaults."""
     if name is None:
-        from flangeye.listing import list_stages
+        from flangeye.plugin.stage_list import list_stages
 
-        typer.echo(list_stages())
+        say(list_stages())
         return
-    from flangeye.catalogue_text import describe_one
+    from flangeye.plugin.describe import describe_one
 
-    typer.echo(describe_one(load_plugins(), name))
+    say(describe_one(load_plugins(), name))
 
 
 @app.command()
 def plugins() -> None:
     """List the installed plugins, what each offers, and those that could not be loaded."""
     registry = load_plugins()
+    registry.everything()
     for plugin, version in registry.versions().items():
         offers = sorted(n for n, owner in registry.owners.items() if owner == plugin)
-        typer.echo(f"{plugin} {version}: {', '.join(offers) or 'no stages or parts'}")
+        say(f"{plugin} {version}: {', '.join(offers) or 'no stages or parts'}")
     for plugin, error in registry.broken.items():
-        typer.echo(f"{plugin}: could not be loaded: {type(error).__name__}: {error}")
+        say(f"{plugin}: could not be loaded: {type(error).__name__}: {error}")
 
 
 @app.command()
@@ -68,17 +70,18 @@ def schema(
     """Print the JSON Schema of recipes, for editors that check YAML while you type."""
     import json
 
+    from flangeye.files.written import write_whole
+    from flangeye.recipe.schema import header_line, recipe_schema
     from flangeye.result import Result
-    from flangeye.schema import header_line, recipe_schema
 
     document = Result.model_json_schema() if result else recipe_schema(load_plugins())
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if out is None:
-        typer.echo(text)
+        say(text)
     else:
-        out.write_text(text + "\n", encoding="utf-8")
+        write_whole(out, text + "\n")
     if not result:
-        typer.echo(f"first line of your recipe: {header_line(out)}", err=True)
+        say(f"first line of your recipe: {header_line(out)}", err=True)
 
 
 @app.command("new-plugin")
@@ -88,7 +91,7 @@ def new_plugin(
     into: Annotated[Path, typer.Option(help="Where its folder is made.")] = Path(),
 ) -> None:
     """Write an installable package with one plugin, a stand-in whose tests pass at once."""
-    from flangeye.newplugin import write_plugin
+    from flangeye.plugin.scaffold import write_plugin
 
     folder = write_plugin(name, kind, into)
-    typer.echo(f"{folder}: pip install --editable '{folder}[dev]' && pytest {folder}")
+    say(f"{folder}: pip install --editable '{folder}[dev]' && pytest {folder}")

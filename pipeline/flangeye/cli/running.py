@@ -9,23 +9,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
 from flangeye.errors import FlangeyeError
 
 if TYPE_CHECKING:
-    from flangeye.recipe import Recipe
-    from flangeye.registry import Registry
-    from flangeye.replay import Earlier, Replay
+    from flangeye.batch.request import Tls
+    from flangeye.plugin.registry import Registry
+    from flangeye.recipe.load import Recipe
     from flangeye.result import Result
-    from flangeye.runfolder import RunFolder
-    from flangeye.session import Start
+    from flangeye.run.folder import RunFolder
+    from flangeye.run.restart import FromNothing
+    from flangeye.run.session import Start
 
 
 @app.command()
 def run(  # noqa: PLR0913  one for each option
     recipe: Annotated[
         str | None,
-        typer.Argument(help="A recipe file, or the name of a shipped recipe."),
+        typer.Argument(help="A recipe file, or the name of a bundled recipe."),
     ] = None,
     archive: Annotated[
         Path | None,
@@ -57,26 +58,47 @@ def run(  # noqa: PLR0913  one for each option
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
-    from flangeye.runfolder import RunFolder
-    from flangeye.session import Start
+    from flangeye.run.folder import RunFolder
+    from flangeye.run.session import Start
     from flangeye.types import ArchivePath
 
     registry = load_plugins()
-    checked, earlier = _recipe_of(recipe, resume, registry, overrides or ())
-    replay = _replay(checked, source, at)
-    start = Start(ArchivePath(archive), replay, earlier, MotionAllowed(move))
-    result = _record(checked, registry, RunFolder.create(checked.name, out), start)
+    checked, point = _recipe_of(recipe, resume, registry, overrides or ())
+    start = Start(ArchivePath(archive), point or _point(checked, source, at), MotionAllowed(move))
+    folder = RunFolder.create(checked.name, out)
+    result = _record(checked, registry, folder, start)
+    if result.status == "refused":
+        _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
 
+def _advise(log: Path, registry: Registry) -> None:
+    """Say what to do about a refusal: the doctor's command, and what it finds first."""
+    from flangeye.cli.logs import of_foreign
+    from flangeye.doctor import examine, open_session
+
+    say(f"\nwhat to do: flangeye doctor {log}")
+    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
+    try:
+        with of_foreign(log, "it cannot be examined"):
+            findings = examine(open_session(log, registry, None), checks).findings
+    except FlangeyeError:
+        return  # the doctor needs more than this log has, and says so when it is asked
+    if findings:
+        say(f"  likely: {findings[0].name}: {findings[0].what}\n  fix: {findings[0].fix}")
+    else:
+        say(
+            "  it finds no mistake in poses or scans: more poses, turned further, are the next step"
+        )
+
+
 def _recipe_of(
     name: str | None, resume: Path | None, registry: Registry, overrides: Sequence[str]
-) -> tuple[Recipe, Earlier | None]:
+) -> tuple[Recipe, FromNothing | None]:
     """Return the checked recipe, named or of the run to go on with; and that run."""
     from flangeye.errors import StageError
-    from flangeye.recipe import find_recipe, load_recipe
-    from flangeye.replay import earlier_run
+    from flangeye.run.restart import earlier_run
 
     if (name is None) == (resume is None):
         raise StageError("name a recipe, or --resume RUN, which brings its own")
@@ -84,28 +106,33 @@ def _recipe_of(
         if overrides:
             raise StageError("--set and --resume: a run goes on with the recipe it began with")
         return earlier_run(resume, registry)
-    return load_recipe(find_recipe(str(name)), registry, overrides), None
+    return read_recipe(str(name), registry, overrides), None
 
 
-def _replay(recipe: Recipe, source: Path | None, at: str | None) -> Replay | None:
+def _point(recipe: Recipe, source: Path | None, at: str | None) -> FromNothing:
     from flangeye.errors import StageError
-    from flangeye.replay import replay_from
-    from flangeye.runlog import read_run
+    from flangeye.log.read import read_run
+    from flangeye.run.restart import FromNothing, restart_at
 
     if (source is None) != (at is None):
         raise StageError("--from and --at go together: --from run.mcap --at solve.svd")
     if source is None or at is None:
-        return None
-    return replay_from(read_run(source), recipe, at)
+        return FromNothing()
+    log = read_run(source)
+    for note in log.notes:
+        say(f"note: {note}", err=True)
+    if not log.gathered:
+        raise StageError(f"{log.path}: nothing was gathered in it; there is nothing to run on")
+    return restart_at(log, recipe, at)
 
 
 def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start) -> Result:
     """Run with a log and a progress bar, and say what came of it."""
     from rich.console import Console
 
-    from flangeye.replay import resumable
-    from flangeye.session import record_run
-    from flangeye.terminal import ProgressBar, print_result
+    from flangeye.cli.terminal import ProgressBar, print_result
+    from flangeye.run.restart import restart_hint, resumable
+    from flangeye.run.session import record_run
 
     try:
         with ProgressBar(Console(stderr=True)) as progress:
@@ -113,16 +140,27 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
-            sys.stderr.write(f"what was gathered is in {folder.log}\n")
+            say(f"what was gathered is in {folder.log}", err=True)
+            say(f"with other parameters: {restart_hint(recipe, folder.log)}", err=True)
             if resumable(recipe):
-                sys.stderr.write(
-                    f"go on with it: flangeye run --resume {folder.path}"
-                    f"{' --move' if start.motion.allowed else ''}\n"
-                )
+                moving = " --move" if start.motion.allowed else ""
+                say(f"go on with it: flangeye run --resume {folder.path}{moving}", err=True)
         raise
     print_result(Console(), result)
-    typer.echo(f"\n{folder.path}/: report.html  calibration.yaml  result.json  run.mcap")
+    names = ("report.html", "calibration.yaml", "result.json", "run.mcap")
+    written = [name for name in names if (folder.path / name).exists()]
+    say(f"\n{folder.path}/: {'  '.join(written)}")
     return result
+
+
+def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:
+    from flangeye.batch.request import BatchError, Tls
+
+    if ca is None and cert is None and key is None:
+        return None
+    if ca is None or cert is None or key is None:
+        raise BatchError("--tls-ca, --tls-cert and --tls-key go together")
+    return Tls(ca, cert, key)
 
 
 @app.command()
@@ -147,7 +185,14 @@ def batch(  # noqa: PLR0913  one argument an option
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="A running dask scheduler to use instead."),
+        typer.Option(metavar="tls://HOST:PORT", help="A running dask scheduler to use instead."),
+    ] = None,
+    tls_ca: Annotated[
+        Path | None, typer.Option(help="Certificate (PEM) that signed the scheduler's and ours.")
+    ] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Our certificate (PEM).")] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(help="Its key (PEM): who has it may use the workers.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -168,13 +213,13 @@ def batch(  # noqa: PLR0913  one argument an option
 
     request = Request(
         recipe, tuple(archives or ()), tuple(overrides or ()), tuple(grid or ()), repeat, vary,
-        workers, scheduler, out, report,
+        workers, scheduler, _tls(tls_ca, tls_cert, tls_key), out, report,
     )  # fmt: skip
     try:
         done = run_batch(request, load_plugins(), Console(stderr=True))
     except KeyboardInterrupt:
         sys.stderr.write("stopped; the same command goes on from here\n")
         raise typer.Exit(130) from None
-    typer.echo(summary_text(done))
+    say(summary_text(done))
     if not done.accepted:
         raise typer.Exit(1)

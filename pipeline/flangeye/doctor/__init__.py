@@ -2,6 +2,6 @@
 
 from flangeye.doctor.examine import Diagnosis, examine
 from flangeye.doctor.opening import open_session
-from flangeye.doctor.telling import as_json, as_text
+from flangeye.doctor.text import as_json, as_text
 
 __all__ = ["Diagnosis", "as_json", "as_text", "examine", "open_session"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from flangeye.diagnosis import FEWEST, Finding, NotApplicable, Session
+from flangeye.doctor.diagnosis import FEWEST, Finding, NotApplicable, RecordedSession
 from flangeye.errors import StageError
-from flangeye.stage import Chosen, Part
+from flangeye.plugin.stage import BoundPart, Part
 
 FALSE_ALARM = 1e-3
 """Probability of any finding at all about a session without a mistake."""
@@ -27,14 +27,14 @@ class Diagnosis:
         idle: Those that do not apply to this session, by name, and why.
     """
 
-    session: Session
+    session: RecordedSession
     findings: tuple[Finding, ...]
     notes: tuple[Finding, ...]
     checks: tuple[str, ...]
     idle: Mapping[str, str]
 
 
-def examine(session: Session, checks: Iterable[Part]) -> Diagnosis:
+def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
     """Look for mistakes, the most telling first.
 
     Each check has counted the alternatives it tried; here the checks are counted (Bonferroni), so
@@ -47,19 +47,21 @@ def examine(session: Session, checks: Iterable[Part]) -> Diagnosis:
     found, current = list(session.remarks), session
     _require_enough(session)
     offered, idle = _offered(current, bound)
-    while mendable := [f for f in offered if f.mended is not None and not f.note]:
+    while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:
         found.append(max(mendable, key=lambda finding: finding.gain))
-        current = found[-1].mended or current
+        current = found[-1].corrected_session or current
         offered = []
         if len(found) == MOST_MISTAKES or current.seen.sum() < FEWEST:
             break
         offered, _ = _offered(current, bound)
-    found += [f for f in offered if f.mended is None and not f.note]
+    found += [f for f in offered if f.corrected_session is None and not f.note]
     notes = tuple(f for f in offered if f.note)
     return Diagnosis(session, tuple(found), notes, tuple(check.part.name for check in bound), idle)
 
 
-def _offered(session: Session, checks: Sequence[Chosen]) -> tuple[list[Finding], dict[str, str]]:
+def _offered(
+    session: RecordedSession, checks: Sequence[BoundPart]
+) -> tuple[list[Finding], dict[str, str]]:
     """Return the findings that hold against the number of checks, and which do not apply."""
     found: list[Finding] = []
     idle: dict[str, str] = {}
@@ -73,7 +75,7 @@ def _offered(session: Session, checks: Sequence[Chosen]) -> tuple[list[Finding],
     return found, idle
 
 
-def _require_enough(session: Session) -> None:
+def _require_enough(session: RecordedSession) -> None:
     seen = int(session.seen.sum())
     if seen < FEWEST:
         raise StageError(

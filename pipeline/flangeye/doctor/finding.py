@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import types as t
-from flangeye.archive import Archive
-from flangeye.diagnosis import FEWEST
+from flangeye.doctor.diagnosis import FEWEST
 from flangeye.errors import StageError
-from flangeye.geometry import rigid
-from flangeye.recipe import Recipe
-from flangeye.registry import Registry
-from flangeye.runner import Runner
-from flangeye.stage import Chosen, Part
-from flangeye.steps import Step
+from flangeye.files.recording import Archive
+from flangeye.maths.geometry import rigid
+from flangeye.plugin.registry import Registry
+from flangeye.plugin.stage import BoundPart, Part
+from flangeye.recipe.load import Recipe
+from flangeye.recipe.steps import Step
+from flangeye.run.runner import Runner
 
 APART = 0.01
 """Between two stand-in poses [m]."""
@@ -73,7 +73,7 @@ def _found_by(
     archive: Archive, first: Step, recipe: Recipe, registry: Registry
 ) -> dict[str, t.Feature]:
     """Return what the recipe's own steps find in the archive's scans, by id."""
-    stand_in = Chosen(
+    stand_in = BoundPart(
         Part("reader.stand_in", lambda _: _with_stand_in_poses(archive), None, {}, (Archive,)), None
     )
     params = first.params.model_copy(update={"reader": stand_in}) if first.params else None
@@ -84,7 +84,10 @@ def _found_by(
 
 def _with_stand_in_poses(archive: Archive) -> Archive:
     recordings = [
-        replace(recording, base_T_flange=rigid(np.eye(3), np.array([APART * (i % 1000), 0.0, 0.5])))
+        replace(
+            recording,
+            poses={t.FLANGE: rigid(np.eye(3), np.array([APART * (i % 1000), 0.0, 0.5]))},
+        )
         for i, recording in enumerate(archive.recordings)
     ]
     return replace(archive, recordings=recordings)

@@ -13,22 +13,24 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.archive import Archive, Recording, check_ids
-from flangeye.catalogue import RobotModel, ScannerModel
-from flangeye.configuration import DEFAULT, Configuration
-from flangeye.diagnosis import Finding, Floats, Reader, Session
-from flangeye.doctor.carrying import State, in_configuration
+from flangeye.doctor.as_recorded import State, in_configuration
+from flangeye.doctor.diagnosis import Finding, Reader, RecordedSession
 from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
-from flangeye.kinematics import Arm
-from flangeye.recipe import Recipe, parse_recipe
-from flangeye.registry import Registry
-from flangeye.runlog import read_run
-from flangeye.stage import Chosen, Params
-from flangeye.steps import Step
+from flangeye.files.recording import Archive, Recording, check_ids
+from flangeye.log.read import is_log, log_of, read_run
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import DEFAULT, Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerData
+from flangeye.plugin.registry import Registry
+from flangeye.plugin.stage import BoundPart, Params
+from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.steps import Step
+from flangeye.types import Floats
 
 
-def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> Session:
+def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> RecordedSession:
     """Return what an archive holds, as checks see it.
 
     Args:
@@ -42,22 +44,25 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
     """
     if not path.exists():
         raise StageError(f"{path}: does not exist")
-    if path.suffix == ".mcap":
-        return _of_log(path, registry, recipe)
+    if path.suffix == ".mcap" or is_log(log_of(path)):
+        return _of_log(log_of(path), registry, recipe)
     if recipe is None:
         return _of_centres(path, registry)
     return _of_recipe(path, registry, recipe)
 
 
-def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> Session:
+def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSession:
     log = read_run(path)
-    text = log.attachments.get("recipe.yaml")
+    text = log.text("recipe.yaml")
+    if not log.gathered:
+        log.require_sound()
+        raise StageError(f"{path}: the run ended early; nothing was gathered yet")
     if recipe is None and text is not None:
-        recipe = parse_recipe(text.decode(), path.name, registry)
+        recipe = parse_recipe(text, path.name, registry)
     found = {o.id: o.feature for o in log.observations()}
     calibration = [meta for meta in log.poses.values() if meta["role"] == "calibration"]
     given = {o.id: o.base_T_flange.matrix for o in log.observations()}
-    poses = {meta["id"]: np.array(meta["base_T_flange"]["matrix"]) for meta in calibration}
+    poses = {meta["id"]: np.array(meta["poses"][t.FLANGE]["matrix"]) for meta in calibration}
     times = {meta["id"]: int(meta["time_ns"]) for meta in calibration}
     session = _session({**given, **poses}, found, times)
     states = {meta["id"]: _state_of(meta) for meta in calibration}
@@ -65,14 +70,14 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> Session:
 
 
 def _state_of(meta: Mapping[str, Any]) -> State:
-    joints, second = meta["joints"], meta.get("base2_T_flange2")
+    joints, second = meta["joints"], meta["poses"].get(t.FLANGE2)
     return State(
         None if joints is None else np.array(joints),
         None if second is None else np.array(second["matrix"]),
     )
 
 
-def _of_centres(path: Path, registry: Registry) -> Session:
+def _of_centres(path: Path, registry: Registry) -> RecordedSession:
     archive: Archive = registry.part("reader.auto").bind()(path)
     if not _ready_made(archive):
         raise StageError(
@@ -82,10 +87,10 @@ def _of_centres(path: Path, registry: Registry) -> Session:
     return _of_archive(archive, _ready_made(archive))
 
 
-def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> Session:
+def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSession:
     first = recipe.steps[0]
     reader = getattr(first.params, "reader", None)
-    if not isinstance(reader, Chosen):
+    if not isinstance(reader, BoundPart):
         raise StageError(
             f"{recipe.name}: begins with {first.stage.name}, which reads no archive; the doctor "
             "needs a recipe that begins with acquire.archive or acquire.centres"
@@ -94,15 +99,15 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> Session:
     check_ids(archive)
     found, remark = found_in(archive, first, recipe, registry)
     kept = _kept(archive, first)
-    states = {r.id: State(r.joints, r.base2_T_flange2) for r in kept.recordings}
+    states = {r.id: State(r.joints, r.poses.get(t.FLANGE2)) for r in kept.recordings}
     session = _as_recipe(_of_archive(kept, found), recipe, states)
     return session if remark is None else _in_other_unit(session, *remark)
 
 
-def _in_other_unit(session: Session, unit: str, why: str) -> Session:
+def _in_other_unit(session: RecordedSession, unit: str, why: str) -> RecordedSession:
     """Return the session with the remark that the clouds are in another unit than was said."""
-    mended = session.with_changes(unit=unit)
-    return replace(mended, remarks=(Finding("unit", why, mended.step()),))
+    corrected_session = session.with_changes(unit=unit)
+    return replace(corrected_session, remarks=(Finding("unit", why, corrected_session.step()),))
 
 
 def _kept(archive: Archive, first: Step) -> Archive:
@@ -123,7 +128,7 @@ def _ready_made(archive: Archive) -> dict[str, t.Feature]:
     }
 
 
-def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> Session:
+def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> RecordedSession:
     calibration: Sequence[Recording] = [r for r in archive.recordings if r.role == "calibration"]
     poses = {r.id: r.base_T_flange for r in calibration}
     times = {r.id: r.time_ns for r in calibration}
@@ -137,10 +142,10 @@ def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> Session:
 
 def _session(
     poses: Mapping[str, Floats], found: Mapping[str, t.Feature], times: Mapping[str, int]
-) -> Session:
+) -> RecordedSession:
     features = [found.get(name) for name in poses]
     when = np.array([times.get(name, 0) for name in poses], dtype=np.float64)
-    return Session(
+    return RecordedSession(
         ids=tuple(poses),
         poses=np.array(list(poses.values())).reshape(-1, 4, 4),
         centres=_rows(None if f is None else f.centre for f in features),
@@ -165,12 +170,14 @@ def _rotations(features: Iterable[t.Feature | None]) -> Floats:
     ).reshape(-1, 3, 3)
 
 
-def _as_recipe(session: Session, recipe: Recipe, states: Mapping[str, State]) -> Session:
+def _as_recipe(
+    session: RecordedSession, recipe: Recipe, states: Mapping[str, State]
+) -> RecordedSession:
     """Add what the recipe says of the cell and of how the archive is read."""
     first = recipe.steps[0]
-    scanner: ScannerModel | None = recipe.context.get(ScannerModel)
+    scanner: ScannerData | None = recipe.context.get(ScannerData)
     robot: RobotModel | None = recipe.context.get(RobotModel)
-    reach = session.reach if scanner is None else (scanner.near, scanner.far)
+    reach = session.reach if scanner is None else scanner.range
     reader = _written(getattr(first.params, "reader", None))
     configuration: Configuration = recipe.context.get(Configuration) or DEFAULT
     arm = Arm(robot) if robot else None
@@ -186,7 +193,7 @@ def _as_recipe(session: Session, recipe: Recipe, states: Mapping[str, State]) ->
 
 def _written(reader: Any) -> Reader:
     """Return a reader as people write it: its name, with the parameters that were stated."""
-    if not isinstance(reader, Chosen):
+    if not isinstance(reader, BoundPart):
         return "auto"
     name = reader.part.name.partition(".")[2]
     params = {} if reader.params is None else _given(reader.params)

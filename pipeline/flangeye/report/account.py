@@ -13,7 +13,7 @@ from flangeye.report.units import duration
 
 
 @dataclass(frozen=True)
-class Rejected:
+class RejectedRow:
     """One capture that was not used."""
 
     id: str
@@ -32,7 +32,7 @@ class SetAside:
         late: Set aside by the solver.
     """
 
-    rows: list[Rejected] = field(default_factory=list)
+    rows: list[RejectedRow] = field(default_factory=list)
     counts: list[tuple[int, str, str]] = field(default_factory=list)
     early: int = 0
     late: int = 0
@@ -46,7 +46,7 @@ def set_aside_of(facts: Facts) -> SetAside:
     for each in facts.set_aside:
         stage = stages.get(each.id, solver)
         reason = (each.reason or "no reason was given").removeprefix(f"{stage}: ")
-        rows.append(Rejected(each.id, stage, reason))
+        rows.append(RejectedRow(each.id, stage, reason))
     kinds = Counter((x.stage, without_numbers(x.reason)) for x in rows)
     counts = [(n, stage, reason) for (stage, reason), n in kinds.most_common()]
     early = sum(x.id in stages for x in rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import types as t
-from flangeye.foxglove import circle_lines
+from flangeye.log.foxglove import circle_lines
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     AXES as COLOURS,
@@ -14,7 +14,6 @@ from flangeye.report.plot import (
     CIRCLE,
     NEUTRAL,
     USED,
-    Floats,
     Trace,
     box_edges,
     figure3d,
@@ -25,6 +24,7 @@ from flangeye.report.plot import (
     thinned,
 )
 from flangeye.report.space import Drawing, in_words, mapped, target_centres
+from flangeye.types import Floats
 
 FLANGE_POINTS = 3_000
 SCAN_POINTS = 3_000

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.foxglove import circle_lines
-from flangeye.geometry import basis_of_plane
+from flangeye.log.foxglove import circle_lines
+from flangeye.maths.geometry import basis_of_plane
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     CIRCLE,
     DIVERGING,
-    Floats,
     Trace,
     figure3d,
     lines,
@@ -23,6 +22,7 @@ from flangeye.report.plot import (
     thinned,
 )
 from flangeye.report.units import millimetres, percent
+from flangeye.types import Floats
 
 CLOUD_POINTS = 4_000
 """Points of one panel; three panels and the cell together stay below 20,000."""
@@ -46,7 +46,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedFeature:
     """One capture's cloud in the axes of its circle: z along the normal, (N, 3) [m]."""
 
     id: str
@@ -74,7 +74,7 @@ def cloud_panels(facts: Facts) -> list[Panel]:
     return [_panel(fit, why, limit, facts) for fit, why in chosen]
 
 
-def _colour_limit(fits: list[Fit]) -> float:
+def _colour_limit(fits: list[FittedFeature]) -> float:
     """Return the distance [m] at the ends of the common colours.
 
     The median of the panels: one fit that is far off shows as plain colour and leaves the
@@ -84,7 +84,7 @@ def _colour_limit(fits: list[Fit]) -> float:
     return max(float(np.median(extremes)), 1e-5)
 
 
-def fits_of(facts: Facts) -> list[Fit]:
+def fits_of(facts: Facts) -> list[FittedFeature]:
     """Return every capture that has both a flange cloud and a circle with a normal."""
     log = facts.log
     flanges = {e.capture: e.value for e in log.of_kind("segment")}
@@ -96,11 +96,11 @@ def fits_of(facts: Facts) -> list[Fit]:
                 continue
             axes = basis_of_plane(circle.normal)
             xyz = (flange.cloud.xyz.astype(np.float64) - circle.centre) @ axes.T
-            fits.append(Fit(str(entry.capture), xyz, circle))
+            fits.append(FittedFeature(str(entry.capture), xyz, circle))
     return fits
 
 
-def _telling(ranked: list[Fit], name: str) -> list[tuple[Fit, str]]:
+def _telling(ranked: list[FittedFeature], name: str) -> list[tuple[FittedFeature, str]]:
     if not ranked:
         return []
     places = {0: f"smallest {name}", len(ranked) // 2: f"median {name}"}
@@ -108,7 +108,7 @@ def _telling(ranked: list[Fit], name: str) -> list[tuple[Fit, str]]:
     return [(ranked[place], why) for place, why in sorted(places.items())]
 
 
-def _panel(fit: Fit, why: str, limit: float, facts: Facts) -> Panel:
+def _panel(fit: FittedFeature, why: str, limit: float, facts: Facts) -> Panel:
     shown = thinned(fit.xyz, CLOUD_POINTS)
     figure = figure3d([_cloud(shown, limit), *_fitted(fit)], eye=(1.1, -1.3, 1.3))
     figure["layout"]["showlegend"] = False
@@ -129,13 +129,13 @@ def _cloud(xyz: Floats, limit: float) -> Trace:
     return scatter3d(xyz, "markers", marker=marker, name="flange")
 
 
-def _fitted(fit: Fit) -> list[Trace]:
+def _fitted(fit: FittedFeature) -> list[Trace]:
     axes = basis_of_plane(fit.circle.normal)  # type: ignore[arg-type]
     drawn = [(line - fit.circle.centre) @ axes.T for line in circle_lines(fit.circle)]
     return [lines(drawn, CIRCLE, 5, name="fitted circles and normal")]
 
 
-def _caption(fit: Fit, shown: int, facts: Facts) -> list[tuple[str, str]]:
+def _caption(fit: FittedFeature, shown: int, facts: Facts) -> list[tuple[str, str]]:
     observation = next((o for o in facts.measured if o.id == fit.id), None)
     rows = []
     if fit.id in facts.residuals:

@@ -7,17 +7,17 @@ from what was logged, with the same functions, so that everything after this has
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.runlog import RunLog
+from flangeye.files.yaml_lines import parse_yaml
+from flangeye.log.read import RunLog
+from flangeye.models.workspace import work_of
 from flangeye.units import parse_quantity
-from flangeye.workspace import work_of
-from flangeye.yamlfile import parse_yaml
 
 INCOMPLETE = "incomplete"
 UNSOLVED = "the run ended before the solver"
@@ -76,8 +76,7 @@ def facts_of(log: RunLog) -> Facts:
     """Return what ``log`` lets us say."""
     attached = log.attachments.get("recipe.resolved.yaml", log.attachments.get("recipe.yaml", b""))
     recipe = attached.decode("utf-8", "replace")
-    raw = log.result
-    result = _so_far(log, recipe) if raw is None else r.Result.model_validate(raw)
+    result = r.logged_result(log) or _so_far(log, recipe)
     return Facts(log, result, recipe)
 
 
@@ -99,6 +98,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
         holdout=r.holdout_result(verifications),
         verifications={step: _verification(found) for step, found in verifications.items()},
         truth=_truth(source, calibration, box),
+        notes=list(calibration.notes) if calibration else [],
         timing=_timing(log),
         provenance=_provenance(source, calibration, header, recipe),
     )
@@ -131,7 +131,8 @@ def _truth(
 ) -> r.TruthResult | None:
     if source.truth is None or calibration is None or box is None:
         return None
-    return r.truth_result(calibration, source.truth, box)
+    # What the arm is like stands in the recipe, which a killed run may not have left.
+    return r.truth_result(calibration, replace(source.truth, unseen=()), box)
 
 
 def _timing(log: RunLog) -> dict[str, r.StageTiming]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.report.facts import Facts
-from flangeye.report.plot import Floats, round_up
+from flangeye.report.plot import round_up
+from flangeye.types import Floats
 
 MARGIN = 0.25
 """Around the corners, over their extent."""

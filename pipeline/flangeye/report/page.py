@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import os
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flangeye import __version__
-from flangeye.errors import StageError
+from flangeye.files.bundled import VERSION
+from flangeye.files.written import write_whole
+from flangeye.log.read import RunLog
+from flangeye.plugin.stage import Stage
 from flangeye.report.account import provenance_of, set_aside_of, timings_of
 from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
+from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.images import image_view
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
 from flangeye.report.space import workspace_drawing
-from flangeye.report.summary import headlines_of, transform_text, verdict_of
-from flangeye.report.units import degrees, millimetres, percent
+from flangeye.report.summary import TransformText, headlines_of, transform_text, verdict_of
+from flangeye.report.units import degrees, figure, millimetres, percent
 from flangeye.report.weld import weld_drawing
-from flangeye.runlog import RunLog
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -26,33 +33,45 @@ if TYPE_CHECKING:
 _HERE = Path(__file__).parent
 
 
-def write_report(log: RunLog, path: Path) -> None:
+def write_report(
+    log: RunLog, path: Path, exports: Sequence[Stage] = (), library: Path | None = None
+) -> None:
     """Write the report of a run, finished or not, as one HTML file that needs nothing else.
 
     Args:
-        log: What :func:`flangeye.runlog.read_run` gave.
+        log: What :func:`flangeye.log.read.read_run` gave.
         path: The file to write.
+        exports: The formats in which the matrix can be copied, besides itself.
+        library: A copy of plotly.js that several reports share, for example those of a batch; it
+            is written if it is not there. Without it the page holds one.
 
     Raises:
         StageError: The file cannot be written.
     """
-    page = render(log)
-    try:
-        path.write_bytes(page.encode("utf-8", "replace"))
-    except OSError as error:
-        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from None
+    shared = None if library is None else os.path.relpath(library, path.parent)
+    if library is not None and not library.exists():
+        write_whole(library, plotly_js())
+    write_whole(path, render(log, exports, shared))
 
 
-def render(log: RunLog) -> str:
-    """Return the page as text."""
-    facts = facts_of(log)
-    return _environment().get_template("report.html.j2").render(_content(facts))
+def render(log: RunLog, exports: Sequence[Stage] = (), library: str | None = None) -> str:
+    """Return the page as text; see :func:`write_report`."""
+    content = _content(facts_of(log))
+    content |= {"library": library, "plotly_js": "" if library else packed_plotly()}
+    content |= {"exports": exported(content["result"], exports)}
+    return _environment().get_template("report.html.j2").render(content)
+
+
+def _corrected(facts: Facts) -> list[TransformText]:
+    """Return the poses for the corrected arm, where an error of it was found."""
+    answers = facts.result.answers
+    if answers is None or answers.corrected is None:
+        return []
+    return [transform_text(*item) for item in answers.corrected.transforms.items()]
 
 
 def _content(facts: Facts) -> dict[str, Any]:
     """Return what the template shows, in reading order."""
-    from plotly.offline import get_plotlyjs
-
     errors = errors_of(facts)
     return {
         "facts": facts,
@@ -60,6 +79,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "verdict": verdict_of(facts),
         "headlines": headlines_of(facts),
         "transforms": [transform_text(*item) for item in facts.result.transforms.items()],
+        "corrected": _corrected(facts),
         "errors": errors,
         "residuals": residual_figure(errors),
         "workspace": workspace_drawing(facts),
@@ -71,9 +91,21 @@ def _content(facts: Facts) -> dict[str, Any]:
         "set_aside": set_aside_of(facts),
         "timings": timings_of(facts),
         "provenance": provenance_of(facts),
-        "plotly_js": get_plotlyjs(),
-        "version": __version__,
+        "version": VERSION,
     }
+
+
+@cache
+def packed_plotly() -> str:
+    """Return plotly.js, gzip in base64: the page unpacks it, and is a third of the size."""
+    return base64.b64encode(gzip.compress(plotly_js().encode(), mtime=0)).decode()
+
+
+def plotly_js() -> str:
+    """Return plotly.js as it is."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs())
 
 
 def _environment() -> Environment:
@@ -89,4 +121,5 @@ def _environment() -> Environment:
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
     environment.filters |= {"mm": millimetres, "deg": degrees, "percent": percent}
+    environment.filters |= {"figure": figure, "words": lambda name: name.replace("_", " ")}
     return environment

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flangeye.types import Floats
+
 Trace = dict[str, Any]
 Figure = dict[str, Any]
 

@@ -40,7 +40,19 @@
       { responsive: true, displaylogo: false });
   }
 
+  // plotly.js is inside the page, packed: a third of its size.
+  async function unpackPlotly() {
+    const packed = document.getElementById("plotly");
+    if (!packed) return;
+    const bytes = Uint8Array.from(atob(packed.textContent), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const script = document.createElement("script");
+    script.textContent = await new Response(stream).text();
+    packed.replaceWith(script);
+  }
+
   async function drawAll() {
+    if (plots.length) await unpackPlotly();
     for (const div of plots) {
       await draw(div);
       await new Promise((done) => setTimeout(done)); // let the page answer in between
@@ -80,6 +92,13 @@
 
   for (const button of document.querySelectorAll("[data-copies]"))
     button.addEventListener("click", () => copy(button));
+  const tabs = [...document.querySelectorAll("[role=tab]")];
+  for (const tab of tabs) tab.addEventListener("click", () => {
+    for (const each of tabs) {
+      each.setAttribute("aria-selected", each === tab);
+      document.getElementById(each.getAttribute("aria-controls")).hidden = each !== tab;
+    }
+  });
   dark.addEventListener("change", retheme);
   addEventListener("beforeprint", fitPaper);
   drawAll();

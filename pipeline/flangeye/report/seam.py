@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
+from flangeye.maths.seam_geometry import distances_to_line, tube_radii, tube_rings
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     CIRCLE,
     NEUTRAL,
     TRUTH,
     USED,
-    Floats,
     Trace,
     figure3d,
     lines,
@@ -25,7 +25,7 @@ from flangeye.report.plot import (
     thinned,
 )
 from flangeye.report.units import millimetres
-from flangeye.seamline import distances_to_line, tube_radii, tube_rings
+from flangeye.types import Floats
 
 CLOUD_POINTS = 8_000
 ARROWS = 9

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.geometry import covariance_at
+from flangeye.maths.geometry import covariance_at
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     CIRCLE,
     NEUTRAL,
     TRUTH,
     UNUSED,
-    Floats,
     Trace,
     box_edges,
     figure3d,
@@ -26,6 +25,7 @@ from flangeye.report.plot import (
     scatter3d,
 )
 from flangeye.report.units import millimetres
+from flangeye.types import Floats
 
 FLANGE_POINTS = 3_000
 SCAN_POINTS = 3_000

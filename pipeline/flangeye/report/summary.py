@@ -8,10 +8,11 @@ import numpy as np
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.geometry import quaternion_from_rotation, rpy_from_rotation
+from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.report.facts import INCOMPLETE, Facts
 from flangeye.report.units import degrees, millimetres
 
+UNKNOWN = "not measured"
 _FRAMES = {
     t.BASE: "the robot's base",
     t.FLANGE: "the flange",
@@ -88,9 +89,16 @@ def headlines_of(facts: Facts) -> list[Headline]:
     result = facts.result
     figures = []
     if held := result.holdout:
-        note = f"on poses left out, {held.folds} folds"
+        note = f"on poses left out, {held.folds} folds, over all poses"
         for name, value in (("rms", held.rms), ("median", held.median), ("95 %", held.p95)):
             figures.append(Headline(f"Held-out {name}", millimetres(value), "mm", note))
+        if held.figures.get("outliers"):
+            value, note = (
+                held.figures["rms_inliers"],
+                f"without {held.figures['outliers']:.0f} outliers",
+            )
+            figures.append(Headline("Held-out rms", millimetres(value), "mm", note))
+    figures += _expected(result)
     if box := result.workspace:
         note = "95 % of errors over the workspace are below"
         figures.append(Headline("Predicted error", millimetres(box.predicted_p95), "mm", note))
@@ -100,6 +108,20 @@ def headlines_of(facts: Facts) -> list[Headline]:
         centre = f"at the workspace's centre; rotation {degrees(truth.rotation_error)}°"
         figures.append(Headline("True error", millimetres(truth.error_at_centroid), "mm", centre))
     return [*figures, _poses(facts)]
+
+
+def _expected(result: r.Result) -> list[Headline]:
+    """Return the error to expect at the work, of both answers where there are two."""
+    if result.answers is None:
+        return []
+    named = {"the arm as its controller reports it": result.answers.as_reported}
+    if result.answers.corrected:
+        named["the arm corrected, with the pose that belongs to it"] = result.answers.corrected
+    return [
+        Headline("Expected at the work", millimetres(answer.expected_rms), "mm", f"rms; {note}")
+        for note, answer in named.items()
+        if answer.expected_rms is not None
+    ]
 
 
 def _poses(facts: Facts) -> Headline:
@@ -144,7 +166,6 @@ def transform_text(name: str, estimate: r.TransformResult) -> TransformText:
     """Return an estimated transform for people."""
     parent, _, child = name.partition("_T_")
     matrix = np.array(estimate.matrix)
-    std = np.sqrt(np.maximum(np.diag(np.array(estimate.covariance)), 0.0))
     return TransformText(
         name=name,
         parent=parent,
@@ -154,8 +175,8 @@ def transform_text(name: str, estimate: r.TransformResult) -> TransformText:
         translation=[f"{x * 1e3:z.3f}" for x in matrix[:3, 3]],
         rotation=[degrees(x) for x in rpy_from_rotation(matrix[:3, :3])],
         quaternion=[f"{x:z.7f}" for x in quaternion_from_rotation(matrix[:3, :3])],
-        translation_std=[millimetres(x) for x in std[3:]],
-        rotation_std=[degrees(x) for x in std[:3]],
+        translation_std=[UNKNOWN if x is None else millimetres(x) for x in estimate.sigma[3:]],
+        rotation_std=[UNKNOWN if x is None else degrees(x) for x in estimate.sigma[:3]],
         about=[f"{x * 1e3:z.1f}" for x in estimate.about],
     )
 

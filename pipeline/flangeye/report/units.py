@@ -26,6 +26,25 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-6 else "0 ms"
 
 
+LENGTHS = ("rms", "median", "p95", "max", "worst", "distance", "offset", "sigma", "shift", "error")
+ANGLES = ("tilt", "angle", "rotation", "turn")
+
+
+def figure(name: str, value: float) -> str:
+    """Return a verification's figure with its unit, which its name tells.
+
+    Figures are in SI; counts are whole numbers, and what no name tells stays as it is.
+    """
+    words = name.split("_")
+    if float(value).is_integer():
+        return f"{value:.0f}"
+    if any(word in ANGLES for word in words):
+        return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
+    if any(word in LENGTHS for word in words):
+        return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"
+    return f"{value:.4g}"
+
+
 def percent(share: float) -> str:
     """Return a share in whole percent."""
     return f"{share:.0%}"

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye.report.facts import Facts
 from flangeye.report.plot import CIRCLE, HELD_OUT, TRUTH, UNUSED, USED, Figure, Trace, packed
 from flangeye.report.units import millimetres
-from flangeye.types import WeldReport, WorkpieceScan
-
-Floats = NDArray[np.float64]
+from flangeye.types import Floats, WeldReport, WorkpieceScan
 
 BANDS = {"seeking": "#8a8f98", "bridging": "#d98a00", "ending": "#3a7ebf", "stopped": "#d5451b"}
 """Colours of the controller's phases; following, the rule, has none."""

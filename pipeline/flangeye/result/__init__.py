@@ -5,6 +5,7 @@ of the same recipe, input and seed give the same document bit for bit, ``timing`
 """
 
 from flangeye.result.calibration import (
+    answers_result,
     correction_result,
     holdout_result,
     observations_result,
@@ -32,6 +33,8 @@ from flangeye.result.contract import (
     WeldTruthResult,
     WorkspaceResult,
 )
+from flangeye.result.exported import calibrated_pose
+from flangeye.result.logged import logged_result
 from flangeye.result.provenance import library_versions, sha256
 from flangeye.result.welding import seam_result, weld_result
 
@@ -53,9 +56,12 @@ __all__ = [
     "WeldResult",
     "WeldTruthResult",
     "WorkspaceResult",
+    "answers_result",
+    "calibrated_pose",
     "correction_result",
     "holdout_result",
     "library_versions",
+    "logged_result",
     "observations_result",
     "seam_result",
     "sha256",

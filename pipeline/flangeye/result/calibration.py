@@ -8,9 +8,20 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.geometry import covariance_at, rotation_log
+from flangeye.maths.arm_correction import corrected_observation
+from flangeye.maths.geometry import covariance_at, rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import (
+    DEFAULT,
+    Configuration,
+    carriers_of,
+    mapped_and_expected,
+)
 from flangeye.result.contract import (
+    AnswerResult,
+    AnswersResult,
     CorrectionResult,
+    FieldResult,
     HoldoutResult,
     ObservationResult,
     TransformErrorResult,
@@ -19,6 +30,8 @@ from flangeye.result.contract import (
     VerificationResult,
     WorkspaceResult,
 )
+
+Robots = tuple[Configuration, Arm | None]
 
 
 def transforms_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
@@ -37,16 +50,67 @@ def _transform(estimate: t.TransformEstimate) -> TransformResult:
     )
 
 
-def correction_result(calibration: t.HandEye | None) -> CorrectionResult | None:
-    """Return the section ``correction``."""
-    correction = calibration.correction if calibration else None
+def correction_result(correction: t.ArmCorrection | None) -> CorrectionResult | None:
+    """Return a correction as ``result.json`` and ``calibration.yaml`` carry it."""
     if correction is None:
         return None
-    offsets = correction.joint_offsets
+    field = correction.field
     return CorrectionResult(
         tool_offset=correction.tool_offset.tolist(),
-        joint_offsets=None if offsets is None else offsets.tolist(),
+        joint_offsets=_listed(correction.joint_offsets),
+        joints=_listed(correction.joints),
+        lengths=_listed(correction.lengths),
+        field=field
+        and FieldResult(
+            about=field.about.tolist(),
+            length=field.length,
+            rigid=field.rigid.tolist(),
+            weights=field.weights.tolist(),
+        ),
     )
+
+
+def _listed(values: t.Array | None) -> Any:
+    return None if values is None else np.asarray(values).tolist()
+
+
+def answers_result(
+    calibration: t.HandEye | None, holdout: HoldoutResult | None
+) -> AnswersResult | None:
+    """Return the section ``answers``.
+
+    Args:
+        calibration: The estimate.
+        holdout: What poses held out showed of it, if a step measured that.
+    """
+    if calibration is None:
+        return None
+    corrected = calibration.as_corrected()
+    figures = holdout.figures if holdout else {}
+    found = {"all": holdout.rms, **figures} if holdout else {}
+    return AnswersResult(
+        as_reported=_answer(calibration.as_reported(), found.get("all"), found.get("rms_inliers")),
+        corrected=corrected
+        and _answer(corrected, found.get("corrected_rms"), found.get("corrected_rms_inliers")),
+    )
+
+
+def _answer(calibration: t.HandEye, of_all: float | None, inliers: float | None) -> AnswerResult:
+    return AnswerResult(
+        transforms=transforms_result(calibration),
+        correction=correction_result(calibration.correction),
+        expected_rms=_expected(calibration, inliers),
+        holdout_rms=of_all,
+    )
+
+
+def _expected(calibration: t.HandEye, inliers: float | None) -> float | None:
+    """Return the error to expect at the work: what poses held out show, less the centres' noise."""
+    used = [pair.observation.feature for pair in calibration.pairs if pair.used]
+    if inliers is None or not used:
+        return None
+    noise = float(np.mean([np.trace(feature.centre_covariance) for feature in used]))
+    return float(np.sqrt(max(inliers**2 - noise, 0.0)))
 
 
 def observations_result(
@@ -69,7 +133,7 @@ def _observation(pair: t.Pair) -> ObservationResult:
         radii=dict(circle.radii) if circle else None,
         covariance=feature.centre_covariance.tolist(),
         arc_coverage=circle.arc_coverage if circle else None,
-        clocking=circle.clocking if circle else None,
+        clocking=circle.roll if circle else None,
         tcp_in_base=pair.observation.tcp_in_base.tolist(),
         residual=float(np.linalg.norm(pair.residual)),
         residual_in_base=pair.residual.tolist(),
@@ -98,10 +162,18 @@ def _p95_of_gaussians(covariances: t.Array, draws: int = 400) -> float:
     return float(np.quantile(np.linalg.norm(roots @ unit.T, axis=1), 0.95))
 
 
-def truth_result(calibration: t.HandEye, truth: t.Truth, box: t.Box) -> TruthResult:
+def truth_result(
+    calibration: t.HandEye, truth: t.Truth, box: t.Box, robots: Robots = (DEFAULT, None)
+) -> TruthResult:
     """Return how far the estimate maps points of the workspace from where they are.
 
     What is marked as unobservable does not count.
+
+    Args:
+        calibration: The estimate.
+        truth: What the simulation knows.
+        box: The workspace.
+        robots: The configuration, and the kinematics of the arm whose error was corrected.
     """
     error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
     known = {x.name: x for x in (truth.camera, *truth.others)}
@@ -114,7 +186,23 @@ def truth_result(calibration: t.HandEye, truth: t.Truth, box: t.Box) -> TruthRes
         error_at_centroid=float(_displacement(error, box.centre, free)),
         rms_over_workspace=float(np.sqrt((_displacement(error, box.grid(), free) ** 2).mean())),
         rotation_error=float(np.linalg.norm(rotation_log(error[:3, :3]))),
+        at_work=_at_work(calibration.as_reported(), truth.unseen, robots),
+        at_work_corrected=_at_work(calibration.as_corrected(), truth.unseen, robots),
     )
+
+
+def _at_work(
+    calibration: t.HandEye | None, unseen: Sequence[t.Observation], robots: Robots
+) -> float | None:
+    """Return the rms distance of what is seen from where the (corrected) arm has it [m]."""
+    if calibration is None or not unseen:
+        return None
+    configuration, arm = robots
+    corrected = [corrected_observation(o, calibration.correction, arm) for o in unseen]
+    transforms = {name: x.transform for name, x in calibration.transforms.items()}
+    carriers = carriers_of(configuration, corrected, arm)
+    mapped, expected = mapped_and_expected(configuration, transforms, carriers, corrected)
+    return float(np.sqrt(((mapped - expected) ** 2).sum(axis=1).mean()))
 
 
 def _error(estimate: t.TransformEstimate, truth: t.Transform) -> TransformErrorResult:

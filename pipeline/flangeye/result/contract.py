@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import BaseModel, ConfigDict, Field
 
+PARTLY = 0.01
+"""An axis with a larger share in a direction that was not measured has no deviation of its own."""
 Vector = list[float]
 Matrix = list[list[float]]
 
@@ -26,6 +30,15 @@ class TransformResult(_Part):
         description="Directions (rotation, translation), about the same point, along which the "
         "estimate is arbitrary and the covariance says nothing.",
     )
+
+    @property
+    def sigma(self) -> list[float | None]:
+        """Deviations about and along the parent's axes [rad, m]; None where not measured."""
+        free = [max(map(abs, column)) for column in zip(*(self.unobservable or []), strict=True)]
+        return [
+            None if free and free[i] > PARTLY else math.sqrt(max(row[i], 0.0))
+            for i, row in enumerate(self.covariance)
+        ]
 
 
 class ObservationResult(_Part):
@@ -93,6 +106,15 @@ class TruthResult(_Part):
     error_at_centroid: float = Field(description="At the workspace's centre [m].")
     rms_over_workspace: float = Field(description="Over the workspace box [m].")
     rotation_error: float = Field(description="[rad]")
+    at_work: float | None = Field(
+        None,
+        description="Where the arm is not what it reports: rms distance, at poses that took no "
+        "part, between where the camera says the target is and where the controller has it, the "
+        "correction of the circle's place applied if there is one [m].",
+    )
+    at_work_corrected: float | None = Field(
+        None, description="The same of the pose for the corrected arm, and that arm [m]."
+    )
 
 
 class SeamTruthResult(_Part):
@@ -141,11 +163,53 @@ class WeldResult(_Part):
     truth: WeldTruthResult | None = None
 
 
+class FieldResult(_Part):
+    """A smooth displacement over the workspace; flangeye.maths.smooth_field evaluates it."""
+
+    about: Vector = Field(description="Middle of the calibration's poses, in the base [m].")
+    length: float = Field(description="Over which it changes [m].")
+    rigid: Matrix = Field(description="6xK, the rigid motion that each feature is less.")
+    weights: Vector = Field(description="Of the K features [m].")
+
+
 class CorrectionResult(_Part):
     """What is wrong with where the arm says its flange is, estimated with the transforms."""
 
     tool_offset: Vector = Field(description="The circle's centre in the flange frame [m].")
     joint_offsets: Vector | None = Field(None, description="To add to the joint angles [rad].")
+    joints: Vector | None = Field(
+        None, description="A configuration on the branch of the arm that was calibrated [rad]."
+    )
+    lengths: Matrix | None = Field(
+        None, description="nx3, to add to each joint's a, d [m] and alpha [rad]."
+    )
+    field: FieldResult | None = Field(
+        None, description="Smooth displacement of the flange, to add to where the arm reports it."
+    )
+
+
+class AnswerResult(_Part):
+    """The pose for one arm: as its controller reports it, or corrected."""
+
+    transforms: dict[str, TransformResult]
+    correction: CorrectionResult | None = Field(
+        None, description="What the poses hold with: without it they are another arm's."
+    )
+    expected_rms: float | None = Field(
+        None,
+        description="Error to expect at the work, rms: of the pose, of the arm, and of all else "
+        "that poses held out show beyond the noise of a circle's centre [m].",
+    )
+    holdout_rms: float | None = Field(None, description="On poses held out, over all of them [m].")
+
+
+class AnswersResult(_Part):
+    """The two answers, side by side: never mix the pose of one with the arm of the other."""
+
+    as_reported: AnswerResult = Field(description="For the arm as its controller reports it.")
+    corrected: AnswerResult | None = Field(
+        None, description="For the arm with its error corrected; null: no error was found."
+    )
 
 
 class StageTiming(_Part):
@@ -175,9 +239,14 @@ class Result(_Part):
     status: str = Field(description="verified, unverified (no verify step) or refused.")
     refused: str | None = Field(None, description="Why.")
     method: str | None = Field(None, description="The solve step.")
-    transforms: dict[str, TransformResult]
+    transforms: dict[str, TransformResult] = Field(
+        description="The best for the arm as its controller reports it."
+    )
     correction: CorrectionResult | None = Field(
-        None, description="The transforms hold for the arm so corrected; null: as it reports."
+        None, description="Where on the flange the circle is, if not at its origin."
+    )
+    answers: AnswersResult | None = Field(
+        None, description="The transforms for the arm as it reports, and those for it corrected."
     )
     observations: list[ObservationResult]
     workspace: WorkspaceResult | None = None
@@ -186,5 +255,12 @@ class Result(_Part):
     truth: TruthResult | None = None
     seam: SeamResult | None = None
     weld: WeldResult | None = None
+    notes: list[str] = Field(
+        default_factory=list,
+        description="What the solver and later steps want people to know with the verdict.",
+    )
+    exports: dict[str, str] = Field(
+        default_factory=dict, description="What export steps wrote: file name -> content."
+    )
     timing: dict[str, StageTiming]
     provenance: Provenance

@@ -7,7 +7,7 @@ import platform
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
-from flangeye import __version__
+from flangeye.files.bundled import VERSION
 
 
 def sha256(text: str) -> str:
@@ -24,7 +24,7 @@ def library_versions() -> dict[str, str]:
 def _library_versions() -> tuple[tuple[str, str], ...]:
     """Read them once: each is a file to find and to parse, 5 ms together."""
     names = ("numpy", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "pydantic", "mcap")
-    found = {"flangeye": __version__, "python": platform.python_version()}
+    found = {"flangeye": VERSION, "python": platform.python_version()}
     for name in names:
         try:
             found[name] = version(name)

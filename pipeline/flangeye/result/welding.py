@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import types as t
+from flangeye.maths.seam_geometry import errors_from, torch_deviation, tube_radii
 from flangeye.result.contract import SeamResult, SeamTruthResult, WeldResult, WeldTruthResult
-from flangeye.seamline import errors_from, torch_deviation, tube_radii
 
 
 def seam_result(seam: t.Seam | None, scan: t.WorkpieceScan | None) -> SeamResult | None:
@@ -59,7 +59,8 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
 
 def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
     """Compare with the true seam that is nearest, where the torch was between its ends."""
-    found = [torch_deviation(weld.torch, truth, weld.opening) for truth in true_seams]
+    torch = weld.true_torch if len(weld.true_torch) else weld.torch
+    found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
     return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))
 

@@ -9,6 +9,7 @@ from flangeye.testing.afterwards import CheckConformance, GuideConformance, Repl
 from flangeye.testing.base import Conformance
 from flangeye.testing.costs import CostConformance, ErrorConformance
 from flangeye.testing.devices import RobotConformance, ScannerConformance, SensorConformance
+from flangeye.testing.exporting import ExportConformance
 from flangeye.testing.percapture import FitConformance, SegmentConformance
 from flangeye.testing.solving import RefineConformance, SolveConformance, VerifyConformance
 from flangeye.testing.sources import (
@@ -26,6 +27,7 @@ KITS = {
     "solve": SolveConformance,
     "refine": RefineConformance,
     "verify": VerifyConformance,
+    "export": ExportConformance,
     "scan": ScanConformance,
     "seam": SeamConformance,
     "weld": WeldConformance,

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.diagnosis import Finding, NotApplicable, Session
+from flangeye.doctor.diagnosis import Finding, NotApplicable, RecordedSession
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import require, require_refusal
 from flangeye.testing.solving import observed, work_points
 
 
-def session(count: int = 16) -> Session:
+def session(count: int = 16) -> RecordedSession:
     """Return recordings without a mistake: a known cell with 0.05 mm of noise."""
     observations = observed(work_points(count))
     features = [o.circle for o in observations]
-    return Session(
+    return RecordedSession(
         ids=tuple(o.id for o in observations),
         poses=np.array([o.base_T_flange.matrix for o in observations]),
         centres=np.array([feature.centre for feature in features]),
@@ -37,7 +37,7 @@ class CheckConformance(Conformance):
 
     kind = "check"
 
-    def found(self, recordings: Session) -> list[Finding]:
+    def found(self, recordings: RecordedSession) -> list[Finding]:
         """Return what the check finds; nothing where it does not apply."""
         try:
             findings = list(self.call({}, recordings))
@@ -60,7 +60,7 @@ class CheckConformance(Conformance):
         """No sample, two, or some without a target tell nothing, and are looked at all the same."""
         blind = replace(session(), centres=np.full_like(session().centres, np.nan))
 
-        def look(given: Session) -> Any:
+        def look(given: RecordedSession) -> Any:
             for finding in self.found(given):
                 require("\n" not in finding.what, f"{finding.name}: one sentence, one line")
             return t.Rejected("")

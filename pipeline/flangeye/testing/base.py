@@ -9,16 +9,12 @@ from types import NoneType
 from typing import Any, ClassVar, get_args
 
 from flangeye import types as t
-from flangeye.catalogue import (
-    Flange,
-    RobotModel,
-    ScannerModel,
-    flange_of,
-    load_model,
-    load_standard,
-)
-from flangeye.registry import load_registry
-from flangeye.stage import KINDS, PARTS, Params, Part, Plugin
+from flangeye.models.loading import load_model
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerData, ScannerModel
+from flangeye.models.targets import Flange, plate_of
+from flangeye.plugin.registry import load_registry
+from flangeye.plugin.stage import KINDS, PARTS, Params, Part, Plugin
 from flangeye.testing.judge import require
 
 LONGEST_SUMMARY = 110
@@ -80,7 +76,7 @@ class Conformance:
     @cached_property
     def flange(self) -> Flange:
         """What the kit's arm carries."""
-        return flange_of(self.robot, load_standard(self.robot.flange.standard))
+        return plate_of(self.robot)
 
     def context(self) -> Mapping[Any, Any]:
         """Return what the plugin may ask for by type, besides what its kind works on."""
@@ -106,6 +102,7 @@ class Conformance:
     def _cell(self) -> dict[Any, Any]:
         return {
             RobotModel: self.robot,
+            ScannerData: self.scanner,
             ScannerModel: self.scanner,
             Flange: self.flange,
             t.Seed: t.Seed(0),

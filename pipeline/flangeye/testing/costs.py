@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye import types as t
-from flangeye.geometry import rigid, rotation_exp
+from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import plain, require, require_close, require_refusal
 from flangeye.testing.solving import CAMERA, observed, work_points
-
-Floats = NDArray[np.float64]
+from flangeye.types import Floats
 
 AT = np.array([0.05, -0.03, 0.7])
 """Where the work is, in ``camera`` [m]."""

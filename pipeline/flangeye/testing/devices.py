@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flangeye import types as t
-from flangeye.catalogue import read_model
 from flangeye.devices import (
     GRACE,
     PATIENCE,
@@ -24,7 +23,9 @@ from flangeye.devices import (
     StateSource,
     TactileSensor,
 )
-from flangeye.shipped import shipped
+from flangeye.files.bundled import bundled
+from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import require, require_close, require_one_line, require_round_trip
 from flangeye.testing.sources import logged
@@ -244,7 +245,7 @@ class ScannerConformance(DriverConformance):
         with self.opened() as scanner:
             scan = self.scanned(scanner)
         pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
-        capture = t.Capture("0", scan.cloud, pose, time_ns=scan.ended_ns)
+        capture = t.Capture("0", scan.cloud, t.by_frame(pose), time_ns=scan.ended_ns)
         require_round_trip(capture, logged)
 
 
@@ -254,11 +255,9 @@ class SensorConformance(DriverConformance):
     kind = "sensor"
 
     def context(self) -> Mapping[Any, Any]:
-        """Return an arm that stands, and the shipped finger for a part that asks for one."""
-        finger = self.plugin.needs.get("finger")
-        shipped_finger = shipped("data") / "fingers" / "srm.yaml"
-        known = {} if finger is None else {finger: read_model(shipped_finger, finger)}
-        return {StateSource: _Standing(), **known}
+        """Return an arm that stands, and the bundled finger."""
+        finger = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
+        return {StateSource: _Standing(), Finger: finger}
 
     def frames(self, sensor: TactileSensor, count: int) -> list[SensorFrame]:
         """Return the next frames."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.record import Recorder, adapter, clouds_of
-from flangeye.runlog import read_run
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder, adapter, clouds_of
 
 
 def require(holds: object, message: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from flangeye.catalogue import Flange, Sphere
+from flangeye.models.targets import Flange, Sphere
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import (
     plain,

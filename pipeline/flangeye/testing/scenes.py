@@ -10,11 +10,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.catalogue import Flange, Sphere
-from flangeye.geometry import rigid, rotation_exp
-from flangeye.types import BASE, CAMERA, FLANGE, Capture, FlangeCloud, PointCloud, Transform
-
-Floats = NDArray[np.float64]
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.models.targets import Flange, Sphere
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    Capture,
+    FlangeCloud,
+    Floats,
+    PointCloud,
+    Transform,
+    by_frame,
+)
 
 DEPTH = 0.7
 """Of the flange's centre in ``camera`` [m]."""
@@ -89,7 +97,7 @@ class Scene:
     def capture(self) -> Capture:
         """Return the whole scan, as a scanner gives it."""
         cloud = PointCloud(CAMERA, self.xyz.astype(np.float32))
-        return Capture("0", cloud, Transform(BASE, FLANGE, np.eye(4)))
+        return Capture("0", cloud, by_frame(Transform(BASE, FLANGE, np.eye(4))))
 
     def flange_cloud(self) -> FlangeCloud:
         """Return what a segment stage cuts out: the points near the feature, with a rough start."""

@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye import types as t
-from flangeye.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
+from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import (
     plain,
@@ -21,8 +20,7 @@ from flangeye.testing.judge import (
     require_round_trip,
 )
 from flangeye.testing.scenes import FACING, flange_scene
-
-Floats = NDArray[np.float64]
+from flangeye.types import Floats
 
 CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))
 """``base_T_camera`` of the kit's cell."""
@@ -68,7 +66,7 @@ def observed(
             normal_covariance=scatter if normals else None,
             arc_coverage=1.0,
         )
-        observations.append(t.Observation(f"{index:04d}", circle, pose))
+        observations.append(t.Observation(f"{index:04d}", circle, t.by_frame(pose)))
     return observations
 
 
@@ -92,7 +90,7 @@ def reference_solution(observations: Sequence[t.Observation]) -> t.HandEye:
 def elsewhere(observations: Sequence[t.Observation], motion: Floats) -> list[t.Observation]:
     """Return the same scans for a robot whose base stands elsewhere."""
     moved = t.Transform(t.BASE, t.BASE, motion)
-    return [replace(o, base_T_flange=moved @ o.base_T_flange) for o in observations]
+    return [replace(o, poses={**o.poses, t.FLANGE: moved @ o.base_T_flange}) for o in observations]
 
 
 class SolvingConformance(Conformance):

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye import types as t
-from flangeye.archive import Archive, check_ids
-from flangeye.geometry import rigid, rotation_exp
-from flangeye.kinematics import Arm
-from flangeye.record import Recorder
-from flangeye.runlog import read_run
+from flangeye.files.recording import Archive, check_ids
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.motion.planning import Site
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import (
     only,
@@ -26,8 +26,7 @@ from flangeye.testing.judge import (
     require_refusal,
     require_round_trip,
 )
-
-Floats = NDArray[np.float64]
+from flangeye.types import Floats
 
 REACH = 5.0
 """No arm's flange is farther from its base: a larger number is in millimetres [m]."""
@@ -184,7 +183,7 @@ class PlanConformance(Conformance):
         shift = np.zeros(3) if moved is None else moved
         arm = Arm(self.robot)
         eye = CAMERA[:3, 3] + shift
-        site = self.plugin.needs["site"](
+        site = Site(
             centre=CAMERA[:3, 3] + 0.7 * CAMERA[:3, 2] + shift,
             eye=eye,
             facing=lambda point: _facing(np.asarray(point), eye),
@@ -225,7 +224,7 @@ class PlanConformance(Conformance):
 
     def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
         """Where the arm can show its flange nowhere, the plan is empty, or it says why."""
-        site = self.plugin.needs["site"](
+        site = Site(
             centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
         )
 

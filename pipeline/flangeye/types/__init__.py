@@ -14,17 +14,21 @@
   nowhere else.
 """
 
-from flangeye.types.arrays import Array, FloatArray, Pixels
+from flangeye.types.arrays import Array, FloatArray, Floats, Indices, Mask, Pixels, Singles
 from flangeye.types.calibration import (
     ArmCorrection,
+    CorrectedArm,
     HandEye,
     Pair,
     PoseError,
+    ScatterNoise,
+    SmoothField,
     Solver,
     Verification,
     VerifiedHandEye,
 )
 from flangeye.types.clouds import PointCloud
+from flangeye.types.exports import CalibratedPose, ExportedFile
 from flangeye.types.features import (
     CircleFeature,
     Feature,
@@ -44,8 +48,10 @@ from flangeye.types.frames import (
     TOOL,
     Box,
     FrameMismatchError,
+    Poses,
     Transform,
     TransformEstimate,
+    by_frame,
 )
 from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, WorkpieceScan
@@ -64,17 +70,23 @@ __all__ = [
     "ArmCorrection",
     "Array",
     "Box",
+    "CalibratedPose",
     "Capture",
     "Captures",
     "CircleFeature",
+    "CorrectedArm",
+    "ExportedFile",
     "Feature",
     "FlangeCloud",
     "FloatArray",
+    "Floats",
     "FrameMismatchError",
     "HandEye",
     "Image",
+    "Indices",
     "Journal",
     "Look",
+    "Mask",
     "Observation",
     "Observations",
     "Pair",
@@ -82,13 +94,17 @@ __all__ = [
     "PointCloud",
     "PoseError",
     "PoseFeature",
+    "Poses",
     "Progress",
     "Rejected",
     "Rejection",
     "Resumed",
     "Role",
+    "ScatterNoise",
     "Seam",
     "Seed",
+    "Singles",
+    "SmoothField",
     "Solver",
     "Source",
     "Stream",
@@ -101,4 +117,5 @@ __all__ = [
     "Views",
     "WeldReport",
     "WorkpieceScan",
+    "by_frame",
 ]

@@ -25,6 +25,11 @@ class _AsNestedLists:
         return {"type": "array"}
 
 
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
 Array = Annotated[NDArray[np.float64], _AsNestedLists(np.float64)]
 Pixels = Annotated[NDArray[np.uint8], _AsNestedLists(np.uint8)]
 FloatArray = NDArray[np.float32] | NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from flangeye.types.arrays import Array, freeze
 from flangeye.types.features import Observation
@@ -16,8 +16,8 @@ class Pair:
 
     Attributes:
         observation: What went in.
-        residual: (3,) measured centre, mapped to ``base``, minus where the calibration expects
-            it: at the TCP (corrected, where the solver corrects the arm), or at the target [m].
+        residual: (3,) measured centre, mapped to ``base``, minus where the arm as its controller
+            reports it has the TCP or the target [m].
         used: Whether it took part in the estimate.
         reason: Why it did not.
     """
@@ -32,6 +32,36 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
+class SmoothField:
+    """A smooth displacement of the flange over the workspace: what an arm's many errors leave.
+
+    A Gaussian process of low order: the features of the squared-exponential kernel up to the
+    second power of the place, less the rigid motion that comes nearest to each over the
+    calibration's poses, for that one belongs to the camera's pose. Evaluated by
+    :mod:`flangeye.maths.smooth_field`.
+
+    Attributes:
+        about: (3,) middle of the calibration's poses, in ``base`` [m].
+        length: Over which it changes [m].
+        rigid: (6, K) rotation and translation about the middle that each feature is less.
+        weights: (K,) of the features [m].
+        covariance: (K, K) of the weights [m^2].
+        size: Standard deviation of a weight before anything was seen [m].
+    """
+
+    about: Array
+    length: float
+    rigid: Array
+    weights: Array
+    covariance: Array
+    size: float
+
+    def __post_init__(self) -> None:
+        k = len(self.weights)
+        freeze(self, about=(3,), rigid=(6, k), weights=(k,), covariance=(k, k))
+
+
+@dataclass(frozen=True, eq=False)
 class ArmCorrection:
     """What a solver found wrong with where the arm says its flange is.
 
@@ -40,14 +70,57 @@ class ArmCorrection:
         joint_offsets: (n,) to add to the joint angles [rad], or None.
         joints: (n,) a configuration of the arm on the branch that it was in [rad], from which
             the angles of a pose without any are found; with ``joint_offsets``.
+        lengths: (n, 3) to add to each joint's Denavit-Hartenberg ``a``, ``d`` [m] and ``alpha``
+            [rad], or None; with ``joint_offsets``.
+        field: Smooth displacement of where the arm reports the flange's origin, to add to it in
+            ``base``; the camera's pose holds for the arm as reported with or without it.
     """
 
     tool_offset: Array
     joint_offsets: Array | None = None
     joints: Array | None = None
+    field: SmoothField | None = None
+    lengths: Array | None = None
 
     def __post_init__(self) -> None:
         freeze(self, tool_offset=(3,))
+
+    @property
+    def of_arm(self) -> bool:
+        """Whether it corrects the arm, and not only where on the flange the circle is."""
+        return self.joint_offsets is not None or self.field is not None
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedArm:
+    """The answer for the arm corrected: the pose and the correction hold together.
+
+    Attributes:
+        camera: As in :class:`HandEye`.
+        correction: What to correct.
+        others: As in :class:`HandEye`.
+    """
+
+    camera: TransformEstimate
+    correction: ArmCorrection
+    others: tuple[TransformEstimate, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScatterNoise:
+    """What differs from pose to pose, beside what all poses share.
+
+    Attributes:
+        arm: Variance of the flange's place per axis, beyond its smooth error and beyond the
+            features' own noise [m^2].
+        feature_scale: Factor on the features' own covariances, at most 1.
+        widening: Factor on what is stated of a single prediction: for what is unknown of the noise,
+            and for what errors on poses held out show beyond it; at least 1.
+    """
+
+    arm: float
+    feature_scale: float
+    widening: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +129,16 @@ class HandEye:
 
     Attributes:
         camera: The camera's pose in the frame that carries it: ``base_T_camera`` where it stands
-            beside the robot, ``flange_T_camera`` where the robot moves it.
+            beside the robot, ``flange_T_camera`` where the robot moves it. The best there is for
+            the arm as its controller reports it.
         pairs: Every observation the solver pulled.
         method: Stage that solved it.
         notes: What the solver wants the person to know.
-        correction: What it found wrong with the arm; the pose holds with it.
+        correction: What it found wrong with the arm and this pose holds with and without.
         others: The configuration's other unknowns, such as ``base_T_target``.
+        corrected: Where another pose is the best for the corrected arm: that pose, with its
+            correction.
+        noise: What differs from pose to pose, as the residuals show it; None where not estimated.
     """
 
     camera: TransformEstimate
@@ -70,6 +147,23 @@ class HandEye:
     notes: tuple[str, ...] = ()
     correction: ArmCorrection | None = None
     others: tuple[TransformEstimate, ...] = ()
+    corrected: CorrectedArm | None = None
+    noise: ScatterNoise | None = None
+
+    def as_reported(self) -> HandEye:
+        """Return the answer for the arm as its controller reports it, alone."""
+        known = self.correction and replace(
+            self.correction, joint_offsets=None, field=None, lengths=None
+        )
+        return replace(self, correction=known, corrected=None)
+
+    def as_corrected(self) -> HandEye | None:
+        """Return the answer for the arm corrected, alone; None where no error of it was found."""
+        if self.corrected is not None:
+            found = self.corrected
+            answer = replace(self, camera=found.camera, correction=found.correction)
+            return replace(answer, others=found.others or self.others, corrected=None)
+        return self if self.correction is not None and self.correction.of_arm else None
 
     @property
     def base_T_camera(self) -> TransformEstimate:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.types.arrays import Array, freeze
-from flangeye.types.frames import FrameMismatchError, Transform
+from flangeye.types.frames import FrameMismatchError, Placed, Poses, Transform
 from flangeye.types.scans import FlangeCloud
 
 
@@ -24,7 +24,7 @@ class CircleFeature:
         covariance: (3, 3) of the centre [m^2].
         normal_covariance: (3, 3) of the normal, singular along it; None with the normal.
         arc_coverage: Share of the rim's circumference that was seen, 0 to 1; 0 if not known.
-        clocking: Angle of the hole pattern about the normal [rad], or None when not visible.
+        roll: Angle of the hole pattern about the normal [rad], or None when not visible.
         centre_in_flange: (3,) where the arm carries that centre, in ``flange`` [m]: its origin,
             unless a target is mounted on it.
     """
@@ -35,7 +35,7 @@ class CircleFeature:
     covariance: Array
     normal_covariance: Array | None
     arc_coverage: float
-    clocking: float | None = None
+    roll: float | None = None
     centre_in_flange: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
@@ -109,14 +109,13 @@ class Rejection:
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
+class Observation(Placed):
     """A fitted feature and the robot poses it belongs to: one equation for the solver."""
 
     id: str
     feature: Feature
-    base_T_flange: Transform
+    poses: Poses
     joints: Array | None = None
-    base2_T_flange2: Transform | None = None
 
     @property
     def circle(self) -> CircleFeature:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -87,6 +88,26 @@ class Transform:
     def _require(self, expected: str, got: str) -> None:
         if expected != got:
             raise FrameMismatchError(f"{self.name} acts on frame '{expected}', not on '{got}'")
+
+
+Poses = Mapping[str, Transform]
+"""What the controllers reported, by the frame that each pose places: flange, flange2, rail, …"""
+
+
+def by_frame(*transforms: Transform | None) -> Poses:
+    """Return transforms by the frame they place; what is None is left out."""
+    return {each.child: each for each in transforms if each is not None}
+
+
+class Placed:
+    """What was seen while controllers reported poses."""
+
+    poses: Poses
+
+    @property
+    def base_T_flange(self) -> Transform:
+        """Pose of the (first) arm's flange."""
+        return self.poses[FLANGE]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye.types.arrays import Array, Pixels, freeze
 from flangeye.types.clouds import PointCloud
-from flangeye.types.frames import Transform
+from flangeye.types.frames import Placed, Poses
 
 Role = Literal["calibration", "verification"]
 
@@ -42,28 +42,26 @@ class Image:
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
+class Capture(Placed):
     """One look at the flange: where the robot says it stood, and what the scanner saw.
 
     Attributes:
         id: Unique within a run.
         cloud: The scan, in ``camera``; without points where only an image was taken.
-        base_T_flange: Pose read from the controller.
+        poses: What the controllers reported, by frame.
         joints: (n,) joint angles [rad], when known.
         time_ns: When the exposure ended.
         role: ``verification`` captures are kept from every solver.
         image: What a camera in the scanner saw, in the same frame, if one looked.
-        base2_T_flange2: Where a second arm stood, if there is one.
     """
 
     id: str
     cloud: PointCloud
-    base_T_flange: Transform
+    poses: Poses
     joints: Array | None = None
     time_ns: int = 0
     role: Role = "calibration"
     image: Image | None = None
-    base2_T_flange2: Transform | None = None
 
 
 @dataclass(frozen=True, eq=False)

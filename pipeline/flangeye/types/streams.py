@@ -48,9 +48,11 @@ class Captures(Stream[Capture | Rejection]):
     A source that knows a capture to be useless gives its ``Rejection`` in its place.
 
     Attributes:
-        became: What became of each capture, by id: its observation, or None if it was set aside
+        outcomes: What became of each capture, by id: its observation, or None if it was set aside
             or kept for verifying. A source that chooses its next pose may look here.
         look: Simulation only: scans other things with the same scanner, see :data:`Look`.
+        recorded: Whether the captures are there already, as in an archive: the next may be pulled
+            before it is known what became of the last.
     """
 
     def __init__(
@@ -59,9 +61,11 @@ class Captures(Stream[Capture | Rejection]):
         source: Source,
         total: int | None = None,
         look: Look | None = None,
+        recorded: bool = False,
     ) -> None:
         super().__init__(items, source, total)
-        self.became: dict[str, Observation | None] = {}
+        self.recorded = recorded
+        self.outcomes: dict[str, Observation | None] = {}
         self.look = look
 
     def __iter__(self) -> Iterator[Capture | Rejection]:
@@ -88,10 +92,14 @@ class Truth:
     Attributes:
         camera: Where the camera is, in the frame that carries it.
         others: The other unknowns of the configuration.
+        unseen: What a scanner without noise would see at poses that took no part: where the
+            flange (the target) really is, beside what the controllers report. They show what a
+            calibration is worth at the work where the arm is not what it says.
     """
 
     camera: Transform
     others: tuple[Transform, ...] = ()
+    unseen: tuple[Observation, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

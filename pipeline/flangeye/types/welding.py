@@ -84,6 +84,10 @@ class WeldReport:
         figures: By name, in SI units.
         loop: How the loop kept time, by name, in SI units; differs from run to run.
         notes: What the person should be told.
+        sigma: (K,) standard deviation of the torch's place across the seam [m], or empty.
+        bound: (K,) what its distance from the seam does not exceed [m], or empty.
+        band: (K,) the same for 95 % of the seam [m], or empty.
+        true_torch: (K, 3) simulation only: where the torch really was [m], or empty.
     """
 
     mode: str
@@ -105,13 +109,20 @@ class WeldReport:
     figures: Mapping[str, float] = field(default_factory=dict)
     loop: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    sigma: Array = field(default_factory=lambda: np.zeros(0))
+    bound: Array = field(default_factory=lambda: np.zeros(0))
+    band: Array = field(default_factory=lambda: np.zeros(0))
+    true_torch: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         k = len(self.phases)
-        for name in ("refined", "tip", "torch", "robot"):
+        for name in ("refined", "tip", "torch", "robot", "true_torch"):
             if not len(getattr(self, name)):  # JSON does not tell (0, 3) from (0,)
                 object.__setattr__(self, name, np.zeros((0, 3)))
         freeze(self, planned=(len(self.planned), 3), refined=(len(self.refined), 3), opening=(3,))
         freeze(self, tip=(k, 3), torch=(k, 3), robot=(k, 3))
+        freeze(self, true_torch=(len(self.true_torch) and k, 3))
+        for name in ("sigma", "bound", "band"):
+            freeze(self, **{name: (len(getattr(self, name)) and k,)})
         for name in ("time", "deflection", "wanted", "speed", "turn", "along"):
             freeze(self, **{name: (k,)})

@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, part
-from flangeye.catalogue import ScannerModel
 from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
+from flangeye.models.scanners import ScannerModel
 from flangeye.types import CAMERA, PointCloud
 
 

@@ -1,0 +1,125 @@
+"""Arms, scanners and flange standards: which there are, and files for those there are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flangeye.cli.app import app, say
+
+
+@app.command()
+def robots() -> None:
+    """List the arms that are known: joints, plate, and what their values come from."""
+    from flangeye.models.loading import load_model, model_names
+
+    for name in model_names("robots"):
+        robot = load_model("robots", name)
+        plate = robot.flange.standard or "plate: feature.standard"
+        say(f"{name:20}  {robot.maker:17}  {len(robot.joints)} joints  {plate:23}  {robot.source}")
+
+
+@app.command()
+def scanners() -> None:
+    """List the scanners that are known: principle, range, resolution, noise."""
+    from flangeye.models.loading import load_model, model_names
+
+    for name in model_names("scanners"):
+        s = load_model("scanners", name)
+        see = f"{1e3 * s.near:.0f} to {1e3 * s.far:.0f} mm"
+        say(
+            f"{name:15}  {s.maker:10}  {s.principle:16}  {see:15}  {s.columns} x {s.rows}  "
+            f"noise {1e3 * s.temporal_noise:g} mm"
+        )
+
+
+@app.command()
+def standards() -> None:
+    """List the flange plates that are known: diameters, threads, and whether sources agree."""
+    from flangeye.models.standards import known_standards
+
+    for plate in known_standards():
+        mm = [1e3 * d for d in (plate.outer, plate.pitch_circle, plate.centring)]
+        checked = "two sources agree" if plate.verified else "one source"
+        say(
+            f"{plate.designation:22}  outer {mm[0]:g}, pitch circle {mm[1]:g}, centring {mm[2]:g} "
+            f"mm; {plate.threads} x M{1e3 * plate.thread:g}; {checked}"
+        )
+
+
+Out = Annotated[Path | None, typer.Option(help="File to write; default NAME.yaml.")]
+
+
+@app.command("new-robot")
+def new_robot(  # noqa: PLR0913  one for each option
+    name: Annotated[str, typer.Argument(help="What to call the arm.")],
+    urdf: Annotated[Path | None, typer.Option(help="Its URDF, xacro expanded.")] = None,
+    base: Annotated[str | None, typer.Option(help="With --urdf: the base's link.")] = None,
+    flange: Annotated[str | None, typer.Option(help="With --urdf: the flange's link.")] = None,
+    maker: Annotated[str, typer.Option(help="Who makes it.")] = "",
+    convention: Annotated[
+        str, typer.Option(help="Of --joint: standard or modified (Denavit-Hartenberg), urdf.")
+    ] = "standard",
+    joint: Annotated[
+        list[str] | None,
+        typer.Option(help="One joint, base first: 'd: 89.159 mm, alpha: 90 deg'."),
+    ] = None,
+    standard: Annotated[str | None, typer.Option(help="Plate: ISO 9409-1-50-4-M6.")] = None,
+    out: Out = None,
+) -> None:
+    """Write the file of an arm: from its URDF, or from its joints, given or asked for."""
+    from flangeye.models.new_model import robot_of_joints, write_robot
+    from flangeye.models.urdf import robot_from_urdf
+
+    path = out or Path(f"{name}.yaml")
+    if urdf is not None:
+        found = robot_from_urdf(urdf, base, flange, standard)
+        robot = found.model_copy(update={"model": name, "maker": maker})
+    else:
+        robot = robot_of_joints(name, maker, convention, joint or _ask_joints(), standard)
+    say(write_robot(path, robot))
+
+
+def _ask_joints() -> list[str]:
+    say(
+        "One joint a line, base first, an empty line ends; for example: d: 89.159 mm, alpha: 90 deg"
+    )
+    joints: list[str] = []
+    while text := typer.prompt(f"joint {len(joints) + 1}", default="", show_default=False):
+        joints.append(text)
+    return joints
+
+
+@app.command("new-scanner")
+def new_scanner(  # noqa: PLR0913  one for each option
+    name: Annotated[str, typer.Argument(help="What to call the scanner.")],
+    near: Annotated[str | None, typer.Option(help="Nearest it sees: '300 mm'.")] = None,
+    far: Annotated[str | None, typer.Option(help="Farthest it sees: '900 mm'.")] = None,
+    principle: Annotated[
+        str | None, typer.Option(help="structured light, time of flight, …")
+    ] = None,
+    pixels: Annotated[tuple[int, int] | None, typer.Option(help="Columns and rows.")] = None,
+    field: Annotated[
+        tuple[str, str] | None, typer.Option(help="Field of view: '75 deg' '65 deg'.")
+    ] = None,
+    noise: Annotated[str | None, typer.Option(help="Of a pixel at mid range: '0.1 mm'.")] = None,
+    error: Annotated[str | None, typer.Option(help="Smooth distortion, rms: '0.1 mm'.")] = None,
+    out: Out = None,
+) -> None:
+    """Write the file of a scanner: a range is enough for archives, all options for simulations."""
+    from flangeye.models.new_model import write_scanner
+
+    columns, rows = pixels or (None, None)
+    values = {
+        "model": name,
+        "near": near or typer.prompt("nearest it sees, for example 300 mm"),
+        "far": far or typer.prompt("farthest it sees, for example 900 mm"),
+        "principle": principle, "columns": columns, "rows": rows,
+        "field_of_view": list(field) if field else None,
+        "temporal_noise": noise, "calibration_error": error,
+    }  # fmt: skip
+    if principle or pixels or field or noise or error:
+        values |= {"maker": "", "source": "stated when the file was made"}
+    say(write_scanner(out or Path(f"{name}.yaml"), values))

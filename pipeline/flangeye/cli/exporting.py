@@ -1,0 +1,65 @@
+"""``flangeye export``: a run's calibration as another program takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flangeye.cli.app import app, load_plugins, say
+from flangeye.files.written import write_whole
+
+if TYPE_CHECKING:
+    from flangeye.types import ExportedFile
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap.")],
+    to: Annotated[str, typer.Option(help="The format, for example ros2_launch, ur or kuka.")],
+    values: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the format: parent=base."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write, - to print; default RUN/exports/.")
+    ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Export a refused calibration too; the file says so.")
+    ] = False,
+) -> None:
+    """Write the calibration as another program takes it; 'flangeye stages' lists the formats.
+
+    Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
+    """
+    file = _exported(run, f"export.{to.removeprefix('export.')}", values or [], anyway)
+    if out == Path("-"):
+        typer.echo(file.text, nl=False)
+        return
+    path = out or (run if run.is_dir() else run.parent) / "exports" / file.name
+    write_whole(path, file.text)
+    say(f"{path}: {file.use}")
+
+
+def _exported(run: Path, name: str, values: list[str], anyway: bool) -> ExportedFile:
+    from flangeye.errors import StageError
+    from flangeye.log.read import read_run
+    from flangeye.recipe.given import params_given
+    from flangeye.result import calibrated_pose, logged_result
+
+    registry = load_plugins()
+    stage = registry.stage(name)
+    if stage not in registry.exports():
+        raise StageError(
+            f"{name}: needs more of a run than the camera's pose; add it to the recipe"
+        )
+    params = params_given(stage, values, registry)
+    log = read_run(run)
+    result = logged_result(log)
+    log.require_sound()
+    if result is None:
+        raise StageError(f"{log.path}: the run did not come to its end; there is nothing to export")
+    pose = calibrated_pose(result, anyway)
+    file: ExportedFile = stage.function(pose=pose, **({"params": params} if params else {}))
+    return file

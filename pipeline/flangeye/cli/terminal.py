@@ -1,0 +1,284 @@
+"""What people see in the terminal: progress while a run goes on, and its result."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+
+from flangeye.files.printable import printable
+from flangeye.maths.geometry import rpy_from_rotation
+from flangeye.plugin.hookspecs import hookimpl
+from flangeye.result import (
+    CorrectionResult,
+    HoldoutResult,
+    Result,
+    TransformResult,
+    Vector,
+    logged_result,
+)
+from flangeye.types import Rejection, Source
+
+if TYPE_CHECKING:
+    from flangeye.log.read import RunLog
+
+
+class ProgressBar:
+    """Shows captures as they go through; a hook implementation like any other."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("captures", total=None)
+
+    @hookimpl
+    def flangeye_run_started(self, source: Source, total: int | None) -> None:
+        """Start the bar and tell what the source reports."""
+        for note in source.notes:
+            _say(self._console, f"note: {note}")
+        self._progress.update(self._task, total=total)
+        self._progress.start()
+
+    @hookimpl
+    def flangeye_capture_rejected(self, rejection: Rejection) -> None:
+        """Say what was set aside, and why."""
+        line = f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}"
+        _say(self._console, line)
+
+    @hookimpl
+    def flangeye_capture_finished(self, capture: str) -> None:
+        """Move the bar."""
+        self._progress.advance(self._task)
+
+    @hookimpl
+    def flangeye_stage_finished(
+        self, step: str, capture: str | None, value: Any, seconds: float
+    ) -> None:
+        """Name the steps that run once, after the captures."""
+        if capture is None:
+            self._progress.update(self._task, description=step.partition(".")[2])
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        self._progress.stop()
+
+
+def print_result(console: Console, result: Result) -> None:
+    """Print the matrix, how far it can be trusted, and how that is known."""
+    used = sum(o.used for o in result.observations)
+    lines = [result.title, f"{result.status}: {used} of {len(result.observations)} captures used"]
+    lines += [f"note: {note}" for note in result.notes]
+    for name, estimate in result.transforms.items():
+        lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]
+        lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
+        lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
+    lines += _errors(result)
+    lines += _answers(result)
+    lines += _seam(result)
+    lines += _weld(result)
+    if result.refused:
+        lines += ["", f"refused: {result.refused}"]
+    _say(console, "\n".join(lines))
+
+
+def _uncertainty(parent: str, estimate: TransformResult) -> list[str]:
+    rpy = np.degrees(rpy_from_rotation(np.array(estimate.matrix)[:3, :3]))
+    unknown = [f"  not observable     {_motion(d)}" for d in estimate.unobservable or []]
+    turns = [None if s is None else np.degrees(s) for s in estimate.sigma[:3]]
+    shifts = [None if s is None else s * 1e3 for s in estimate.sigma[3:]]
+    return [
+        f"  roll, pitch, yaw   {rpy[0]:.4f}, {rpy[1]:.4f}, {rpy[2]:.4f} deg",
+        f"  one sigma          {_listed(turns, 4)} deg about {parent} x, y, z; "
+        f"{_listed(shifts, 3)} mm at the work",
+        *unknown,
+    ]
+
+
+def _listed(values: list[float | None], digits: int) -> str:
+    return ", ".join("unknown" if x is None else f"{x:.{digits}f}" for x in values)
+
+
+def _motion(direction: Vector) -> str:
+    """Return ``translation along (0.00, 0.00, 1.00)`` or the like for a unit direction."""
+    kinds = (("rotation about", direction[:3]), ("translation along", direction[3:]))
+    parts = [(kind, np.array(v)) for kind, v in kinds if np.linalg.norm(v) > 1e-3]
+    axes = [(kind, np.round(v / np.linalg.norm(v), 2) + 0.0) for kind, v in parts]
+    return " with ".join(f"{kind} ({', '.join(f'{x:.2f}' for x in v)})" for kind, v in axes)
+
+
+def _errors(result: Result) -> list[str]:
+    lines = []
+    if result.workspace:
+        w = result.workspace
+        size = " x ".join(f"{x * 1e3:.0f}" for x in w.size)
+        lines.append(
+            f"  predicted error    {_mm(w.predicted_rms)} rms, 95 % below {_mm(w.predicted_p95)} "
+            f"over the workspace ({size} mm)"
+        )
+    if result.holdout:
+        h = result.holdout
+        lines.append(
+            f"  held-out error     {_mm(h.rms)} rms, {_mm(h.median)} median, "
+            f"95 % below {_mm(h.p95)} ({_over(h)})"
+        )
+    if result.truth:
+        t = result.truth
+        if t.at_work is not None:
+            told = f"{_mm(t.at_work)} rms at poses that took no part"
+            if t.at_work_corrected is not None:
+                told += f", {_mm(t.at_work_corrected)} with the arm corrected"
+            lines.append(f"  true at the work   {told}")
+        lines.append(
+            f"  true error         {_mm(t.rms_over_workspace)} rms over the workspace, "
+            f"{_mm(t.error_at_centroid)} at its centre, {np.degrees(t.rotation_error):.4f} deg"
+        )
+    return lines
+
+
+def _over(held: HoldoutResult) -> str:
+    """Return what the held-out figures are over, and that of the inliers where it differs."""
+    outliers = int(held.figures.get("outliers", 0))
+    over = f"{held.folds} folds over all poses"
+    if not outliers:
+        return over
+    return f"{over}; {_mm(held.figures['rms_inliers'])} rms without {outliers} outliers"
+
+
+def _answers(result: Result) -> list[str]:
+    """Tell both answers, where an error of the arm was found."""
+    answers = result.answers
+    if answers is None or answers.corrected is None:
+        return []
+    lines = ["", "Two answers: never use the pose of one with the arm of the other"]
+    for name, answer in (
+        ("arm as it reports", answers.as_reported), ("arm corrected", answers.corrected)
+    ):  # fmt: skip
+        pose = np.array(next(iter(answer.transforms.values())).matrix)
+        at = ", ".join(f"{x * 1e3:z.2f}" for x in pose[:3, 3])
+        turn = ", ".join(f"{x:z.3f}" for x in np.degrees(rpy_from_rotation(pose[:3, :3])))
+        error = "" if answer.expected_rms is None else f"; {_mm(answer.expected_rms)} rms expected"
+        lines.append(f"  {name:<18} ({at}) mm, ({turn}) deg{error}")
+    lines.append(f"  {'its correction':<18} {_correction(answers.corrected.correction)}")
+    return lines
+
+
+def _correction(found: CorrectionResult | None) -> str:
+    """Return a correction in a few words; calibration.yaml carries all of it."""
+    parts = []
+    if found and found.joint_offsets:
+        parts.append(f"joints {', '.join(f'{x * 1e3:.2f}' for x in found.joint_offsets)} mrad")
+    if found and found.field:
+        parts.append(f"a smooth field of {len(found.field.weights)} weights")
+    return f"{' and '.join(parts)}; in calibration.yaml"
+
+
+def _seam(result: Result) -> list[str]:
+    seam = result.seam
+    if seam is None:
+        return []
+    lines = ["", f"seam: {seam.source}"]
+    start, end = (", ".join(f"{1e3 * x:.1f}" for x in seam.points[i]) for i in (0, -1))
+    lines.append(f"  from ({start}) to ({end}) mm in base, {_mm(seam.length)} along")
+    lines.append(f"  tube               95 % within {_mm(max(seam.tube))} of the plan")
+    if t := seam.truth:
+        told = f"{_mm(t.rms)} rms, {_mm(t.max)} at most, {t.inside:.0%} of it inside the tube"
+        lines.append(f"  true error         {told}")
+    return lines
+
+
+def _weld(result: Result) -> list[str]:
+    weld = result.weld
+    if weld is None:
+        return []
+    lines = [f"  weld               {weld.mode}, {weld.seconds:.1f} s"]
+    if weld.correction_rms is not None:
+        lines.append(f"  felt off the plan  {_mm(weld.correction_rms)} rms")
+    if weld.truth:
+        lines.append(
+            f"  torch off the seam {_mm(weld.truth.rms)} rms, {_mm(weld.truth.max)} at most"
+        )
+    if not weld.completed:
+        lines += ["", f"the weld was stopped: {weld.reason}"]
+    return lines
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.3f} mm"
+
+
+def print_log(console: Console, log: RunLog) -> None:
+    """Print what happened in a run, step by step."""
+    from rich.table import Table
+    from rich.text import Text
+
+    result = logged_result(log)
+
+    state = _state(log)
+    expected = f" of {log.total}" if log.total else ""
+    _say(console, f"{log.path}: {state}")
+    _say(console, f"{len(log.poses)}{expected} captures arrived, {len(log.finished)} went through")
+    for note in log.source.notes if log.source else ():
+        _say(console, f"note: {note}")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("step", "values", "seconds", "set aside"):
+        table.add_column(column, justify="left" if column == "step" else "right")
+    set_aside = Counter(r.stage for r in log.rejections)
+    for step, poses in _by_acquire_step(log).items():
+        seconds = sum(pose["seconds"] for pose in poses)
+        table.add_row(Text(printable(step)), str(len(poses)), f"{seconds:.2f}", "0")
+    for step in dict.fromkeys(entry.step for entry in log.entries):
+        entries = [entry for entry in log.entries if entry.step == step]
+        seconds = sum(entry.seconds for entry in entries)
+        aside = set_aside[entries[0].stage]
+        table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(aside))
+    console.print(table)
+    for rejection in log.rejections:
+        _say(console, f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}")
+    if log.finished and not log.complete:
+        last = [e for e in log.entries if e.capture == log.finished[-1]]
+        after = f", last step {last[-1].step}" if last else ""
+        _say(console, f"last finished capture: {log.finished[-1]}{after}")
+    if result:
+        print_result(console, result)
+
+
+def _state(log: RunLog) -> str:
+    if log.damage:
+        return "damaged: some of it cannot be read; shown as far as it goes"
+    if log.complete:
+        return "complete"
+    if not log.gathered:
+        return "incomplete: the run ended early; nothing was gathered yet"
+    return "incomplete: the run ended early; shown as far as it goes"
+
+
+def _by_acquire_step(log: RunLog) -> dict[str, list[dict[str, Any]]]:
+    steps: dict[str, list[dict[str, Any]]] = {}
+    for pose in log.poses.values():
+        steps.setdefault(pose["step"], []).append(pose)
+    return steps
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(printable(line), markup=False, highlight=False, soft_wrap=True)

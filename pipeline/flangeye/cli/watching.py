@@ -1,0 +1,107 @@
+"""Keep watch over a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flangeye.cli.app import app, load_plugins, say
+
+if TYPE_CHECKING:
+    from flangeye.doctor.monitor import Check, StoredCalibration
+    from flangeye.doctor.monitor.history import Finding
+    from flangeye.plugin.registry import Registry
+
+
+@app.command()
+def monitor(  # noqa: PLR0913  one argument an option
+    calibration: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
+    archive: Annotated[
+        list[Path] | None,
+        typer.Option(help="Later scans in which the flange appears, a check each; oldest first."),
+    ] = None,
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="[NEW]...", help="More of these.")
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Take the scans with the arm, as the recipe drives it.")
+    ] = False,
+    scans: Annotated[int, typer.Option(min=1, help="How many with --live.")] = 3,
+    move: Annotated[
+        bool, typer.Option("--move", help="Move the arm; without it: the plan.")
+    ] = False,
+    history: Annotated[
+        Path | None, typer.Option(help="Default: monitor.parquet beside the calibration's log.")
+    ] = None,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm at a check.")
+    ] = 2e-4,
+    limit: Annotated[str, typer.Option(help="Slow drift that counts as moved.")] = "0.4 mm",
+    opcua: Annotated[
+        str | None,
+        typer.Option(metavar="URL,NODE", help="Write the state into an OPC UA node."),
+    ] = None,
+) -> None:
+    """Say whether a calibration still holds: OK, DEGRADED or MOVED, since when, and which part.
+
+    One JSON line a check. Exit codes, by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could
+    be checked: a script that stops the cell on 2 is safe either way.
+    """
+    from flangeye.doctor.monitor import (
+        CODES,
+        History,
+        as_json,
+        judge,
+        stored_calibration,
+        write_chart,
+    )
+    from flangeye.errors import StageError
+    from flangeye.handeye.drift import DriftTest
+    from flangeye.units import parse_quantity
+
+    archive = [*(archive or ()), *(more or ())]
+    if live == bool(archive):
+        raise StageError("name later scans with --archive, or let the arm take them with --live")
+    try:
+        test = DriftTest(false_alarms=false_alarms, limit=parse_quantity(limit, "length"))
+    except ValueError as error:
+        raise StageError(f"--limit: {error}") from None
+    stored = stored_calibration(calibration)
+    kept = History.read(history or stored.path.parent / "monitor.parquet", stored.key)
+    registry = load_plugins()
+    for check in _checks(stored, registry, archive, (scans, move)):
+        kept.add(check)
+        kept.findings.append(judge(stored, kept, test))
+        kept.write()
+        say(as_json(kept, kept.findings[-1]))
+    write_chart(kept, test, kept.path.with_suffix(".html"))
+    if opcua:
+        _tell(opcua, kept.findings[-1])
+    raise typer.Exit(CODES[kept.findings[-1].state])
+
+
+def _checks(
+    stored: StoredCalibration,
+    registry: Registry,
+    archives: list[Path],
+    live: tuple[int, bool],
+) -> Iterator[Check]:
+    from flangeye.doctor.monitor import from_archive, from_arm
+
+    for path in archives:
+        yield from_archive(path, stored, registry)
+    if not archives:
+        yield from_arm(stored, registry, *live)
+
+
+def _tell(opcua: str, finding: Finding) -> None:
+    from flangeye.doctor.monitor.opcua import write_state
+    from flangeye.errors import StageError
+
+    url, comma, node = opcua.partition(",")
+    if not comma:
+        raise StageError(f"--opcua {opcua}: give URL,NODE: opc.tcp://plc:4840,ns=2;s=flangeye")
+    write_state(url, node, finding)

@@ -1,0 +1,246 @@
+"""What a ``check`` part takes and gives: a session as arrays, and findings about it.
+
+A check is a part ``check.<name>``, a function of a :class:`RecordedSession` (and its own
+parameters) that returns the :class:`Finding` s it can defend, or raises :class:`NotApplicable`.
+``flangeye doctor`` runs every check that is installed, believes the finding that explains most,
+corrects the session as that finding says, and looks again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from flangeye.types import Floats, Mask
+
+Reader = str | Mapping[str, Any]
+"""A reader as a recipe writes it: its name, or its name and parameters."""
+
+Arms = Literal["both", "first", "second"]
+"""Whose poses: where there is one arm, ``both`` is that one."""
+
+FEWEST = 4
+"""Samples below which every explanation fits."""
+
+CERTAIN = float("inf")
+"""Gain of a finding that needs no statistics, such as a pose that is exactly the identity."""
+
+
+class NotApplicable(Exception):
+    """What a check looks for cannot show in this session, and why not."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSession:
+    """N robot poses and what was seen at each, in the order they were recorded.
+
+    Attributes:
+        ids: Name of each.
+        poses: (N, 4, 4) ``base_T_flange`` [m], as the archive's reader gave them.
+        centres: (N, 3) the target's centre in ``camera`` [m]; NaN where nothing was found.
+        normals: (N, 3) its axis in ``camera``; NaN where none was measured.
+        rotations: (N, 3, 3) ``camera_R_target``; NaN where the target has no full pose.
+        places: (N, 3) that centre in the target's own frame [m]; NaN where it is not known where
+            the target is.
+        times: (N,) when each was taken [s]; NaN where unknown.
+        carried: What the arm moves: the target, or the camera; ``both`` where it moves the camera
+            and a second arm the target.
+        links: (N, 4, 4) base_T_link of the link that carries the camera [m]; None where none does.
+        seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
+        place: (4, 4) of the target in the flange or base that has it, where that is known [m].
+        reach: Nearest and farthest distance that the scanner sees [m].
+        reader: The archive's reader, as the recipe writes it.
+        acquire: Name of the recipe's first step.
+        changes: Parameters of that step that differ from the recipe's, by what was mended.
+        marks_open: Whether the recipe's solver marks translations that the motion cannot show.
+        remarks: Mistakes that opening the archive has shown already, mended here.
+    """
+
+    ids: tuple[str, ...]
+    poses: Floats
+    centres: Floats
+    normals: Floats
+    rotations: Floats
+    places: Floats
+    times: Floats
+    carried: Literal["target", "camera", "both"] = "target"
+    links: Floats | None = None
+    seconds: Floats | None = None
+    place: Floats = field(default_factory=lambda: np.eye(4))
+    reach: tuple[float, float] = (0.05, 5.0)
+    reader: Reader = "auto"
+    acquire: str = "acquire.archive"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    marks_open: bool = False
+    remarks: tuple[Finding, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def seen(self) -> Mask:
+        """(N,) where something was found."""
+        return np.asarray(np.isfinite(self.centres[:, 0]))
+
+    @property
+    def arms(self) -> tuple[Arms, ...]:
+        """Whose poses may share a mistake, the likeliest first."""
+        return ("both",) if self.seconds is None else ("both", "first", "second")
+
+    @property
+    def uses_poses(self) -> bool:
+        """Whether flanges' poses matter: not to a camera on a link before a target in the base."""
+        return self.links is None or self.carried == "target"
+
+    def require_samples(self) -> None:
+        """Go on only with samples enough to tell anything from.
+
+        Raises:
+            NotApplicable: There are too few with a target in them.
+        """
+        if (seen := int(self.seen.sum())) < FEWEST:
+            raise NotApplicable(f"{seen} samples with a target in them, {FEWEST} are needed")
+
+    def require_poses(self) -> None:
+        """Go on only where a mistake in the flanges' poses would show.
+
+        Raises:
+            NotApplicable: There are too few samples, or all poses follow from joint angles.
+        """
+        self.require_samples()
+        if not self.uses_poses:
+            raise NotApplicable("the camera's link is where the joint angles say")
+
+    def where(self, mask: Mask) -> RecordedSession:
+        """Return the samples of a mask."""
+        return replace(
+            self,
+            ids=tuple(name for name, kept in zip(self.ids, mask, strict=True) if kept),
+            poses=self.poses[mask],
+            centres=self.centres[mask],
+            normals=self.normals[mask],
+            rotations=self.rotations[mask],
+            places=self.places[mask],
+            times=self.times[mask],
+            links=None if self.links is None else self.links[mask],
+            seconds=None if self.seconds is None else self.seconds[mask],
+        )
+
+    def without(self, mask: Mask) -> RecordedSession:
+        """Return the session with the samples of a mask left out by the recipe."""
+        names = [name for name, gone in zip(self.ids, mask, strict=True) if gone]
+        earlier = self.changes.get("leave_out", [])
+        return self.where(~mask).with_changes(leave_out=[*earlier, *names])
+
+    def with_changes(self, **changes: Any) -> RecordedSession:
+        """Return the session as the acquire step gives it with other parameters."""
+        return replace(self, changes={**self.changes, **changes})
+
+    def read_with(self, **correction: Any) -> RecordedSession:
+        """Return the session as ``reader.corrected`` with a correction would give it."""
+        stated = {name: value for name, value in correction.items() if (name, value) != _DEFAULT}
+        return replace(self, reader={"corrected": {"reader": self.reader, **stated}})
+
+    def corrected(self, change: Change, arms: Arms = "both", **correction: Any) -> RecordedSession:
+        """Return the session with changed poses, as ``reader.corrected`` reads them.
+
+        Args:
+            change: Gives an arm's poses (N, 4, 4) as they should be.
+            arms: Whose.
+            correction: What the reader is told.
+        """
+        poses = self.poses if arms == "second" else change(self.poses)
+        given = self.seconds
+        seconds = given if given is None or arms == "first" else change(given)
+        read = self.read_with(arms=arms, **correction)
+        return replace(read, poses=poses, seconds=seconds)
+
+    def with_poses(self, poses: Floats) -> RecordedSession:
+        """Return the session with other poses (N, 4, 4)."""
+        return replace(self, poses=poses)
+
+    def step(self) -> str:
+        """Return the acquire step that gives this session, as a line of the recipe."""
+        return f"- {self.acquire}: {_flow({'reader': self.reader, **self.changes})}"
+
+
+class Misfit(NamedTuple):
+    """Errors of the best calibration, rms over the samples.
+
+    Attributes:
+        position: Of the target's centre [m].
+        angle: Of its normal or rotation [rad]; None where only centres were seen.
+    """
+
+    position: float
+    angle: float | None = None
+
+    @property
+    def numbers(self) -> Floats:
+        """(1,) or (2,) those there are."""
+        return np.array([x for x in self if x is not None])
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One mistake that a check found.
+
+    Attributes:
+        name: Of the mistake, in a word or two.
+        what: One sentence: what is wrong, and with which samples.
+        fix: What to do: the recipe's line to change, where one helps.
+        samples: Ids of the samples it concerns; empty for all of them.
+        before: Errors as things are; None where they say nothing.
+        after: The same once it is mended.
+        probability: Of so large an improvement in a session without this mistake, every
+            alternative that was tried counted.
+        gain: Logarithm of the likelihood ratio, less what further parameters cost; ranks findings.
+        corrected_session: The session without the mistake, to look for others; None where only
+            new recordings help.
+        note: Whether it is only worth knowing, and no mistake.
+    """
+
+    name: str
+    what: str
+    fix: str
+    samples: tuple[str, ...] = ()
+    before: Misfit | None = None
+    after: Misfit | None = None
+    probability: float = 0.0
+    gain: float = CERTAIN
+    corrected_session: RecordedSession | None = field(default=None, repr=False)
+    note: bool = False
+
+
+Findings = Iterable[Finding]
+Change = Callable[[Floats], Floats]
+"""Gives poses (N, 4, 4) as they should be."""
+
+_DEFAULT = ("arms", "both")
+
+_NAME = re.compile(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*")
+_QUANTITY = re.compile(r"-?[\d.]+ [A-Za-z]+")
+
+
+def _flow(value: Any) -> str:
+    """Return a value as YAML on one line, unquoted where that is read back the same."""
+    if isinstance(value, Mapping):
+        inside = ", ".join(f"{key}: {_flow(each)}" for key, each in value.items())
+        return f"{{{inside}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_flow, value))}]"
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    plain = not isinstance(value, str) or _NAME.fullmatch(text) or _QUANTITY.fullmatch(text)
+    return text if plain else f"'{text}'"
+
+
+class Check(Protocol):
+    """How a ``check`` part is called."""
+
+    def __call__(self, session: RecordedSession) -> Iterable[Finding]:
+        """Return the mistakes that it can defend; raise :class:`NotApplicable` to abstain."""
+        ...

@@ -1,0 +1,90 @@
+"""The history as one HTML page that needs no network."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from flangeye.doctor.monitor.history import Finding, History
+from flangeye.errors import StageError
+from flangeye.handeye.drift import DriftTest
+
+COLOURS = {"OK": "#2e9e5b", "DEGRADED": "#d68910", "MOVED": "#d64545"}
+PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{state}: {path}</title>
+<style>
+:root {{ color-scheme: light; }}
+body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: #1c2230; background: #fff;
+  font: 1rem/1.5 system-ui, sans-serif; }}
+h1 {{ margin: 0; font-size: 1.5rem; color: {colour}; }}
+p {{ margin: .4rem 0; overflow-wrap: anywhere; }}
+</style></head><body><h1>{state}</h1><p>{sentence}</p>{figure}
+<p>{checks} checks of {path}. A step is reported at a false-alarm rate of at most {rate:g} a check.
+</p></body></html>"""
+
+
+def write_chart(history: History, test: DriftTest, path: Path) -> None:
+    """Write the chart of every check.
+
+    Raises:
+        StageError: It cannot be written.
+    """
+    last = history.findings[-1]
+    page = PAGE.format(
+        state=last.state, colour=COLOURS[last.state], sentence=escape(sentence(last)),
+        figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
+        checks=len(history.findings), path=escape(str(history.path)), rate=test.false_alarms,
+    )  # fmt: skip
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def sentence(finding: Finding) -> str:
+    """Return what a check says, in words."""
+    how_far = f"the work is off by {finding.shift * 1e3:.2f} mm at its worst corner"
+    if finding.since is None:
+        return f"{how_far}, which is within what the calibration allows."
+    part = f"; {finding.part} explains it best ({finding.probability:.0%})" if finding.part else ""
+    return f"{how_far}, since check {finding.since}{part}."
+
+
+def figure(history: History, test: DriftTest) -> Any:
+    """Return the chart as a plotly figure: shift and test statistic over the checks."""
+    from plotly.subplots import make_subplots
+
+    chart = make_subplots(
+        rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35]
+    )
+    at = _axis(history)
+    colours = [COLOURS[f.state] for f in history.findings]
+    shifts = [f.shift * 1e3 for f in history.findings]
+    chart.add_scatter(
+        x=at, y=shifts, mode="lines+markers", line={"color": "#8a93a3", "width": 1},
+        marker={"color": colours, "size": 8}, text=[f.state for f in history.findings],
+        hovertemplate="%{y:.3f} mm, %{text}<extra></extra>", row=1, col=1,
+    )  # fmt: skip
+    chart.add_scatter(
+        x=at, y=[f.statistic for f in history.findings], mode="lines",
+        line={"color": "#3a7ebf"}, hovertemplate="%{y:.2f}<extra></extra>", row=2, col=1,
+    )  # fmt: skip
+    limit = test.limit * 1e3
+    chart.add_hline(y=limit, line_color=COLOURS["MOVED"], line_dash="dot", row=1, col=1)
+    chart.add_hline(y=limit / 2, line_color=COLOURS["DEGRADED"], line_dash="dot", row=1, col=1)
+    chart.add_hline(y=1.0, line_color=COLOURS["MOVED"], line_dash="dot", row=2, col=1)
+    chart.update_yaxes(title_text="shift of the work, mm", rangemode="tozero", row=1, col=1)
+    chart.update_yaxes(title_text="step test / threshold", rangemode="tozero", row=2, col=1)
+    chart.update_layout(
+        template="plotly_white", height=560, showlegend=False, margin={"t": 20, "r": 20}
+    )
+    return chart
+
+
+def _axis(history: History) -> list[Any]:
+    times = [c.time_ns for c in history.checks[: len(history.findings)]]
+    if all(times) and len(set(times)) == len(times):
+        return [datetime.fromtimestamp(x / 1e9, UTC) for x in times]
+    return list(range(len(times)))

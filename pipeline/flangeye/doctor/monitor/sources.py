@@ -1,0 +1,90 @@
+"""Where a check's sightings come from: an archive of any kind, or the arm itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flangeye import types as t
+from flangeye.devices import MotionAllowed
+from flangeye.doctor.monitor.history import Check
+from flangeye.doctor.monitor.stored import StoredCalibration
+from flangeye.errors import StageError
+from flangeye.files.yaml_lines import parse_yaml
+from flangeye.log.read import read_run
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.runner import Runner
+
+
+def from_archive(path: Path, stored: StoredCalibration, registry: Registry) -> Check:
+    """Return what an archive shows of the flange: one check.
+
+    Args:
+        path: A later run's folder or ``run.mcap``, or recordings that a reader knows; those are
+            segmented and fitted as the calibration's own recipe did.
+        stored: The calibration.
+        registry: The plugins on offer.
+
+    Raises:
+        StageError: It cannot be read, or the flange is in none of its scans.
+    """
+    log = path / "run.mcap" if path.is_dir() else path
+    if log.suffix == ".mcap" and log.is_file():
+        return _checked(path, *_of_log(log))
+    if not path.exists():
+        raise StageError(f"{path}: does not exist")
+    recipe = parse_recipe(_from_archive(stored), stored.path.name, registry)
+    seen = Runner(recipe, registry, t.ArchivePath(path)).take(None)
+    return _checked(path, seen, path.stat().st_mtime_ns)
+
+
+def from_arm(stored: StoredCalibration, registry: Registry, scans: int, move: bool) -> Check:
+    """Take scans with the arm, as the calibration's own recipe drives it: one check.
+
+    Raises:
+        NothingMoved: ``move`` is false; the plan.
+        StageError: The recipe drives no arm, or the flange is in none of the scans.
+    """
+    first = str(_steps(stored)["steps"][0])
+    if "acquire.live" not in first:
+        raise StageError(
+            f"{stored.path}: was not calibrated live; take scans yourself and name them with "
+            "--archive"
+        )
+    recipe = parse_recipe(stored.recipe, stored.path.name, registry)
+    runner = Runner(recipe, registry, t.ArchivePath(), MotionAllowed(move))
+    return _checked(stored.path, runner.take(scans))
+
+
+def _of_log(path: Path) -> tuple[list[t.Observation], int]:
+    log = read_run(path)
+    times = [int(meta["time_ns"]) for meta in log.poses.values()]
+    return log.observations(), max(times, default=0) or path.stat().st_mtime_ns
+
+
+def _from_archive(stored: StoredCalibration) -> str:
+    """Return the calibration's recipe, made to read recordings."""
+    data = _steps(stored)
+    if "acquire.archive" not in data["steps"][0]:
+        data["steps"][0] = "acquire.archive"
+    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+
+
+def _steps(stored: StoredCalibration) -> dict[str, Any]:
+    if not stored.recipe:
+        raise StageError(
+            f"{stored.path}: holds no recipe, so nothing says how to take or read scans"
+        )
+    return dict(parse_yaml(stored.recipe, stored.path.name).data)
+
+
+def _checked(path: Path, seen: list[t.Observation], time_ns: int = 0) -> Check:
+    circles = [o for o in seen if isinstance(o.feature, t.CircleFeature)]
+    if not circles:
+        raise StageError(
+            f"{path}: the flange was found in none of its scans, so nothing is checked"
+        )
+    return Check(str(path), tuple(circles), time_ns)

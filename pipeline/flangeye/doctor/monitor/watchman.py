@@ -1,0 +1,65 @@
+"""Judge the newest check against the calibration and all checks before it."""
+
+from __future__ import annotations
+
+from flangeye.doctor.monitor.history import Finding, History
+from flangeye.doctor.monitor.stored import StoredCalibration
+from flangeye.handeye.drift import (
+    DriftTest,
+    Information,
+    Sightings,
+    Verdict,
+    blame,
+    information_of,
+    moved_since,
+    suspects,
+    verdict,
+)
+
+CODES = {"OK": 0, "DEGRADED": 1, "MOVED": 2}
+"""Exit codes, for a script that stops a cell."""
+
+
+def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Finding:
+    """Return what the history's last check says; what has moved stays moved.
+
+    Args:
+        stored: The calibration.
+        history: Every check, of which the last has no finding yet.
+        test: How the test is set.
+    """
+    sightings = stored.sightings(*history.sightings())
+    checks = information_of(sightings, test.daily)
+    earlier = history.findings[-1] if history.findings else None
+    prior, corners = stored.estimate.covariance, stored.corners
+    if earlier and earlier.state == "MOVED" and earlier.since is not None:
+        found = moved_since(checks, prior, corners, test, earlier.since, earlier.statistic)
+    else:
+        found = verdict(checks, prior, corners, test)
+    part, probability = _blamed(stored, checks, sightings, found, test)
+    return Finding(
+        len(checks.matrix) - 1, found.state, found.shift, tuple(found.motion.tolist()),
+        found.since, found.statistic, part, probability,
+    )  # fmt: skip
+
+
+def _blamed(
+    stored: StoredCalibration,
+    checks: Information,
+    sightings: Sightings,
+    found: Verdict,
+    test: DriftTest,
+) -> tuple[str, float]:
+    """Return the likeliest part and its probability, where something changed."""
+    if found.since is None:
+        return "", 0.0
+    n = len(checks.matrix)
+    before = Information.of_covariance(stored.estimate.covariance).plus(
+        checks.summed(max(found.since - test.reference, 0), found.since)
+    )
+    scanner = stored.estimate.transform.translation
+    parts = blame(before, sightings.of(found.since, n), stored.estimate.about, scanner, test.daily)
+    (suspect, probability), *_ = suspects(parts)
+    words = {"arm": ("arm", "joint")}.get(suspect, (suspect,))
+    likeliest = next(part for part in parts if part.startswith(words))
+    return likeliest, probability

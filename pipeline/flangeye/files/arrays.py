@@ -1,0 +1,124 @@
+"""Arrays of numbers in files, with the shape a layout says they have."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile, ZipInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import StageError
+from flangeye.files.clouds import array_of, holds_numbers, load_npy
+from flangeye.files.regular import open_regular, read_text
+from flangeye.types import Floats
+
+MAX_ARRAY = 1 << 28
+"""What an array of an .npz file may expand to [bytes]: two million poses."""
+
+
+def read_npy(path: Path, shape: tuple[int | None, ...]) -> Floats:
+    """Return the array of a .npy file.
+
+    Args:
+        path: The file.
+        shape: What it must have; None is any length.
+
+    Raises:
+        StageError: It is missing, damaged, or of another shape.
+    """
+    return _checked(path, load_npy(path), shape)
+
+
+def read_npz(path: Path, name: str, shape: tuple[int | None, ...]) -> Floats:
+    """Return the array ``name`` of an .npz file.
+
+    Raises:
+        StageError: It is missing, damaged, or of another shape.
+    """
+    arrays = _expanded(path, name)
+    if name not in arrays:
+        raise StageError(f"{path}: holds no array '{name}'")
+    return _checked(path, arrays[name], shape)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the numbers of an .npz file by name, or of a .npy file, whose name is empty.
+
+    What else an .npz file holds, a text beside its arrays, is left out.
+
+    Raises:
+        StageError: It is missing or damaged.
+    """
+    return {"": load_npy(path)} if path.suffix.lower() == ".npy" else _expanded(path)
+
+
+def _expanded(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
+    if not path.exists():
+        raise StageError(f"{path}: does not exist")
+    with open_regular(path) as file:
+        try:
+            with ZipFile(file) as archive:
+                named = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+                return {
+                    name: _member(path, archive, name, info)
+                    for name, info in named.items()
+                    if only == name or (only is None and _of_numbers(archive, info))
+                }
+        except StageError:
+            raise
+        except Exception as error:  # damaged bytes can break the decoders in any way
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise StageError(f"{path}: is not a NumPy .npz file: {reason}") from None
+
+
+def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:
+    if info.file_size > MAX_ARRAY:
+        return True  # to be refused by its size, nothing of it expanded
+    with archive.open(info) as content:
+        return holds_numbers(content)
+
+
+def _member(path: Path, archive: ZipFile, name: str, info: ZipInfo) -> NDArray[Any]:
+    """Return one array of the archive: its size is known before any of it is expanded."""
+    if info.file_size > MAX_ARRAY:
+        raise StageError(
+            f"{path}: '{name}' expands to {info.file_size} bytes; at most {MAX_ARRAY} are read"
+        )
+    with archive.open(info) as content:
+        return array_of(f"{path}: '{name}'", content.read())
+
+
+def read_table(path: Path, width: int, rows: slice = slice(None)) -> Floats:
+    """Return the rows of ``width`` numbers of a text file, as (n, width).
+
+    Raises:
+        StageError: It is missing, or a row holds something else.
+    """
+    lines = read_text(path).splitlines()
+    numbered = [(i, line.split()) for i, line in enumerate(lines, 1) if line.strip()][rows]
+    if not numbered:
+        raise StageError(f"{path}: holds no numbers")
+    return np.array([_numbers(f"{path}:{i}", words, width) for i, words in numbered])
+
+
+def _numbers(where: str, words: list[str], width: int) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise StageError(f"{where}: {error}") from None
+    if len(values) != width or not all(map(math.isfinite, values)):
+        raise StageError(f"{where}: has {len(values)} numbers, not {width} that are finite")
+    return values
+
+
+def _checked(path: Path, array: NDArray[Any], shape: tuple[int | None, ...]) -> Floats:
+    fits = len(array.shape) == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in "fiu":
+        wanted = ", ".join("n" if want is None else str(want) for want in shape)
+        raise StageError(f"{path}: has shape {array.shape}, expected ({wanted}) numbers")
+    return array.astype(np.float64)

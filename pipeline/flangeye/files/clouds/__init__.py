@@ -1,0 +1,108 @@
+"""Point cloud files: PCD, PLY, NumPy arrays and plain text, read strictly and without surprises.
+
+A file is refused, never repaired: its header is held against its size before anything is
+allocated, so a header that promises a billion points costs nothing. Points that are not finite
+are kept, as missing points, so that organised clouds keep their grid; a file of nothing but
+missing points is a valid file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from flangeye.files.clouds.header import refuse
+from flangeye.files.clouds.pcd import open_pcd
+from flangeye.files.clouds.plain import array_of, holds_numbers, load_npy, open_npy, open_text
+from flangeye.files.clouds.ply import open_ply
+from flangeye.files.clouds.table import PointTable
+from flangeye.types import CAMERA, PointCloud
+
+__all__ = [
+    "CLOUD_SUFFIXES",
+    "PER_METRE",
+    "LengthUnit",
+    "array_of",
+    "check_cloud_file",
+    "holds_numbers",
+    "load_npy",
+    "read_cloud",
+    "write_cloud",
+]
+
+LengthUnit = Literal["m", "mm", "in"]
+PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
+"""How many of a unit are in a metre."""
+
+_OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
+    ".csv": open_text,
+    ".npy": open_npy,
+    ".pcd": open_pcd,
+    ".ply": open_ply,
+    ".txt": open_text,
+    ".xyz": open_text,
+}
+CLOUD_SUFFIXES = tuple(_OPENERS)
+"""Endings of the files that can be read."""
+
+
+def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
+    """Read a point cloud.
+
+    Args:
+        path: A file with one of :data:`CLOUD_SUFFIXES`.
+        unit: Unit of the file's coordinates; files do not say.
+
+    Returns:
+        The points in ``camera`` [m], organised (H, W, 3) if the file is; a missing point is NaN.
+
+    Raises:
+        StageError: The file is missing, empty, truncated, or not a point cloud.
+    """
+    table = _open(path)
+    xyz = table.decode()
+    if unit != "m":
+        xyz /= np.float32(PER_METRE[unit])  # exact to the last bit, which times 0.001 is not
+    return PointCloud(CAMERA, xyz.reshape(*table.shape, 3))
+
+
+def check_cloud_file(path: Path) -> int:
+    """Return how many points a file holds, its header held against its size; decodes nothing.
+
+    Raises:
+        StageError: As :func:`read_cloud`; only damage inside the data is left to be found there.
+    """
+    return math.prod(_open(path).shape)
+
+
+def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
+    """Write a cloud as binary PCD, organised if it is; missing points stay missing.
+
+    Args:
+        path: File to write.
+        cloud: The points [m].
+        unit: Unit of the file's coordinates.
+    """
+    height, width = cloud.xyz.shape[:2] if cloud.organised else (1, len(cloud.xyz))
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+        f"TYPE F F F\nCOUNT 1 1 1\nWIDTH {width}\nHEIGHT {height}\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {width * height}\nDATA binary\n"
+    )
+    xyz = cloud.xyz * np.float32(PER_METRE[unit])
+    path.write_bytes(header.encode() + xyz.astype("<f4").tobytes())
+
+
+def _open(path: Path) -> PointTable:
+    opener = _OPENERS.get(path.suffix.lower())
+    if opener is None:
+        refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(_OPENERS)}")
+    table = opener(path)
+    if math.prod(table.shape) == 0:
+        refuse(path, "holds no points")
+    table.check()
+    return table

@@ -1,0 +1,80 @@
+"""What every format's header goes through: found, split into words, its counts believed or not."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NoReturn
+
+from flangeye.errors import StageError
+from flangeye.files.regular import open_regular
+
+HEADER_BYTES = 65536
+"""Headers seen in the wild have 200 to 1,000 bytes; nothing longer is read as a header."""
+MAX_DIGITS = 18
+"""Counts stay below 2^63."""
+
+
+def refuse(path: Path | str, what: str) -> NoReturn:
+    """Raise the StageError of a file: its path, and what is wrong with it."""
+    raise StageError(f"{path}: {what}")
+
+
+def read_head(path: Path) -> bytes:
+    """Return the file's first bytes, up to :data:`HEADER_BYTES`.
+
+    Raises:
+        StageError: There is no such file, or it is empty.
+    """
+    if not path.exists():
+        refuse(path, "does not exist")
+    if path.is_dir():
+        refuse(path, "is a folder, not a point cloud")
+    with open_regular(path) as file:
+        head = file.read(HEADER_BYTES)
+    if not head:
+        refuse(path, "is empty (0 bytes)")
+    return head
+
+
+def split_header(path: Path, last: bytes, sort: str) -> tuple[list[list[str]], int]:
+    """Return the words of each header line up to the one that begins with ``last``.
+
+    Returns:
+        The lines, and the byte at which the points begin.
+
+    Raises:
+        StageError: The file is missing or empty, or no line begins so: it is not of this sort.
+    """
+    lines: list[list[str]] = []
+    offset = 0
+    for line in io.BytesIO(read_head(path)):
+        offset += len(line)
+        lines.append(line.decode("latin-1").split())
+        if line.startswith(last):
+            return lines, offset
+    refuse(path, f"is not a {sort} file: its header has no {last.decode()} line")
+
+
+def axes_of(path: Path, names: Iterable[str]) -> tuple[int, int, int]:
+    """Return where x, y and z are among ``names``.
+
+    Raises:
+        StageError: One of them is missing.
+    """
+    known = [name.lower() for name in names]
+    if not {"x", "y", "z"} <= set(known):
+        refuse(path, f"has no x, y, z; its fields are: {', '.join(known) or 'none'}")
+    return known.index("x"), known.index("y"), known.index("z")
+
+
+def count_of(path: Path, what: str, text: str) -> int:
+    """Return a count a header states.
+
+    Raises:
+        StageError: It is not a whole number from 0 on, of a size a file can have.
+    """
+    if not (text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS):
+        refuse(path, f"its header says {what} '{text[:24]}', which is not a count")
+    return int(text)

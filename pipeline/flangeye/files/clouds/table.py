@@ -1,0 +1,198 @@
+"""Tables of points inside files: held against the file's size first, decoded afterwards."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.files.clouds.header import refuse
+from flangeye.files.clouds.lzf import MAX_EXPANSION, LzfError, decompress
+
+Shape = tuple[int, ...]
+Points = NDArray[np.float32]
+
+
+class PointTable(Protocol):
+    """Where a file keeps its points, as its header says."""
+
+    @property
+    def shape(self) -> Shape:
+        """(N,) or (H, W)."""
+
+    def check(self) -> None:
+        """Raise StageError if the file is too short for what its header promises."""
+
+    def decode(self) -> Points:
+        """Return (N, 3) float32, in the file's own unit; a missing point is NaN."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """One point a row, as text.
+
+    Attributes:
+        path: The file.
+        shape: (N,) or (H, W).
+        offset: Byte at which the rows begin.
+        width: Values in a row.
+        axes: Where x, y and z are in a row.
+        skipped: Rows before the points.
+        rows: Rows in all, points and others.
+        delimiter: What separates values, white space if None.
+    """
+
+    path: Path
+    shape: Shape
+    offset: int
+    width: int
+    axes: tuple[int, int, int]
+    skipped: int
+    rows: int
+    delimiter: str | None = None
+
+    def check(self) -> None:
+        """Count the rows, and the values of the last one."""
+        found, last = 0, b""
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            for line in file:
+                if not line.isspace():
+                    found, last = found + 1, line
+        if found < self.rows:
+            refuse(self.path, f"truncated: its header promises {self.rows} rows, it has {found}")
+        if found > self.rows:
+            refuse(self.path, f"its header promises {self.rows} rows, but it has {found}")
+        values = len(last.decode("latin-1").split(self.delimiter))
+        if self.rows == self.skipped + math.prod(self.shape) and values != self.width:
+            refuse(self.path, f"truncated: its last row has {values} of {self.width} values")
+
+    def decode(self) -> Points:
+        """Parse the rows; every row must be complete."""
+        n = math.prod(self.shape)
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            text = io.TextIOWrapper(file, encoding="latin-1")
+            rows = (row for row in text if not row.isspace())
+            values = self._parse(islice(rows, self.skipped, self.skipped + n))
+        if values.shape != (n, self.width):
+            refuse(self.path, f"its rows have {values.shape[1]} values, not {self.width}")
+        return np.ascontiguousarray(values[:, list(self.axes)])
+
+    def _parse(self, rows: Iterator[str]) -> Points:
+        try:
+            return np.loadtxt(rows, np.float32, comments=None, delimiter=self.delimiter, ndmin=2)
+        except ValueError as error:
+            refuse(self.path, f"is not a table of numbers: {str(error).partition(';')[0]}")
+
+
+@dataclass(frozen=True)
+class BinaryTable:
+    """One record a point.
+
+    Attributes:
+        path: The file.
+        shape: (N,) or (H, W).
+        offset: Byte at which the records begin.
+        record: Layout of a record, with fields ``x``, ``y``, ``z``.
+    """
+
+    path: Path
+    shape: Shape
+    offset: int
+    record: np.dtype[np.void]
+
+    def check(self) -> None:
+        """Compare bytes; more than the records need is padding, which writers leave."""
+        promised = math.prod(self.shape)
+        found = max(0, self.path.stat().st_size - self.offset)
+        if found < promised * self.record.itemsize:
+            refuse(
+                self.path,
+                f"truncated: its header promises {promised} points "
+                f"({promised * self.record.itemsize} bytes), "
+                f"it has {found // self.record.itemsize} ({found} bytes)",
+            )
+
+    def decode(self) -> Points:
+        """Read the records."""
+        n = math.prod(self.shape)
+        records = np.fromfile(self.path, self.record, count=n, offset=self.offset)
+        if len(records) != n:
+            refuse(self.path, f"changed while it was read: {len(records)} of {n} points are left")
+        return _stack(*(records[axis] for axis in "xyz"))
+
+
+@dataclass(frozen=True)
+class CompressedTable:
+    """Columns one after the other, LZF-compressed (PCL's ``binary_compressed``).
+
+    Attributes:
+        path: The file.
+        shape: (N,) or (H, W).
+        offset: Byte at which the two sizes and the stream begin.
+        record: Layout one point would have, with fields ``x``, ``y``, ``z``.
+    """
+
+    path: Path
+    shape: Shape
+    offset: int
+    record: np.dtype[np.void]
+
+    def check(self) -> None:
+        """Hold the two stated sizes against the header and the file."""
+        whole = math.prod(self.shape) * self.record.itemsize
+        found = self.path.stat().st_size - self.offset - 8
+        compressed, decompressed = self._sizes()
+        if decompressed != whole:
+            refuse(
+                self.path,
+                f"its header promises {math.prod(self.shape)} points ({whole} bytes), "
+                f"but its compressed data stands for {decompressed} bytes",
+            )
+        if compressed > found:
+            refuse(self.path, f"truncated: {compressed} compressed bytes promised, it has {found}")
+        if decompressed > MAX_EXPANSION * compressed:
+            refuse(self.path, f"{compressed} compressed bytes cannot stand for {decompressed}")
+
+    def decode(self) -> Points:
+        """Decompress as far as the last of x, y and z, and no further."""
+        n = math.prod(self.shape)
+        fields: Mapping[str, tuple[Any, ...]] = self.record.fields or {}
+        layout = {axis: (fields[axis][0].base, fields[axis][1]) for axis in "xyz"}
+        end = max(n * (offset + kind.itemsize) for kind, offset in layout.values())
+        columns = self._decompress(end)
+        return _stack(*(np.frombuffer(columns, kind, n, n * at) for kind, at in layout.values()))
+
+    def _sizes(self) -> tuple[int, int]:
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            raw = file.read(8)
+        if len(raw) < 8:
+            refuse(self.path, "truncated: its header is there, its points are not")
+        return int.from_bytes(raw[:4], "little"), int.from_bytes(raw[4:], "little")
+
+    def _decompress(self, wanted: int) -> bytearray:
+        compressed, _ = self._sizes()
+        with self.path.open("rb") as file:
+            file.seek(self.offset + 8)
+            data = file.read(compressed)
+        try:
+            return decompress(data, wanted)
+        except LzfError as error:
+            refuse(self.path, f"its compressed data is damaged: {error}")
+
+
+def _stack(x: NDArray[np.generic], y: NDArray[np.generic], z: NDArray[np.generic]) -> Points:
+    out = np.empty((len(x), 3), np.float32)
+    # A double beyond single precision becomes infinite, that is, a missing point.
+    with np.errstate(over="ignore", invalid="ignore"):
+        out[:, 0], out[:, 1], out[:, 2] = x, y, z
+    return out

@@ -1,0 +1,61 @@
+"""Decode images that others made: bounded, and refused in our words."""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_FILE = 1 << 28
+"""Largest image file [bytes]."""
+MAX_PIXELS = 1 << 26
+"""Largest image that is decoded; the largest scanner's has a tenth."""
+
+# OpenCV reads both once, when it is loaded; its own bound is eight times as large.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+# What is wrong is said once, by us.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+
+TOO_LARGE = f"is an image of more than {MAX_PIXELS} pixels"
+
+
+class ImageError(ValueError):
+    """The bytes are no image, damaged, or of a size that no camera has."""
+
+
+def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
+    """Return the pixels of an encoded image.
+
+    Args:
+        raw: A PNG, JPEG, BMP or TIFF file.
+        flags: OpenCV's, such as ``cv2.IMREAD_GRAYSCALE``.
+
+    Raises:
+        ImageError: Says what is wrong.
+    """
+    import cv2
+
+    if _stated_pixels(raw) > MAX_PIXELS:
+        raise ImageError(TOO_LARGE)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), flags) if raw else None
+    except cv2.error as error:
+        large = "MAX_IMAGE" in str(error)
+        raise ImageError(TOO_LARGE if large else "is a damaged image") from None
+    if pixels is None:
+        raise ImageError("is not an image, or is damaged")
+    return np.asarray(pixels)
+
+
+def _stated_pixels(raw: bytes) -> int:
+    """Return how many pixels a PNG's or BMP's header states; OpenCV fills them before it looks."""
+    if raw[:8] == b"\x89PNG\r\n\x1a\n" and len(raw) >= 24:
+        width, height = struct.unpack_from(">II", raw, 16)
+    elif raw[:2] == b"BM" and len(raw) >= 26:
+        width, height = map(abs, struct.unpack_from("<ii", raw, 18))
+    else:
+        return 0
+    return int(width * height)

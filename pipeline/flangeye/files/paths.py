@@ -1,0 +1,50 @@
+"""Parameters that name a file: beside the recipe, or one that comes with the project."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
+
+from flangeye.files.bundled import bundled
+
+
+def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
+    if not isinstance(value, (str, Path)):
+        raise ValueError("a path is text")
+    path = Path(value).expanduser()
+    return path if info.context is None else info.context.folder / path
+
+
+RecipePath = Annotated[
+    Path,
+    BeforeValidator(_beside_recipe),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
+"""A path in a parameter; a relative one starts at the recipe's folder."""
+
+
+def bundled_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
+    """Return the check of a parameter that names a file of ``data/FOLDER`` or one's own.
+
+    Args:
+        kind: What it is, for people: ``workpiece``.
+        folder: Where those that come with the project are: ``workpieces``.
+    """
+
+    def found(value: Any, info: ValidationInfo) -> Path:
+        if not isinstance(value, (str, Path)):
+            raise ValueError(f"a {kind} is a name or a path to a .yaml file")
+        if str(value).endswith((".yaml", ".yml")):
+            return _beside_recipe(value, info)
+        path = bundled("data") / folder / f"{value}.yaml"
+        if not path.is_file():
+            known = sorted(p.stem for p in path.parent.glob("*.yaml"))
+            near = difflib.get_close_matches(str(value), known, n=2) or known
+            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or a .yaml file")
+        return path
+
+    return found

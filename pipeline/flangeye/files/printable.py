@@ -1,0 +1,15 @@
+"""Text that others wrote, before it reaches a terminal."""
+
+from __future__ import annotations
+
+import re
+
+_CONTROLS = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""All but tab and line feed: escape sequences begin with them, and directions hide what is said."""
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters written out as escapes."""
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)

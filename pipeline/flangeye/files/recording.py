@@ -1,0 +1,214 @@
+"""What a ``reader`` part gives: recorded scans and robot poses, before any cloud is decoded.
+
+A reader is a part ``reader.<name>``, a function of a path (and its own parameters) that returns
+an :class:`Archive`. It reads the poses, finds the clouds, and raises :class:`NotThisLayout` when
+the path holds something else, so that ``reader.auto`` can ask one reader after the other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.files.clouds import LengthUnit
+from flangeye.types import FLANGE, Floats, Role
+
+MIN_CAPTURES = 3
+MIN_SPREAD = 1e-3
+"""Largest distance of a flange from their mean [m] below which the arm has not moved at all."""
+MAX_REACH = 20.0
+"""Distance from the base [m] that no arm has; metres read as millimetres lie far beyond."""
+SAME_POSE = 1e-6
+"""Poses whose entries [m, and of the rotation] differ by less are one pose given twice."""
+
+
+class Reader(Protocol):
+    """How a ``reader`` part is called."""
+
+    def __call__(self, path: Path) -> Archive:
+        """Return what the path holds; raise :class:`NotThisLayout` where it is something else."""
+        ...
+
+
+class NotThisLayout(StageError):
+    """The path holds nothing that this reader knows; says what it looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One pose of an archive, and what was recorded there.
+
+    Attributes:
+        id: Unique within the archive.
+        poses: (4, 4) each, by the frame it places (flange, flange2, …), translation in [m].
+        cloud: The scan's file; None when the archive has none for this pose.
+        centre_in_camera: (3,) ready-made circle centre [m], if the archive has one.
+        joints: (n,) joint angles [rad], if known.
+        role: ``verification`` keeps it from every solver.
+        time_ns: When it was taken, 0 if not known.
+        image: The camera's image; None when the archive has none for this pose.
+        camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
+        camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if it has them.
+    """
+
+    id: str
+    poses: Mapping[str, Floats]
+    cloud: Path | None = None
+    centre_in_camera: Floats | None = None
+    joints: Floats | None = None
+    role: Role = "calibration"
+    time_ns: int = 0
+    image: Path | None = None
+    camera_T_target: Floats | None = None
+    camera: tuple[Floats, Floats] | None = None
+
+    @property
+    def base_T_flange(self) -> Floats:
+        """(4, 4) pose of the (first) arm's flange [m]."""
+        return self.poses[FLANGE]
+
+
+@dataclass(frozen=True, eq=False)
+class Archive:
+    """What a reader found.
+
+    Attributes:
+        layout: How notes call the layout, for example ``ancorasir aubo``.
+        root: Folder that all files lie in.
+        recordings: One per pose, in the archive's order.
+        files: Files the poses and centres were read from.
+        cloud_unit: Unit of the clouds where the layout fixes it, else None.
+        notes: What the person should be told.
+    """
+
+    layout: str
+    root: Path
+    recordings: Sequence[Recording]
+    files: Sequence[Path]
+    cloud_unit: LengthUnit | None = None
+    notes: Sequence[str] = ()
+
+
+def check_ids(archive: Archive) -> None:
+    """Refuse an archive without poses, or with two of one name.
+
+    Raises:
+        StageError: Says which.
+    """
+    if not archive.recordings:
+        raise StageError(f"{archive.root}: holds no poses")
+    seen: set[str] = set()
+    for recording in archive.recordings:
+        if recording.id in seen:
+            raise StageError(f"{archive.root}: pose '{recording.id}' is given twice")
+        seen.add(recording.id)
+
+
+def check_poses(root: Path, recordings: Sequence[Recording], whole: bool = False) -> None:
+    """Refuse poses that cannot all be true, or that no calibration can be made from.
+
+    Args:
+        root: What messages begin with.
+        recordings: Those that are to be used, verification included.
+        whole: Whether the target's whole pose was seen: then turning alone is motion too.
+
+    Raises:
+        StageError: A pose out of any arm's reach, one given twice, fewer than three to calibrate
+            with, or all of those at one place.
+    """
+    for recording in recordings:
+        distance = float(np.linalg.norm(recording.base_T_flange[:3, 3]))
+        if distance > MAX_REACH:
+            raise StageError(
+                f"{root}: pose '{recording.id}' is {distance:.4g} m from the base, beyond any "
+                "arm; are the positions in millimetres?"
+            )
+    _check_distinct(root, recordings)
+    _check_motion(root, [r for r in recordings if r.role == "calibration"], whole)
+
+
+def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
+    poses = np.array([recording.base_T_flange for recording in recordings])
+    for i in range(len(poses)):
+        difference = np.abs(poses[i + 1 :] - poses[i]).max(axis=1)
+        same = np.all(difference < SAME_POSE, axis=1)
+        if same.any():
+            other = recordings[i + 1 + int(np.argmax(same))]
+            raise StageError(
+                f"{root}: poses '{recordings[i].id}' and '{other.id}' are the same; every capture "
+                "needs a pose of its own"
+            )
+
+
+def _check_motion(root: Path, recordings: Sequence[Recording], whole: bool) -> None:
+    if len(recordings) < MIN_CAPTURES:
+        raise StageError(
+            f"{root}: {len(recordings)} captures to calibrate with; at least {MIN_CAPTURES} are "
+            "needed, at different places"
+        )
+    places = np.array([recording.base_T_flange[:3, 3] for recording in recordings])
+    spread = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+    if spread < MIN_SPREAD and not whole:
+        raise StageError(
+            f"{root}: all {len(places)} poses have the flange within {spread * 1e3:.2g} mm of one "
+            "place; move it through the workspace"
+        )
+
+
+def digests_of(files: Iterable[Path]) -> dict[Path, str]:
+    """Return the SHA-256 of every file's content.
+
+    Raises:
+        StageError: A file cannot be read.
+    """
+    digests: dict[Path, str] = {}
+    for path in files:
+        try:
+            with path.open("rb") as file:
+                digests[path] = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise StageError(f"{path}: cannot be read: {error.strerror}") from None
+    return digests
+
+
+def fingerprint_of(root: Path, digests: dict[Path, str]) -> str:
+    """Return one hash of files: it changes with any content and any name, not with the root."""
+    lines = sorted(f"{_name_below(root, path)} {d}\n" for path, d in digests.items())
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _name_below(root: Path, path: Path) -> str:
+    """Return a name that is the same wherever the archive, or what was taken out of it, lies."""
+    return os.path.relpath(path, root) if path.is_relative_to(root) else path.name
+
+
+def check_distinct_clouds(recordings: Sequence[Recording], digests: dict[Path, str]) -> None:
+    """Refuse a scan that stands at two poses; a verification scan used for training above all.
+
+    Raises:
+        StageError: Names both files.
+    """
+    first: dict[str, Recording] = {}
+    for recording in sorted(recordings, key=lambda r: r.role != "verification"):
+        if recording.cloud is None:
+            continue
+        other = first.setdefault(digests[recording.cloud], recording)
+        if other is recording:
+            continue
+        if other.role != recording.role:
+            raise StageError(
+                f"{recording.cloud}: is the verification cloud {_name(other)} again; a cloud that "
+                "verifies must not be calibrated with"
+            )
+        raise StageError(f"{recording.cloud}: has the same content as {_name(other)}")
+
+
+def _name(recording: Recording) -> str:
+    return recording.cloud.name if recording.cloud else recording.id

@@ -1,0 +1,72 @@
+"""Read files that others have named: regular ones, of a size one expects, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from flangeye.errors import FlangeyeError, StageError
+
+MAX_TEXT = 64_000_000
+"""Longest table, list of poses or JSON file [bytes]: a million poses."""
+
+
+_FLAGS = os.O_RDONLY | sum(
+    getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")
+)
+"""Not every system has all of them."""
+
+
+def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
+    """Open a regular file, or a link to one, for reading; never waits, as a FIFO would make one.
+
+    Args:
+        path: The file.
+        error: What to raise.
+
+    Raises:
+        FlangeyeError: Of the given sort: it does not exist, cannot be read, or is a folder, a
+            device, a FIFO or a socket.
+    """
+    try:
+        number = os.open(path, _FLAGS)
+    except (OSError, ValueError) as failure:
+        raise error(f"{path}: cannot be read: {_reason(failure)}") from None
+    mode = os.fstat(number).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(number)
+        kind = "a folder" if stat.S_ISDIR(mode) else "a device, a FIFO or a socket"
+        raise error(f"{path}: is {kind}; a file is needed")
+    return os.fdopen(number, "rb")
+
+
+def read_regular(
+    path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = StageError
+) -> bytes:
+    """Return what a regular file holds; raises as :func:`open_regular`, and where it is longer
+    than ``limit`` [bytes].
+    """  # noqa: D205
+    with open_regular(path, error) as file:
+        try:
+            raw = file.read(limit + 1)
+        except OSError as failure:
+            raise error(f"{path}: cannot be read: {_reason(failure)}") from None
+    if len(raw) > limit:
+        raise error(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
+    return raw
+
+
+def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = StageError) -> str:
+    """Return a regular file's UTF-8 text, without a byte-order mark; raises as
+    :func:`read_regular`, and where it is no UTF-8.
+    """  # noqa: D205
+    try:
+        return read_regular(path, limit, error).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(f"{path}: is not UTF-8 text") from None
+
+
+def _reason(failure: Exception) -> str:
+    return getattr(failure, "strerror", None) or str(failure)

@@ -1,0 +1,57 @@
+"""Turn pydantic's complaints into ours: what is wrong, and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+EXPLAINED = "explained"
+"""Type of an error whose message went through :func:`sentence` already."""
+
+
+def sentence(details: Any, model: type[BaseModel], given: Any) -> str:
+    """Return one of pydantic's error details as a sentence about a field of ``model``.
+
+    Args:
+        details: An entry of ``ValidationError.errors()``.
+        model: The model that was validated.
+        given: What the person wrote at that place.
+    """
+    if details["type"] == EXPLAINED:
+        return str(details["msg"])
+    if details["type"] == "extra_forbidden":
+        return _unknown_key(str(details["loc"][-1]), _fields_at(model, details["loc"][:-1]))
+    if details["type"] == "missing":
+        return "is missing"
+    message = str(details["msg"]).removeprefix("Value error, ")
+    message = message.replace("Input should be", "must be")
+    if details["type"].startswith(("greater", "less")) and isinstance(given, str):
+        message += " in SI units"
+    if isinstance(given, (str, int, float)) and str(given) not in message:
+        message += f", not '{given}'"
+    return message[0].lower() + message[1:]
+
+
+def _unknown_key(key: str, fields: list[str]) -> str:
+    near = difflib.get_close_matches(key, fields, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    return f"unknown key '{key}'{hint} (allowed: {', '.join(fields) or 'none'})"
+
+
+def _fields_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
+    """Return the field names of the model nested at ``loc``, where that can be told."""
+    for key in loc:
+        if isinstance(key, int):  # one of several of the same model
+            continue
+        annotation = model.model_fields[key].annotation if key in model.model_fields else None
+        nested = [
+            a
+            for a in (annotation, *get_args(annotation))
+            if isinstance(a, type) and issubclass(a, BaseModel)
+        ]
+        if not nested:
+            return []
+        model = nested[0]
+    return list(model.model_fields)

@@ -1,0 +1,269 @@
+"""Errors of the arm itself: found when the poses show them, kept when they help on others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flangeye.handeye.candidates import Model, better, rms
+from flangeye.handeye.likelihood import Problem, Solution, weigh
+from flangeye.handeye.nuisance import Nuisance, nuisance_of
+from flangeye.maths.arm_correction import follow
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.smooth_field import effects, field_over
+from flangeye.maths.statistics import f_quantile
+from flangeye.types import ArmCorrection, Floats
+
+SIGNIFICANT = 0.9999
+OBSERVABLE = 0.5e-3
+"""An offset that would be known less well than this [m] is not estimated."""
+LARGEST_MODEL_ERROR = 5e-3
+"""Further from the controller's poses than this [m], the catalogue's arm is another one."""
+FEWEST_FOR_FIELD = 12
+"""Poses below which a field is not looked for: its folds would hold too few to compare."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovedFlange:
+    """The arm whose flange carries one end of the loop.
+
+    Attributes:
+        poses: (N, 4, 4) base_T_flange as reported.
+        joints: (N, n) as reported [rad], or None.
+        carries_camera: Whether it carries the camera, else the target.
+        kinematics: The arm's, where its model is known.
+        deviation: Standard deviation of a joint's zero [rad], by the robot's file.
+    """
+
+    poses: Floats
+    joints: Floats | None
+    carries_camera: bool
+    kinematics: Arm | None = None
+    deviation: float = 0.0
+
+    def nuisance(self, twists: Floats, deviation: float, sized: bool = False) -> Nuisance:
+        """Return numbers that move the flange by (N, 6, k) twists, in ``base`` at its origin."""
+        turned = np.swapaxes(self.poses[:, :3, :3], 1, 2)
+        moves = np.concatenate([turned @ twists[:, :3], turned @ twists[:, 3:]], axis=1)
+        still = np.zeros_like(moves)
+        pair = (moves, still) if self.carries_camera else (still, moves)
+        return nuisance_of(*pair, deviation, sized)
+
+    def branches(self, starts: int = 96) -> Iterator[Floats]:
+        """Give the (N, n) joint angles [rad], on each branch they may be on.
+
+        Args:
+            starts: Of the search for branches; few find one, many all.
+        """
+        arm = self.kinematics
+        if arm is None:
+            return
+        if self.joints is not None:
+            apart = np.linalg.norm((arm.flange(self.joints) - self.poses)[:, :3, 3], axis=1).max()
+            if apart < LARGEST_MODEL_ERROR:
+                yield self.joints
+            return
+        for first in arm.inverse(self.poses[0], starts):
+            with suppress(ValueError):  # this branch does not reach all poses
+                yield follow(arm, self.poses, first)
+
+    @cached_property
+    def _some_joints(self) -> Floats | None:
+        return next(self.branches(starts=12), None)
+
+    def zeros(self, deviation: float, sized: bool = False) -> Nuisance | None:
+        """Return what joint zeros do; None when the arm's model does not reach the poses.
+
+        The first joint's zero is right by definition: it fixes the base's x axis.
+        """
+        joints = self._some_joints
+        if joints is None or self.kinematics is None:
+            return None
+        return self.nuisance(self.kinematics.jacobian(joints)[:, :, 1:], deviation, sized)
+
+
+def with_field(model: Model, flange: MovedFlange) -> Model:
+    """Estimate a smooth error of the arm over the workspace, if that helps.
+
+    Its size is found with it. It is without a rigid part, so the camera's pose stays the best for
+    the arm as reported. Not beside joint offsets, which explain the same.
+    """
+    if model.corrects_joints or int(model.found.inliers.sum()) < FEWEST_FOR_FIELD:
+        return model
+    places = flange.poses[:, :3, 3]
+    field = field_over(places[model.found.inliers])
+    moves = effects(field, places)
+    twists = np.concatenate([np.zeros_like(moves), moves], axis=1)
+    candidate = _with(model, flange.nuisance(twists, 1.0, sized=True))
+    if candidate is None:
+        return model
+    k, found = len(field.weights), candidate.found
+    field = replace(
+        field,
+        weights=found.at.nuisance[-k:],
+        covariance=found.covariance[-k:, -k:],
+        size=found.noise.size,
+    )
+    size = rms(moves[found.inliers] @ field.weights) * 1e3
+    tool = np.zeros(3) if model.correction is None else found.at.nuisance[:3]
+    what = f"the arm is off by a smooth error over the workspace, {size:.3f} mm rms"
+    chosen = better(model, replace(candidate, correction=ArmCorrection(tool, field=field)), what)
+    return model if chosen.found is model.found else chosen
+
+
+def with_tool_offset(model: Model, flange: MovedFlange) -> Model:
+    """Estimate an offset of the seen circle in the flange frame, if the poses can show it.
+
+    It shows when the flange turns between poses; with constant orientation it moves all centres
+    alike, as the camera's position does. Joint zeros that are off bend the arm's space, and part
+    of that looks like an offset of a millimetre: it has to be larger than they explain.
+    """
+    moves = np.zeros((len(flange.poses), 6, 3))
+    moves[:, 3:] = np.eye(3)
+    offset = nuisance_of(np.zeros_like(moves), moves, np.inf)
+    for considered in (False, True):
+        zeros = flange.zeros(flange.deviation) if considered and flange.deviation else None
+        others = offset if zeros is None else zeros.and_also(offset)
+        covariance = _covariance_of_last(model, others, 3)
+        known = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        if known > OBSERVABLE:
+            return model.noted(_not_told_apart(known, flange.poses[:, :3, :3]))
+    candidate = _with(model, offset)
+    if candidate is None:
+        return model
+    values = candidate.found.at.nuisance[-3:]
+    if not _significant(values, covariance, candidate.found.freedom):
+        return model
+    listed = ", ".join(f"{value * 1e3:.3f}" for value in values)
+    what = f"the seen circle is ({listed}) mm from the origin of the flange frame, in it"
+    return better(model, replace(candidate, correction=ArmCorrection(values)), what)
+
+
+def with_joint_offsets(model: Model, flange: MovedFlange, prior: float) -> Model:
+    """Estimate offsets of the arm's joints together with the pose, if that helps.
+
+    Those of the first and of the last joint do not show: one turns the base with the camera, the
+    other the flange about its own axis. Where no joint angles are known, every branch of the
+    inverse kinematics is tried and the one that fits best is taken.
+
+    Args:
+        model: What was found without.
+        flange: The arm.
+        prior: Standard deviation of an offset expected beforehand [rad].
+    """
+    fitted = [_with_offsets(model, flange, joints, prior) for joints in flange.branches()]
+    candidates = [candidate for candidate in fitted if candidate is not None]
+    if not candidates:
+        return model.noted("joint offsets left out: the arm's model does not reach these poses")
+    kept = model.found.inliers
+    best = min(candidates, key=lambda candidate: rms(candidate.residuals()[kept]))
+    offsets = None if best.correction is None else best.correction.joint_offsets
+    listed = ", ".join(f"{offset * 1e3:.2f}" for offset in np.asarray(offsets))
+    what = f"the joints are off by ({listed}) mrad; the matrix holds for the arm so corrected"
+    return better(model, best, what)
+
+
+def unknown_zeros(model: Model, flange: MovedFlange) -> Floats | None:
+    """Return what unknown joint zeros add to the (18, 18) covariance of the transforms.
+
+    None when the arm's model does not reach the poses.
+
+    They move neighbouring poses alike, so that the answer follows them where independent noise
+    would average out; residuals do not show that. ("Consider" covariance, Schmidt 1966.)
+    """
+    zeros = flange.zeros(np.inf)
+    if zeros is None:
+        return None
+    k, bare = len(zeros), replace(model.problem, nuisance=_without_sized(model.problem.nuisance))
+    fit = _weighed(bare, model, zeros)
+    followed = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
+    moved = fit.basis[:18, :-k] @ followed
+    return np.asarray(flange.deviation**2 * moved @ moved.T)
+
+
+def _with(model: Model, nuisance: Nuisance) -> Model | None:
+    """Return the model with more nuisances, those sized begun at the size of the residuals."""
+    problem, found = model.problem, model.found
+    joined = problem.nuisance.and_also(nuisance) if len(problem.nuisance) else nuisance
+    size = max(rms(found.linear.residuals[found.inliers][:, 3:]), 1e-7)
+    noise = replace(found.noise, size=size) if nuisance.sized.any() else found.noise
+    started = replace(model.consensus, found=replace(found, noise=noise))
+    return replace(model, consensus=started).with_problem(replace(problem, nuisance=joined))
+
+
+def _with_offsets(model: Model, flange: MovedFlange, joints: Floats, prior: float) -> Model | None:
+    """Fit with offsets linearised about none, then about those found; None if it is refused."""
+    if flange.kinematics is None:
+        return None
+    k, offsets, fitted = flange.kinematics.n - 2, np.zeros(flange.kinematics.n), model
+    for _ in range(2):
+        candidate = _about(model, flange, joints, offsets, prior)
+        if candidate is None:
+            return None
+        fitted, values = candidate, candidate.found.at.nuisance
+        offsets = offsets + np.pad(values[-k:], 1)
+    tool = np.zeros(3) if model.correction is None else fitted.found.at.nuisance[-k - 3 : -k]
+    return replace(fitted, correction=ArmCorrection(tool, offsets, joints[0]))
+
+
+def _about(
+    model: Model, flange: MovedFlange, joints: Floats, offsets: Floats, prior: float
+) -> Model | None:
+    """Return the model with the arm moved by ``offsets``, and what remains of them as nuisances."""
+    arm, s = flange.kinematics, model.problem.measurements
+    if arm is None:
+        return None
+    move = np.linalg.inv(arm.flange(joints)) @ arm.flange(joints + offsets)
+    moved = replace(flange, poses=flange.poses @ move)
+    s = replace(s, a=s.a @ move) if flange.carries_camera else replace(s, b=s.b @ move)
+    remainder = moved.nuisance(arm.jacobian(joints + offsets)[:, :, 1:-1], prior)
+    remainder = replace(remainder, mean=-offsets[1:-1])
+    return _with(replace(model, consensus=replace(
+        model.consensus, problem=replace(model.problem, measurements=s))), remainder)  # fmt: skip
+
+
+def _without_sized(nuisance: Nuisance) -> Nuisance:
+    kept = ~nuisance.sized
+    return Nuisance(
+        nuisance.camera[:, :, kept],
+        nuisance.target[:, :, kept],
+        nuisance.prior[kept],
+        nuisance.mean[kept],
+        nuisance.sized[kept],
+    )
+
+
+def _weighed(problem: Problem, model: Model, further: Nuisance) -> Solution:
+    """Return what the agreeing measurements say of a model with further nuisances."""
+    joined = problem.nuisance.and_also(further) if len(problem.nuisance) else further
+    found = model.found
+    at = replace(found.at, nuisance=np.zeros(len(joined)))
+    return weigh(replace(problem, nuisance=joined), at, found.noise, found.inliers.astype(float))
+
+
+def _covariance_of_last(model: Model, nuisance: Nuisance, k: int) -> Floats:
+    """Return the (k, k) covariance that the last k of the nuisances would have."""
+    information = _weighed(model.problem, model, nuisance).information
+    rest, cross = information[:-k, :-k], information[:-k, -k:]
+    own = information[-k:, -k:] - cross.T @ np.linalg.solve(rest, cross)
+    values, vectors = np.linalg.eigh(own)
+    return np.asarray(vectors / np.maximum(values, 1e-12) @ vectors.T)
+
+
+def _significant(values: Floats, covariance: Floats, freedom: float) -> bool:
+    square = float(values @ np.linalg.solve(covariance, values)) / len(values)
+    return square > f_quantile(SIGNIFICANT, len(values), freedom)
+
+
+def _not_told_apart(known: float, turns: Floats) -> str:
+    cosines = (np.einsum("nij,mij->nm", turns, turns) - 1) / 2
+    turn = np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))
+    how = f"would be known to {known * 1e3:.1f} mm only" if known < 0.1 else "does not show"
+    return (
+        "a constant offset of the seen circle in the flange frame (tool frame, bias of the fit) "
+        f"{how}, for orientations differ by {turn:.1f} deg at most: it stays in the camera's place"
+    )

@@ -1,0 +1,305 @@
+"""The calibration of a cell: what its measurements agree on, with the arm's error in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flangeye.handeye.arm import (
+    MovedFlange,
+    unknown_zeros,
+    with_field,
+    with_joint_offsets,
+    with_tool_offset,
+)
+from flangeye.handeye.candidates import Model, understated
+from flangeye.handeye.consensus import find_consensus
+from flangeye.handeye.degeneracy import (
+    ObservabilityLimits,
+    require_enough,
+    require_turns,
+    unobservable,
+)
+from flangeye.handeye.estimates import (
+    columns_of,
+    estimate_at,
+    points_of_interest,
+    transforms_of,
+)
+from flangeye.handeye.flange_roll import roll_note
+from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.loop import ArmNoise, meaningless_turns
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.target_size import require_size
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import covariance_inflation
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.types import (
+    FLANGE,
+    CorrectedArm,
+    Floats,
+    HandEye,
+    Observation,
+    Pair,
+    ScatterNoise,
+    TransformEstimate,
+)
+
+TYPICAL_ARM = ArmNoise(np.radians(0.01), 0.05e-3)
+"""Noise of the poses of an arm of which nothing is known: what else is found is in its ratio."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a solver takes into account; see the parameters of ``solve.robust``.
+
+    Attributes:
+        normals: Whether circles' normals count.
+        normal_bias: Standard deviation of a tilt common to all normals [rad].
+        robot_noise: Of the poses the arm reports, where it is known.
+        pose_noise: Of the arm's position per axis, where it is known [m].
+        limits: What has to be known, and how well.
+        tool_offset: Whether an offset of the seen circle is looked for.
+        joint_offsets: Whether joint offsets are looked for.
+        joint_prior: Standard deviation of one [rad].
+        joint_zeros: Whether the covariance includes what zeros may be off by.
+        smooth_error: Whether a smooth error of the arm is looked for.
+        size_limit: Share by which a marker may be of another size.
+    """
+
+    normals: bool
+    normal_bias: float
+    robot_noise: ArmNoise | None
+    pose_noise: float | None
+    limits: ObservabilityLimits
+    tool_offset: bool
+    joint_offsets: bool
+    joint_prior: float
+    joint_zeros: bool
+    smooth_error: bool
+    size_limit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What was observed, and where.
+
+    Attributes:
+        observations: N of them.
+        configuration: Who carries what.
+        robot: The arm's model, where it is known.
+    """
+
+    observations: Sequence[Observation]
+    configuration: Configuration
+    robot: RobotModel | None
+
+    @cached_property
+    def arm(self) -> Arm | None:
+        """The arm's kinematics."""
+        return Arm(self.robot) if self.robot else None
+
+    @cached_property
+    def flange(self) -> MovedFlange | None:
+        """The arm whose flange carries camera or target; None where a link does, or nothing."""
+        carried = self.configuration.camera, self.configuration.target
+        if FLANGE not in carried:
+            return None
+        arm = self.arm
+        known = [o.joints for o in self.observations if o.joints is not None]
+        usable = arm is not None and all(len(q) == arm.n for q in known)
+        return MovedFlange(
+            np.array([o.base_T_flange.matrix for o in self.observations]),
+            np.array(known) if usable and len(known) == len(self.observations) else None,
+            self.configuration.camera == FLANGE,
+            arm,
+            self.robot.joint_accuracy if self.robot else 0.0,
+        )
+
+
+def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
+    """Return every unknown of a cell with its covariance, and what is wrong with the arm.
+
+    Raises:
+        StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose
+            is missing.
+        CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
+            (it says which motion is missing), or a marker has another size than its fit was told.
+    """
+    problem = _problem(cell, options)
+    require_enough(problem)
+    require_turns(problem)
+    model = Model(find_consensus(problem, options.limits.rotation))
+    weak = unobservable(model.problem, model.found, options.limits)
+    require_size(model.problem, model.found, options.size_limit)
+    reported, model = (
+        (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
+    )
+    camera, *others = _estimates(reported, cell, options, weak)
+    notes = (*_noise_notes(model, cell, weak), *_note_of_zeros(cell, options))
+    return HandEye(
+        camera,
+        _pairs(reported, model, cell),
+        method,
+        model.consensus.notes + notes + model.notes,
+        reported.correction,
+        tuple(others),
+        _corrected(model, cell, options, weak),
+        _scatter(model.found),
+    )
+
+
+def _problem(cell: Cell, options: Options) -> Problem:
+    s = measurements_of(cell.observations, cell.configuration, cell.arm, normals=options.normals)
+    loop, noise = loop_of(cell.configuration), options.robot_noise
+    typical = TYPICAL_ARM if loop.y or loop.z or s.are_poses else None
+    return Problem(
+        s, loop, noise or typical, options.normal_bias, stated=noise is not None,
+        pose_noise=None if options.pose_noise is None else options.pose_noise**2,
+    )  # fmt: skip
+
+
+def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]:
+    """Return the models of the arm as reported, and with what helps of the arm's error."""
+    flange = cell.flange
+    if flange is None or model.problem.stated:
+        return model, model
+    if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
+        considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
+        model = with_tool_offset(model, considered)
+    if options.joint_offsets and flange.kinematics is not None:
+        candidate = with_joint_offsets(model, flange, options.joint_prior)
+        if candidate.corrects_joints:
+            return model, candidate
+        model = candidate
+    if options.smooth_error:
+        model = with_field(model, flange)
+    return model, model
+
+
+def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> CorrectedArm | None:
+    """Return the answer for the arm with its joint offsets corrected, if they were found."""
+    if model.correction is None or not model.corrects_joints:
+        return None
+    ignoring = replace(options, joint_zeros=False)
+    camera, *others = _estimates(model, cell, ignoring, weak)
+    return CorrectedArm(camera, model.correction, tuple(others))
+
+
+def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list[TransformEstimate]:
+    """Return the transforms with their covariances."""
+    found, configuration = model.found, cell.configuration
+    at, alone = found.at, not (model.problem.loop.y or model.problem.loop.z)
+    transforms = transforms_of(configuration, at.x, at.y, at.z)
+    points = points_of_interest(configuration, transforms, _agreeing(model, cell), cell.arm)
+    wider = covariance_inflation(found.freedom, 6 if alone else found.parameters)
+    covariance = found.covariance[:18, :18] * wider
+    if _considers_zeros(cell, options):
+        added = unknown_zeros(model, cell.flange) if cell.flange else None
+        covariance = covariance if added is None else covariance + added
+    turns = meaningless_turns(model.problem.measurements, model.problem.loop, at)
+    arbitrary = np.hstack([weak[:18], turns[:18]])
+    columns = {name: columns_of(name, configuration) for name in transforms}
+    return [
+        estimate_at(
+            transform,
+            covariance[columns[name], columns[name]],
+            points[name],
+            arbitrary[columns[name]],
+        )
+        for name, transform in transforms.items()
+    ]
+
+
+def _considers_zeros(cell: Cell, options: Options) -> bool:
+    known = cell.flange is not None and cell.flange.kinematics is not None
+    return known and options.joint_zeros and cell.configuration.is_default
+
+
+def _note_of_zeros(cell: Cell, options: Options) -> tuple[str, ...]:
+    """Say whether the covariance includes unknown joint zeros."""
+    flange = cell.flange
+    if flange is None or not _considers_zeros(cell, options):
+        return ()
+    each = f"unknown joint zeros ({flange.deviation * 1e3:g} mrad each)"
+    if flange.zeros(flange.deviation) is None:
+        return (f"{each} not considered: the arm's model misses these poses",)
+    return (
+        f"{each} are in the covariance: they move all poses alike, which held-out errors do not "
+        "show",
+    )
+
+
+def _scatter(found: Solution) -> ScatterNoise:
+    """Return what differs from pose to pose, at the place where the target is seen."""
+    of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2)[:, 3:].mean() * found.noise.arms
+    arm = float(of_arms + found.noise.pose)
+    unknown = covariance_inflation(found.freedom, 3) if np.isfinite(found.freedom) else 1.0
+    return ScatterNoise(arm, found.noise.centre_scale, unknown * understated(found))
+
+
+def _agreeing(model: Model, cell: Cell) -> list[Observation]:
+    return [o for o, kept in zip(cell.observations, model.found.inliers, strict=True) if kept]
+
+
+def _without(model: Model, weak: Floats) -> Model:
+    """Return the fit moved to where the camera has no part along unobservable moves."""
+    found, along = model.found, weak[3:6]
+    steps = np.linalg.lstsq(along.T @ along, -along.T @ found.at.x[:3, 3], rcond=None)[0]
+    # What is left of the basis is what the poses tell: the covariance is of that.
+    kept = found.basis - weak @ (weak.T @ found.basis)
+    u, sizes, _ = np.linalg.svd(kept, full_matrices=False)
+    basis = u[:, sizes > 1e-6]
+    change = np.linalg.pinv(found.basis) @ basis
+    information = change.T @ found.information @ change
+    moved = replace(found, at=found.at.moved(weak @ steps), basis=basis, information=information)
+    return replace(model, consensus=replace(model.consensus, found=moved))
+
+
+def _pairs(reported: Model, model: Model, cell: Cell) -> tuple[Pair, ...]:
+    """Return every observation with its residual for the arm as reported, in ``base``.
+
+    What is set aside, and why, the whole model says.
+    """
+    found, residuals, left = model.found, reported.residuals(as_reported=True), model.residuals()
+    turns = np.degrees(np.linalg.norm(found.linear.residuals[:, :3], axis=1))
+    pairs = []
+    for i, (o, used) in enumerate(zip(cell.observations, found.inliers, strict=True)):
+        turn = f" and {turns[i]:.1f} deg" if model.problem.measurements.freedoms[i] == 6 else ""
+        far = f"{np.linalg.norm(left[i]) * 1e3:.1f} mm{turn}"
+        reason = None if used else f"residual {far}, {np.sqrt(found.squares[i]):.0f} sigma"
+        pairs.append(Pair(o, residuals[i], bool(used), reason))
+    return tuple(pairs)
+
+
+def _noise_notes(model: Model, cell: Cell, weak: Floats) -> tuple[str, ...]:
+    notes, found = [], model.found
+    if not model.problem.stated:
+        notes += _beyond(found, model.problem)
+    if cell.configuration.is_default and not model.problem.measurements.are_poses:
+        notes.append(
+            roll_note(_agreeing(model, cell), found.at.x[:3, :3], found.covariance[:3, :3])
+        )
+    if weak.shape[1]:
+        notes.append(
+            f"not observable from these poses, and set to zero: {weak.shape[1]} translation"
+            f"{'s' if weak.shape[1] > 1 else ''} along which the arm's axes do not tilt"
+        )
+    return tuple(notes)
+
+
+def _beyond(found: Solution, problem: Problem) -> list[str]:
+    """Say what noise there is beyond the features' own."""
+    of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
+    shift = np.sqrt(of_arms[3:].mean() + found.noise.pose) * 1e3
+    turn = np.degrees(np.sqrt(of_arms[:3].mean() + found.noise.tilt))
+    if problem.measurements.are_poses or problem.arms is not None:
+        return [f"noise beyond the features' own: {shift:.3f} mm and {turn:.3f} deg per axis"]
+    notes = [f"noise beyond the centres' own: {shift:.3f} mm per axis"]
+    if problem.measurements.has_normal.any():
+        notes.append(f"noise beyond the normals' own: {turn:.3f} deg per axis")
+    return notes

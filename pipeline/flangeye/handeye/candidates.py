@@ -1,0 +1,132 @@
+"""Models of the same measurements, compared on poses held out; ties go to the simpler."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import CalibrationRefused
+from flangeye.handeye.consensus import Consensus, again
+from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.loop import COLUMNS
+from flangeye.types import ArmCorrection, Floats
+
+FOLDS, LARGEST_FOLD = 5, 20
+"""More folds where there are many poses, so that the cost stays linear in them."""
+HELPFUL = 0.9
+"""An error of the arm is kept when it brings the held-out error to this share or less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What the measurements agree on, and what was found wrong with the arm.
+
+    Attributes:
+        consensus: The measurements and the fit.
+        correction: The arm's error, if any helped.
+        notes: For the person.
+    """
+
+    consensus: Consensus
+    correction: ArmCorrection | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def problem(self) -> Problem:
+        """What was given."""
+        return self.consensus.problem
+
+    @property
+    def found(self) -> Solution:
+        """The fit."""
+        return self.consensus.found
+
+    @property
+    def corrects_joints(self) -> bool:
+        """Whether joint offsets are corrected."""
+        return self.correction is not None and self.correction.joint_offsets is not None
+
+    def noted(self, note: str) -> Model:
+        """Return the model with one more note."""
+        return replace(self, notes=(*self.notes, note))
+
+    def residuals(self, as_reported: bool = False) -> Floats:
+        """Return the (N, 3) mapped centres minus where they are expected, in ``base`` [m].
+
+        Args:
+            as_reported: By the arm as its controller reports it, without a smooth error.
+        """
+        found, sized = self.found, self.problem.nuisance.sized
+        left = found.linear.residuals[:, 3:]
+        if as_reported and sized.any():
+            moves = found.linear.jacobian[:, 3:, COLUMNS:][:, :, sized]
+            left = left + moves @ found.at.nuisance[sized]
+        turns = self.problem.measurements.a[:, :3, :3] @ found.at.x[:3, :3]
+        return np.asarray((turns @ left[..., None])[..., 0])
+
+    def with_problem(self, problem: Problem) -> Model | None:
+        """Return the model of another problem; None when no answer of it can be trusted."""
+        try:
+            return replace(self, consensus=again(self.consensus, problem))
+        except (CalibrationRefused, np.linalg.LinAlgError):
+            return None
+
+
+def better(model: Model, candidate: Model, what: str) -> Model:
+    """Return the candidate if it helps on poses held out, else the model; either says so."""
+    kept = model.found.inliers | candidate.found.inliers
+    before, after = (rms(held_out(m.found)[0][kept]) for m in (model, candidate))
+    compared = f"held-out error {after * 1e3:.3f} mm with it, {before * 1e3:.3f} mm without"
+    if not after <= HELPFUL * before:
+        return model.noted(f"left out, for it does not help: {what} ({compared})")
+    return candidate.noted(f"{what} ({compared})")
+
+
+def held_out(found: Solution) -> tuple[Floats, Floats]:
+    """Return (N, 3) errors of the centres, each of a fit to the other folds, in ``camera`` [m].
+
+    With them their (N, 3, 3) covariances, as such a fit states them; zero for those that took no
+    part. In closed form, the fit being as good as linear and its noise known.
+    """
+    errors, covariances = found.linear.residuals.copy(), np.zeros((len(found.squares), 3, 3))
+    kept = np.flatnonzero(found.inliers)
+    folds = max(FOLDS, len(kept) // LARGEST_FOLD)
+    order = np.random.default_rng(0).permutation(kept)
+    for fold in range(min(folds, len(kept))):
+        part = np.sort(order[fold::folds])
+        error, covariance = _without(found, part)
+        errors[part], n = error, len(part)
+        covariances[part] = covariance.reshape(n, 6, n, 6)[np.arange(n), 3:, np.arange(n), 3:]
+    return errors[:, 3:], covariances
+
+
+def _without(found: Solution, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return (n, 6) errors of a part by a fit to the rest, and their (6 n, 6 n) covariance."""
+    size = 6 * len(part)
+    jacobian = found.linear.jacobian[part].reshape(size, -1)
+    weighted = (found.weights[part] @ found.linear.jacobian[part]).reshape(size, -1)
+    noise = np.linalg.pinv(found.weights[part], rcond=1e-12, hermitian=True)
+    own = np.zeros((len(part), 6, len(part), 6))
+    own[np.arange(len(part)), :, np.arange(len(part))] = noise
+    right = np.column_stack([found.linear.residuals[part].ravel(), own.reshape(size, size)])
+    share = np.eye(size) - jacobian @ found.covariance @ weighted.T
+    left = np.asarray(np.linalg.lstsq(share, right, rcond=1e-9)[0], dtype=np.float64)
+    return left[:, 0].reshape(-1, 6), left[:, 1:]
+
+
+def understated(found: Solution) -> float:
+    """Return by what factor stated covariances fall short of errors on poses held out, at least 1.
+
+    Sizes of noise and of smooth errors are themselves estimated: that shows here alone.
+    """
+    errors, covariances = held_out(found)
+    kept = found.inliers
+    solved = np.linalg.solve(covariances[kept], errors[kept][..., None])[..., 0]
+    return max(1.0, float((errors[kept] * solved).sum(axis=1).mean()) / 3)
+
+
+def rms(errors: Floats) -> float:
+    """Return the root mean square length of (N, 3) errors."""
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))

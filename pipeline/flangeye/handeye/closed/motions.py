@@ -1,0 +1,77 @@
+"""What poses give to closed forms: the motions between them, AX = XB.
+
+One arm, whoever carries camera and target: with ``G = carrier_T_target_carrier`` of the
+controllers, turned round, and ``M = camera_T_target`` measured, ``G X M`` is the same at every
+pose (it is the target's place Z). Two poses i, j therefore give ``A X = X B`` with
+``A = inv(G_j) G_i`` and ``B = M_j inv(M_i)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import CalibrationRefused
+from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_log
+from flangeye.types import Floats
+
+LARGEST_TURN = np.radians(170.0)
+"""The axis of a rotation by half a turn may point either way: such pairs of poses are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """K pairs of poses, as motions of the carrier and of the camera.
+
+    Attributes:
+        a: (K, 4, 4) of the carrier.
+        b: (K, 4, 4) of the camera.
+        alpha: (K, 3) rotation vectors of the first [rad].
+        beta: (K, 3) rotation vectors of the second [rad].
+    """
+
+    a: Floats
+    b: Floats
+    alpha: Floats
+    beta: Floats
+
+
+def motions_of(carried: Floats, seen: Floats) -> Motions:
+    """Return the motions between all pairs of N poses that turn by clearly less than half a turn.
+
+    Args:
+        carried: (N, 4, 4) target_carrier_T_camera_carrier.
+        seen: (N, 4, 4) camera_T_target.
+
+    Raises:
+        CalibrationRefused: There is no such pair.
+    """
+    i, j = np.triu_indices(len(carried), k=1)
+    a = invert(carried[j]) @ carried[i]
+    b = seen[j] @ invert(seen[i])
+    alpha, beta = rotation_log(a[:, :3, :3]), rotation_log(b[:, :3, :3])
+    turns = np.maximum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1))
+    kept = turns < LARGEST_TURN
+    if not kept.any():
+        raise CalibrationRefused(
+            f"all {len(a)} motions between poses turn by {np.degrees(turns.min()):.0f} deg or "
+            "more: the axis of half a turn may point either way; add poses in between"
+        )
+    return Motions(a[kept], b[kept], alpha[kept], beta[kept])
+
+
+def translation_of(rotation: Floats, motions: Motions) -> Floats:
+    """Return the translation (3,) of X [m] that fits its rotation (3, 3) best.
+
+    ``(R_A - 1) t_X = R_X t_B - t_A``, by least squares over all motions.
+    """
+    left = motions.a[:, :3, :3] - np.eye(3)
+    right = motions.b[:, :3, 3] @ rotation.T - motions.a[:, :3, 3]
+    return np.asarray(np.linalg.lstsq(left.reshape(-1, 3), right.ravel(), rcond=None)[0])
+
+
+def place_of(carried: Floats, x: Floats, seen: Floats) -> Floats:
+    """Return the (4, 4) place Z of the target: the mean of ``G X M`` over the poses."""
+    each = carried @ x @ seen
+    return rigid(nearest_rotation(each[:, :3, :3].mean(axis=0)), each[:, :3, 3].mean(axis=0))

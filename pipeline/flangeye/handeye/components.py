@@ -1,0 +1,138 @@
+"""How much noise residuals show beyond the features' own, and whose: variance components, arrays.
+
+After Helmert: each component is such that the weighted squares it explains are as many as there are
+numbers, less those that the fit took up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.types import Floats
+
+FINEST = 1e-7
+"""Added to every standard deviation [m, rad]: exact inputs keep finite weights."""
+
+
+LARGEST = 1e8
+"""Factor on a noise beyond which nothing is looked for."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise beside the covariances of the features.
+
+    Attributes:
+        pose: Variance of each coordinate of the arm's position [m^2].
+        tilt: Variance of each component of the arm's axis [rad^2].
+        centre_scale: Factor on the centres' covariances, at most 1.
+        normal_scale: Factor on the normals' covariances, at most 1.
+        arms: Factor on the covariances that are taken for the arms' poses.
+        size: Standard deviation of the nuisances whose size is estimated.
+    """
+
+    pose: float
+    tilt: float
+    centre_scale: float = 1.0
+    normal_scale: float = 1.0
+    arms: float = 1.0
+    size: float = 1.0
+
+    def is_close(self, other: Noise) -> bool:
+        """Whether nothing differs by more than a thousandth."""
+        pairs = zip(self._variances(), other._variances(), strict=True)
+        return all(abs(a - b) <= 1e-3 * max(a, b) + 1e-12 for a, b in pairs)
+
+    def _variances(self) -> tuple[float, ...]:
+        scales = self.centre_scale, self.normal_scale, self.arms, self.size**2
+        return (self.pose + FINEST**2, self.tilt + FINEST**2, *scales)
+
+
+def noise_of(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -> Noise:
+    """Return the noise that residuals show.
+
+    What translations show beyond their own noise is the arms', which turn what is far from them
+    the more, as long as the rotations do not speak against it; the rest is added evenly.
+
+    Args:
+        turned: Of N rotations.
+        shifted: Of N translations.
+        own: (N, 6, 6) covariances of the features, order (rotation, translation).
+        arms: (N, 6, 6) those of typical arms' poses; zero where nothing is known of them.
+    """
+    share = _share_of_arms(turned, shifted, own, arms)
+    own = own + share * arms
+    tilt, normal_scale = turned.extra(own[:, :3, :3])
+    pose, centre_scale = shifted.extra(own[:, 3:, 3:])
+    return Noise(pose, tilt, centre_scale, normal_scale, share)
+
+
+def _share_of_arms(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -> float:
+    """Return the factor on the arms' covariances with which the translations are explained.
+
+    At most that with which rotations would be explained too well to be chance, at 5 %.
+    """
+    if not arms.any():
+        return 1.0
+    share = shifted.factor(own[:, 3:, 3:], arms[:, 3:, 3:], shifted.freedom)
+    if np.isinf(turned.freedom):
+        return share
+    least = chi2_quantile(0.05, max(round(turned.freedom), 1))
+    return min(share, turned.factor(own[:, :3, :3], arms[:, :3, :3], least))
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Errors of one kind, to find their noise from.
+
+    Attributes:
+        errors: (N, 3).
+        projectors: (N, 3, 3) onto what was measured.
+        freedom: How many numbers they are, less what the fit took up; infinite where none.
+    """
+
+    errors: Floats
+    projectors: Floats
+    freedom: float
+
+    def factor(self, own: Floats, further: Floats, wanted: float) -> float:
+        """Return how often covariances have to be added to own ones for a sum of squares."""
+        squares, shares = self._along(own, further)
+        if np.isinf(wanted) or squares.sum() <= wanted:
+            return 0.0
+        low, high = 0.0, 1.0
+        while (squares / (1 + high * shares)).sum() > wanted and high < LARGEST:
+            low, high = high, 4 * high
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            more = (squares / (1 + middle * shares)).sum() > wanted
+            low, high = (middle, high) if more else (low, middle)
+        return high
+
+    def extra(self, own: Floats) -> tuple[float, float]:
+        """Return the variance to add, and the scale of the covariances, at most one."""
+        if np.isinf(self.freedom):
+            return 0.0, 1.0
+        freedom, unit = max(self.freedom, 1.0), max(float((self.errors**2).mean()), FINEST**2)
+        explained = float(self._along(own, unit * np.eye(3))[0].sum())
+        if explained <= freedom:
+            return 0.0, max(explained / freedom, 1e-6)
+        return unit * self.factor(own, unit * np.eye(3), freedom), 1.0
+
+    def _along(self, own: Floats, further: Floats) -> tuple[Floats, Floats]:
+        """Return squared errors (3 N,) in units of their noise, and what is to be added there.
+
+        Along the axes in which both covariances are diagonal.
+        """
+        p, eye = self.projectors, np.eye(3)
+        root = np.linalg.cholesky(p @ (own + FINEST**2 * eye) @ p + (eye - p))
+        whitened = np.linalg.solve(
+            root, np.concatenate([self.errors[..., None], p @ further @ p], 2)
+        )
+        added = np.linalg.solve(root, np.swapaxes(whitened[..., 1:], 1, 2))
+        shares, axes = np.linalg.eigh(0.5 * (added + np.swapaxes(added, 1, 2)))
+        errors = np.einsum("nij,ni->nj", axes, whitened[..., 0])
+        return (errors**2).ravel(), np.maximum(shares, 0.0).ravel()

@@ -1,0 +1,394 @@
+r"""Whether a calibration still holds: a sequential likelihood-ratio test. Arrays only.
+
+A camera that was at :math:`T` and is now at :math:`\exp(\xi) T` leaves, at a target that the arm
+carries to :math:`b` and the camera sees at :math:`c`, the residual
+:math:`r = T c - b = -J \xi + \varepsilon`. Each *check* is one to a few such sightings, reduced to
+an information matrix :math:`H` and a vector :math:`g = -\sum J^\top W r`. What the cell does with
+the hours of the day is one more unknown of each check, with a known variance, and marginalised.
+
+**Steps.** The last :math:`w` checks are held against those before, which start from the
+calibration and its covariance. With :math:`\hat\xi` and :math:`C` from before,
+:math:`s = \sum g - \sum H \hat\xi` has covariance :math:`\sum H + \sum H C \sum H` while nothing
+moved, and :math:`s^\top \mathrm{cov}^{+} s` is the generalised likelihood ratio of a step
+(Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold is the quantile of an F
+distribution, for the scatter is learned from the checks before, at the false-alarm rate divided by
+the number of windows: by Bonferroni's inequality no more false alarms come a check.
+
+**Slow drift.** The mean of the last checks is held against the calibration with the first checks;
+what counts is how far it surely moves a point of the work.
+
+**Which part.** A camera, an arm's zeros and a tool explain residuals by different patterns. The
+marginal likelihoods of the three are compared, each with a Gaussian prior of its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import adjoint_shift, hat
+from flangeye.maths.statistics import chi2_quantile, f_quantile
+from flangeye.types import Floats
+
+NO_NORMAL = 1.0
+"""Variance [rad^2] of a tilt that was not measured: it tells nothing."""
+SURE = 1.64
+"""Standard deviations: a drift counts when it is larger than its limit with 95 %."""
+LEVER = 0.5
+"""What moves the work by a length turns it by the length over this [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N sightings of the target, against the stored calibration.
+
+    Attributes:
+        residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
+        effects: (N, 5, 6) their derivative by a motion of the camera about ``about``.
+        covariances: (N, 5, 5) with nothing moved, the scan's and the arm's.
+        flanges: (N, 3, 3) base_R_flange.
+        joints: (N, 5, n) their derivative by the arm's joints; None where those are not known.
+        check: (N,) which check each belongs to, from 0, in order.
+    """
+
+    residuals: Floats
+    effects: Floats
+    covariances: Floats
+    flanges: Floats
+    joints: Floats | None
+    check: NDArray[np.intp]
+
+    def of(self, first: int, last: int) -> Sightings:
+        """Return those of the checks from ``first`` up to, not with, ``last``."""
+        kept = (self.check >= first) & (self.check < last)
+        joints = None if self.joints is None else self.joints[kept]
+        return Sightings(
+            self.residuals[kept], self.effects[kept], self.covariances[kept], self.flanges[kept],
+            joints, self.check[kept],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DriftTest:
+    """How the test is set.
+
+    Attributes:
+        false_alarms: Probability of a false alarm at one check.
+        daily: Standard deviation of what the cell does within days, at the work [m].
+        seasonal: Standard deviation of what it does within a year [m].
+        window: Largest number of checks in which a step is looked for.
+        reference: How many checks before them it is held against.
+        settled: Checks of which a mean is taken for slow drift.
+        limit: Slow drift of the work that counts as moved [m]; half of it, as degraded.
+    """
+
+    false_alarms: float = 2e-4
+    daily: float = 0.03e-3
+    seasonal: float = 0.1e-3
+    window: int = 4
+    reference: int = 30
+    settled: int = 9
+    limit: float = 0.4e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What the last check says.
+
+    Attributes:
+        state: OK, DEGRADED or MOVED.
+        motion: (6,) of the camera since, about ``about`` (rotation [rad], translation [m]).
+        covariance: (6, 6) of it.
+        shift: How far the motion moves the point of the work it moves most [m].
+        since: Index of the first check after the change; None while there is none.
+        statistic: The test's, over its threshold: above one something moved.
+    """
+
+    state: str
+    motion: Floats
+    covariance: Floats
+    shift: float
+    since: int | None
+    statistic: float
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What checks tell of the camera's motion, in information form.
+
+    Attributes:
+        matrix: (..., 6, 6).
+        vector: (..., 6).
+    """
+
+    matrix: Floats
+    vector: Floats
+
+    @classmethod
+    def of_covariance(cls, covariance: Floats) -> Information:
+        """Return what a motion of zero, known with a (6, 6) covariance, tells."""
+        return cls(np.asarray(np.linalg.inv(covariance)), np.zeros(6))
+
+    def summed(self, first: int, last: int) -> Information:
+        """Return what the checks from ``first`` up to ``last`` tell together."""
+        return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
+
+    def plus(self, other: Information) -> Information:
+        """Return both together."""
+        return Information(self.matrix + other.matrix, self.vector + other.vector)
+
+    @property
+    def covariance(self) -> Floats:
+        """(6, 6)."""
+        return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
+
+    @property
+    def mean(self) -> Floats:
+        """(6,) the motion."""
+        return np.asarray(self.covariance @ self.vector)
+
+
+def allowance(deviation: float) -> Floats:
+    """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m] an axis."""
+    return np.diag([(deviation / LEVER) ** 2] * 3 + [deviation**2] * 3)
+
+
+def information_of(sightings: Sightings, daily: float) -> Information:
+    """Return what each check tells, its share of the day's motion marginalised."""
+    weights = np.linalg.inv(sightings.covariances)
+    weighted = sightings.effects.transpose(0, 2, 1) @ weights
+    matrices, vectors = weighted @ sightings.effects, -(weighted @ sightings.residuals[..., None])
+    count = int(sightings.check.max()) + 1 if len(sightings.check) else 0
+    matrix, vector = np.zeros((count, 6, 6)), np.zeros((count, 6, 1))
+    np.add.at(matrix, sightings.check, matrices)
+    np.add.at(vector, sightings.check, vectors)
+    taken = matrix @ np.linalg.inv(matrix + np.linalg.inv(allowance(daily)))
+    return Information(matrix - taken @ matrix, (vector - taken @ vector)[..., 0])
+
+
+def verdict(checks: Information, prior: Floats, corners: Floats, test: DriftTest) -> Verdict:
+    """Judge the last of the checks; every change found is its first.
+
+    Args:
+        checks: Of n checks in order.
+        prior: (6, 6) covariance of the calibration about ``about``.
+        corners: (8, 3) of the work, from ``about`` [m].
+        test: How it is set.
+    """
+    n = len(checks.matrix)
+    start = Information.of_covariance(prior + allowance(test.seasonal))
+    found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
+    if found[0] > 1.0:
+        return moved_since(checks, prior, corners, test, found[1], found[0])
+    motion, covariance = _slow(checks, prior, test)
+    shift = largest_shift(motion, corners)
+    surely = shift - SURE * _deviation(motion, covariance, corners)
+    state = "MOVED" if surely > test.limit else "DEGRADED" if surely > test.limit / 2 else "OK"
+    since = None if state == "OK" else _began(checks, corners, prior, test)
+    return Verdict(state, motion, covariance, shift, since, found[0])
+
+
+def moved_since(
+    checks: Information, prior: Floats, corners: Floats, test: DriftTest, since: int, ratio: float
+) -> Verdict:
+    """Return how far the camera is from where it was before check ``since``."""
+    start = Information.of_covariance(prior + allowance(test.seasonal))
+    before = start.plus(checks.summed(max(since - test.reference, 0), since))
+    after = checks.summed(since, len(checks.matrix))
+    motion, covariance = after.mean - before.mean, after.covariance + before.covariance
+    return Verdict("MOVED", motion, covariance, largest_shift(motion, corners), since, ratio)
+
+
+def largest_shift(motion: Floats, corners: Floats) -> float:
+    """Return how far a motion (6,) moves the corner that it moves most [m]."""
+    return float(np.linalg.norm(np.cross(motion[:3], corners) + motion[3:], axis=1).max())
+
+
+def _deviation(motion: Floats, covariance: Floats, corners: Floats) -> float:
+    """Return the standard deviation of :func:`largest_shift`, along that shift [m]."""
+    shifts = np.cross(motion[:3], corners) + motion[3:]
+    lengths = np.linalg.norm(shifts, axis=1)
+    worst = int(lengths.argmax())
+    rows = np.concatenate([-hat(corners[worst]), np.eye(3)], axis=1)
+    along = shifts[worst] / max(lengths[worst], 1e-12) @ rows
+    return float(np.sqrt(along @ covariance @ along))
+
+
+def _windows(n: int, test: DriftTest) -> range:
+    return range(1, min(test.window, n) + 1)
+
+
+def _step(
+    checks: Information, start: Information, first: int, test: DriftTest
+) -> tuple[float, int]:
+    """Return the likelihood ratio of a step at check ``first``, over its threshold; and it."""
+    low = max(first - test.reference, 0)
+    before, after = start.plus(checks.summed(low, first)), checks.summed(first, len(checks.matrix))
+    statistic, rank = (x.item() for x in _surprise(after, before))
+    scale, freedom = _scatter(checks, low, first)
+    rate = test.false_alarms / test.window
+    limit = rank * scale * f_quantile(1 - rate, int(rank), freedom) if rank else np.inf
+    return statistic / limit, first
+
+
+def _surprise(after: Information, before: Information) -> tuple[Floats, Floats]:
+    """Return the squared distances (...) of what came after from what was before, and ranks."""
+    left = after.vector - after.matrix @ before.mean
+    values, axes = np.linalg.eigh(after.matrix + after.matrix @ before.covariance @ after.matrix)
+    seen = values > 1e-9 * values[..., -1:]
+    along = (np.swapaxes(axes, -1, -2) @ left[..., None])[..., 0]
+    squares = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0)
+    return squares.sum(-1), seen.sum(-1)
+
+
+def _scatter(checks: Information, low: int, high: int, fewest: int = 10) -> tuple[float, float]:
+    """Return by what factor checks scatter more than they say, and its degrees of freedom.
+
+    The median, so that one bad check does not hide the next; never below a quarter.
+    """
+    n = high - low
+    if n < fewest:
+        return 1.0, np.inf
+    own = Information(checks.matrix[low:high], checks.vector[low:high])
+    squares, ranks = _surprise(own, checks.summed(low, high))
+    typical = [chi2_quantile(0.5, int(rank)) for rank in ranks]
+    return max(float(np.median(squares / typical)), 0.25), 0.4 * float(ranks.mean()) * n
+
+
+def _slow(checks: Information, prior: Floats, test: DriftTest) -> tuple[Floats, Floats]:
+    """Return the motion from the calibration and the first checks to the last ones."""
+    n = len(checks.matrix)
+    start = Information.of_covariance(prior)
+    first = start.plus(checks.summed(0, min(test.settled, max(n - test.settled, 0))))
+    last = start if n < test.settled else checks.summed(n - test.settled, n)
+    return last.mean - first.mean, last.covariance + first.covariance
+
+
+def _began(checks: Information, corners: Floats, prior: Floats, test: DriftTest) -> int:
+    """Return the check at which a slow drift had gone a quarter of its limit, for good."""
+    shifts = []
+    for n in range(test.settled, len(checks.matrix) + 1):
+        motion, _ = _slow(Information(checks.matrix[:n], checks.vector[:n]), prior, test)
+        shifts.append(largest_shift(motion, corners) > test.limit / 4)
+    below = [i for i, above in enumerate(shifts) if not above]
+    return min((below[-1] + 1 if below else 0) + test.settled - 1, len(checks.matrix) - 1)
+
+
+LARGEST = 1e-3
+"""Standard deviation of what a part may do: [rad] or [m]."""
+
+
+def blame(
+    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+) -> Mapping[str, float]:
+    """Return the probability that each part explains what is seen after a change, likeliest first.
+
+    The scanner turned, shifted or both, the flange replaced (so that the circle is elsewhere on
+    it), and, where the arm's kinematics are known, one joint or the arm re-mastered.
+
+    Args:
+        before: What was known of the camera before, with the calibration.
+        after: The sightings since.
+        about: (3,) where motions are taken [m].
+        scanner: (3,) where the scanner stands [m]: it turns about itself.
+        daily: See :class:`DriftTest`.
+    """
+    residuals = after.residuals + after.effects @ before.mean
+    designs = _designs(after, about, scanner)
+    noise = _noise(before, after, daily)
+    scores = {part: _evidence(residuals.ravel(), noise, *d) for part, d in designs.items()}
+    best = max(scores.values())
+    weights = {part: float(np.exp(score - best)) for part, score in scores.items()}
+    total = sum(weights.values())
+    return {part: w / total for part, w in sorted(weights.items(), key=lambda x: -x[1])}
+
+
+def suspects(parts: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Return (scanner, flange or arm, its probability), likeliest first."""
+    of = {"scanner": 0.0, "flange": 0.0, "arm": 0.0}
+    for part, probability in parts.items():
+        of[part.split()[0].replace("joint", "arm")] += probability
+    return sorted(of.items(), key=lambda x: -x[1])
+
+
+def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tuple[Floats, Floats]]:
+    n = len(after.residuals)
+    at_scanner = -after.effects @ adjoint_shift(about - scanner)
+    tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
+    moved = at_scanner.reshape(5 * n, 6)
+    found = {
+        "scanner turned": (moved[:, :3], np.full(3, LARGEST)),
+        "scanner shifted": (moved[:, 3:], np.full(3, LARGEST)),
+        "scanner moved": (moved, np.full(6, LARGEST)),
+        "flange replaced": (tool.reshape(5 * n, 3), np.full(3, LARGEST)),
+    }
+    if after.joints is None:
+        return found
+    k = after.joints.shape[2]
+    columns = after.joints.reshape(5 * n, k)
+    # The first joint turns the base as the scanner would, so it is no suspect of its own.
+    scale = np.full(k - 1, LARGEST)
+    one = {f"joint {j + 1} re-mastered": (columns[:, [j]], scale[:1]) for j in range(1, k)}
+    return found | one | {"arm re-mastered": (columns[:, 1:], scale)}
+
+
+def _noise(before: Information, after: Sightings, daily: float) -> Floats:
+    """Return the (5N, 5N) covariance of the residuals without a change."""
+    n = len(after.residuals)
+    stacked = after.effects.reshape(5 * n, 6)
+    out = stacked @ before.covariance @ stacked.T
+    same = np.repeat(after.check, 5)[:, None] == np.repeat(after.check, 5)
+    out += same * (stacked @ allowance(daily) @ stacked.T)
+    for i, own in enumerate(after.covariances):
+        out[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] += own
+    return np.asarray(out)
+
+
+def _evidence(residuals: Floats, noise: Floats, design: Floats, prior: Floats) -> float:
+    """Return the log of the marginal likelihood of residuals under a linear cause."""
+    total = noise + (design * prior**2) @ design.T
+    _, volume = np.linalg.slogdet(total)
+    return float(-0.5 * (residuals @ np.linalg.solve(total, residuals) + volume))
+
+
+def sightings_of(  # noqa: PLR0913  one argument a measured quantity
+    pose: Floats,
+    about: Floats,
+    centres: Floats,
+    normals: Floats,
+    covariances: Floats,
+    expected: Floats,
+    jacobians: Floats | None,
+    check: NDArray[np.intp],
+) -> Sightings:
+    """Linearise N sightings of a circle at the stored calibration.
+
+    Args:
+        pose: (4, 4) base_T_camera.
+        about: (3,) where motions are taken [m].
+        centres: (N, 3) in camera [m].
+        normals: (N, 3) in camera; NaN where none was measured.
+        covariances: (N, 5, 5) in base, tilts across the flange's axis last.
+        expected: (N, 4, 4) the frame of the circle in base, where the arm is believed to have it.
+        jacobians: (N, 6, n) of the circle's centre (rotation, translation), or None.
+        check: (N,) which check each belongs to.
+    """
+    turn, axes = pose[:3, :3], expected[:, :3, 2]
+    across = expected[:, :3, :2].transpose(0, 2, 1)
+    mapped, seen = centres @ turn.T + pose[:3, 3], np.nan_to_num(normals) @ turn.T
+    has = np.asarray(np.isfinite(normals).all(axis=1))
+    tilts = np.where(has[:, None], np.einsum("nai,ni->na", across, seen - axes), 0.0)
+    effects = np.zeros((len(centres), 5, 6))
+    effects[:, :3, :3], effects[:, :3, 3:] = -hat(mapped - about), np.eye(3)
+    effects[:, 3:, :3] = -across @ hat(seen) * has[:, None, None]
+    own = np.array(covariances)
+    own[~has, 3:, 3:] = NO_NORMAL * np.eye(2)
+    joints = None
+    if jacobians is not None:
+        turned = across @ -hat(axes) @ jacobians[:, :3] * has[:, None, None]
+        joints = np.concatenate([jacobians[:, 3:], turned], axis=1)
+    residuals = np.concatenate([mapped - expected[:, :3, 3], tilts], axis=1)
+    return Sightings(residuals, effects, own, expected[:, :3, :3], joints, np.asarray(check))

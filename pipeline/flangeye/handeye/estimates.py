@@ -1,0 +1,97 @@
+"""From the fit of a loop to the transforms with covariances that people get."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.maths.geometry import adjoint_shift
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import Configuration, carriers_of, mapped_and_expected
+from flangeye.types import Floats, HandEye, Observation, Pair, Transform, TransformEstimate
+
+
+def transforms_of(
+    configuration: Configuration, x: Floats, y: Floats, z: Floats
+) -> dict[str, Transform]:
+    """Return a configuration's unknowns by name, from X, Y and Z (4, 4)."""
+    values = [x, *([y] if configuration.other_base else []), z]
+    return {
+        name: Transform.named(name, matrix)
+        for name, matrix in zip(configuration.unknowns, values, strict=False)
+    }
+
+
+def columns_of(name: str, configuration: Configuration) -> slice:
+    """Return where an unknown stands among the moves of X, Y and Z."""
+    if name == configuration.unknowns[0]:
+        return slice(0, 6)
+    return slice(6, 12) if name == configuration.other_base else slice(12, 18)
+
+
+def estimate_at(
+    transform: Transform, covariance: Floats, about: Floats, unobservable: Floats
+) -> TransformEstimate:
+    """Return an estimate, its covariance taken about a point instead of the child's origin.
+
+    Args:
+        transform: The value.
+        covariance: (6, 6), rotation and translation, this at the child's origin.
+        about: (3,) in the parent [m].
+        unobservable: (6, k) moves, taken like the covariance.
+    """
+    shift = adjoint_shift(about - transform.translation)
+    moved = shift @ covariance @ shift.T
+    sizes = np.linalg.norm(unobservable, axis=0)
+    # A direction that moves another unknown alone is none of this one.
+    kept = (shift @ unobservable)[:, sizes > 1e-6]
+    directions = np.linalg.qr(kept)[0].T if kept.shape[1] else np.zeros((0, 6))
+    return TransformEstimate(transform, 0.5 * (moved + moved.T), about, directions)
+
+
+def points_of_interest(
+    configuration: Configuration,
+    transforms: dict[str, Transform],
+    observations: Sequence[Observation],
+    arm: Arm | None,
+) -> dict[str, Floats]:
+    """Return, by name of each unknown, where its error matters, in its parent [m].
+
+    The middle of what the camera saw; for a target's place the target itself.
+    """
+    carriers = carriers_of(configuration, observations, arm)
+    mapped, _ = mapped_and_expected(configuration, transforms, carriers, observations)
+    seen = np.array([o.feature.centre for o in observations])
+    camera, *others = configuration.unknowns
+    points = {name: transforms[name].translation for name in others}
+    if configuration.other_base:
+        points[configuration.other_base] = mapped.mean(axis=0)
+    return {camera: transforms[camera].apply(seen).mean(axis=0), **points}
+
+
+def pairs_of(
+    configuration: Configuration,
+    transforms: dict[str, Transform],
+    observations: Sequence[Observation],
+    arm: Arm | None,
+    reasons: Sequence[str | None],
+) -> tuple[Pair, ...]:
+    """Return every observation with its residual in ``base``, and why it was not used."""
+    carriers = carriers_of(configuration, observations, arm)
+    mapped, expected = mapped_and_expected(configuration, transforms, carriers, observations)
+    return tuple(
+        Pair(o, residual, reason is None, reason)
+        for o, residual, reason in zip(observations, mapped - expected, reasons, strict=True)
+    )
+
+
+def hand_eye_of(
+    estimates: Sequence[TransformEstimate],
+    pairs: tuple[Pair, ...],
+    method: str,
+    notes: Sequence[str] = (),
+) -> HandEye:
+    """Return the calibration: the camera's pose first, then the other unknowns."""
+    camera, *others = estimates
+    return HandEye(camera, pairs, method, tuple(notes), others=tuple(others))

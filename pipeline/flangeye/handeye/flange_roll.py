@@ -1,0 +1,63 @@
+"""How the flange is turned about its own axis against the controller's frame: from its holes.
+
+The camera's pose does not depend on it, since centres and normals do not show it; a seam found in
+the flange's frame, or a registration of its whole shape, does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.types import Floats, Observation
+
+FEWEST = 3
+"""Poses whose holes were seen, for their scatter to mean anything."""
+
+
+def roll_note(
+    observations: Sequence[Observation], base_R_camera: Floats, covariance: Floats
+) -> str:
+    """Say by how much the plate is turned about its axis, or that it cannot be told.
+
+    Args:
+        observations: The poses that agree.
+        base_R_camera: (3, 3) what they agree on.
+        covariance: (3, 3) of its rotation [rad^2].
+    """
+    turns = roll_of(observations, base_R_camera)
+    if len(turns) < FEWEST:
+        return (
+            "a constant turn of the plate about its own axis (clocking) does not show, for holes "
+            f"were told apart in {len(turns)} of {len(observations)} poses: the camera's pose "
+            "does not depend on it"
+        )
+    mean = np.angle(np.exp(1j * turns).mean())  # the angles may lie about half a turn
+    off = np.angle(np.exp(1j * (turns - mean)))
+    middle = mean + np.median(off)
+    of_one = SIGMA_OF_MAD * float(np.median(np.abs(off - np.median(off))))
+    rotation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    # A median's standard deviation is 1.25 times a mean's.
+    deviation = np.hypot(1.25 * of_one / np.sqrt(len(turns)), rotation)
+    return (
+        f"the plate is turned by {np.degrees(middle):.2f} +- {np.degrees(deviation):.2f} deg about "
+        f"its own axis against the controller's frame (clocking, from the holes in {len(turns)} "
+        "poses): the camera's pose does not depend on it"
+    )
+
+
+def roll_of(observations: Sequence[Observation], base_R_camera: Floats) -> Floats:
+    """Return the (M,) angles of the hole pattern about the flange's z [rad], where holes show."""
+    turns = []
+    for o in observations:
+        if o.circle.roll is None or o.circle.normal is None:
+            continue
+        across = basis_of_plane(o.circle.normal)
+        angle = o.circle.roll
+        x_in_camera = np.cos(angle) * across[0] + np.sin(angle) * across[1]
+        x, y, _ = o.base_T_flange.rotation.T @ base_R_camera @ x_in_camera
+        turns.append(np.arctan2(y, x))
+    return np.array(turns)

@@ -1,0 +1,327 @@
+"""The most likely unknowns of any configuration, and the noise beyond what was stated.
+
+Levenberg-Marquardt over SE(3) with analytic derivatives; gross outliers by graduated
+non-convexity, then by how far each measurement is from what the others say. Arrays only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.handeye.components import FINEST, Noise, Residuals, noise_of
+from flangeye.handeye.inliers import gate, truncated_weights
+from flangeye.handeye.loop import (
+    COLUMNS,
+    ArmNoise,
+    Linear,
+    Unknowns,
+    free_columns,
+    linearise,
+    weights_of,
+)
+from flangeye.handeye.measurements import Loop, Measurements
+from flangeye.handeye.nuisance import Nuisance, no_nuisance
+from flangeye.maths.statistics import f_quantile
+from flangeye.types import Floats, Mask
+
+ITERATIONS, SETTLED = 60, 1e-11
+"""Steps at most; a step that could better the sum of squares by no more than this is the last."""
+LEAST_DAMPING = 1e-12
+"""Keeps the equations solvable where the poses tell nothing of a direction, and slows nothing."""
+ROUNDS = 12
+GRADUATION = 1.4
+"""Factor between the steps of graduated non-convexity: Yang et al. (2020)."""
+TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is given.
+
+    Attributes:
+        measurements: N of them.
+        loop: What is unknown.
+        arms: Noise of the arms' reported poses; None where nothing is known of it.
+        tilt: Standard deviation of a tilt common to all normals [rad], or None.
+        stated: Whether that is all the noise there is beside the measurements' own; else more is
+            estimated, or all of it scaled down.
+        nuisance: Errors of the arms that are estimated along.
+        pose_noise: Variance of each coordinate beyond the features' own [m^2], where it is known.
+    """
+
+    measurements: Measurements
+    loop: Loop
+    arms: ArmNoise | None
+    tilt: float | None
+    stated: bool = False
+    nuisance: Nuisance = field(default_factory=lambda: no_nuisance(0))
+    pose_noise: float | None = None
+
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
+        """Return the problem of some of the measurements."""
+        nuisance = self.nuisance.where(chosen) if len(self.nuisance) else self.nuisance
+        return replace(self, measurements=self.measurements.where(chosen), nuisance=nuisance)
+
+    def prior(self, noise: Noise) -> tuple[Floats, Floats]:
+        """Return information and mean (20 + k,) known beforehand: of tilt and nuisances alone."""
+        known = 0.0 if self.tilt is None else self.tilt**-2.0
+        nuisance = self.nuisance.of_size(noise.size)
+        information = np.concatenate([np.zeros(18), np.full(2, known), nuisance.prior**-2.0])
+        return information, np.concatenate([np.zeros(COLUMNS), nuisance.mean])
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Values of the unknowns, and how well they are known.
+
+    Attributes:
+        at: The values.
+        basis: (20 + k, p) moves of the unknowns that were fitted.
+        information: (p, p) Fisher information.
+        linear: All N measurements, linearised there.
+        weights: (N, 6, 6) their inverse covariances.
+        noise: Noise those were made with.
+        inliers: (N,) which took part.
+        freedom: Degrees of freedom the noise was estimated from; infinite where it was stated.
+        squares: (N,) squared distances from the fit, or from what the others say.
+        cost: What was made small: weighted squares of the shares, and of what was surprising.
+        slope: (p,) of half of it.
+        all_freedom: As ``freedom``, which is of rotations or translations, of both together.
+    """
+
+    at: Unknowns
+    basis: Floats
+    information: Floats
+    linear: Linear
+    weights: Floats
+    noise: Noise
+    inliers: Mask
+    freedom: float = np.inf
+    squares: Floats = field(default_factory=lambda: np.zeros(0))
+    cost: float = np.inf
+    slope: Floats = field(default_factory=lambda: np.zeros(0))
+    all_freedom: float = np.inf
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(20 + k, 20 + k) of all moves, the unobservable directions left out."""
+        root = np.sqrt(np.maximum(np.diag(self.information), TINY))
+        scaled = self.information / np.outer(root, root)
+        try:
+            half = np.linalg.inv(np.linalg.cholesky(scaled)) / root
+            return np.asarray(self.basis @ (half.T @ half) @ self.basis.T)
+        except np.linalg.LinAlgError:
+            known = np.linalg.pinv(self.information, rcond=1e-14, hermitian=True)
+            return np.asarray(self.basis @ known @ self.basis.T)
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers the transforms have that were fitted."""
+        return int(self.basis.shape[1] - len(self.at.nuisance))
+
+
+def climb(
+    problem: Problem, start: Unknowns, noise: Noise, shares: Floats, iterations: int = ITERATIONS
+) -> Solution:
+    """Return the most likely unknowns near a start, each measurement counting by its share.
+
+    Args:
+        problem: What is given.
+        start: Where to begin.
+        noise: Noise beyond the stated covariances; not estimated here.
+        shares: (N,) from 0 to 1.
+        iterations: Steps at most.
+    """
+    here, damping = weigh(problem, start, noise, shares), LEAST_DAMPING
+    for _ in range(iterations):
+        step, gain = _step(here, damping)
+        if gain < SETTLED * max(1.0, here.cost) or damping > 1e8:
+            break
+        there = weigh(problem, here.at.moved(step), noise, shares)
+        better = there.cost <= here.cost * (1 + 1e-12)
+        here = there if better else here
+        damping = max(damping / 100, LEAST_DAMPING) if better else max(1e-4, damping * 10)
+    return here
+
+
+def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solution:
+    """Return some values of the unknowns with what the measurements say of them."""
+    s, k = problem.measurements, len(problem.nuisance)
+    if len(at.nuisance) != k:
+        at = replace(at, nuisance=np.zeros(k))
+    linear = linearise(s, problem.loop, at, problem.arms, problem.nuisance)
+    weights, basis = weights_of(s, linear, noise), free_columns(s, problem.loop, at, problem.tilt)
+    jacobian = (linear.jacobian @ basis).reshape(len(s) * 6, -1)
+    weighted = (weights @ linear.jacobian @ basis).reshape(len(s) * 6, -1)
+    squares = (linear.residuals * (weights @ linear.residuals[..., None])[..., 0]).sum(axis=1)
+    counting = np.repeat(shares, 6)
+    known, mean = problem.prior(noise)
+    surprise = np.concatenate([np.zeros(18), at.tilt, at.nuisance]) - mean
+    information = jacobian.T @ (counting[:, None] * weighted) + basis.T @ (known[:, None] * basis)
+    slope = weighted.T @ (counting * linear.residuals.ravel()) - basis.T @ (known * surprise)
+    cost = float(shares @ squares + known @ surprise**2)
+    return Solution(
+        at, basis, information, linear, weights, noise, shares > 0.5, np.inf, squares, cost, slope
+    )
+
+
+def _step(here: Solution, damping: float) -> tuple[Floats, float]:
+    """Return the move that makes the cost least, were all linear, and by how much it would."""
+    # Scaled to unit diagonal, so that metres and radians are damped alike.
+    root = np.sqrt(np.maximum(np.diag(here.information), 1e-12))
+    scaled = here.information / np.outer(root, root) + damping * np.eye(len(root))
+    step = np.linalg.solve(scaled, here.slope / root) / root
+    return np.asarray(here.basis @ step), float(here.slope @ step)
+
+
+def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
+    """Return the solution that most measurements agree on, its noise estimated with it.
+
+    Truncated least squares by graduated non-convexity, and the noise of those that agree, until
+    the same agree; then every measurement is judged by what the others say.
+
+    Args:
+        problem: What is given.
+        start: Where to begin.
+        noise: First guess of the noise beyond the stated covariances.
+    """
+    found = climb(problem, start, noise, np.ones(len(problem.measurements)))
+    inliers = np.zeros(len(problem.measurements), dtype=bool)
+    for _ in range(ROUNDS):
+        found = _graduate(problem, found)
+        if (found.inliers == inliers).all() or found.inliers.sum() < 3:
+            break
+        inliers = found.inliers
+        found = with_noise(problem, found)
+    return agreeing(problem, found)
+
+
+def agreeing(problem: Problem, found: Solution) -> Solution:
+    """Return the fit to the measurements that agree with the others, begun at those of a fit."""
+    for _ in range(ROUNDS):
+        found = with_noise(problem, found)
+        squares, agree = judged(problem, found)
+        if (agree == found.inliers).all() or agree.sum() < 3:
+            break
+        found = replace(found, inliers=agree)
+    return replace(found, squares=squares)
+
+
+def judged(problem: Problem, found: Solution) -> tuple[Floats, Mask]:
+    """Return squared distances (N,) of measurements from what the others say, and who agrees.
+
+    A measurement that was fitted has drawn fit and noise towards itself: it is compared with what
+    both would be without it, in closed form (the externally studentised residual of Cook &
+    Weisberg 1982). Under normal noise either sort follows Fisher's F.
+    """
+    jacobian, p = found.linear.jacobian, problem.measurements.projectors
+    share = jacobian @ found.covariance @ jacobian.transpose(0, 2, 1)
+    signs = np.where(found.inliers, -1.0, 1.0)[:, None, None]
+    noise = np.linalg.pinv(found.weights, rcond=1e-12, hermitian=True)
+    # A measurement that alone says something is fitted exactly: there is nothing to compare with.
+    inverse = np.linalg.pinv(noise + signs * (p @ share @ p), rcond=1e-9, hermitian=True)
+    squares = np.einsum("na,nab,nb->n", found.linear.residuals, inverse, found.linear.residuals)
+    freedoms = problem.measurements.freedoms
+    # Its squares are of rotation and translation: held against the freedom of both together.
+    without = found.all_freedom - freedoms
+    if np.isfinite(found.freedom):
+        left = np.maximum(found.all_freedom - squares, TINY) / np.maximum(without, TINY)
+        squares = np.where(found.inliers & (without > 0), squares / left, squares)
+    outer = gates(problem, found.freedom)
+    inner = gates(problem, found.freedom - float(freedoms.max()))
+    return squares, squares <= np.where(found.inliers, inner, outer)
+
+
+def gates(problem: Problem, freedom: float) -> Floats:
+    """Return the (N,) squared distances beyond which measurements do not agree."""
+    k, share = problem.measurements.freedoms.astype(int), gate(len(problem.measurements))
+    of = {n: n * f_quantile(share, n, freedom) if freedom > 0 else np.inf for n in set(k.tolist())}
+    return np.array([of[n] for n in k.tolist()])
+
+
+def _graduate(problem: Problem, start: Solution) -> Solution:
+    limits, noise = gates(problem, start.freedom), start.noise
+    found = climb(problem, start.at, noise, start.inliers.astype(float))
+    largest = float((found.squares / limits).max())
+    if largest <= 1.0:
+        return replace(climb(problem, found.at, noise, np.ones(len(limits))), freedom=start.freedom)
+    mu = 1.0 / (2.0 * largest - 1.0)
+    shares = np.ones(len(limits))
+    while mu < 1e8:
+        shares = truncated_weights(found.squares / limits, 1.0, mu)
+        # Early on all shares are small, and only their ratios matter.
+        if (np.minimum(shares, 1 - shares) < 1e-6).all() or shares.max() < 1e-9:
+            break
+        found = climb(problem, found.at, noise, shares, iterations=2)
+        mu *= GRADUATION
+    shares = (shares > 0.5).astype(float)
+    return replace(climb(problem, found.at, noise, shares), freedom=start.freedom)
+
+
+def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solution:
+    """Return the solution with the noise its inliers show, where none was stated.
+
+    Variance components after Helmert, as in ``components.py``: added to the stated covariances, or
+    these scaled down. The size of nuisances by their evidence (MacKay 1992).
+
+    Args:
+        problem: What is given.
+        found: A solution.
+        refit: Whether the unknowns follow the weights; else they stay.
+    """
+    shares, freedom, both = found.inliers.astype(float), np.inf, np.inf
+    solve = climb if refit else weigh
+    found = solve(problem, found.at, found.noise, shares)
+    if problem.stated:
+        return found
+    for _ in range(ROUNDS):
+        before = found.noise
+        noise, freedom, both = _components(problem, found)
+        found = solve(problem, found.at, noise, shares)
+        if before.is_close(noise):
+            break
+    return replace(found, freedom=freedom, all_freedom=both)
+
+
+def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]:
+    """Return the noise that the residuals show, and its degrees of freedom: the fewer, and all."""
+    kept, covariance = found.inliers, found.covariance
+    turned, shifted = (
+        _residuals(problem, found, covariance, at) for at in (slice(0, 3), slice(3, 6))
+    )
+    if problem.pose_noise is not None:
+        shifted = replace(shifted, freedom=np.inf)
+    own, arms = problem.measurements.covariances[kept], found.linear.of_arms[kept]
+    noise = noise_of(turned, shifted, own, arms)
+    if problem.pose_noise is not None:
+        noise = replace(noise, pose=problem.pose_noise)
+    size = _size(problem, found, covariance)
+    freedoms = [f for f in (turned.freedom, shifted.freedom) if np.isfinite(f)]
+    fewer, both = min(freedoms, default=np.inf), sum(freedoms) if freedoms else np.inf
+    return replace(noise, size=size), max(fewer, 1.0), max(both, 1.0)
+
+
+def _size(problem: Problem, found: Solution, covariance: Floats) -> float:
+    """Return the standard deviation that makes the sized nuisances most likely, one step on."""
+    sized, size = problem.nuisance.sized, found.noise.size
+    if not sized.any():
+        return size
+    values = found.at.nuisance[sized]
+    told = sized.sum() - np.diag(covariance)[COLUMNS:][sized].sum() / size**2
+    return max(float(np.sqrt((values @ values) / max(told, 1e-3))), FINEST)
+
+
+def _residuals(problem: Problem, found: Solution, covariance: Floats, at: slice) -> Residuals:
+    """Return the rotations', or the translations', of those that agree."""
+    kept, p = found.inliers, problem.measurements.projectors[found.inliers]
+    jacobian = found.linear.jacobian[kept]
+    # Numbers less their share in the fit.
+    told = found.weights[kept][:, at] @ jacobian @ covariance
+    shares = (told * jacobian[:, at]).sum()
+    measured = np.diagonal(p, axis1=1, axis2=2)[:, at].sum()
+    freedom = float(measured - shares) if measured else np.inf
+    return Residuals(found.linear.residuals[kept][:, at], p[:, at, at], freedom)

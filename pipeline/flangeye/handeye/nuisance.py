@@ -1,0 +1,61 @@
+"""Small numbers common to all poses that move the arms: errors of theirs, estimated along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.types import Floats, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """k small numbers.
+
+    Attributes:
+        camera: (N, 6, k) twist by each of the frame that carries the camera, in it.
+        target: (N, 6, k) the same of the frame that carries the target.
+        prior: (k,) standard deviation known beforehand; infinite where nothing is known.
+        mean: (k,) value expected beforehand.
+        sized: (k,) whether the prior is itself estimated, one for all that are.
+    """
+
+    camera: Floats
+    target: Floats
+    prior: Floats
+    mean: Floats
+    sized: Mask
+
+    def __len__(self) -> int:
+        return len(self.prior)
+
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Nuisance:
+        """Return the effects on some of the poses."""
+        return replace(self, camera=self.camera[chosen], target=self.target[chosen])
+
+    def and_also(self, other: Nuisance) -> Nuisance:
+        """Return both sets of numbers, these first."""
+        return Nuisance(
+            np.concatenate([self.camera, other.camera], axis=2),
+            np.concatenate([self.target, other.target], axis=2),
+            np.concatenate([self.prior, other.prior]),
+            np.concatenate([self.mean, other.mean]),
+            np.concatenate([self.sized, other.sized]),
+        )
+
+    def of_size(self, size: float) -> Nuisance:
+        """Return the same, its sized numbers expected to be of a size."""
+        return replace(self, prior=np.where(self.sized, size, self.prior))
+
+
+def no_nuisance(count: int) -> Nuisance:
+    """Return none, for so many poses."""
+    return nuisance_of(np.zeros((count, 6, 0)), np.zeros((count, 6, 0)), 1.0)
+
+
+def nuisance_of(camera: Floats, target: Floats, deviation: float, sized: bool = False) -> Nuisance:
+    """Return numbers of mean zero and one deviation, from their (N, 6, k) twists."""
+    k = camera.shape[2]
+    return Nuisance(camera, target, np.full(k, deviation), np.zeros(k), np.full(k, sized))

@@ -1,0 +1,156 @@
+"""Our values as Foxglove messages, so that any MCAP viewer shows a run without a plugin.
+
+The messages are protobuf with the published schemas; each function builds one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import basis_of_plane, quaternion_from_rotation, rigid
+from flangeye.maths.seam_geometry import seam_frames, tube_rings
+from flangeye.types import CircleFeature, Image, PointCloud, Seam, Transform
+
+ERROR, WARNING, INFO = 4, 3, 2
+
+
+def point_cloud(cloud: PointCloud, xyz: NDArray[np.float32], time_ns: int) -> Any:
+    """Return ``xyz`` (N, 3) float32, as it is, as a foxglove.PointCloud in the cloud's frame."""
+    from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as Message
+
+    fields = [
+        PackedElementField(name=name, offset=4 * i, type=PackedElementField.FLOAT32)
+        for i, name in enumerate("xyz")
+    ]
+    data = np.ascontiguousarray(xyz, dtype="<f4").tobytes()
+    message = Message(frame_id=cloud.frame, point_stride=12, fields=fields, data=data)
+    message.pose.orientation.w = 1.0
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def points_of(message: Any) -> NDArray[np.float32]:
+    """Return the (N, 3) float32 points of a message made by :func:`point_cloud`."""
+    return np.frombuffer(message.data, dtype="<f4").reshape(-1, 3)
+
+
+def frame_transform(transform: Transform, time_ns: int) -> Any:
+    """Return a foxglove.FrameTransform: where the child stands in the parent."""
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+
+    message = FrameTransform(parent_frame_id=transform.parent, child_frame_id=transform.child)
+    _set_pose(message.translation, message.rotation, transform)
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def pose_in_frame(transform: Transform, time_ns: int) -> Any:
+    """Return a foxglove.PoseInFrame: the pose of the child in the parent."""
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+
+    message = PoseInFrame(frame_id=transform.parent)
+    _set_pose(message.pose.position, message.pose.orientation, transform)
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def compressed_image(image: Image, time_ns: int, frame: str = "camera") -> Any:
+    """Return the pixels as a foxglove.CompressedImage, PNG: nothing is lost."""
+    import cv2
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    colour = image.pixels[..., ::-1] if image.pixels.ndim == 3 else image.pixels
+    _, data = cv2.imencode(".png", np.ascontiguousarray(colour))
+    message = CompressedImage(frame_id=frame, format="png", data=data.tobytes())
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def circle_scene(capture: str, circle: CircleFeature, time_ns: int) -> Any:
+    """Return a foxglove.SceneUpdate with the fitted circles and the normal, in ``camera``."""
+    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    entity = SceneEntity(frame_id="camera", id=f"circle/{capture}")
+    entity.timestamp.FromNanoseconds(time_ns)
+    for points in circle_lines(circle):
+        line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=2.0, scale_invariant=True)
+        line.pose.orientation.w = 1.0
+        line.color.r, line.color.g, line.color.b, line.color.a = 0.9, 0.3, 0.1, 1.0
+        for x, y, z in points:
+            line.points.add(x=x, y=y, z=z)
+    return SceneUpdate(entities=[entity])
+
+
+def circle_points(circle: CircleFeature, time_ns: int) -> Any:
+    """Return the fitted circles and the normal as a foxglove.PointCloud, in ``camera``.
+
+    Viewers that know no SceneUpdate, such as Rerun, show them so.
+    """
+    lines = circle_lines(circle, 360) or [circle.centre[None]]
+    xyz = np.vstack(lines).astype(np.float32)
+    return point_cloud(PointCloud("camera", xyz), xyz, time_ns)
+
+
+def seam_scene(seam: Seam, time_ns: int) -> Any:
+    """Return a foxglove.SceneUpdate with the planned seam and rings of its tube, in ``base``."""
+    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    entity = SceneEntity(frame_id="base", id="seam")
+    entity.timestamp.FromNanoseconds(time_ns)
+    for points, thickness in [(seam.points_in_base, 3.0), *((r, 1.0) for r in tube_rings(seam))]:
+        line = entity.lines.add(
+            type=LinePrimitive.LINE_STRIP, thickness=thickness, scale_invariant=True
+        )
+        line.pose.orientation.w = 1.0
+        line.color.r, line.color.g, line.color.b, line.color.a = 0.0, 0.45, 0.7, 1.0
+        for x, y, z in points:
+            line.points.add(x=x, y=y, z=z)
+    return SceneUpdate(entities=[entity])
+
+
+def seam_poses(seam: Seam, time_ns: int) -> Any:
+    """Return foxglove.PosesInFrame: along the seam, x in its direction and z into the groove."""
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+
+    message = PosesInFrame(frame_id="base")
+    message.timestamp.FromNanoseconds(time_ns)
+    for point, rotation in zip(seam.points_in_base, seam_frames(seam), strict=True):
+        pose = message.poses.add()
+        _set_pose(
+            pose.position, pose.orientation, Transform("base", "seam", rigid(rotation, point))
+        )
+    return message
+
+
+def circle_lines(circle: CircleFeature, segments: int = 72) -> list[NDArray[np.float64]]:
+    """Return polylines (N, 3) [m] in ``camera``: one ring a radius, and the normal as 30 mm."""
+    if circle.normal is None:
+        return []
+    u, v, n = basis_of_plane(circle.normal)
+    angle = np.linspace(0, 2 * np.pi, segments + 1)[:, None]
+    ring = np.cos(angle) * u + np.sin(angle) * v
+    rings = [circle.centre + radius * ring for radius in circle.radii.values()]
+    return [*rings, np.stack([circle.centre, circle.centre + 0.03 * n])]
+
+
+def log(message: str, level: int, time_ns: int) -> Any:
+    """Return a foxglove.Log line."""
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+
+    line = Log(level=level, message=message, name="flangeye")  # type: ignore[arg-type]
+    line.timestamp.FromNanoseconds(time_ns)
+    return line
+
+
+def _set_pose(position: Any, orientation: Any, transform: Transform) -> None:
+    position.x, position.y, position.z = transform.translation
+    x, y, z, w = quaternion_from_rotation(transform.rotation)
+    orientation.x, orientation.y, orientation.z, orientation.w = x, y, z, w

@@ -1,0 +1,468 @@
+"""Read a run's MCAP back, finished or killed half way: for people, and to run again.
+
+Read from front to back: a file without its end is read as far as its last whole message, and there
+is one way for both. What is damaged or foreign is named in ``RunLog.damage`` and left out; the rest
+is read (:mod:`flangeye.log.records`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, NotRequired, TypeVar
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.files.images import decode_image
+from flangeye.files.regular import open_regular
+from flangeye.log import foxglove
+from flangeye.log.record import adapter
+from flangeye.log.records import DamageError, LogFile, Message, NotMcapError, reason_of
+from flangeye.log.scans import unpack
+
+_TYPES: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        t.FlangeCloud, t.CircleFeature, t.PoseFeature, t.HandEye, t.VerifiedHandEye, t.Verification,
+        t.Observation, t.WorkpieceScan, t.Seam, t.WeldReport,
+    )
+}  # fmt: skip
+
+_GIVEN: dict[str, tuple[type, ...]] = {
+    "segment": (t.FlangeCloud,),
+    "fit": (t.CircleFeature, t.PoseFeature),
+    "verify": (t.Verification,),
+}
+"""What the steps of a kind give, where others rely on it."""
+
+MAX_JSON = 1 << 24
+"""Longest JSON message that is read [bytes]; decoded, it takes forty times as much."""
+MAX_TOLD = 10
+"""Damaged parts that are named one by one."""
+
+Value = TypeVar("Value")
+
+MAGIC = b"\x89MCAP0\r\n"
+"""How every MCAP file begins; the name of the program that wrote it follows."""
+
+
+class _CaptureFacts(TypedDict):
+    """What ``/capture`` says."""
+
+    id: str
+    poses: dict[str, t.Transform]
+    joints: list[float] | None
+    time_ns: int
+    role: t.Role
+    shape: list[Annotated[int, Field(ge=0)]]
+    full: bool
+    step: str
+    seconds: float
+    image: NotRequired[dict[str, Any] | None]
+
+
+class _StepFacts(TypedDict):
+    """What a message of a step says of itself."""
+
+    capture: str | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One value a step gave.
+
+    Attributes:
+        step: Its label, such as ``2.fit.rim``.
+        capture: The capture's id, for steps that run once per capture.
+        seconds: What it took.
+        type: Name of the value's type.
+        value: The value, or plain data when its type is not ours.
+    """
+
+    step: str
+    capture: str | None
+    seconds: float
+    type: str
+    value: Any
+
+    @property
+    def stage(self) -> str:
+        """Name of the stage, such as ``fit.rim``."""
+        return self.step.partition(".")[2]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the stage, such as ``fit``."""
+        return self.stage.partition(".")[0]
+
+
+@dataclass(frozen=True)
+class Note:
+    """One line of a step's journal.
+
+    Attributes:
+        step: Its label, such as ``7.weld.tactile``.
+        name: Under which it was written.
+        value: Plain data; pixels (H, W) or (H, W, 3) for an image.
+    """
+
+    step: str
+    name: str
+    value: Any
+
+
+@dataclass
+class RunLog:
+    """What a log holds, its raw clouds aside (see :meth:`captures`).
+
+    Attributes:
+        path: The file.
+        complete: Whether the run came to its end.
+        attachments: Name -> bytes: the recipe, the result.
+        source: Where the captures came from; None when the run died before.
+        total: How many captures were expected, when known.
+        poses: Capture id -> its metadata, in order of arrival.
+        entries: Every value, in order.
+        rejections: Captures set aside.
+        finished: Ids of the captures that went through.
+        messages: Log lines for people.
+        damage: What could not be read, and why, a sentence each.
+    """
+
+    path: Path
+    complete: bool = False
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    source: t.Source | None = None
+    total: int | None = None
+    poses: dict[str, dict[str, Any]] = field(default_factory=dict)
+    entries: list[Entry] = field(default_factory=list)
+    rejections: list[t.Rejection] = field(default_factory=list)
+    finished: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+
+    @property
+    def gathered(self) -> bool:
+        """Whether anything was recorded before the log ended."""
+        return bool(self.poses or self.entries or self.rejections)
+
+    @property
+    def notes(self) -> list[str]:
+        """What whoever runs on this log must be told of its damage, in a few lines."""
+        kept = f"kept: {len(self.poses)} captures, {len(self.entries)} values of steps"
+        told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:MAX_TOLD]]
+        more = len(self.damage) - MAX_TOLD
+        return told + ([f"{self.path}: damaged: and {more} more"] if more > 0 else [])
+
+    def require_sound(self) -> None:
+        """Refuse a log of which a part is damaged.
+
+        Raises:
+            StageError: The first damage, how many there are, and what was kept.
+        """
+        if self.damage:
+            more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
+            raise StageError(f"{self.notes[0]}{more}")
+
+    def text(self, name: str) -> str | None:
+        """Return an attached text, such as ``recipe.yaml``; None when there is none."""
+        raw = self.attachments.get(name)
+        return None if raw is None else raw.decode()
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """The content of ``result.json``, when the run came to its end."""
+        raw = self.attachments.get("result.json")
+        return None if raw is None else json.loads(raw)
+
+    def of_kind(self, kind: str) -> list[Entry]:
+        """Return the values of every step of one kind, in order."""
+        return [entry for entry in self.entries if entry.kind == kind]
+
+    def observations(self) -> list[t.Observation]:
+        """Return one observation for each feature that was fitted, in order."""
+        given = [e.value for e in self.of_kind("acquire") if isinstance(e.value, t.Observation)]
+        fitted = [
+            t.Observation(str(e.capture), e.value, *self._pose(str(e.capture)))
+            for e in self.of_kind("fit")
+            if e.capture in self.poses
+        ]
+        return given + fitted
+
+    def flange_clouds(self) -> Iterator[tuple[t.Capture, t.FlangeCloud]]:
+        """Yield each segmented flange with its capture, whose own cloud is the flange's."""
+        for entry in self.of_kind("segment"):
+            if str(entry.capture) not in self.poses:
+                continue  # its pose is in the damaged part
+            yield self._capture(str(entry.capture), entry.value.cloud), entry.value
+
+    def views(self) -> t.Views:
+        """Return the verification views."""
+        return t.Views(
+            t.VerificationView(capture.id, flange, capture.base_T_flange)
+            for capture, flange in self.flange_clouds()
+            if capture.role == "verification"
+        )
+
+    def calibration(self, stage: str | None = None) -> t.HandEye | None:
+        """Return what ``stage`` gave, or the last calibration of any, if it came so far."""
+        if stage is not None:
+            found: t.HandEye | None = self.given(stage)
+            return found
+        return self.last(t.HandEye)
+
+    def given(self, stage: str) -> Any:
+        """Return the last value that ``stage`` gave, None when the run did not come so far."""
+        return next((e.value for e in reversed(self.entries) if e.stage == stage), None)
+
+    def last(self, kind: type[Value]) -> Value | None:
+        """Return the last value of a type that any step gave."""
+        return next((e.value for e in reversed(self.entries) if isinstance(e.value, kind)), None)
+
+    def captures(self) -> Iterator[t.Capture]:
+        """Yield the captures with their images, and their clouds as logged, thinned or whole."""
+        yield from (reading for reading in self.readings() if isinstance(reading, t.Capture))
+
+    def readings(self) -> Iterator[t.Capture | t.Rejection]:
+        """Yield the captures; one that cannot be read is given as its rejection."""
+        capture, parts = "", dict[str, Any]()
+        for message in _messages(self.path):
+            topic = message.channel.topic
+            try:
+                if topic == "/capture":
+                    capture, parts = str(decode_json(message.data)["id"]), {}
+                elif topic == "/capture/scan" and capture in self.poses:
+                    parts["scan"] = unpack(message.data, self.poses[capture]["shape"])
+                elif topic == "/capture/image":
+                    parts["pixels"] = _decode_image(message.data)
+                elif topic == "/capture/cloud" and capture in self.poses:
+                    yield self._logged_capture(capture, message.data, **parts)
+            except Exception as error:  # what a foreign log holds can be wrong in any way
+                if capture in self.poses:
+                    step = self.poses[capture]["step"].partition(".")[2]
+                    yield t.Rejection(capture, step, _told(message, error))
+
+    def _logged_capture(
+        self, capture: str, data: bytes, scan: t.Singles | None = None, pixels: Any = None
+    ) -> t.Capture:
+        meta, xyz = self.poses[capture], _decode_cloud(data).xyz if scan is None else scan
+        if meta["full"]:
+            xyz = xyz.reshape(meta["shape"])
+        return self._capture(capture, t.PointCloud(t.CAMERA, xyz), pixels)
+
+    @property
+    def has_full_clouds(self) -> bool:
+        """Whether the raw scans were logged whole."""
+        return bool(self.poses) and all(meta["full"] for meta in self.poses.values())
+
+    def _pose(self, capture: str) -> tuple[t.Poses, Any]:
+        """Return the controllers' poses by frame, and the joint angles."""
+        meta = self.poses[capture]
+        poses = adapter(dict[str, t.Transform]).validate_python(meta["poses"])
+        return poses, None if meta["joints"] is None else np.array(meta["joints"])
+
+    def _capture(self, capture: str, cloud: t.PointCloud, pixels: Any = None) -> t.Capture:
+        meta = self.poses[capture]
+        poses, joints = self._pose(capture)
+        image = None if pixels is None else t.Image(pixels, **meta["image"])
+        return t.Capture(capture, cloud, poses, joints, meta["time_ns"], meta["role"], image)
+
+
+def log_of(path: Path) -> Path:
+    """Return the log of a run that is given as its folder or as the log itself."""
+    return path / "run.mcap" if path.is_dir() else path
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a file may be a log of ours; other programs write MCAP too."""
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(64)
+    return not head.startswith(MAGIC) or b"flangeye" in head
+
+
+def read_run(path: Path) -> RunLog:
+    """Read a log, or that of a run's folder, as far as it goes.
+
+    Raises:
+        StageError: The file is missing, empty, or not an MCAP file of ours.
+    """
+    log = RunLog(log_of(path))
+    clouds: dict[str, t.PointCloud] = {}
+    for message in _messages(log.path, log):
+        try:
+            _take(log, message, clouds)
+        except Exception as error:  # what a foreign log holds can be wrong in any way
+            log.damage.append(_told(message, error))
+    _check_texts(log)
+    return log
+
+
+def read_notes(path: Path) -> Iterator[Note]:
+    """Yield what steps wrote into their journals, in order, as far as the log goes.
+
+    Raises:
+        StageError: The file is missing, no MCAP file, or damaged: decisions without what was
+            noted would be others.
+    """
+    for message in _messages(path, strict=True):
+        if message.channel.topic.startswith("/note/"):
+            try:
+                yield _note(message)
+            except Exception as error:  # what a foreign log holds can be wrong in any way
+                raise StageError(f"{path}: {_told(message, error)}") from None
+
+
+def _note(message: Message) -> Note:
+    step, _, name = message.channel.topic.removeprefix("/note/").rpartition("/")
+    if message.channel.schema == "foxglove.CompressedImage":
+        return Note(step, name, _decode_image(message.data))
+    return Note(step, name, decode_json(message.data)["value"])
+
+
+def _take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
+    """Take in one message; whatever it raises is damage."""
+    topic, schema = message.channel.topic, message.channel.schema
+    if schema == "foxglove.PointCloud" and topic.startswith("/step/"):
+        clouds[topic] = _decode_cloud(message.data)
+    elif topic == "/log":
+        log.messages.append(_decode_log(message.data))
+    elif schema.startswith("flangeye.") and schema != "flangeye.Scan":
+        _take_json(log, topic, schema.removeprefix("flangeye."), message.data, clouds)
+
+
+def _take_json(
+    log: RunLog, topic: str, schema: str, raw: bytes, clouds: dict[str, t.PointCloud]
+) -> None:
+    if topic.startswith("/note/"):
+        return
+    data = decode_json(raw)
+    if topic == "/source":
+        total = adapter(int | None).validate_python(data.pop("total"), strict=True)
+        log.source, log.total = adapter(t.Source).validate_python(data), total
+    elif topic == "/capture":
+        adapter(_CaptureFacts).validate_python(data)
+        log.poses[data["id"]] = data
+    elif topic == "/capture/finished":
+        log.finished.append(adapter(str).validate_python(data["capture"]))
+    elif topic == "/rejection":
+        log.rejections.append(adapter(t.Rejection).validate_python(data))
+    elif topic.startswith("/step/"):
+        facts = adapter(_StepFacts).validate_python(data)
+        held = _held(topic, data.get("shapes", {}), clouds)
+        value = _decode_value(schema, data["value"], held)
+        step = topic.removeprefix("/step/")
+        entry = Entry(step, facts["capture"], facts["seconds"], schema, value)
+        _check_kind(entry)
+        log.entries.append(entry)
+
+
+def _check_kind(entry: Entry) -> None:
+    """Refuse what no stage of a kind gives."""
+    expected = _GIVEN.get(entry.kind)
+    if expected and not isinstance(entry.value, expected):
+        names = " or ".join(kind.__name__ for kind in expected)
+        raise DamageError(f"a step of {entry.kind} gives {names}, not {entry.type}")
+
+
+def _check_texts(log: RunLog) -> None:
+    """Take attachments that are not what their name says for damaged."""
+    for name, raw in list(log.attachments.items()):
+        try:
+            if name.endswith(".yaml"):
+                raw.decode()
+            elif name == "result.json":
+                decode_json(raw)
+        except Exception as error:  # what a foreign log holds can be wrong in any way
+            del log.attachments[name]
+            log.damage.append(f"the attached {name}: {reason_of(error)}")
+
+
+def decode_json(raw: bytes) -> dict[str, Any]:
+    """Return a JSON object of a log.
+
+    Raises:
+        ValueError: It is too long, no JSON, or something else.
+    """
+    if len(raw) > MAX_JSON:
+        raise DamageError(f"it has {len(raw)} bytes; at most {MAX_JSON} are read")
+    data = json.loads(raw, parse_constant=_no_number)
+    if not isinstance(data, dict):
+        raise DamageError(f"it is no object but of type {type(data).__name__}")
+    return data
+
+
+def _no_number(text: str) -> None:
+    raise DamageError(f"it holds {text}, which is no number")
+
+
+def _told(message: Message, error: Exception) -> str:
+    return f"message {message.number} on {message.channel.topic}: {reason_of(error)}"
+
+
+def _held(
+    topic: str, shapes: Mapping[str, list[int]], clouds: Mapping[str, t.PointCloud]
+) -> dict[str, t.PointCloud]:
+    """Return the clouds of a step's value by field name, in rows and columns as they were."""
+    found = {at.rpartition("/")[2]: c for at, c in clouds.items() if at.rpartition("/")[0] == topic}
+    return {
+        name: t.PointCloud(cloud.frame, cloud.xyz.reshape(shapes.get(name, cloud.xyz.shape)))
+        for name, cloud in found.items()
+    }
+
+
+def _decode_value(schema: str, data: Any, held: Mapping[str, t.PointCloud]) -> Any:
+    cls = _TYPES.get(schema)
+    return data if cls is None else adapter(cls).validate_python({**data, **held})
+
+
+def _decode_cloud(data: bytes) -> t.PointCloud:
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+    message = PointCloud.FromString(data)
+    return t.PointCloud(message.frame_id, foxglove.points_of(message))
+
+
+def _decode_image(data: bytes) -> Any:
+    import cv2
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    pixels = decode_image(CompressedImage.FromString(data).data, cv2.IMREAD_UNCHANGED)
+    return pixels if pixels.ndim == 2 else pixels[..., ::-1]
+
+
+def _decode_log(data: bytes) -> str:
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+
+    return str(Log.FromString(data).message)
+
+
+def _messages(path: Path, log: RunLog | None = None, strict: bool = False) -> Iterator[Message]:
+    """Yield the messages until the log's end, or as far as it goes; fill ``log``."""
+
+    def damaged(what: str) -> None:
+        if strict:
+            raise StageError(f"{path}: damaged: {what}")
+        if log is not None:
+            log.damage.append(what)
+
+    reading = LogFile(damaged)
+    with open_regular(path) as file:
+        try:
+            yield from reading.messages(file, path.stat().st_size)
+        except NotMcapError:
+            raise StageError(f"{path}: is not an MCAP file") from None
+        except OSError as error:
+            raise StageError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if log is not None:
+        log.attachments, log.complete = reading.attachments, reading.ended
+        if log.source is None and not log.attachments and not reading.may_be_ours:
+            raise StageError(f"{path}: is an MCAP file, but not a log of flangeye")

@@ -1,0 +1,275 @@
+"""The one door through which logs are read: checked, bounded, and past what is damaged.
+
+A log may be torn, changed, or made by anybody. Checksums of chunks and attachments are compared,
+hashes of the recipe and the result too; what a chunk expands to is bounded before it is expanded.
+A damaged part is named and left out, and reading goes on behind it.
+
+MCAP's records: https://mcap.dev/spec. The library's own stream reader does not check attachments,
+and stops at the first damaged chunk; its parsers of single records are used here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from mcap.records import Chunk
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_RECORD = 1 << 30
+"""Largest record that is read [bytes]."""
+MAX_CHUNK = 1 << 28
+"""What one chunk may expand to [bytes]; a whole scan of the largest scanner has an eighth."""
+SLACK, MAX_RATIO = 1 << 30, 100
+"""What all chunks together may: so much [bytes], and so many times what they take up."""
+HASHES = "flangeye.sha256"
+"""Name of the metadata record that says an attachment's hash."""
+
+
+class Channel(NamedTuple):
+    """Where messages come from.
+
+    Attributes:
+        topic: Its name.
+        schema: Name of the messages' schema.
+        schema_encoding: ``jsonschema`` or ``protobuf``.
+        schema_data: The schema itself.
+        encoding: Of the messages: ``json`` or ``protobuf``.
+    """
+
+    topic: str
+    schema: str
+    schema_encoding: str
+    schema_data: bytes
+    encoding: str
+
+
+class Message(NamedTuple):
+    """One message of a log.
+
+    Attributes:
+        channel: Where it comes from.
+        time_ns: When it was logged.
+        data: Its bytes.
+        number: How many came before it.
+    """
+
+    channel: Channel
+    time_ns: int
+    data: bytes
+    number: int = 0
+
+
+class NotMcapError(ValueError):
+    """The file does not begin as an MCAP file does."""
+
+
+class DamageError(ValueError):
+    """A part of a log is not as it was written: what is wrong with it."""
+
+
+@dataclass
+class LogFile:
+    """One pass through a log.
+
+    Attributes:
+        damaged: Is told of every damaged part, in one sentence.
+        library: What wrote the log.
+        attachments: Name -> bytes, of those that are sound.
+        ended: Whether the log has its end.
+    """
+
+    damaged: Callable[[str], None]
+    library: str = ""
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    ended: bool = False
+    _schemas: dict[int, Any] = field(default_factory=dict)
+    _channels: dict[int, Channel] = field(default_factory=dict)
+    _hashes: dict[str, str] = field(default_factory=dict)
+    _messages: int = 0
+    _read: int = 0
+    _expanded: int = 0
+    _crc: int = 0
+    _sound: bool = True
+
+    @property
+    def may_be_ours(self) -> bool:
+        """Whether the log says that flangeye wrote it, or was killed before it could."""
+        return self.library.startswith("flangeye") or not self._read
+
+    def messages(self, file: IO[bytes], size: int = MAX_RECORD) -> Iterator[Message]:
+        """Yield the messages until the log's end, or as far as it goes.
+
+        Args:
+            file: Stands at the log's first byte; may wait for more.
+            size: Of the file, where it is known [bytes]: no record is longer.
+
+        Raises:
+            NotMcapError: It is no MCAP file.
+        """
+        for number, (opcode, body) in enumerate(self._records(file, size)):
+            try:
+                yield from self._taken(opcode, body)
+            except Exception as error:  # damaged bytes can break a parser in any way
+                self._sound = False
+                self.damaged(f"record {number}: {reason_of(error)}")
+            if self.ended:
+                break
+        self._check_hashes()
+
+    def _records(self, file: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
+        """Yield (opcode, content); a record that is cut off was being written, and is no damage."""
+        begin = file.read(len(MAGIC))
+        if not MAGIC.startswith(begin):
+            raise NotMcapError
+        self._crc = zlib.crc32(begin)
+        while len(head := file.read(9)) == 9:
+            opcode, length = struct.unpack("<BQ", head)
+            body = file.read(min(length, size)) if length <= MAX_RECORD else MAGIC
+            if len(body) < length:
+                if body.endswith(MAGIC):  # the end is there, so nothing was being written
+                    self._sound = False
+                    self.damaged(f"a record says that it has {length} bytes; the rest is not read")
+                return
+            self._read += 9 + length
+            yield opcode, body
+            self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
+
+    def _taken(self, opcode: int, body: bytes) -> Iterator[Message]:
+        from mcap import records
+        from mcap.data_stream import ReadDataStream
+        from mcap.opcode import Opcode
+
+        stream = ReadDataStream(io.BytesIO(body))
+        if opcode == Opcode.HEADER:
+            self.library = records.Header.read(stream).library
+        elif opcode == Opcode.CHUNK:
+            yield from self._of_chunk(records.Chunk.read(stream))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield from self._flat(opcode, body)
+        elif opcode == Opcode.ATTACHMENT:
+            self._attach(records.Attachment.read(stream), body)
+        elif opcode == Opcode.METADATA:
+            metadata = records.Metadata.read(stream)
+            if metadata.name == HASHES:
+                self._hashes.update(metadata.metadata)
+        elif opcode == Opcode.DATA_END:
+            if self._sound and records.DataEnd.read(stream).data_section_crc not in (0, self._crc):
+                raise DamageError("the log's checksum does not match: it was changed or damaged")
+        elif opcode == Opcode.FOOTER:
+            self.ended = True
+
+    def _flat(self, opcode: int, body: bytes) -> Iterator[Message]:
+        """Take in one of the records that may stand in a chunk."""
+        from mcap import records
+        from mcap.data_stream import ReadDataStream
+        from mcap.opcode import Opcode
+
+        stream = ReadDataStream(io.BytesIO(body))
+        if opcode == Opcode.SCHEMA:
+            schema = records.Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = records.Channel.read(stream)
+            schema = self._schemas.get(channel.schema_id)
+            name, encoding, described = (
+                (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+            )
+            self._channels[channel.id] = Channel(
+                channel.topic, name, encoding, described, channel.message_encoding
+            )
+        elif opcode == Opcode.MESSAGE:
+            message = records.Message.read(stream, len(body))
+            self._messages += 1
+            if message.channel_id not in self._channels:
+                raise DamageError(f"message {self._messages - 1} is of no channel")
+            yield Message(
+                self._channels[message.channel_id],
+                message.log_time,
+                message.data,
+                self._messages - 1,
+            )
+
+    def _of_chunk(self, chunk: Chunk) -> Iterator[Message]:
+        content = memoryview(self._expand(chunk))
+        at = 0
+        while at < len(content):
+            if at + 9 > len(content):
+                raise DamageError("a chunk ends in the middle of a record")
+            opcode, length = struct.unpack_from("<BQ", content, at)
+            if at + 9 + length > len(content):
+                raise DamageError("a chunk ends in the middle of a record")
+            yield from self._flat(opcode, bytes(content[at + 9 : at + 9 + length]))
+            at += 9 + length
+
+    def _expand(self, chunk: Chunk) -> bytes:
+        if chunk.uncompressed_size > MAX_CHUNK:
+            raise DamageError(
+                f"a chunk says that it expands to {chunk.uncompressed_size} bytes; at most "
+                f"{MAX_CHUNK} are read"
+            )
+        self._expanded += chunk.uncompressed_size
+        if self._expanded > SLACK + MAX_RATIO * self._read:
+            raise DamageError(f"the log expands to more than {MAX_RATIO} times its size")
+        content = _decompressed(chunk)
+        if len(content) != chunk.uncompressed_size:
+            raise DamageError("a chunk does not expand to the size that it states")
+        if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
+            raise DamageError("a chunk's checksum does not match: it was changed or damaged")
+        return content
+
+    def _attach(self, attachment: Any, body: bytes) -> None:
+        stated = int.from_bytes(body[-4:], "little")
+        if stated not in (0, zlib.crc32(body[:-4])):
+            raise DamageError(
+                f"the checksum of the attached {attachment.name} does not match: it was changed "
+                "or damaged"
+            )
+        self.attachments[attachment.name] = attachment.data
+
+    def _check_hashes(self) -> None:
+        for name, stated in self._hashes.items():
+            data = self.attachments.get(name)
+            if data is not None and hashlib.sha256(data).hexdigest() != stated:
+                del self.attachments[name]
+                self.damaged(f"the hash of the attached {name} does not match: it was changed")
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """Return at most one byte more than the chunk states."""
+    limit = chunk.uncompressed_size + 1
+    if chunk.compression == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(
+            chunk.data
+        ) as reader:
+            return reader.read(limit)
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=limit)
+        return data
+    if chunk.compression:
+        raise DamageError(f"a chunk is compressed with '{chunk.compression}'; zstd or lz4 are read")
+    return chunk.data
+
+
+def reason_of(error: Exception) -> str:
+    """Return what is wrong with foreign content, in one short line without its own wording."""
+    if isinstance(error, KeyError):
+        return f"it lacks {error}"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, UnicodeDecodeError):
+        return "it is not UTF-8 text"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if type(error).__name__ == "ValidationError" and len(lines) > 2:
+        lines = [f"{lines[1]}: {lines[2].partition(' [type=')[0]}"]
+    return (lines[0] if lines else type(error).__name__)[:200]

@@ -1,0 +1,141 @@
+"""What a run looks like so far, gathered from its messages."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flangeye.files.printable import printable
+from flangeye.log.read import decode_json
+from flangeye.log.records import Message, reason_of
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+LINES = 6
+"""Latest events that are shown."""
+
+
+@dataclass
+class View:
+    """The state of a run.
+
+    Attributes:
+        name: The run's folder.
+        total: Captures that are expected at most, when known.
+        captures: Captures that arrived.
+        fitted: Those that became an observation.
+        arm: Where the arm was last: position [m], and when [s].
+        progress: What the solver last knew of its error.
+        events: The latest lines for people.
+        newest_ns: When the last message was logged.
+        ended: Whether the run came to its end.
+    """
+
+    name: str
+    total: int | None = None
+    captures: int = 0
+    fitted: int = 0
+    arm: tuple[list[float], str] | None = None
+    progress: dict[str, Any] | None = None
+    events: list[str] = field(default_factory=list)
+    newest_ns: int = 0
+    ended: bool = False
+
+    def take(self, message: Message) -> None:
+        """Take in one message."""
+        self.newest_ns = message.time_ns
+        before = vars(self).copy()
+        try:
+            self._take(message)
+            self.rows()  # what cannot be shown is not taken in
+        except Exception as error:  # what a foreign log holds can be wrong in any way
+            vars(self).update(before)
+            self.note(f"message {message.number} on {message.channel.topic}: {reason_of(error)}")
+
+    def note(self, what: str) -> None:
+        """Show a line of our own among the events."""
+        self._say(what)
+
+    def _take(self, message: Message) -> None:
+        topic, schema = message.channel.topic, message.channel.schema
+        if message.channel.encoding != "json":
+            return
+        content = decode_json(message.data)
+        if topic == "/source":
+            self.total = content["total"]
+            self._say(*content["notes"])
+        elif topic == "/capture":
+            self.captures += 1
+            self._place(content["poses"]["flange"], "at the last capture")
+        elif topic == "/rejection":
+            self._say(f"set aside {content['id']}: {content['stage']}: {content['reason']}")
+        elif topic.startswith("/step/"):
+            self._step(topic.removeprefix("/step/"), schema, content)
+        elif topic.startswith("/note/"):
+            self._note(schema, content["value"])
+
+    def _step(self, step: str, schema: str, content: dict[str, Any]) -> None:
+        if content["capture"] is None:
+            reason = f": {content['value']['reason']}" if schema.endswith("Verification") else ""
+            self._say(f"{step} done{reason}")
+        elif step.partition(".")[2].startswith("fit"):
+            self.fitted += 1
+            self._say(f"fitted {content['capture']}")
+
+    def _note(self, schema: str, value: dict[str, Any]) -> None:
+        if schema == "flangeye.RobotState":
+            self._place(value["base_T_flange"], value["mode"])
+        elif schema == "flangeye.Progress":
+            self.progress = value
+
+    def _place(self, base_T_flange: dict[str, Any], when: str) -> None:
+        self.arm = [row[3] for row in base_T_flange["matrix"][:3]], when
+
+    def _say(self, *lines: str) -> None:
+        self.events = [*self.events, *map(str, lines)][-LINES:]
+
+    def rendered(self) -> RenderableType:
+        """Return the view for the terminal."""
+        from rich.console import Group
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table.grid(padding=(0, 2))
+        for label, text in self.rows():
+            table.add_row(Text(label, style="bold"), Text(printable(text)))
+        return Group(table, *(Text(printable(f"  {line}"), style="dim") for line in self.events))
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return labels and texts."""
+        of = f" of at most {self.total}" if self.total else ""
+        return [
+            ("run", f"{self.name}{', ended' if self.ended else self._silence()}"),
+            ("captures", f"{self.captures}{of}, {self.fitted} fitted"),
+            ("arm", self._arm()),
+            ("error so far", self._error()),
+        ]
+
+    def _arm(self) -> str:
+        if self.arm is None:
+            return "not known yet"
+        place, when = self.arm
+        return ", ".join(f"{1e3 * x:.1f}" for x in place) + f" mm in the base, {when}"
+
+    def _error(self) -> str:
+        if self.progress is None:
+            return "not known yet"
+        error, required = (self.progress[key] for key in ("error", "required"))
+        if not np.isfinite(error or np.inf):
+            return f"not observable yet after {self.progress['poses']} poses"
+        return (
+            f"95 % below {error * 1e3:.3f} mm after {self.progress['poses']} poses, "
+            f"{required * 1e3:.3f} mm required"
+        )
+
+    def _silence(self) -> str:
+        silent = time.time() - self.newest_ns * 1e-9
+        return f", nothing new for {silent:.0f} s" if self.newest_ns and silent > 5 else ""

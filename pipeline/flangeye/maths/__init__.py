@@ -1,0 +1,1 @@
+"""Geometry, kinematics and statistics that any room may use. Arrays only."""

@@ -1,0 +1,118 @@
+"""Where the flange is, when the arm's own report of it is known to be wrong. Arrays only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.smooth_field import displacement
+from flangeye.types import ArmCorrection, Floats, Observation
+
+REACHED = 1e-9
+"""Joint angles belong to a pose when they reach it this closely [rad, m]."""
+SUBSTITUTIONS = 4
+"""Each leaves about a hundredth of the error before it."""
+STEPS, LONGEST_STEP = 200, 0.2
+"""Newton steps at most, and the most that a joint moves in each [rad]."""
+
+
+def corrected_flange(
+    base_T_flange: Floats,
+    joints: Floats | None,
+    correction: ArmCorrection | None,
+    arm: Arm | None,
+) -> Floats:
+    """Return the (4, 4) pose of the seen circle, from the pose the arm reports.
+
+    Args:
+        base_T_flange: (4, 4) as reported.
+        joints: (n,) as reported [rad], or None.
+        correction: What is wrong with the arm, if anything.
+        arm: Its kinematics; needed when joint offsets are corrected.
+
+    Raises:
+        ValueError: Joint offsets are to be corrected without kinematics, or the pose is out of
+            the arm's reach.
+    """
+    if correction is None:
+        return base_T_flange
+    pose = np.array(base_T_flange)
+    if correction.field is not None:
+        pose[:3, 3] += displacement(correction.field, base_T_flange[:3, 3])
+    if correction.joint_offsets is not None:
+        if arm is None or correction.joints is None:
+            raise ValueError("joint offsets need the arm's kinematics and a configuration")
+        angles = follow(arm, base_T_flange, correction.joints) if joints is None else joints
+        built = arm if correction.lengths is None else arm.altered(np.asarray(correction.lengths))
+        moved = built.flange(angles + correction.joint_offsets)
+        pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved
+    pose[:3, 3] += pose[:3, :3] @ correction.tool_offset
+    return pose
+
+
+def corrected_observation(
+    observation: Observation, correction: ArmCorrection | None, arm: Arm | None
+) -> Observation:
+    """Return an observation with the flange where the corrected arm has it; see above."""
+    if correction is None:
+        return observation
+    reported = observation.base_T_flange
+    pose = corrected_flange(reported.matrix, observation.joints, correction, arm)
+    moved = {reported.child: replace(reported, matrix=pose)}
+    return replace(observation, poses={**observation.poses, **moved})
+
+
+def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm | None) -> Floats:
+    """Return the (4, 4) pose to command, so that the corrected arm puts its flange at a pose.
+
+    The inverse of :func:`corrected_flange` without the circle's place on the flange, by repeated
+    substitution: a correction changes little over its own size.
+
+    Args:
+        base_T_flange: (4, 4) where the flange shall really be.
+        correction: What is wrong with the arm.
+        arm: Its kinematics; needed when joint offsets are corrected.
+
+    Raises:
+        ValueError: As :func:`corrected_flange` does.
+    """
+    of_arm = replace(correction, tool_offset=np.zeros(3))
+    commanded = np.array(base_T_flange)
+    for _ in range(SUBSTITUTIONS):
+        reached = corrected_flange(commanded, None, of_arm, arm)
+        commanded = base_T_flange @ np.linalg.inv(reached) @ commanded
+    return commanded
+
+
+def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
+    """Return the joint angles (..., n) that reach (..., 4, 4) poses on the branch of ``near``.
+
+    Newton's method in small steps: a configuration leads to its own branch.
+
+    Args:
+        arm: The kinematics.
+        base_T_flange: (..., 4, 4) poses.
+        near: (n,) joint angles to start from [rad].
+
+    Raises:
+        ValueError: It does not get to every pose.
+    """
+    joints = np.broadcast_to(near, (*base_T_flange.shape[:-2], arm.n)).astype(np.float64)
+    for _ in range(STEPS):
+        twist = _twist(base_T_flange, arm.flange(joints))
+        if np.abs(twist).max() < REACHED:
+            return joints
+        step = (np.linalg.pinv(arm.jacobian(joints), rcond=1e-6) @ twist[..., None])[..., 0]
+        longest = np.abs(step).max(axis=-1, keepdims=True)
+        joints = joints + step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
+    raise ValueError("no joint angles near the given ones reach the pose")
+
+
+def _twist(wanted: Floats, reached: Floats) -> Floats:
+    """Return (..., 6) that leads from one pose to another, exact when they are near."""
+    turn = wanted[..., :3, :3] @ np.swapaxes(reached[..., :3, :3], -1, -2)
+    skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
+    axis = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    return np.concatenate([axis, wanted[..., :3, 3] - reached[..., :3, 3]], axis=-1)

@@ -1,0 +1,76 @@
+"""Circles in flat points: what finding a flange and fitting it have in common. Arrays only.
+
+Robust without drawing lots: every function gives the same answer whatever the order of the
+points, and there is no seed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.types import Floats, Indices
+
+
+def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> Indices:
+    """Return the point farthest from (or nearest to) the centre in each of ``bins`` sectors.
+
+    Args:
+        flat: (N, 2) [m].
+        centre: (2,) [m].
+        bins: Number of equal sectors about the centre; those without points give none.
+        outer: Farthest if true, nearest otherwise.
+    """
+    offsets = flat - centre
+    reach = np.hypot(offsets[:, 0], offsets[:, 1]) * (1 if outer else -1)
+    sector = sectors(offsets, bins)
+    best = np.full(bins, -np.inf)
+    np.maximum.at(best, sector, reach)
+    at_edge = np.flatnonzero(reach == best[sector])
+    return at_edge[np.unique(sector[at_edge], return_index=True)[1]]
+
+
+def sectors(offsets: Floats, bins: int) -> Indices:
+    """Return which of ``bins`` equal sectors each of (N, 2) offsets from a centre lies in."""
+    turn = np.arctan2(offsets[:, 1], offsets[:, 0]) / (2 * np.pi) + 0.5
+    return np.minimum((turn * bins).astype(np.intp), bins - 1)
+
+
+def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: float) -> Floats:
+    """Return the (2,) centre that most edge points agree on, their circles' radii being given.
+
+    Every edge point votes for all centres one radius away from it (Hough 1962, Duda and Hart
+    1972). Half a rim, or a rim with stray points, still has a single peak.
+
+    Args:
+        edges: Edge points (K, 2) [m], each group with the radius [m] of its circle.
+        start: (2,) where to look [m].
+        reach: How far from there the centre may be [m].
+    """
+    cell = min(radius for _, radius in edges) / 20
+    half = int(np.ceil(reach / cell))
+    size = 2 * half + 1
+    votes = np.zeros(size * size)
+    for points, radius in edges:
+        angle = np.arange(0, 2 * np.pi, cell / radius)
+        circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        x, y = (
+            np.rint(((points[:, None, k] - start[k]) + circle[:, k]) / cell).astype(np.intp) + half
+            for k in range(2)
+        )
+        inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
+        votes += np.bincount((x * size + y)[inside], minlength=size * size)
+    return start + cell * (_peak(votes.reshape(size, size)) - half)
+
+
+def _peak(votes: Floats) -> Floats:
+    """Return the (2,) centre of mass of the 5 x 5 cells with the most votes."""
+    padded, size = np.pad(votes, 2), len(votes)
+    tall = np.add.reduce([padded[k : k + size] for k in range(5)])
+    sums = np.add.reduce([tall[:, k : k + size] for k in range(5)])
+    row, column = np.unravel_index(np.argmax(sums), votes.shape)
+    mass = padded[row : row + 5, column : column + 5]
+    if mass.sum() == 0:
+        return np.array([row, column], dtype=np.float64)
+    ticks = np.arange(-2, 3)
+    shift = np.array([ticks @ mass.sum(axis=1), ticks @ mass.sum(axis=0)]) / mass.sum()
+    return np.asarray(np.array([row, column]) + shift)

@@ -1,0 +1,202 @@
+"""Rigid-body and least-squares geometry shared by more than one kind of plugin. Arrays only."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flangeye.types import Floats
+
+
+def hat(v: Floats) -> Floats:
+    """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_exp(phi: Floats) -> Floats:
+    """Return the rotations of rotation vectors, (..., 3) [rad] -> (..., 3, 3) (Rodrigues)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    if phi.ndim == 1:  # an arm's pose, hundreds of times a second: floats are five times faster
+        return _rotation_exp_of_one(*phi.tolist())
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    k = hat(phi)
+    # sin(x)/x and (1 - cos(x))/x^2 without cancellation near zero.
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def _rotation_exp_of_one(x: float, y: float, z: float) -> Floats:
+    angle = math.sqrt(x * x + y * y + z * z)
+    half = 0.5 * angle
+    a = math.sin(angle) / angle if angle else 1.0
+    b = 0.5 * (math.sin(half) / half) ** 2 if half else 0.5
+    return np.array(
+        [
+            [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+        ]
+    )
+
+
+def rotation_log(rotation: Floats) -> Floats:
+    """Return the rotation vectors (..., 3) [rad] of (..., 3, 3), their length at most pi."""
+    q = quaternion_from_rotation(rotation)
+    xyz, w = q[..., :3], q[..., 3:]
+    length = np.linalg.norm(xyz, axis=-1, keepdims=True)
+    # Twice the angle over its sine; at zero angle, where w is one, the ratio is two.
+    ratio = 2.0 * np.arctan2(length, w) / np.maximum(length, 1e-300)
+    return np.asarray(xyz * np.where(length < 1e-12, 2.0, ratio))
+
+
+def quaternion_from_rotation(rotation: Floats) -> Floats:
+    """Return unit quaternions (..., 4) xyzw, w >= 0, of (..., 3, 3) (Bar-Itzhack 2000).
+
+    The dominant eigenvector of a symmetric matrix: stable at every angle, and the nearest
+    rotation where the matrix is not quite orthonormal.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    symmetric = r + np.swapaxes(r, -1, -2)
+    trace = np.trace(r, axis1=-2, axis2=-1)[..., None, None]
+    k = np.empty((*r.shape[:-2], 4, 4))
+    k[..., :3, :3] = symmetric - trace * np.eye(3)
+    k[..., 3, 3] = trace[..., 0, 0]
+    k[..., :3, 3] = k[..., 3, :3] = np.stack(
+        [
+            r[..., 2, 1] - r[..., 1, 2],
+            r[..., 0, 2] - r[..., 2, 0],
+            r[..., 1, 0] - r[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    q = np.linalg.eigh(k)[1][..., -1]
+    return np.asarray(np.where(q[..., 3:] >= 0, q, -q))
+
+
+def rotation_from_quaternion(xyzw: Floats) -> Floats:
+    """Return the (3, 3) rotation of a quaternion (4,) xyzw; it is normalised first."""
+    q = np.asarray(xyzw, dtype=np.float64)
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """Return the (3, 3) rotation Rz(yaw) Ry(pitch) Rx(roll), angles [rad] (URDF, ROS)."""
+    cr, cp, cy = np.cos([roll, pitch, yaw])
+    sr, sp, sy = np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rpy_from_rotation(rotation: Floats) -> Floats:
+    """Return (roll, pitch, yaw) [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
+
+
+def rigid(rotation: Floats, translation: Floats) -> Floats:
+    """Return the (4, 4) matrix of a (3, 3) rotation and a (3,) translation [m]."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, translation
+    return out
+
+
+def invert(transforms: Floats) -> Floats:
+    """Return the inverses of rigid (..., 4, 4) matrices."""
+    out = np.zeros_like(transforms)
+    out[..., :3, :3] = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    out[..., :3, 3] = -(out[..., :3, :3] @ transforms[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def nearest_rotation(matrices: Floats) -> Floats:
+    """Return the proper rotations (..., 3, 3) nearest to any (..., 3, 3), by Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]
+    return np.asarray(u @ vt)
+
+
+def basis_of_plane(normal: Floats) -> Floats:
+    """Return (3, 3) whose rows are two in-plane axes and the unit normal, right-handed."""
+    n = np.asarray(normal, dtype=np.float64) / np.linalg.norm(normal)
+    helper = np.eye(3)[np.argmin(np.abs(n))]
+    u = hat(helper) @ n
+    u /= np.linalg.norm(u)
+    return np.stack([u, hat(n) @ u, n])
+
+
+def kabsch(source: Floats, target: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:
+    """Return R (3, 3), t (3,) minimising sum w |R source + t - target|^2, for (N, 3) points.
+
+    Umeyama (1991) with scale one: the paper's equations (8) to (10), with the sign taken from
+    det(U) det(V), which also holds for coplanar points, where det of the covariance is zero.
+    """
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    mean_s, mean_t = w @ source, w @ target
+    cross = (target - mean_t).T @ (w[:, None] * (source - mean_s))
+    u, _, vt = np.linalg.svd(cross)
+    sign = np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
+    rotation = u @ sign @ vt
+    return rotation, mean_t - rotation @ mean_s
+
+
+def adjoint_shift(offset: Floats) -> Floats:
+    """Return the (6, 6) map of a perturbation (phi, tau) to another reference point.
+
+    With ``tau`` taken about p, ``adjoint_shift(q - p) @ (phi, tau)`` is taken about q:
+    ``tau_q = tau_p + phi x (q - p)``.
+    """
+    out = np.eye(6)
+    out[3:, :3] = -hat(offset)
+    return out
+
+
+def covariance_at(covariance: Floats, about: Floats, points: Floats) -> Floats:
+    """Return the (N, 3, 3) covariance of mapped points from a transform's (6, 6) covariance.
+
+    Args:
+        covariance: Order (rotation, translation), left perturbation, translation about ``about``.
+        about: (3,) reference point [m].
+        points: (N, 3) in the parent frame [m].
+    """
+    jacobian = np.zeros((len(points), 3, 6))
+    jacobian[:, :, :3] = -hat(np.asarray(points) - about)
+    jacobian[:, :, 3:] = np.eye(3)
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
+
+
+def kabsch_covariance(target: Floats, sigma: float) -> Floats:
+    """Return the (6, 6) covariance of :func:`kabsch`, translation about the targets' centroid.
+
+    Every coordinate of every pair carries independent noise of ``sigma`` [m], on either side.
+    Rotation and translation are then independent, and this is the Cramér-Rao bound
+    (Fitzpatrick, West & Maurer 1998).
+
+    Raises:
+        numpy.linalg.LinAlgError: The targets lie on a line: a rotation is not determined.
+    """
+    levers = hat(target - target.mean(axis=0))
+    out = np.zeros((6, 6))
+    out[:3, :3] = sigma**2 * np.linalg.inv(np.einsum("nki,nkj->ij", levers, levers))
+    out[3:, 3:] = sigma**2 / len(target) * np.eye(3)
+    return out

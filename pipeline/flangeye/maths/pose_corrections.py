@@ -1,0 +1,129 @@
+"""Robot poses as they were meant: the changes that undo mistakes in recordings. Arrays only.
+
+Poses are (N, 4, 4) ``base_T_flange`` [m], in the order they were recorded.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.types import Floats, Mask
+
+
+def scaled(poses: Floats, factor: float) -> Floats:
+    """Return the poses with their positions times ``factor``: other units."""
+    out = np.array(poses)
+    out[..., :3, 3] *= factor
+    return out
+
+
+def inverted(poses: Floats) -> Floats:
+    """Return the inverse of each pose: ``flange_T_base`` was given."""
+    return np.asarray(np.linalg.inv(poses))
+
+
+def transposed(poses: Floats) -> Floats:
+    """Return the poses with their rotations transposed: matrices stored column by column."""
+    out = np.array(poses)
+    out[..., :3, :3] = poses[..., :3, :3].swapaxes(-1, -2)
+    return out
+
+
+def reread(poses: Floats, read_as: str, written_as: str) -> Floats:
+    """Return the poses with their rotations' numbers read another way.
+
+    Args:
+        poses: As they were read.
+        read_as: How the rotations were read, as :class:`PoseConvention`
+            names it.
+        written_as: How they were written; of as many numbers.
+    """
+    out = np.array(poses)
+    out[..., :3, :3] = _rotations(_numbers(poses[..., :3, :3], read_as), written_as)
+    return out
+
+
+def _numbers(rotations: Floats, written_as: str) -> Floats:
+    from scipy.spatial.transform import Rotation
+
+    known = Rotation.from_matrix(rotations)
+    if written_as == "vector":
+        return np.asarray(known.as_rotvec())
+    if written_as in ("xyzw", "wxyz"):
+        return np.asarray(known.as_quat()[:, _xyzw_to(written_as)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # gimbal lock: one answer of many
+        return np.asarray(known.as_euler(written_as))
+
+
+def _rotations(numbers: Floats, written_as: str) -> Floats:
+    from scipy.spatial.transform import Rotation
+
+    if written_as == "vector":
+        return np.asarray(Rotation.from_rotvec(numbers).as_matrix())
+    if written_as in ("xyzw", "wxyz"):
+        back = np.argsort(_xyzw_to(written_as))
+        return np.asarray(Rotation.from_quat(numbers[:, back]).as_matrix())
+    return np.asarray(Rotation.from_euler(written_as, numbers).as_matrix())
+
+
+def _xyzw_to(order: str) -> list[int]:
+    return [0, 1, 2, 3] if order == "xyzw" else [3, 0, 1, 2]
+
+
+def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
+    """Return the poses that belong to the samples, and which samples have one.
+
+    Args:
+        poses: (N, 4, 4).
+        by: A sample's pose is the one recorded so many samples later.
+        start: Index of the first sample that is shifted; those before keep their own.
+    """
+    source, kept = sources(len(poses), by, start)
+    return poses[source], kept
+
+
+def sources(count: int, by: int, start: int = 0) -> tuple[NDArray[np.intp], Mask]:
+    """Return (N,) from which sample each gets its pose, its own if from none, and which get one.
+
+    Args:
+        count: Samples there are.
+        by: A sample's pose is the one recorded so many samples later.
+        start: Index of the first sample that is shifted; those before keep their own.
+    """
+    samples = np.arange(count)
+    source = np.where(samples < start, samples, samples + by)
+    kept = (source >= 0) & (source < count) & ((samples < start) | (source >= start))
+    return np.where(kept, source, samples), kept
+
+
+def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
+    """Return the poses the arm had ``delay`` later, and for which samples they are known.
+
+    Between two samples the arm is taken to move evenly.
+
+    Args:
+        poses: (N, 4, 4).
+        times: (N,) when, rising [s].
+        delay: Negative for earlier [s].
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    wanted = times + delay
+    kept = (wanted >= times[0]) & (wanted <= times[-1])
+    inside = np.clip(wanted, times[0], times[-1])
+    out = np.array(poses)
+    out[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(inside, times, poses[:, axis, 3])
+    return out, np.asarray(kept)
+
+
+def without_tool(poses: Floats, offset: Floats) -> Floats:
+    """Return the flange's poses, where those of a point (3,) in ``flange`` [m] were given."""
+    out = np.array(poses)
+    out[..., :3, 3] -= poses[..., :3, :3] @ offset
+    return out

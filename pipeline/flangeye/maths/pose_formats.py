@@ -1,0 +1,253 @@
+"""How controllers, files and people write a pose: as a row of numbers, each in its own way.
+
+A pose is a (4, 4) ``parent_T_child`` in metres here and nowhere else. Outside it is a position and
+a rotation vector, a quaternion, or three angles about axes in some order. The sources of each
+maker's convention are beside its entry in :data:`CONVENTIONS`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from flangeye.maths.geometry import (
+    quaternion_from_rotation,
+    rigid,
+    rotation_exp,
+    rotation_from_quaternion,
+    rotation_log,
+)
+from flangeye.types import Floats
+
+LengthUnit = Literal["m", "mm"]
+AngleUnit = Literal["rad", "deg"]
+_Token = Mapping[str, str | Any]
+
+NORM_TOLERANCE = 1e-3
+"""Of a quaternion: four printed digits pass, a wrong order of numbers does not."""
+
+EULER_ORDERS = tuple(
+    "".join(axes)
+    for letters in ("xyz", "XYZ")
+    for axes in product(letters, repeat=3)
+    if axes[0] != axes[1] != axes[2]
+)
+"""The twelve orders about fixed axes (``xyz``, extrinsic) and about turned ones (``ZYX``,
+intrinsic), spelt as scipy spells them."""
+
+_LENGTHS = {"m": 1.0, "mm": 1e-3}
+_ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+_TOKEN = re.compile(
+    r"(?:(?P<label>[A-Za-z][A-Za-z0-9]*)\s*[:=]?\s*)?"
+    r"(?<![\d.])(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+    r"(?:\s*(?P<unit>mm|m|deg|rad|°)(?![A-Za-z]))?"
+)
+_NESTED = re.compile(r"\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]")
+"""Position and rotation of a RAPID robtarget; configuration and further axes come behind."""
+
+
+@dataclass(frozen=True)
+class PoseConvention:
+    """One way to write a pose.
+
+    Attributes:
+        name: For people.
+        labels: What each number is called, position first.
+        rotation: ``vector``, a quaternion's order (``xyzw``, ``wxyz``) or one of
+            :data:`EULER_ORDERS`, in which angles are written in the order of their axes.
+        length: Unit of the position.
+        angle: Unit of a rotation vector's length and of angles; a quaternion has none.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    rotation: str
+    length: LengthUnit
+    angle: AngleUnit = "rad"
+
+    def __post_init__(self) -> None:
+        known = ("vector", "xyzw", "wxyz", *EULER_ORDERS)
+        if self.rotation not in known:
+            raise ValueError(f"no rotation '{self.rotation}'; known: {', '.join(known)}")
+        if len(self.labels) != self.count:
+            raise ValueError(f"{self.name}: {self.count} numbers need as many labels")
+
+    @property
+    def is_quaternion(self) -> bool:
+        """Whether the rotation is four numbers without a unit."""
+        return self.rotation in ("xyzw", "wxyz")
+
+    @property
+    def count(self) -> int:
+        """How many numbers a pose has."""
+        return 7 if self.is_quaternion else 6
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each number; empty for a quaternion's."""
+        return (self.length,) * 3 + (("",) * 4 if self.is_quaternion else (self.angle,) * 3)
+
+    def in_units(self, length: LengthUnit, angle: AngleUnit) -> Self:
+        """Return the same convention in other units."""
+        return replace(self, length=length, angle=angle)
+
+    def matrix(self, numbers: Sequence[float] | Floats) -> Floats:
+        """Return the pose (4, 4) [m] of a row of numbers.
+
+        Raises:
+            ValueError: Their count is wrong, one is not finite, or a quaternion's norm is not 1.
+        """
+        values = np.asarray(numbers, dtype=np.float64)
+        if values.shape != (self.count,):
+            raise ValueError(
+                f"{self.name} has {self.count} numbers ({' '.join(self.labels)}), not {values.size}"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"{self.name}: a number is not finite")
+        return rigid(self._rotation(values[3:]), values[:3] * _LENGTHS[self.length])
+
+    def numbers(self, matrix: Floats) -> Floats:
+        """Return the row of numbers (6,) or (7,) of a pose (4, 4) [m].
+
+        A rotation vector is at most half a turn long, a quaternion has w >= 0. Where two of three
+        angles turn about the same axis, the third is zero.
+        """
+        position = matrix[:3, 3] / _LENGTHS[self.length]
+        return np.concatenate([position, self._written(matrix[:3, :3])])
+
+    def read(self, text: str) -> Floats:
+        """Return the pose (4, 4) [m] of typed or pasted text; see :meth:`read_numbers`.
+
+        Raises:
+            ValueError: As there, or as :meth:`matrix`.
+        """
+        return self.matrix(self.read_numbers(text))
+
+    def read_numbers(self, text: str) -> Floats:
+        """Return the row of numbers of typed or pasted text, in the convention's units.
+
+        Numbers stand in order, or in any order each behind its label, as a pendant shows them;
+        brackets, separators and what else has a label are passed over. A number with a unit of
+        its own (``0.4 m``) counts in that unit.
+
+        Raises:
+            ValueError: A number is missing, surplus, or has a unit of another kind.
+        """
+        text = text.replace("\N{MINUS SIGN}", "-")
+        if nested := _NESTED.search(text):
+            text = f"{nested[1]} {nested[2]}"
+        found = self._in_order([match.groupdict() for match in _TOKEN.finditer(text)])
+        return np.array([self._in_own_unit(i, token) for i, token in enumerate(found)])
+
+    def text(self, matrix: Floats) -> str:
+        """Return a pose (4, 4) [m] as a person reads it, to 0.01 mm and 0.001 deg."""
+        digits = {"m": 5, "mm": 2, "deg": 3, "rad": 5, "": 6}
+        written = []
+        for label, number, unit in zip(self.labels, self.numbers(matrix), self.units, strict=True):
+            # Adding zero takes the sign off a zero.
+            rounded = round(number, digits[unit]) + 0.0
+            written.append(f"{label} {rounded:.{digits[unit]}f} {unit}".rstrip())
+        return "  ".join(written)
+
+    def _in_order(self, found: list[_Token]) -> list[_Token]:
+        labelled = {token["label"].upper(): token for token in found if token["label"]}
+        wanted = {label: labelled.get(label.upper()) for label in self.labels}
+        if not any(wanted.values()):
+            return found
+        missing = [label for label, token in wanted.items() if token is None]
+        if missing:
+            raise ValueError(f"{self.name}: there is no {' and no '.join(missing)}")
+        return [token for token in wanted.values() if token is not None]
+
+    def _rotation(self, values: Floats) -> Floats:
+        if self.is_quaternion:
+            norm = float(np.linalg.norm(values))
+            if abs(norm - 1) > NORM_TOLERANCE:
+                raise ValueError(
+                    f"{self.name}: the quaternion's norm is {norm:.4g}; "
+                    f"it must be 1 (within {NORM_TOLERANCE})"
+                )
+            return rotation_from_quaternion(
+                values if self.rotation == "xyzw" else values[[1, 2, 3, 0]]
+            )
+        radians = values * _ANGLES[self.angle]
+        return (
+            rotation_exp(radians)
+            if self.rotation == "vector"
+            else _from_euler(self.rotation, radians)
+        )
+
+    def _written(self, rotation: Floats) -> Floats:
+        if self.is_quaternion:
+            q = quaternion_from_rotation(rotation)
+            return q if self.rotation == "xyzw" else q[[3, 0, 1, 2]]
+        radians = (
+            rotation_log(rotation)
+            if self.rotation == "vector"
+            else _to_euler(self.rotation, rotation)
+        )
+        return np.asarray(radians / _ANGLES[self.angle])
+
+    def _in_own_unit(self, index: int, token: _Token) -> float:
+        value = float(token["number"])
+        unit = (token["unit"] or "").replace("°", "deg")
+        if not unit or index >= self.count:
+            return value
+        own = self.units[index]
+        for table in (_LENGTHS, _ANGLES):
+            if unit in table and own in table:
+                return value * table[unit] / table[own]
+        raise ValueError(
+            f"{self.name}: {self.labels[index]} has the unit {unit}, not {own or 'none'}"
+        )
+
+
+def _from_euler(order: str, radians: Floats) -> Floats:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_euler(order, radians).as_matrix())
+
+
+def _to_euler(order: str, rotation: Floats) -> Floats:
+    from scipy.spatial.transform import Rotation
+
+    with warnings.catch_warnings():
+        # At gimbal lock scipy warns and sets the third angle to zero: one answer of many.
+        warnings.simplefilter("ignore", UserWarning)
+        return np.asarray(Rotation.from_matrix(rotation).as_euler(order))
+
+
+_XYZ = ("X", "Y", "Z")
+
+CONVENTIONS: Mapping[str, PoseConvention] = {
+    # PolyScope's Move tab in its default units; URScript's p[...] is the same in metres.
+    "ur": PoseConvention("UR", (*_XYZ, "RX", "RY", "RZ"), "vector", "mm"),
+    # KUKA System Software, operating manual: A about Z, B about the turned Y, C about the turned X.
+    "kuka": PoseConvention("KUKA ABC", (*_XYZ, "A", "B", "C"), "ZYX", "mm", "deg"),
+    # FANUC operator's manual: W about X, P about Y, R about Z, the axes of the user frame.
+    "fanuc": PoseConvention("Fanuc WPR", (*_XYZ, "W", "P", "R"), "xyz", "mm", "deg"),
+    # ABB RAPID reference, data type orient: q1 is the real part.
+    "abb": PoseConvention("ABB", (*_XYZ, "Q1", "Q2", "Q3", "Q4"), "wxyz", "mm"),
+    # Yaskawa operator's manual: as Fanuc.
+    "yaskawa": PoseConvention("Yaskawa", (*_XYZ, "RX", "RY", "RZ"), "xyz", "mm", "deg"),
+    # Staubli VAL 3 reference, data type trsf: Rx, Ry, Rz about turned axes.
+    "staubli": PoseConvention("Staubli", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "mm", "deg"),
+    # Kawasaki AS reference: orientation, altitude, tool; ZYZ about turned axes.
+    "kawasaki": PoseConvention("Kawasaki OAT", (*_XYZ, "O", "A", "T"), "ZYZ", "mm", "deg"),
+    # Doosan programming manual (DRL), posx: A, B, C are Euler angles ZYZ.
+    "doosan": PoseConvention("Doosan", (*_XYZ, "A", "B", "C"), "ZYZ", "mm", "deg"),
+    # MVTec HALCON, create_pose with 'gba': Rx Ry Rz about turned axes, metres.
+    "halcon": PoseConvention("HALCON", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "m", "deg"),
+    # ROS REP 103, and the URDF: fixed axes.
+    "rpy": PoseConvention("roll pitch yaw", (*_XYZ, "ROLL", "PITCH", "YAW"), "xyz", "m"),
+    "quaternion_xyzw": PoseConvention("quaternion", (*_XYZ, "QX", "QY", "QZ", "QW"), "xyzw", "m"),
+    "quaternion_wxyz": PoseConvention("quaternion", (*_XYZ, "QW", "QX", "QY", "QZ"), "wxyz", "m"),
+}
+"""The conventions people meet, by name; others are made from :class:`PoseConvention`."""

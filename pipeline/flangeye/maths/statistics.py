@@ -1,0 +1,112 @@
+"""The few statistics that solvers and verifiers share. Arrays only."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from flangeye.maths.geometry import hat
+from flangeye.types import Floats
+
+SIGMA_OF_MAD = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation."""
+
+SAMPLES = 4000
+"""Draws of the pose: a 95 % quantile from this many varies by one percent."""
+
+
+def chi2_quantile(probability: float, freedom: int) -> float:
+    """Return the value a chi-square variable stays below with ``probability``."""
+    from scipy.special import chdtri
+
+    return float(chdtri(freedom, 1.0 - probability))
+
+
+def f_quantile(probability: float, freedom: int, noise_freedom: float) -> float:
+    """Return the value a mean square of ``freedom`` degrees stays below with ``probability``.
+
+    In units of a variance that was itself estimated from ``noise_freedom`` degrees; infinite when
+    it is known.
+    """
+    from scipy.special import fdtri
+
+    if np.isinf(noise_freedom):
+        return chi2_quantile(probability, freedom) / freedom
+    return float(fdtri(freedom, noise_freedom, probability))
+
+
+def covariance_inflation(freedom: float, parameters: int = 6, probability: float = 0.95) -> float:
+    """Return the factor that makes a region scaled by an estimated variance hold its share.
+
+    People draw regions with the chi-square quantile, which takes the noise as known. When it was
+    estimated from ``freedom`` degrees of freedom, the squared distance follows
+    ``parameters * F(parameters, freedom)`` instead; the ratio of the quantiles makes up for it.
+    """
+    honest = parameters * f_quantile(probability, parameters, freedom)
+    return honest / chi2_quantile(probability, parameters)
+
+
+def excess_variance(errors: Floats, covariances: Floats) -> float:
+    """Return the isotropic variance [m^2] that errors show beyond their own covariances, robustly.
+
+    Chosen so that the median squared distance is that of a chi-square variable of three degrees
+    of freedom; up to half of the errors may be anything. Never negative.
+
+    Args:
+        errors: (N, 3) [m].
+        covariances: (N, 3, 3) what is known of each [m^2].
+    """
+    variances, axes = np.linalg.eigh(covariances)
+    squares = np.einsum("nji,nj->ni", axes, errors) ** 2
+    median = chi2_quantile(0.5, 3)
+
+    def too_small(excess: float) -> bool:
+        return bool(np.median((squares / (variances + excess)).sum(axis=1)) > median)
+
+    low, high = 0.0, float(squares.sum(axis=1).max())
+    tiny = np.finfo(float).tiny
+    if high <= tiny or not too_small(tiny):
+        return 0.0
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if too_small(middle) else (low, middle)
+    return high
+
+
+def squared_distances(errors: Floats, covariances: Floats) -> Floats:
+    """Return the (N,) squared Mahalanobis distances of (N, k) errors, covariances (N, k, k)."""
+    solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("ni,ni->n", errors, solved))
+
+
+def corners_of(centre: Floats, size: Floats) -> Floats:
+    """Return the (8, 3) corners of an axis-aligned box."""
+    signs = np.array(list(product([-0.5, 0.5], repeat=3)))
+    return np.asarray(centre + signs * size)
+
+
+def largest_error_quantile(
+    covariance: Floats, about: Floats, corners: Floats, probability: float = 0.95
+) -> float:
+    """Return what the largest error anywhere in a box stays below with ``probability`` [m].
+
+    The error of a small pose error is an affine function of the place, so its length is largest
+    in a corner. The distribution of the largest corner has no closed form: it is drawn, always
+    with the same draws.
+
+    Args:
+        covariance: (6, 6), order (rotation, translation), translation about ``about``.
+        about: (3,) in base [m].
+        corners: (8, 3) in base [m].
+        probability: Share of the draws below the result.
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.clip(variances, 0.0, None))
+    draws = np.random.default_rng(0).standard_normal((SAMPLES, 6)) @ root.T
+    motions = np.concatenate(
+        [-hat(corners - about), np.broadcast_to(np.eye(3), (len(corners), 3, 3))], axis=2
+    )
+    errors = (draws @ motions.reshape(-1, 6).T).reshape(SAMPLES, -1, 3)
+    squares = np.einsum("sci,sci->sc", errors, errors).max(axis=1)
+    return float(np.sqrt(np.quantile(squares, probability)))

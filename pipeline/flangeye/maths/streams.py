@@ -1,0 +1,149 @@
+"""Recorded streams: poses with times, when the arm stood still, and how far two clocks are apart.
+
+Times are (N,) ascending [s], poses (N, 4, 4) [m]. Arrays only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.maths.geometry import nearest_rotation, rigid, rotation_log
+from flangeye.types import Floats
+
+STILL_DISTANCE = 0.5e-3
+STILL_ANGLE = np.radians(0.1)
+STILL_TIME = 0.3
+"""An arm stands still while it stays so near to one pose [m, rad], for so long at least [s]."""
+LARGEST_OFFSET = 2.0
+"""Of two clocks [s]: further apart than this, nothing is looked for."""
+CLEAR_CORRELATION = 0.7
+"""Of two signals of motion, below which their best shift means nothing."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of time, both ends in it [s]."""
+
+    start: float
+    end: float
+
+    @property
+    def middle(self) -> float:
+        """Half way between its ends."""
+        return (self.start + self.end) / 2
+
+
+def standstills(times: Floats, poses: Floats) -> list[Span]:
+    """Return when the arm stood still, in order."""
+    found: list[Span] = []
+    first = 0
+    while first < len(times):
+        last = _still_until(times, poses, first)
+        if times[last] - times[first] >= STILL_TIME:
+            found.append(Span(float(times[first]), float(times[last])))
+            first = last + 1
+        else:
+            first += 1
+    return found
+
+
+def _still_until(times: Floats, poses: Floats, first: int) -> int:
+    """Return the last sample up to which the arm stays near its pose at ``first``."""
+    last, size = first, 16
+    while last + 1 < len(times):
+        ahead = poses[last + 1 : last + 1 + size]
+        moved = np.linalg.norm(ahead[:, :3, 3] - poses[first, :3, 3], axis=1)
+        turned = np.linalg.norm(rotation_log(poses[first, :3, :3].T @ ahead[:, :3, :3]), axis=1)
+        away = (moved > STILL_DISTANCE) | (turned > STILL_ANGLE)
+        if away.any():
+            return last + int(np.argmax(away))
+        last, size = last + len(ahead), 2 * size
+    return last
+
+
+def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
+    """Return the poses (M, 4, 4) at the times ``at`` (M,), the ends held outside the stream."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    inside = np.clip(at, times[0], times[-1])
+    turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
+    moved = np.stack([np.interp(inside, times, poses[:, k, 3]) for k in range(3)], axis=1)
+    return np.array([rigid(r, p) for r, p in zip(turned, moved, strict=True)])
+
+
+def mean_pose(poses: Floats) -> Floats:
+    """Return the mean (4, 4) of poses that are near each other."""
+    rotation = nearest_rotation(poses[:, :3, :3].mean(axis=0))
+    return rigid(rotation, poses[:, :3, 3].mean(axis=0))
+
+
+def turning(times: Floats, poses: Floats) -> tuple[Floats, Floats]:
+    """Return times (N - 1,) and angular speeds [rad/s] there: the same in every frame."""
+    steps = np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]
+    spans = np.maximum(np.diff(times), 1e-9)
+    return (times[1:] + times[:-1]) / 2, np.linalg.norm(rotation_log(steps), axis=1) / spans
+
+
+def clock_offset(
+    first: tuple[Floats, Floats], second: tuple[Floats, Floats]
+) -> tuple[float, float]:
+    """Return what to add to the second stream's times, and the correlation there.
+
+    Args:
+        first: Times (N,) and a signal of motion (N,) there, of the first stream.
+        second: The same of the second, in any unit.
+
+    Returns:
+        Offset [s] and correlation: 0 and 0 where nothing clear was found.
+    """
+    step = float(min(np.median(np.diff(first[0])), np.median(np.diff(second[0])), 0.05))
+    best, shifts = 0, np.arange(-LARGEST_OFFSET, LARGEST_OFFSET + step / 2, step)
+    grid = np.arange(first[0][0], first[0][-1], step)
+    wanted = np.interp(grid, *first)
+    alike = np.array([_correlation(wanted, grid, second, shift) for shift in shifts])
+    best = int(np.argmax(alike))
+    if alike[best] < CLEAR_CORRELATION or best in (0, len(shifts) - 1):
+        return 0.0, 0.0
+    left, middle, right = alike[best - 1 : best + 2]
+    bend = left - 2 * middle + right
+    finer = 0.0 if bend == 0 else 0.5 * (left - right) / bend
+    return float(shifts[best] + finer * step), float(middle)
+
+
+def _correlation(
+    wanted: Floats, grid: Floats, signal: tuple[Floats, Floats], shift: float
+) -> float:
+    """Return how alike two signals are once the second is moved by ``shift``, -1 to 1."""
+    inside = (grid >= signal[0][0] + shift) & (grid <= signal[0][-1] + shift)
+    if inside.sum() < 10:
+        return 0.0
+    a, b = wanted[inside], np.interp(grid[inside] - shift, *signal)
+    if a.std() == 0 or b.std() == 0:
+        return 0.0
+    return float(np.mean((a - a.mean()) * (b - b.mean())) / (a.std() * b.std()))
+
+
+def offset_into(spans: list[Span], at: Floats) -> float:
+    """Return the smallest shift that brings most of the moments ``at`` into the spans [s]."""
+    shifts = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, 0.01)
+    shifts = shifts[np.argsort(np.abs(shifts), kind="stable")]
+    starts, ends = (np.array([getattr(s, end) for s in spans]) for end in ("start", "end"))
+    moved = at[None, :] + shifts[:, None]
+    which = np.searchsorted(starts, moved, side="right") - 1
+    inside = (which >= 0) & (moved <= ends[which])
+    return float(shifts[int(np.argmax(inside.sum(axis=1)))])
+
+
+def apart(poses: Floats, distance: float, angle: float) -> list[int]:
+    """Return which poses to keep so that each is away from the kept one before it [m, rad]."""
+    kept: list[int] = []
+    for i, pose in enumerate(poses):
+        if kept:
+            step = np.linalg.inv(poses[kept[-1]]) @ pose
+            turned = float(np.linalg.norm(rotation_log(step[:3, :3])))
+            if np.linalg.norm(step[:3, 3]) < distance and turned < angle:
+                continue
+        kept.append(i)
+    return kept

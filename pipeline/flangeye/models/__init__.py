@@ -1,0 +1,1 @@
+"""What a recipe names: robots, scanners, flange standards, boards, workpieces, configurations."""

@@ -1,0 +1,112 @@
+"""Flat printed targets: where their corners are, and how they look.
+
+The frame ``target`` has its origin in the middle of the board, x to the right, y up and z towards
+whoever looks at it. Lengths are those of the print [m].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator
+
+from flangeye.types import Floats
+
+Pixels = NDArray[np.uint8]
+
+Kind = Literal["charuco", "checkerboard", "marker"]
+
+DICTIONARIES = (
+    *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "ARUCO_ORIGINAL", "ARUCO_MIP_36h12",
+    "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11",
+)  # fmt: skip
+"""Families of markers, as OpenCV names them after ``DICT_``; AprilTags are among them."""
+
+
+def _known(name: str) -> str:
+    name = name.removeprefix("DICT_")
+    if name not in DICTIONARIES:
+        raise ValueError(f"no dictionary '{name}'; known: {', '.join(DICTIONARIES)}")
+    return name
+
+
+Dictionary = Annotated[str, AfterValidator(_known)]
+"""Name of a family in a recipe."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """One printed board.
+
+    Attributes:
+        kind: ChArUco board, plain checkerboard, or one marker alone.
+        columns: Squares from left to right; 1 for a marker.
+        rows: Squares from top to bottom.
+        square: Edge of a square, or of the marker [m].
+        marker: Edge of a ChArUco board's markers [m].
+        dictionary: Family of the markers, one of :data:`DICTIONARIES`.
+        marker_id: Which marker, where it is one alone.
+    """
+
+    kind: Kind
+    columns: int
+    rows: int
+    square: float
+    marker: float = 0.0
+    dictionary: str = "4X4_50"
+    marker_id: int = 0
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return self.columns * self.square, self.rows * self.square
+
+    def inner_corners(self) -> Floats:
+        """Return the (N, 3) corners between squares in ``target`` [m], row by row from the top."""
+        x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+        return self.place(np.asarray(np.stack([x, y], axis=-1).reshape(-1, 2) * self.square))
+
+    def outer_corners(self) -> Floats:
+        """Return the (4, 3) corners in ``target`` [m], clockwise from the top left."""
+        width, height = self.size
+        return self.place(np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
+
+    def place(self, from_top_left: Floats) -> Floats:
+        """Return (N, 2) places, right and down from the top left corner [m], in ``target``."""
+        width, height = self.size
+        x, y = from_top_left[:, 0] - width / 2, height / 2 - from_top_left[:, 1]
+        return np.stack([x, y, np.zeros(len(x))], axis=1)
+
+
+def dictionary_of(board: Board) -> Any:
+    """Return OpenCV's dictionary of the board's markers."""
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+
+
+def charuco_of(board: Board) -> Any:
+    """Return OpenCV's description of a ChArUco board."""
+    import cv2
+
+    size = (board.columns, board.rows)
+    return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
+
+
+def print_of(board: Board, per_square: int = 120) -> Pixels:
+    """Return the print of a board, (rows, columns) x ``per_square`` pixels, without a margin."""
+    import cv2
+
+    size = (board.columns * per_square, board.rows * per_square)
+    if board.kind == "charuco":
+        return np.asarray(charuco_of(board).generateImage(size, marginSize=0), dtype=np.uint8)
+    if board.kind == "marker":
+        marker = cv2.aruco.generateImageMarker(dictionary_of(board), board.marker_id, size[0])
+        return np.asarray(marker, dtype=np.uint8)
+    rows, columns = np.indices((board.rows, board.columns))
+    squares = np.where((rows + columns) % 2 == 0, 0, 255).astype(np.uint8)
+    return np.kron(squares, np.ones((per_square, per_square), np.uint8))

@@ -1,0 +1,199 @@
+"""Who carries the camera, who carries the target, and what therefore has to be found.
+
+All configurations are one loop of frames, read from the robot's base:
+
+    base_T_camera_carrier · carrier_T_camera · camera_T_target
+        = base_T_base2 · base_T_target_carrier · carrier_T_target
+
+The carriers' poses follow from the controllers (the base's own is the identity),
+``camera_T_target`` is measured. What is left is unknown: the camera's pose always; the target's
+where its place is not known; ``base_T_base2`` where another arm carries the target, whose poses
+are then in ``base2``. The paper's equations (1) to (5) and its Figs. 2, 3 and 14 are cases of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.kinematics import Arm
+from flangeye.types import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    Array,
+    Floats,
+    Observation,
+    Transform,
+)
+
+LINK = "link"
+
+CARRIERS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "eye-on-base": ((BASE,), (FLANGE,)),
+    "eye-in-hand": ((FLANGE,), (BASE,)),
+    "eye-on-arm": ((LINK,), (FLANGE, BASE)),
+    "two-arms": ((FLANGE,), (FLANGE2,)),
+}
+"""By name of the configuration: the frames that may carry the camera, and the target."""
+
+EVERY = tuple(CARRIERS)
+"""What a stage declares that serves every configuration: ``@stage("solve.x", serves=EVERY)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Configuration:
+    """One configuration of camera and target.
+
+    Attributes:
+        name: One of :data:`CARRIERS`.
+        camera: Frame that carries the camera.
+        target: Frame that carries the target.
+        place: (4, 4) of the target in that frame; None where it is to be found.
+    """
+
+    name: str = "eye-on-base"
+    camera: str = BASE
+    target: str = FLANGE
+    place: Array | None = None
+
+    @property
+    def is_default(self) -> bool:
+        """Whether it is a camera beside the robot that looks at the flange's own circle."""
+        at_origin = self.place is not None and np.array_equal(self.place, np.eye(4))
+        return self.name == "eye-on-base" and at_origin
+
+    @property
+    def other_base(self) -> str | None:
+        """Name of the unknown pose of the second arm's base, where there is one."""
+        return f"{BASE}_T_{BASE2}" if self.target == FLANGE2 else None
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """Names of the transforms to find, the camera's first."""
+        target = None if self.place is not None else f"{self.target}_T_{TARGET}"
+        named = (f"{self.camera}_T_{CAMERA}", self.other_base, target)
+        return tuple(name for name in named if name)
+
+    @property
+    def equation(self) -> str:
+        """The loop, each unknown in brackets."""
+        left = [_pose_of(self.camera), f"[{self.camera}_T_{CAMERA}]", f"{CAMERA}_T_{TARGET}"]
+        placed = f"{self.target}_T_{TARGET}"
+        right = [self.other_base and f"[{self.other_base}]", _pose_of(self.target)]
+        right.append(f"[{placed}]" if self.place is None else placed)
+        return " · ".join(filter(None, left)) + " = " + " · ".join(filter(None, right))
+
+    def describe(self) -> str:
+        """Return one line: the name, the loop and what is unknown in it."""
+        return f"{self.name}: {self.equation}; to be found: {', '.join(self.unknowns)}"
+
+
+DEFAULT = Configuration(place=np.eye(4))
+"""A camera beside the robot that looks at the flange's own circle."""
+
+
+def _pose_of(carrier: str) -> str | None:
+    bases = {BASE: None, FLANGE2: f"{BASE2}_T_{FLANGE2}"}
+    return bases.get(carrier, f"{BASE}_T_{carrier}")
+
+
+@dataclass(frozen=True, eq=False)
+class Carriers:
+    """What the controllers say of N observations.
+
+    Attributes:
+        camera: (N, 4, 4) base_T_camera_carrier.
+        target: (N, 4, 4) pose of the frame that carries the target, in its own arm's base.
+    """
+
+    camera: Floats
+    target: Floats
+
+
+def carriers_of(
+    configuration: Configuration, observations: Sequence[Observation], arm: Arm | None
+) -> Carriers:
+    """Return where the controllers say that camera and target were carried.
+
+    Args:
+        configuration: Says by which frames.
+        observations: N of them.
+        arm: The arm's kinematics; needed where a link carries the camera.
+
+    Raises:
+        StageError: An observation lacks the second arm's pose, or the joints a link's follows
+            from.
+    """
+    return Carriers(
+        np.array([_carried(configuration.camera, o, arm) for o in observations]),
+        np.array([_carried(configuration.target, o, arm) for o in observations]),
+    )
+
+
+def _carried(frame: str, observation: Observation, arm: Arm | None) -> Floats:
+    if frame == BASE:
+        return np.eye(4)
+    if frame == FLANGE:
+        return observation.base_T_flange.matrix
+    if frame == FLANGE2:
+        if FLANGE2 not in observation.poses:
+            raise StageError(
+                f"observation {observation.id} has no pose of the second arm (base2_T_flange2), "
+                "which the configuration two-arms needs"
+            )
+        return observation.poses[FLANGE2].matrix
+    return _link(frame, observation, arm)
+
+
+def _link(frame: str, observation: Observation, arm: Arm | None) -> Floats:
+    index = int(frame.removeprefix(LINK))
+    if arm is None or observation.joints is None or len(observation.joints) != arm.n:
+        raise StageError(
+            f"where {frame} was at observation {observation.id} follows from the joint angles, "
+            "and there are none: record them, and name the robot's model in the recipe"
+        )
+    return np.asarray(arm.frames(observation.joints)[index])
+
+
+def mapped_and_expected(
+    configuration: Configuration,
+    transforms: Mapping[str, Transform],
+    carriers: Carriers,
+    observations: Sequence[Observation],
+) -> tuple[Floats, Floats]:
+    """Return where observations saw their targets, and where these should be: (N, 3) in ``base``.
+
+    Args:
+        configuration: The loop.
+        transforms: Its unknowns, found, by name.
+        carriers: What the controllers say.
+        observations: What was seen.
+    """
+    seen = np.array([o.feature.centre for o in observations]).reshape(-1, 3)
+    offsets = np.array([o.centre_in_mount for o in observations]).reshape(-1, 3)
+    camera = carriers.camera @ transforms[configuration.unknowns[0]].matrix
+    target = target_poses(configuration, transforms, carriers)
+    return _apply(camera, seen), _apply(target, offsets)
+
+
+def target_poses(
+    configuration: Configuration, transforms: Mapping[str, Transform], carriers: Carriers
+) -> Floats:
+    """Return the (N, 4, 4) base_T_target that the controllers and the transforms speak for."""
+    poses, other = carriers.target, configuration.other_base
+    if other:
+        poses = transforms[other].matrix @ poses
+    if configuration.place is not None:
+        return np.asarray(poses @ configuration.place)
+    return np.asarray(poses @ transforms[f"{configuration.target}_T_{TARGET}"].matrix)
+
+
+def _apply(poses: Floats, points: Floats) -> Floats:
+    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[..., 0] + poses[:, :3, 3])

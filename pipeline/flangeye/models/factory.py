@@ -1,0 +1,122 @@
+"""A UR's factory calibration: the arm as it was built, from the files its users have.
+
+Two of them: ``calibration.conf`` from the controller (``/root/.urcontrol``), what has to be added
+to the Denavit-Hartenberg table; and the ``kinematics`` file that the ROS driver's
+``calibration_correction`` writes (``default_kinematics.yaml`` is its shape), joints' origins.
+"""
+
+from __future__ import annotations
+
+import configparser
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye.errors import RecipeError
+from flangeye.files.regular import read_text
+from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
+from flangeye.maths.geometry import rotation_from_rpy
+from flangeye.models.robots import Joint, RobotModel, Volume
+
+DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def as_built(robot: RobotModel, path: Path) -> RobotModel:
+    """Return the arm as its maker measured it.
+
+    Args:
+        robot: The model's nominal arm.
+        path: ``calibration.conf``, or the ROS driver's kinematics ``.yaml``.
+
+    Raises:
+        RecipeError: It is none of a UR, cannot be read, or is of another arm.
+    """
+    if robot.maker != "Universal Robots" or robot.convention != "standard":
+        raise RecipeError(f"{path}: a factory calibration is a UR's; {robot.model} has none")
+    if not path.is_file():
+        raise RecipeError(f"{path}: no such file; copy calibration.conf from the controller")
+    if path.suffix in (".yaml", ".yml"):
+        return _from_ros(robot, path)
+    return _from_controller(robot, path)
+
+
+def _from_controller(robot: RobotModel, path: Path) -> RobotModel:
+    parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"))
+    try:
+        parser.read_string(read_text(path, MAX_BYTES, RecipeError))
+        rows = [_numbers(parser["mounting"][name]) for name in DELTAS]
+    except (configparser.Error, KeyError, ValueError, OSError) as error:
+        raise RecipeError(
+            f"{path}: not a controller's calibration.conf: {error}; it has a section [mounting] "
+            f"with {', '.join(DELTAS)}, each [six numbers]"
+        ) from None
+    if {len(row) for row in rows} != {len(robot.joints)}:
+        raise RecipeError(f"{path}: {len(robot.joints)} numbers are needed in each row")
+    joints = [
+        joint.model_copy(
+            update={
+                "theta": joint.theta + theta,
+                "a": joint.a + a,
+                "d": joint.d + d,
+                "alpha": joint.alpha + alpha,
+            }
+        )
+        for joint, theta, a, d, alpha in zip(robot.joints, *rows, strict=True)
+    ]
+    return _sourced(robot, path, joints=tuple(joints))
+
+
+def _numbers(text: str) -> list[float]:
+    numbers = [float(word) for word in text.strip().strip("[]").split(",")]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("a number is not finite")
+    return numbers
+
+
+def _from_ros(robot: RobotModel, path: Path) -> RobotModel:
+    given: Any = read_yaml(path).data
+    links: Any = given.get("kinematics") if isinstance(given, dict) else None
+    try:
+        places = [[float(links[link][key]) for key in PLACE] for link in LINKS]
+    except (TypeError, KeyError, ValueError) as error:
+        raise RecipeError(
+            f"{path}: not a kinematics file of the ROS driver: {error}; it has 'kinematics' with "
+            f"{', '.join(LINKS)}, each with {', '.join(PLACE)}"
+        ) from None
+    joints = tuple(
+        Joint.model_construct(
+            **{
+                **nominal.model_dump(),
+                "a": 0.0,
+                "d": 0.0,
+                "alpha": 0.0,
+                "xyz": tuple(place[:3]),
+                "rpy": tuple(place[3:]),
+            }
+        )
+        for nominal, place in zip(robot.joints, places, strict=True)
+    )
+    volumes = tuple(_in_urdf_frame(volume, robot) for volume in robot.volumes)
+    return _sourced(robot, path, joints=joints, volumes=volumes, convention="urdf")
+
+
+def _in_urdf_frame(volume: Volume, robot: RobotModel) -> Volume:
+    """Return a volume in the frame a URDF gives its link: before the link's own ``a, alpha``."""
+    if volume.link == 0:
+        return volume
+    joint = robot.joints[volume.link - 1]
+    turn = rotation_from_rpy(joint.alpha, 0.0, 0.0)
+    ends = {
+        name: tuple(turn @ np.array(getattr(volume, name)) + [joint.a, 0.0, 0.0])
+        for name in ("start", "end")
+    }
+    return volume.model_copy(update=ends)
+
+
+def _sourced(robot: RobotModel, path: Path, **changes: Any) -> RobotModel:
+    source = f"{robot.source}; factory calibration from {path.name}"
+    return robot.model_copy(update={**changes, "source": source})

@@ -1,0 +1,105 @@
+"""The tool: a compliant finger whose camera watches a tag, and a torch behind its tip.
+
+The tool's axes: x from the torch to the tip (t_d of the paper), z out of the work, y to the left.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from flangeye.files.paths import bundled_file
+from flangeye.models.model import Model
+from flangeye.types import Floats
+from flangeye.units import Angle, Length, Stiffness, param
+
+Row = tuple[float, float, float]
+
+
+class Tag(Model):
+    """The ArUco tag on the finger."""
+
+    dictionary: str = Field("DICT_4X4_50", description="OpenCV's name of the dictionary.")
+    id: int = Field(0, ge=0)
+    side: Length = param(gt=0, description="Of the black square.")
+
+
+class Lens(Model):
+    """The camera in the finger, in pixels; found by an ordinary camera calibration."""
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3) pinhole matrix."""
+        return np.array(
+            [[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]]
+        )
+
+
+class Calibration(Model):
+    """What ``flangeye tactile calibrate`` finds."""
+
+    rest: tuple[Length, Length, Length] = Field(description="The tag in the camera, undeformed.")
+    rotation: tuple[Angle, Angle, Angle] = Field(description="Its rotation vector there.")
+    gain: tuple[Row, Row, Row] = Field(
+        description="Displacement of the tip, in the tool's axes, per displacement of the tag."
+    )
+    noise: tuple[Length, Length, Length] = Field(
+        description="Standard deviation of one measurement of the tip, in the tool's axes."
+    )
+    lateral: Stiffness | None = Field(None, description="Across the finger, at its tip.")
+    axial: Stiffness | None = Field(None, description="Along the finger.")
+    source: str
+
+
+class Finger(Model):
+    """A finger and its torch."""
+
+    model: str
+    tag: Tag
+    camera: Lens
+    tip: tuple[Length, Length, Length] = Field(description="Undeformed, in the flange's frame.")
+    direction: Angle = param(
+        "0 deg", description="From the flange's x to the direction from the torch to the tip."
+    )
+    torch: Length = param(gt=0, description="How far the torch is behind the tip (||d||).")
+    torch_sigma: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."
+    )
+    along_sigma: Length = param(
+        "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
+    )
+    radius: Length = param(gt=0, description="Of the tip's ball.")
+    travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
+    calibration: Calibration | None = None
+    source: str
+
+    @property
+    def flange_R_tool(self) -> Floats:
+        """(3, 3) the tool's axes in the flange's: z out of the work is back to the robot."""
+        c, s = np.cos(self.direction), np.sin(self.direction)
+        return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+    def force(self, displacement: Floats) -> float | None:
+        """Return the force of a tip displaced by (3,) in the tool's axes [N], if it is known."""
+        known = self.calibration
+        if known is None or known.lateral is None or known.axial is None:
+            return None
+        stiffness = np.array([known.lateral, known.lateral, known.axial])
+        return float(np.linalg.norm(stiffness * displacement))
+
+
+FingerPath = Annotated[
+    Path,
+    BeforeValidator(bundled_file("finger", "fingers")),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
+"""A parameter that names a finger: a bundled one, or a file beside the recipe."""

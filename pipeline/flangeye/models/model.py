@@ -1,0 +1,43 @@
+"""What every model read from ``data/`` is: checked, frozen, in SI units.
+
+A recipe names robots, scanners, standards and workpieces; each is a YAML file under ``data/``, or a
+file of the user's own, with units on every value and its source beside it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from flangeye.errors import RecipeError
+from flangeye.files.validation import sentence
+from flangeye.files.yaml_lines import read_yaml
+
+
+class Model(BaseModel):
+    """Base of everything read from ``data/``: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
+
+
+M = TypeVar("M", bound=Model)
+
+
+def read_model(path: Path, cls: type[M]) -> M:
+    """Read one YAML file into a model.
+
+    Raises:
+        RecipeError: Every mistake, with file and line.
+    """
+    document = read_yaml(path)
+    try:
+        return cls.model_validate(document.data)
+    except ValidationError as error:
+        problems = [
+            f"{path}:{document.line(e['loc'])}: {'.'.join(map(str, e['loc']))}: "
+            f"{sentence(e, cls, e['input'])}"
+            for e in error.errors()
+        ]
+        raise RecipeError("\n".join(problems)) from None

@@ -1,0 +1,88 @@
+"""Files for robots and scanners of one's own: written, and read again before they are believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from flangeye.errors import RecipeError
+from flangeye.files.yaml_lines import parse_value
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.models.robots import RobotModel
+from flangeye.models.standards import load_standard
+
+
+def write_robot(path: Path, robot: RobotModel) -> str:
+    """Write an arm's file and return what to compare with the pendant: the flange at zero.
+
+    Raises:
+        RecipeError: The file exists, or the arm's plate is not known.
+    """
+    if robot.flange.standard:
+        load_standard(robot.flange.standard)
+    data = robot.model_dump(mode="json", exclude_unset=True)
+    _write(path, data)
+    written: RobotModel = load_model("robots", str(path))
+    x, y, z = 1e3 * Arm(written).flange(np.zeros(len(written.joints)))[:3, 3]
+    return (
+        f"{path}: {len(written.joints)} joints; with all at zero the flange is at "
+        f"({x:.1f}, {y:.1f}, {z:.1f}) mm in the base: compare with the pendant\n"
+        f"in a recipe: robot: {path}"
+    )
+
+
+def robot_of_joints(
+    name: str, maker: str, convention: str, joints: Sequence[str], standard: str | None
+) -> RobotModel:
+    """Return an arm of joints as text, ``d: 89.159 mm, alpha: 90 deg``, base to flange.
+
+    Raises:
+        RecipeError: A joint is not of that form; says which.
+    """
+    from pydantic import ValidationError
+
+    from flangeye.files.validation import sentence
+
+    parsed = [parse_value("{" + text + "}", f"joint {i + 1}") for i, text in enumerate(joints)]
+    given: dict[str, Any] = {
+        "model": name, "maker": maker, "convention": convention, "joints": parsed,
+        "source": "stated when the file was made",
+        "volumes_missing": "the file has none; give the arm by its URDF, or add volumes to it",
+    }  # fmt: skip
+    try:
+        return RobotModel.model_validate({**given, "flange": {"standard": standard}})
+    except ValidationError as error:
+        told = [
+            f"{'.'.join(map(str, e['loc']))}: {sentence(e, RobotModel, e['input'])}"
+            for e in error.errors()
+        ]
+        raise RecipeError("\n".join(told)) from None
+
+
+def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
+    """Write a scanner's file from what is known of it; nothing that is None.
+
+    Raises:
+        RecipeError: The file exists, or a value is wrong: names the line.
+    """
+    _write(path, {name: value for name, value in values.items() if value is not None})
+    try:
+        scanner = load_model("scanners", str(path))
+    except RecipeError:
+        path.unlink()
+        raise
+    near, far = scanner.range
+    return f"{path}: sees {near:.3f} to {far:.3f} m\nin a recipe: scanner: {path}"
+
+
+def _write(path: Path, data: Mapping[str, Any]) -> None:
+    if path.suffix not in (".yaml", ".yml"):
+        raise RecipeError(f"{path}: a model's file ends in .yaml")
+    if path.exists():
+        raise RecipeError(f"{path}: is there already; take another name with --out")
+    path.write_text(yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True), "utf-8")

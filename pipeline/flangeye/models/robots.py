@@ -1,0 +1,146 @@
+"""Arms: kinematics, flange, and roughly the space they fill."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.models.model import Model
+from flangeye.types import Floats
+from flangeye.units import Angle, AngularSpeed, JointPosition, Length, param
+
+NOWHERE = ("0 mm", "0 mm", "0 mm")
+UNTURNED = ("0 deg", "0 deg", "0 deg")
+
+
+class Recess(Model):
+    """A slot milled into the face along a circle, with round ends, such as Franka's three."""
+
+    angle: Angle = param(description="Of its middle, about the flange's z.")
+    radius: Length = param(gt=0, description="Of the circle its centre line follows.")
+    half_span: Angle = param(description="Half the angle its centre line covers, ends aside.")
+    width: Length = param(gt=0)
+    depth: Length = param(gt=0)
+
+
+Finish = Literal["painted", "metal", "anodised"]
+
+
+class FlangeDetails(Model):
+    """What a scanner sees of one robot's flange and the standard does not fix."""
+
+    standard: str | None = Field(None, description="Designation: ISO 9409-1-50-4-M6 or the like.")
+    rim_chamfer: Length = param("0 mm", description="Radial width of the chamfer at the rim.")
+    bore_chamfer: Length = param("0 mm", description="Radial width of the chamfer at the bore.")
+    bore_depth: Length = param("6 mm", description="Depth of the centring bore.")
+    thickness: Length = param("6 mm", description="Height of the plate above the wrist.")
+    pin_angle: Angle | None = param(
+        None, description="Where the pin hole is, about the flange's z; without it no clocking."
+    )
+    wrist: Length = param("75 mm", description="Diameter of the wrist's housing behind the plate.")
+    wrist_length: Length = param("40 mm", description="Length of that housing, from the face.")
+    countersink: Length = param("0 mm", description="Radial width of the chamfer at the holes.")
+    hole_depth: Length = param("9 mm", description="Depth of the threaded holes and the pin hole.")
+    recesses: tuple[Recess, ...] = ()
+    finish: Finish = Field("metal", description="What the face is made of, as a scanner sees it.")
+    source: str = ""
+
+
+class Joint(Model):
+    """One joint: where it is, what it does, and its limits."""
+
+    a: Length = param("0 mm")
+    alpha: Angle = param("0 deg")
+    d: Length = param("0 mm")
+    theta: Angle = param("0 deg", description="Offset added to the joint's angle.")
+    xyz: tuple[Length, Length, Length] = param(
+        NOWHERE, description="Convention urdf: its frame's origin in the frame of the link before."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        UNTURNED, description="Convention urdf: roll, pitch, yaw of its frame in that frame."
+    )
+    axis: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.0), description="Convention urdf: what it turns about, in its own frame."
+    )
+    slides: bool = Field(False, description="Whether it slides, as a rail does; it turns else.")
+    lower: JointPosition = param("-360 deg")
+    upper: JointPosition = param("360 deg")
+
+    @field_validator("axis")
+    @classmethod
+    def _has_a_direction(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(axis):
+            raise ValueError("an axis needs a direction, for example [0, 0, 1]")
+        return axis
+
+
+class Placement(Model):
+    """Where a frame is in another."""
+
+    xyz: tuple[Length, Length, Length] = param(NOWHERE)
+    rpy: tuple[Angle, Angle, Angle] = param(UNTURNED, description="Roll, pitch, yaw.")
+
+
+class Volume(Model):
+    """A capsule that stands for a piece of the arm, fixed to a link."""
+
+    link: int = Field(ge=0, description="0 is the base, n the last link.")
+    start: tuple[Length, Length, Length]
+    end: tuple[Length, Length, Length]
+    radius: Length = param(gt=0)
+
+
+class RobotModel(Model):
+    """An arm: its kinematics, its flange, and roughly the space it fills."""
+
+    model: str
+    maker: str
+    convention: Literal["standard", "modified", "urdf"] = Field(
+        description="Denavit-Hartenberg, standard or modified (Craig); urdf: origins and axes."
+    )
+    joints: tuple[Joint, ...]
+    flange_offset: Length = param("0 mm", description="Last link to the flange's face, along z.")
+    flange_frame: Placement = Field(
+        Placement(), description="The flange in the last link's frame, before flange_offset."
+    )
+    flange: FlangeDetails = FlangeDetails()
+    volumes: tuple[Volume, ...] = ()
+    volumes_missing: str = Field("", description="Why there are none, where a plan needs them.")
+    repeatability: Length = param("0.1 mm")
+    joint_speed: AngularSpeed = param(
+        "180 deg/s", gt=0, description="No joint is told to turn faster, whatever a recipe says."
+    )
+    joint_accuracy: Angle = param(
+        "0.3 mrad",
+        description="Standard deviation of a joint's zero; makers do not publish it, so it is "
+        "assumed.",
+    )
+    source: str
+
+    @property
+    def link_T_flange(self) -> Floats:
+        """(4, 4) the flange in the frame of the last link."""
+        frame = self.flange_frame
+        placed = rigid(rotation_from_rpy(*frame.rpy), np.asarray(frame.xyz))
+        return placed @ rigid(np.eye(3), np.array([0.0, 0.0, self.flange_offset]))
+
+    @property
+    def length(self) -> float:
+        """Sum of all offsets from base to flange [m]: no point of it is farther from the base."""
+        ends = [*(joint.xyz for joint in self.joints), self.flange_frame.xyz]
+        offsets = [abs(joint.a) + abs(joint.d) for joint in self.joints]
+        slides = [max(-j.lower, j.upper) for j in self.joints if j.slides]
+        return float(np.linalg.norm(ends, axis=1).sum() + sum(offsets + slides)) + abs(
+            self.flange_offset
+        )
+
+
+@dataclass(frozen=True)
+class SecondRobot:
+    """The arm of a recipe that carries the target before the camera on the first."""
+
+    model: RobotModel

@@ -1,0 +1,108 @@
+"""What a scan is searched for: the flange circle as a robot shows it, or a sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from flangeye.errors import RecipeError
+from flangeye.models.robots import FlangeDetails, RobotModel
+from flangeye.models.standards import FlangeStandard, load_standard
+
+
+class Flange(BaseModel):
+    """The circle to look for, as this robot and this recipe have it. All SI, radii.
+
+    Attributes:
+        name: For people.
+        rim: Radius of the visible edge: outer radius less its chamfer, or the wrist circle.
+        outer: Nominal outer radius.
+        bore: Radius of the bore's visible edge (nominal plus chamfer), or None.
+        pitch: Radius of the circle the threads lie on.
+        holes: Angles of the threaded holes about the flange's z [rad].
+        hole: Radius of a threaded hole as it shows on the face.
+        pin: Angle of the locating-pin hole [rad], or None.
+        pin_hole: Radius of the pin hole.
+        details: The robot's own data.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    name: str
+    rim: float
+    outer: float
+    bore: float | None
+    pitch: float
+    holes: tuple[float, ...]
+    hole: float
+    pin: float | None
+    pin_hole: float
+    details: FlangeDetails
+
+    @property
+    def behind(self) -> float:
+        """How far the circle lies behind the origin of ``flange``: a wrist's circle does [m]."""
+        return self.details.thickness if self.bore is None else 0.0
+
+
+def plate_of(robot: RobotModel) -> Flange:
+    """Return the plate that an arm's own file names.
+
+    Raises:
+        RecipeError: It names none.
+    """
+    if robot.flange.standard is None:
+        raise RecipeError(
+            f"{robot.model}: which plate it carries is not known; write feature: "
+            "{standard: ISO 9409-1-50-4-M6} ('flangeye standards' lists them)"
+        )
+    return flange_of(robot.flange, load_standard(robot.flange.standard))
+
+
+def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
+    """Return the circle of ``standard`` as it shows on an arm."""
+    n, pin = standard.threads, details.pin_angle
+    # The pin hole lies on a bisector of the threads (ISO 9409-1, clause 4).
+    holes = (pin or 0.0) + np.pi / n + 2 * np.pi * np.arange(n) / n if n else np.zeros(0)
+    return Flange(
+        name=standard.designation,
+        rim=standard.outer / 2 - details.rim_chamfer,
+        outer=standard.outer / 2,
+        bore=standard.centring / 2 + details.bore_chamfer,
+        pitch=standard.pitch_circle / 2,
+        holes=tuple(float(h) for h in holes),
+        hole=standard.thread / 2 + details.countersink,
+        pin=pin,
+        pin_hole=standard.pin / 2 + details.countersink,
+        details=details,
+    )
+
+
+def wrist_circle_of(details: FlangeDetails, diameter: float) -> Flange:
+    """Return the wrist's outer circle of ``diameter`` [m]: for scanners too coarse for the rim."""
+    return Flange(
+        name=f"wrist circle {diameter * 1e3:g} mm",
+        rim=diameter / 2,
+        outer=diameter / 2,
+        bore=None,
+        pitch=0.0,
+        holes=(),
+        hole=0.0,
+        pin=None,
+        pin_hole=0.0,
+        details=details,
+    )
+
+
+class Sphere(BaseModel):
+    """A calibration sphere that the flange carries. All SI.
+
+    Attributes:
+        radius: Of the sphere.
+        centre_in_flange: Its centre in ``flange``.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    radius: float
+    centre_in_flange: tuple[float, float, float]

@@ -1,0 +1,257 @@
+"""An arm from its URDF: kinematics, limits, and capsules fitted to its collision meshes."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye.errors import RecipeError
+from flangeye.files.regular import read_text
+from flangeye.maths.geometry import invert, rigid, rotation_from_rpy, rpy_from_rotation
+from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
+from flangeye.models.urdf_meshes import MissingMesh, capsule_of
+from flangeye.types import Floats
+from flangeye.units import SI
+
+MAX_BYTES = 10_000_000
+MOVES = ("revolute", "continuous", "prismatic")
+FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame")
+"""Ends of the names that makers give the flange's frame, z outwards; the surest first."""
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A URDF file, read.
+
+    Attributes:
+        path: Of the file.
+        name: Of the robot.
+        links: By name.
+        above: Link's name -> the joint that carries it.
+    """
+
+    path: Path
+    name: str
+    links: Mapping[str, ET.Element]
+    above: Mapping[str, ET.Element]
+
+    def chain(self, link: str) -> list[ET.Element]:
+        """Return the joints from the root to a link."""
+        joints: list[ET.Element] = []
+        while link in self.above:
+            joints.insert(0, self.above[link])
+            link = _end(joints[0], "parent")
+            if len(joints) > len(self.links):
+                raise RecipeError(f"{self.path}: its joints go round in a circle at '{link}'")
+        return joints
+
+
+def robot_from_urdf(
+    path: Path,
+    base: str | None = None,
+    flange: str | None = None,
+    standard: str | None = None,
+    packages: Mapping[str, Path] | None = None,
+) -> RobotModel:
+    """Return the arm between two links of a URDF, as xacro writes one.
+
+    Args:
+        path: The file.
+        base: Link that is the controller's base frame; found by its name if not given.
+        flange: Link at the plate's face, z outwards; found by its name if not given.
+        standard: Designation of the plate.
+        packages: Where the packages are that meshes are named by.
+
+    Raises:
+        RecipeError: It is no URDF, or base and flange cannot be told: says which links there are.
+    """
+    urdf = read_urdf(path)
+    to_base = urdf.chain(_base(urdf, base))
+    to_flange = urdf.chain(_flange(urdf, flange))
+    shared = _shared(to_base, to_flange)
+    if any(joint.get("type") in MOVES for joint in to_base[shared:]):
+        raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
+    base_T_root = invert(_fixed(to_base[shared:]))
+    return _assemble(urdf, base_T_root, to_flange[shared:], standard, packages or {})
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read a URDF file.
+
+    Raises:
+        RecipeError: It is not XML, not a URDF, or a xacro that was not expanded.
+    """
+    text = read_text(path, MAX_BYTES, RecipeError)
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise RecipeError(f"{path}:{error.position[0]}: not valid XML: {error}") from None
+    if root.tag != "robot":
+        raise RecipeError(f"{path}: is no URDF: its outermost element is <{root.tag}>, not <robot>")
+    if any("xacro" in element.tag for element in root.iter()):
+        raise RecipeError(f"{path}: is xacro, not yet a URDF; expand it: xacro {path} > arm.urdf")
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    above = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    return Urdf(path, root.get("name") or path.stem, links, above)
+
+
+def _assemble(
+    urdf: Urdf,
+    base_T_first: Floats,
+    chain: list[ET.Element],
+    standard: str | None,
+    packages: Mapping[str, Path],
+) -> RobotModel:
+    joints: list[Joint] = []
+    volumes: list[Volume] = []
+    missing = ""
+    before = base_T_first  # from the last moving link, or the base, to the link that is reached
+    reached = _end(chain[0], "parent") if chain else ""
+    for joint in [*chain, None]:
+        try:
+            for volume in _volumes(urdf, reached, len(joints), before, packages):
+                volumes.append(volume)
+        except MissingMesh as error:
+            missing = str(error)
+        if joint is None:
+            break
+        before = before @ _origin(joint)
+        reached = _end(joint, "child")
+        if joint.get("type") in MOVES:
+            joints.append(_joint(urdf, joint, before))
+            before = np.eye(4)
+    if not joints:
+        raise RecipeError(f"{urdf.path}: no joint moves between base and flange")
+    return RobotModel(
+        model=urdf.name,
+        maker="",
+        convention="urdf",
+        joints=tuple(joints),
+        flange_frame=Placement(**_pose(before)),
+        flange=FlangeDetails(standard=standard),
+        volumes=() if missing else tuple(volumes),
+        volumes_missing=missing,
+        source=f"URDF {urdf.path.name}",
+    )
+
+
+def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
+    if joint.find("mimic") is not None:
+        raise RecipeError(
+            f"{urdf.path}: joint '{joint.get('name')}' follows another one (mimic), which is not "
+            "supported between base and flange"
+        )
+    axis, limit = joint.find("axis"), joint.find("limit")
+    lower, upper = -2 * np.pi, 2 * np.pi
+    if joint.get("type") != "continuous" and limit is not None:
+        lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+    return Joint(
+        axis=tuple(_numbers(axis, "xyz", "1 0 0")),
+        slides=joint.get("type") == "prismatic",
+        lower=SI(lower),
+        upper=SI(upper),
+        **_pose(pose),
+    )
+
+
+def _volumes(
+    urdf: Urdf, link: str, index: int, pose: Floats, packages: Mapping[str, Path]
+) -> Iterator[Volume]:
+    for collision in urdf.links[link].findall("collision") if link in urdf.links else ():
+        geometry = collision.find("geometry")
+        if geometry is None or not len(geometry):
+            continue
+        placed = pose @ _origin(collision)
+        capsule = capsule_of(geometry[0], urdf.path, packages)
+        ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
+        start, end = (tuple(map(SI, point)) for point in ends)
+        yield Volume(link=index, start=start, end=end, radius=SI(capsule.radius))
+
+
+def _base(urdf: Urdf, asked: str | None) -> str:
+    """Return the base: as asked, the frame ROS-Industrial calls ``base``, or the root."""
+    if asked is not None:
+        return _known(urdf, asked, "base")
+    roots = [name for name in urdf.links if name not in urdf.above]
+    named = [
+        name for name in urdf.links if name in ("base", *(f"{p}base" for p in _prefixes(urdf)))
+    ]
+    if len(named) == 1 or len(roots) == 1:
+        return (named or roots)[0]
+    raise RecipeError(f"{urdf.path}: which link is the base? write base: {' or '.join(roots)}")
+
+
+def _prefixes(urdf: Urdf) -> Iterator[str]:
+    return (name.removesuffix("base_link") for name in urdf.links if name.endswith("base_link"))
+
+
+def _flange(urdf: Urdf, asked: str | None) -> str:
+    """Return the flange: as asked, by a name that makers use, or the only end of the arm."""
+    if asked is not None:
+        return _known(urdf, asked, "flange")
+    for ending in FLANGES:
+        named = [name for name in urdf.links if name.endswith(ending)]
+        if len(named) == 1:
+            return named[0]
+    parents = {_end(joint, "parent") for joint in urdf.above.values()}
+    moved = [n for n in urdf.links if any(j.get("type") in MOVES for j in urdf.chain(n))]
+    ends = [name for name in moved if name not in parents]
+    if len(ends) == 1:
+        return ends[0]
+    raise RecipeError(
+        f"{urdf.path}: which link is the flange, its origin in the plate's face and z outwards? "
+        f"write flange: {' or '.join(ends[:8]) or 'NAME'}"
+    )
+
+
+def _known(urdf: Urdf, asked: str, what: str) -> str:
+    if asked in urdf.links:
+        return asked
+    hint = "; the plate goes to feature: {standard: …}" if "9409" in asked else ""
+    raise RecipeError(
+        f"{urdf.path}: {what}: no link '{asked}'; links: {', '.join(urdf.links)}{hint}"
+    )
+
+
+def _shared(first: list[ET.Element], second: list[ET.Element]) -> int:
+    """Return how many joints two chains from the root begin with in common."""
+    count = 0
+    while count < min(len(first), len(second)) and first[count] is second[count]:
+        count += 1
+    return count
+
+
+def _fixed(joints: list[ET.Element]) -> Floats:
+    pose = np.eye(4)
+    for joint in joints:
+        pose = pose @ _origin(joint)
+    return pose
+
+
+def _origin(element: ET.Element) -> Floats:
+    origin = element.find("origin")
+    rpy, xyz = _numbers(origin, "rpy", "0 0 0"), _numbers(origin, "xyz", "0 0 0")
+    return rigid(rotation_from_rpy(*rpy), np.array(xyz))
+
+
+def _numbers(element: ET.Element | None, name: str, default: str) -> list[float]:
+    text = default if element is None else element.get(name, default)
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        raise RecipeError(f'URDF: {name}="{text}" is not three numbers') from None
+
+
+def _pose(pose: Floats) -> dict[str, Any]:
+    rpy = rpy_from_rotation(pose[:3, :3])
+    return {"xyz": tuple(map(SI, pose[:3, 3])), "rpy": tuple(map(SI, rpy))}
+
+
+def _end(joint: ET.Element, which: str) -> str:
+    end = joint.find(which)
+    return "" if end is None else end.get("link", "")

@@ -1,0 +1,104 @@
+"""What a URDF says a link fills: a mesh or a simple body, as the capsule round it."""
+
+from __future__ import annotations
+
+import itertools
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from flangeye.errors import RecipeError
+from flangeye.maths.capsules import Capsule, fit_capsule
+from flangeye.types import Floats
+
+MAX_BYTES = 200_000_000
+
+
+class MissingMesh(RecipeError):
+    """A mesh is not where the URDF says."""
+
+
+def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Capsule:
+    """Return the capsule round a geometry's body, in its own frame, checked against it.
+
+    Args:
+        body: The element within ``<geometry>``.
+        urdf: The file it is of.
+        packages: Where packages are, by name.
+
+    Raises:
+        MissingMesh: The mesh is not there; says where it was looked for.
+        RecipeError: It cannot be read.
+    """
+    if body.tag == "sphere":
+        return Capsule(np.zeros(3), np.zeros(3), float(body.get("radius", "0")))
+    points = _points(body, urdf, packages)
+    capsule = fit_capsule(points)
+    outside = float(capsule.distance(points).max())
+    if outside > 1e-6:
+        raise RecipeError(f"{urdf}: a mesh sticks {outside * 1e3:.3f} mm out of its capsule")
+    return capsule
+
+
+def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Floats:
+    if body.tag == "box":
+        half = np.array([float(word) for word in body.get("size", "").split()]) / 2
+        return np.asarray(half * np.array(list(itertools.product((-1, 1), repeat=3))))
+    if body.tag == "cylinder":
+        return _cylinder(float(body.get("radius", "0")), float(body.get("length", "0")))
+    if body.tag == "mesh":
+        scale = np.array([float(word) for word in body.get("scale", "1 1 1").split()])
+        return np.asarray(_vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
+    raise RecipeError(f"{urdf}: <{body.tag}> is no body that URDF knows")
+
+
+def _cylinder(radius: float, length: float) -> Floats:
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    around = radius / np.cos(np.pi / 64)  # the polygon that lies about the circle
+    ring = around * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    half = np.array([0, 0, length / 2])
+    return np.concatenate([ring - half, ring + half])
+
+
+def _find(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
+    """Return the file of ``package://NAME/…``, ``file://…`` or a path beside the URDF."""
+    if not name.startswith("package://"):
+        path = urdf.parent / name.removeprefix("file://")
+        if path.is_file():
+            return path
+        raise MissingMesh(f"{urdf}: mesh '{name}' is not at {path}")
+    package, _, below = name.removeprefix("package://").partition("/")
+    folders = [packages[package]] if package in packages else _nearby(urdf, package)
+    for folder in folders:
+        if (folder / below).is_file():
+            return folder / below
+    looked = ", ".join(map(str, folders)) or f"any folder '{package}' above {urdf.parent}"
+    raise MissingMesh(
+        f"{urdf}: mesh '{name}' was not found in {looked}; write "
+        f"robot: {{packages: {{{package}: FOLDER}}}}, where FOLDER holds {below.partition('/')[0]}/"
+    )
+
+
+def _nearby(urdf: Path, package: str) -> list[Path]:
+    above = urdf.absolute().parents
+    named = [folder for folder in above if folder.name == package]
+    return named + [folder / package for folder in above if (folder / package).is_dir()]
+
+
+def _vertices(path: Path) -> Floats:
+    import trimesh
+
+    if path.stat().st_size > MAX_BYTES:
+        raise RecipeError(
+            f"{path}: a mesh of more than {MAX_BYTES} bytes; collision meshes are small"
+        )
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # trimesh raises whatever its readers do
+        raise RecipeError(f"{path}: is no mesh that can be read: {error}") from None
+    points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    if not len(points) or not np.isfinite(points).all():
+        raise RecipeError(f"{path}: has no vertices, or some that are not finite")
+    return points

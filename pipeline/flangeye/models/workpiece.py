@@ -1,0 +1,187 @@
+"""A workpiece to weld: its CAD as triangles, and its seams as polylines, from one YAML file.
+
+::
+
+    title: Plate with a straight V-groove
+    cad: plate.stl            # STL or PLY, beside this file
+    unit: mm                  # of the CAD and of the points below; neither says it itself
+    seams:
+      - name: groove
+        points: [[-100, -10, 14], [100, -10, 14]]   # along the root, from start to end
+        opening: [0, 0, 1]                          # out of the groove, towards the torch
+        half_angle: 40 deg
+        half_width: 8.4 mm
+    source: where the CAD comes from
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from flangeye.errors import StageError
+from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.paths import bundled_file
+from flangeye.files.regular import read_regular
+from flangeye.models.model import Model, read_model
+from flangeye.types import Floats
+from flangeye.units import Angle, Length
+
+Vector = tuple[float, float, float]
+
+MESHES = (".stl", ".ply")
+MAX_MESH = 256_000_000
+"""Largest CAD file [bytes]: five million triangles."""
+MARGIN = 0.1
+"""A seam may be this far outside the CAD's box, as a share of its diagonal."""
+
+
+class SeamLine(Model):
+    """One seam as the file has it."""
+
+    name: str
+    points: tuple[Vector, ...] = Field(min_length=2, description="Along the root, in order.")
+    opening: Vector = Field(description="Out of the groove, towards the torch; of any length.")
+    half_angle: Angle | None = Field(None, description="Between a wall and the opening.")
+    half_width: Length | None = Field(None, description="From the root to a shoulder, sideways.")
+
+
+class WorkpieceFile(Model):
+    """The file."""
+
+    title: str
+    cad: str = Field(description="STL or PLY file with triangles, beside this one.")
+    unit: LengthUnit = Field(description="Of the CAD's coordinates and of the seams' points.")
+    seams: tuple[SeamLine, ...] = Field(min_length=1)
+    source: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class CadSeam:
+    """One seam in the CAD's frame.
+
+    Attributes:
+        points: (N, 3) along the root [m].
+        opening: (3,) unit vector towards the torch.
+        half_angle: Between a wall and the opening [rad], if known.
+        half_width: From the root to a shoulder [m], if known.
+    """
+
+    points: Floats
+    opening: Floats
+    half_angle: float | None
+    half_width: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Workpiece:
+    """A workpiece in its CAD's own frame.
+
+    Attributes:
+        title: For people.
+        path: Its file.
+        unit: In which the CAD was said to be.
+        vertices: (V, 3) [m].
+        triangles: (T, 3) indices of vertices.
+        seams: By name.
+    """
+
+    title: str
+    path: Path
+    unit: LengthUnit
+    vertices: Floats
+    triangles: NDArray[np.int32]
+    seams: Mapping[str, CadSeam]
+
+    @property
+    def diagonal(self) -> float:
+        """Of the box around it [m]."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+
+WorkpiecePath = Annotated[
+    Path,
+    BeforeValidator(bundled_file("workpiece", "workpieces")),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
+"""A parameter that names a workpiece: a bundled one, or a file beside the recipe."""
+
+
+def load_workpiece(path: Path) -> Workpiece:
+    """Read a workpiece and its CAD.
+
+    Raises:
+        RecipeError: The YAML file is wrong; every mistake with its line.
+        StageError: The CAD cannot be read, or a seam is not on it.
+    """
+    file: WorkpieceFile = read_model(path, WorkpieceFile)
+    scale = 1.0 / PER_METRE[file.unit]
+    vertices, triangles = read_mesh(path.parent / file.cad)
+    vertices = vertices * scale
+    seams = {line.name: _seam(path, line, scale) for line in file.seams}
+    if len(seams) < len(file.seams):
+        raise StageError(f"{path}: two seams have one name")
+    for name, seam in seams.items():
+        _check_on_part(path, name, seam, vertices)
+    return Workpiece(file.title, path, file.unit, vertices, triangles, seams)
+
+
+def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
+    """Return vertices (V, 3), in the file's unit, and triangles (T, 3) of an STL or PLY file.
+
+    Raises:
+        StageError: It is missing, damaged, or holds no triangles.
+    """
+    if path.suffix.lower() not in MESHES:
+        raise StageError(f"{path}: '{path.suffix}' is no CAD; known: {', '.join(MESHES)}")
+    vertices, triangles = _decoded(path, read_regular(path, MAX_MESH))
+    if triangles.ndim != 2 or not len(triangles):
+        raise StageError(f"{path}: holds no triangles; is it a mesh, and whole?")
+    if not np.isfinite(vertices).all():
+        raise StageError(f"{path}: holds vertices that are not finite")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise StageError(f"{path}: has a triangle whose corner is no vertex of it; is it whole?")
+    return vertices, triangles.astype(np.int32)
+
+
+def _decoded(path: Path, raw: bytes) -> tuple[Floats, NDArray[np.int64]]:
+    """Decode without native code: Open3D's reader ends the process at a damaged file."""
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(
+            io.BytesIO(raw), file_type=path.suffix[1:].lower(), process=False, force="mesh"
+        )
+        return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    except Exception as error:  # damaged bytes can break the decoder in any way
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise StageError(f"{path}: is not a mesh, or is damaged: {reason}") from None
+
+
+def _seam(path: Path, line: SeamLine, scale: float) -> CadSeam:
+    points = np.array(line.points) * scale
+    opening = np.array(line.opening)
+    if not (np.linalg.norm(np.diff(points, axis=0), axis=1) > 0).all():
+        raise StageError(f"{path}: seam '{line.name}' has the same point twice in a row")
+    if not np.linalg.norm(opening) > 0:
+        raise StageError(f"{path}: seam '{line.name}' has an opening without a direction")
+    opening = opening / np.linalg.norm(opening)
+    return CadSeam(points, opening, line.half_angle, line.half_width)
+
+
+def _check_on_part(path: Path, name: str, seam: CadSeam, vertices: Floats) -> None:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    outside = np.maximum(np.maximum(low - seam.points, seam.points - high), 0.0)
+    off = float(np.linalg.norm(outside, axis=1).max())
+    if off > MARGIN * np.linalg.norm(high - low):
+        raise StageError(
+            f"{path}: seam '{name}' is {off * 1e3:.4g} mm outside its CAD; both must be in one "
+            "frame and one unit"
+        )

@@ -1,0 +1,196 @@
+"""The program's side of a guarded arm."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any
+
+from flangeye.devices import PATIENCE, DeviceError, RobotDriver, RobotState
+from flangeye.errors import RunStopped
+from flangeye.files.children import keep_current_folder_out
+from flangeye.files.load import busy
+from flangeye.models.robots import RobotModel
+from flangeye.motion.keyboard import keys
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import Route
+from flangeye.motion.supervision import Sample
+from flangeye.motion.watchdog import Charge, Report, guard, watchdog_process
+
+OPENING = 30.0
+"""Longest time for a driver to connect, its client library's import included [s]."""
+
+SILENCE = 2.0 * PATIENCE
+"""A guard that says nothing for so long while the arm is under way is lost [s]."""
+
+Told = Callable[[RobotState], None]
+
+
+class WatchedArm:
+    """An arm that somebody watches.
+
+    Attributes:
+        name: For people.
+        period: Between two of the controller's cycles [s].
+    """
+
+    def __init__(self, wire: Connection, told: Told, patience: float | None = OPENING) -> None:
+        """Wait until the arm is open, or for ``patience`` [s]; see :func:`watched`.
+
+        Raises:
+            DeviceError: It cannot be opened, or must not be moved.
+        """
+        self._wire, self._told = wire, told
+        self._unheard: deque[Report] = deque()
+        opened = self._hear(patience, "does not answer")
+        self.name, self.period, state = opened.content
+        self._state: RobotState = state
+
+    @property
+    def state(self) -> RobotState:
+        """What the arm last said: at rest, where it stands."""
+        return self._state
+
+    def go(self, route: Route) -> None:
+        """Set off along a checked route; the arm drives while the program goes on."""
+        self._say("go", route)
+
+    def wait(self) -> RobotState:
+        """Return when the route is driven and the arm has settled.
+
+        Raises:
+            DeviceError: The arm was stopped for a safety fault: the reason.
+            RunStopped: The operator stopped it.
+        """
+        while (report := self._hear(SILENCE, "has fallen silent")).what != "arrived":
+            self._state = report.content
+            self._told(self._state)
+        self._state = report.content
+        self._told(self._state)
+        return self._state
+
+    def during(self, start_ns: int, end_ns: int) -> list[Sample]:
+        """Return where the arm was in an interval that has ended, as far as is known.
+
+        What else the guard says meanwhile, a safety fault too, is heard by the next :meth:`wait`.
+        """
+        self._say("samples", (start_ns, end_ns))
+        while (report := self._read(PATIENCE, "does not answer")).what != "samples":
+            self._unheard.append(report)
+        samples: list[Sample] = report.content
+        return samples
+
+    def stop(self) -> None:
+        """Stop the arm where it is."""
+        self._say("stop")
+
+    def _say(self, request: str, content: Any = None) -> None:
+        with suppress(OSError):  # a guard that is gone has said why; that is still to be heard
+            self._wire.send((request, content))
+
+    def _hear(self, patience: float | None, complaint: str) -> Report:
+        """Return the next report that is no reason to end.
+
+        Raises:
+            DeviceError: A safety fault, or no report in time.
+            RunStopped: The operator stopped the arm.
+        """
+        report = self._unheard.popleft() if self._unheard else self._read(patience, complaint)
+        if report.what == "fault":
+            raise DeviceError(report.content)
+        if report.what == "stopped":
+            raise RunStopped(f"the operator stopped the arm ({report.content})")
+        return report
+
+    def _read(self, patience: float | None, complaint: str) -> Report:
+        try:
+            if not self._wire.poll(patience):
+                raise DeviceError(f"the arm {complaint} ({patience:.0f} s){busy()}")
+            report: Report = self._wire.recv()
+        except (EOFError, OSError):
+            raise DeviceError("the arm is lost: its guard has ended") from None
+        return report
+
+
+@contextmanager
+def watched(
+    driver: RobotDriver, model: RobotModel, limits: MotionLimits, told: Told = lambda state: None
+) -> Iterator[WatchedArm]:
+    """Open an arm under guard; when the context ends, the arm is stopped and let go of.
+
+    Args:
+        driver: Opens the arm. It runs in the guard's process, or, where the driver has to talk
+            to the person, in a thread of this one.
+        model: The arm's model.
+        limits: What the arm must keep to.
+        told: Is told the arm's state now and then while it is under way.
+
+    Raises:
+        DeviceError: The arm cannot be opened, or must not be moved.
+    """
+    charge = Charge(driver.open, model, limits)
+    ours, theirs = multiprocessing.Pipe()
+    start = _in_thread if driver.in_this_process else _in_process
+    with ours, start(ours, theirs, charge):
+        try:
+            # A person who has to say where the arm stands takes the time it takes.
+            yield WatchedArm(ours, told, None if driver.in_this_process else OPENING)
+        finally:
+            with suppress(OSError):
+                ours.send(("close", None))
+
+
+@contextmanager
+def _in_thread(ours: Connection, theirs: Connection, charge: Charge) -> Iterator[None]:
+    thread = threading.Thread(target=guard, args=(theirs, charge), name="guard", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join(PATIENCE)
+        theirs.close()
+
+
+@contextmanager
+def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterator[None]:
+    spawn = multiprocessing.get_context("spawn")
+    heard, alarm = multiprocessing.Pipe(duplex=False)
+    keep_current_folder_out()
+    with keys() as keyboard, _alarmed(alarm):
+        process = spawn.Process(
+            target=watchdog_process,
+            args=(theirs, charge._replace(keyboard=keyboard), heard),
+            name="guard",
+            daemon=True,
+        )
+        process.start()
+        theirs.close()
+        heard.close()
+        try:
+            yield
+        finally:
+            process.join(PATIENCE)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+
+@contextmanager
+def _alarmed(alarm: Connection) -> Iterator[None]:
+    """Let every signal write to the alarm at once, even while a long computation runs."""
+    with alarm:
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        os.set_blocking(alarm.fileno(), False)
+        before = signal.set_wakeup_fd(alarm.fileno(), warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(before)

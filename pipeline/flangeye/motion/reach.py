@@ -1,0 +1,207 @@
+"""Which flange poses a cell allows: in view, in reach, and with the arm out of the way."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.motion.clearance import ArmVolume
+from flangeye.motion.limits import MotionLimits
+from flangeye.types import Floats
+
+MARGIN = 0.95
+"""Share of the field of view, to either side, that a planned flange keeps to."""
+
+MOVES_WELL = 0.5
+"""Share of the best manipulability that is good enough for a posture that is near."""
+
+FOLD = np.radians(120.0)
+"""An arm that is under way does not turn a joint farther from home: it would fold over."""
+
+CLOCKINGS = 8
+"""How many directions of the flange's x axis are tried for the one the arm likes best."""
+
+TABLE = 0.0
+"""Height of the table the arm stands on, in ``base`` [m]."""
+
+
+class Margins(NamedTuple):
+    """How far poses keep away from what an arm must not do.
+
+    Attributes:
+        limits: What it must keep to.
+        joints: Room to the joints' limits [rad].
+        singularity: Smallest singular value of the Jacobian, lengths in units of the reach.
+    """
+
+    limits: MotionLimits
+    joints: float
+    singularity: float
+
+
+class Reach:
+    """What an arm can show a scanner.
+
+    Attributes:
+        arm: Its kinematics.
+        refused: Why poses were impossible, and how often.
+        home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        scanner: ScannerModel,
+        base_T_camera: Floats,
+        radius: float,
+        margins: Margins | None = None,
+    ) -> None:
+        """Set up.
+
+        Args:
+            robot: The arm.
+            scanner: What looks at it.
+            base_T_camera: (4, 4) where that stands.
+            radius: Of the disc that has to be in view [m].
+            margins: What a real arm has to keep to besides.
+        """
+        self.arm = Arm(robot)
+        self._volume = ArmVolume(robot)
+        self._scanner, self._radius = scanner, radius
+        self._base_T_camera = base_T_camera
+        lean = scanner.convergence
+        projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
+        self._eyes = np.stack([np.zeros(3), projector]) @ base_T_camera[:3, :3].T
+        self._eyes += base_T_camera[:3, 3]
+        self._margins = margins
+        self._reach = robot.length
+        self.home = np.zeros(self.arm.n)
+        self._start: Floats | None = None
+        self.refused: Counter[str] = Counter()
+
+    def facing(self, centre: Floats) -> Floats | None:
+        """Return the rotation (3, 3) of a flange at ``centre`` that faces along the view.
+
+        Its z is against the camera's; about z the flange turns to where the arm moves best, or,
+        where it is known where the arm stands, to the nearest posture in which it moves well. The
+        joints of that pose become the home that later poses stay near to.
+        """
+        found = [
+            (float(self.arm.manipulability(joints)), pose[:3, :3], joints)
+            for pose in self._rolls(centre)
+            for joints in self._possible(pose)
+        ]
+        if not found:
+            return None
+        best = max(score for score, *_ in found)
+        start = self._start
+        if start is None:
+            chosen = next(each for each in found if each[0] >= best * (1 - 1e-9))
+        else:
+            good = [each for each in found if each[0] >= MOVES_WELL * best]
+            chosen = min(good, key=lambda each: _turn(each[2], start))
+        self.home = chosen[2]
+        return chosen[1]
+
+    def start_from(self, joints: Floats) -> None:
+        """Prefer postures near (n,) joint angles, where the arm stands [rad]."""
+        self._start = self.home = joints
+
+    def _rolls(self, centre: Floats) -> list[Floats]:
+        """Return poses (4, 4) at a point that look at the scanner, turned about that view."""
+        poses = []
+        for step in range(CLOCKINGS):
+            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / CLOCKINGS)
+            poses.append(rigid(self._base_T_camera[:3, :3] @ turn, centre))
+        return poses
+
+    def joints(self, base_T_flange: Floats) -> Floats | None:
+        """Return joint angles for a pose (4, 4), those nearest to home, or None if there are none.
+
+        None means: out of view or range, out of reach or limits, touching the table or itself, or
+        with a link between scanner and flange.
+        """
+        if not self.in_view(base_T_flange):
+            self.refused["out of the scanner's view"] += 1
+            return None
+        possible = self._possible(base_T_flange)
+        if not possible:
+            return None
+        nearest = min(possible, key=lambda joints: _turn(joints, self.home))
+        if self._start is not None and _turn(nearest, self.home) > FOLD:
+            self.refused["only with the arm folded over"] += 1
+            return None
+        return nearest
+
+    def in_view(self, base_T_flange: Floats) -> bool:
+        """Return whether camera and projector see the whole disc, within the scanner's range."""
+        angle = 2 * np.pi * np.arange(16) / 16
+        rim = self._radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        in_base = rim @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]
+        in_camera = (in_base - self._base_T_camera[:3, 3]) @ self._base_T_camera[:3, :3]
+        scanner, depth = self._scanner, in_camera[:, 2]
+        if not ((depth >= scanner.near) & (depth <= scanner.far)).all():
+            return False
+        turn = rotation_from_rpy(0.0, -2 * scanner.convergence, 0.0)
+        from_projector = (in_base - self._eyes[1]) @ self._base_T_camera[:3, :3] @ turn
+        lit = scanner.projection is None or _within(from_projector, scanner.projection)
+        return lit and _within(in_camera, scanner.field_of_view)
+
+    def _possible(self, base_T_flange: Floats) -> list[Floats]:
+        reachable = self._unwound(self.arm.inverse(base_T_flange))
+        clear = [joints for joints in reachable if self._clear(joints)]
+        possible = [joints for joints in clear if not self._too_near(joints)]
+        if not possible:
+            why = "with the arm in the way" if len(reachable) else "out of the arm's reach"
+            self.refused[str(self._too_near(clear[0])) if clear else why] += 1
+        return possible
+
+    def _unwound(self, joints: Floats) -> Floats:
+        """Take (K, n) angles by whole turns as near to home as the limits allow."""
+        if self._start is None:
+            return joints
+        nearer = joints + 2 * np.pi * np.round((self.home - joints) / (2 * np.pi))
+        allowed = (nearer >= self.arm.lower) & (nearer <= self.arm.upper)
+        return np.where(allowed, nearer, joints)
+
+    def _too_near(self, joints: Floats) -> str | None:
+        """Say what a posture comes too near to."""
+        if self._margins is None:
+            return None
+        limits, room, singularity = self._margins
+        if limits.outside(self.arm.flange(joints)[:3, 3]):
+            return "outside robot.limits.box"
+        if limits.beyond(joints, room):
+            return "near the limits of the joints"
+        jacobian = self.arm.jacobian(joints)
+        jacobian[3:] /= self._reach
+        smallest = np.linalg.svd(jacobian, compute_uv=False)[-1]
+        return "near a singularity" if smallest < singularity else None
+
+    def _clear(self, joints: Floats) -> bool:
+        frames, volume = self.arm.frames(joints), self._volume
+        axes = volume.axes(frames)
+        target = self.arm.flange(joints)[:3, 3]
+        sight = np.stack([self._eyes, np.broadcast_to(target, self._eyes.shape)], axis=1)
+        return (
+            volume.above(axes, TABLE)
+            and volume.apart(axes)
+            and volume.leaves_free(axes, sight, self._radius)
+        )
+
+
+def _turn(first: Floats, second: Floats) -> float:
+    """Return the largest turn of a joint from one posture to another [rad]."""
+    return float(np.abs(first - second).max().round(6))
+
+
+def _within(points: Floats, field: tuple[float, float]) -> bool:
+    """Return whether (N, 3) points before a pinhole lie in its field of view, with a margin."""
+    half = np.tan(np.asarray(field) / 2) * MARGIN
+    return bool((points[:, 2] > 0).all() and (np.abs(points[:, :2] / points[:, 2:]) <= half).all())

@@ -1,0 +1,119 @@
+"""A way from pose to pose that was checked from end to end before anything moves."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.motion.clearance import ArmVolume
+from flangeye.motion.limits import MotionLimits
+from flangeye.types import Floats
+
+STEP = np.radians(2.0)
+"""Largest turn of a joint between two checked postures [rad]."""
+
+JOINT_ACCELERATION = np.radians(60.0)
+"""Of the leading joint [rad/s^2]: a slow default, below what any arm here can do."""
+
+FINER = 8
+"""Postures timed for each that is checked: between those the flange may be a percent faster."""
+
+TABLE = 0.0
+"""Height of the table the arm stands on, in ``base`` [m]."""
+
+
+class Leg(NamedTuple):
+    """A move straight in joint angles.
+
+    Attributes:
+        joints: (n,) where it ends [rad].
+        speed: Of the leading joint [rad/s].
+        acceleration: Of the leading joint [rad/s^2].
+        seconds: What it takes.
+    """
+
+    joints: Floats
+    speed: float
+    acceleration: float
+    seconds: float
+
+
+class Route(NamedTuple):
+    """Legs to drive one after the other.
+
+    Attributes:
+        legs: At least one.
+        via: Name of the posture on the way, if the straight way is barred.
+    """
+
+    legs: tuple[Leg, ...]
+    via: str | None = None
+
+    @property
+    def seconds(self) -> float:
+        """What the whole route takes."""
+        return sum(leg.seconds for leg in self.legs)
+
+
+class Barred(NamedTuple):
+    """There is no way: what stands in it."""
+
+    reason: str
+
+
+class Router:
+    """Finds ways for one arm within its limits."""
+
+    def __init__(self, robot: RobotModel, limits: MotionLimits, home: Floats) -> None:
+        """Set up; ``home`` (n,) is a posture to go by where the straight way is barred [rad]."""
+        self._arm, self._volume = Arm(robot), ArmVolume(robot)
+        self._limits, self._home = limits, home
+
+    def route(self, start: Floats, goal: Floats) -> Route | Barred:
+        """Return a way from joint angles (n,) to joint angles (n,)."""
+        straight = self._leg(start, goal)
+        if isinstance(straight, Leg):
+            return Route((straight,))
+        first, second = self._leg(start, self._home), self._leg(self._home, goal)
+        if isinstance(first, Leg) and isinstance(second, Leg):
+            return Route((first, second), "home")
+        return straight
+
+    def _leg(self, start: Floats, goal: Floats) -> Leg | Barred:
+        count = 2 + int(np.abs(goal - start).max() / STEP)
+        postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
+        frames = self._arm.frames(postures)
+        places = self._arm.flange(postures)[:, :3, 3]
+        for posture, frame, place in zip(postures, frames, places, strict=True):
+            if why := self._bars(posture, frame, place):
+                return Barred(why)
+        return self._timed(start, goal, FINER * count)
+
+    def _bars(self, joints: Floats, frames: Floats, place: Floats) -> str | None:
+        """Say why the arm must not be in a posture."""
+        axes = self._volume.axes(frames)
+        if not self._volume.above(axes, TABLE):
+            return f"touches the table with the flange at {_mm(place)}"
+        if not self._volume.apart(axes):
+            return f"touches itself with the flange at {_mm(place)}"
+        return self._limits.outside(place) or self._limits.beyond(joints)
+
+    def _timed(self, start: Floats, goal: Floats, count: int) -> Leg:
+        """Choose speeds so that neither flange nor joints exceed their limits anywhere."""
+        postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
+        places = self._arm.flange(postures)[:, :3, 3]
+        turn = float(np.abs(goal - start).max())
+        each = turn / (count - 1)
+        lever = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / max(each, 1e-9)
+        limits = self._limits
+        speed = min(limits.joint_speed, limits.speed / max(lever, 1e-6))
+        acceleration = min(JOINT_ACCELERATION, limits.acceleration / max(lever, 1e-6))
+        ramp = min(speed / acceleration, np.sqrt(turn / acceleration))
+        return Leg(goal, speed, acceleration, turn / speed + ramp)
+
+
+def _mm(place: Floats) -> str:
+    return ", ".join(f"{1e3 * x:.0f}" for x in place) + " mm"

@@ -1,0 +1,178 @@
+"""Judge every sample of an arm: under way as told, arrived, or a reason to stop."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.devices import RobotState
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import Leg
+from flangeye.types import Floats
+
+REMEMBERED_NS = 20_000_000_000
+"""How far back samples are kept, for exposures that have ended [ns]."""
+
+SETTLED = 0.1
+"""An arm has settled when it stood for this long [s]."""
+
+STANDING = 1e-3
+"""No joint turns faster on an arm that stands [rad/s]."""
+
+ARRIVED = np.radians(0.05)
+"""Every joint this near to its goal, the arm is there [rad]."""
+
+OFF_ROUTE = np.radians(3.0)
+"""Farther from the commanded way, the arm is not doing what it was told [rad]."""
+
+START = 1.0
+"""An arm that has not set off after this did not take the command [s]."""
+
+SLACK = 0.003
+"""By how much a sample may leave the box before it counts: numerics and braking [m]."""
+
+FAST = 1.3
+"""A joint faster than its limit, and this much, is a safety fault."""
+
+BRAKING = 2.0
+"""An arm that still moves so long after it was stopped is moved by somebody else [s]."""
+
+AGREE = 0.01
+"""The controller's flange and that of the arm's model are one place to within this [m]."""
+
+
+class SafetyFault(Exception):
+    """A reason to stop; its text is for people."""
+
+
+class Sample(NamedTuple):
+    """What is remembered of a state."""
+
+    time_ns: int
+    base_T_flange: Floats
+    joints: Floats
+
+
+class Watch:
+    """What is expected of an arm, and what it does.
+
+    Attributes:
+        samples: The last seconds, newest last.
+        leg: The leg it is on, or None while it should stand.
+    """
+
+    def __init__(self, robot: RobotModel, limits: MotionLimits, by_hand: bool = False) -> None:
+        """Begin; an arm that a person moves is where they say, when they say so."""
+        self._arm, self._limits, self._by_hand = Arm(robot), limits, by_hand
+        self.samples: deque[Sample] = deque()
+        self.leg: Leg | None = None
+        self._from = np.zeros(self._arm.n)
+        self._since_ns = self._stood_ns = self._halted_ns = 0
+        self._led = False
+
+    def set_off(self, leg: Leg) -> None:
+        """Expect the arm to drive a leg from where it is."""
+        newest = self.samples[-1]
+        self.leg, self._from, self._led = leg, newest.joints, False
+        self._since_ns, self._stood_ns = newest.time_ns, 0
+
+    def halted(self) -> None:
+        """Expect the arm to stand, wherever it comes to rest."""
+        self.leg, self._led = None, False
+        self._halted_ns = self.samples[-1].time_ns if self.samples else 0
+
+    def led(self) -> None:
+        """Expect the arm to go where it is led from cycle to cycle, within its limits."""
+        self.leg, self._led = None, True
+
+    def judge(self, state: RobotState) -> bool:
+        """Take in a sample; return whether the leg under way has ended and the arm has settled.
+
+        Raises:
+            Doubt: The arm must stop.
+        """
+        self._remember(state)
+        self._halted_ns = self._halted_ns or state.time_ns
+        if state.mode not in ("ready", "moving"):
+            raise SafetyFault(
+                f"the controller reports {state.mode}: {state.message or 'no reason'}"
+            )
+        if self._by_hand:
+            return self.leg is not None and state.mode == "ready"
+        if self.leg is None and not self._led:
+            self._keep_still(state)
+            return False
+        self._keep_limits(state)
+        if self.leg is None:
+            return False
+        self._keep_route(state, self.leg)
+        return self._settled(state, self.leg)
+
+    def check_model(self, state: RobotState) -> None:
+        """Doubt an arm that is not the model's, or has a tool set that nobody knows of.
+
+        Raises:
+            Doubt: The controller's flange and the model's are apart.
+        """
+        if len(state.joints) != self._arm.n:
+            raise SafetyFault(f"the arm has {len(state.joints)} joints, its model {self._arm.n}")
+        modelled = self._arm.flange(state.joints)[:3, 3]
+        apart = float(np.linalg.norm(modelled - state.base_T_flange.translation))
+        if apart > AGREE:
+            raise SafetyFault(
+                f"the controller's flange is {apart * 1e3:.0f} mm from where the robot's model "
+                "has it: is a tool set in the controller, or is it another model?"
+            )
+
+    def _remember(self, state: RobotState) -> None:
+        self.samples.append(Sample(state.time_ns, state.base_T_flange.matrix, state.joints))
+        while state.time_ns - self.samples[0].time_ns > REMEMBERED_NS:
+            self.samples.popleft()
+
+    def _keep_still(self, state: RobotState) -> None:
+        moves = np.abs(state.joint_speeds).max() > 10 * STANDING
+        if moves and (state.time_ns - self._halted_ns) * 1e-9 > BRAKING:
+            raise SafetyFault(
+                "the arm moves, and was not told to: another program drives it and goes on; "
+                "stop it at the controller, then start again"
+            )
+
+    def _keep_limits(self, state: RobotState) -> None:
+        limits = self._limits
+        place = state.base_T_flange.translation
+        if why := limits.outside(place, SLACK) or limits.beyond(state.joints, -ARRIVED):
+            raise SafetyFault(f"the arm is {why}" if why.startswith("outside") else why)
+        fastest = float(np.abs(state.joint_speeds).max())
+        if fastest > FAST * limits.joint_speed:
+            raise SafetyFault(
+                f"a joint turns at {np.degrees(fastest):.0f} deg/s, "
+                f"allowed {np.degrees(limits.joint_speed):.0f} deg/s"
+            )
+
+    def _keep_route(self, state: RobotState, leg: Leg) -> None:
+        way = leg.joints - self._from
+        along = float((state.joints - self._from) @ way)
+        share = np.clip(along / max(float(way @ way), 1e-12), 0.0, 1.0)
+        off = float(np.abs(state.joints - self._from - share * way).max())
+        if off > OFF_ROUTE:
+            raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from the way it was sent")
+        waited = (state.time_ns - self._since_ns) * 1e-9
+        set_off = np.abs(state.joints - self._from).max() > ARRIVED
+        if waited > START and not set_off and np.abs(way).max() > 2 * ARRIVED:
+            raise SafetyFault(f"the arm has not set off {START:.0f} s after it was told to")
+        if waited > 2.0 * leg.seconds + 2.0:
+            raise SafetyFault(
+                f"the arm is not there after {waited:.1f} s; {leg.seconds:.1f} s were expected"
+            )
+
+    def _settled(self, state: RobotState, leg: Leg) -> bool:
+        near = np.abs(state.joints - leg.joints).max() < ARRIVED
+        if not near or np.abs(state.joint_speeds).max() > STANDING:
+            self._stood_ns = 0
+            return False
+        self._stood_ns = self._stood_ns or state.time_ns
+        return (state.time_ns - self._stood_ns) * 1e-9 >= SETTLED

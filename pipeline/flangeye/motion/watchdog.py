@@ -1,0 +1,221 @@
+"""The watch at work: a loop beside the program that owns the arm and stops it on any safety fault.
+
+It runs in a process of its own, where no computation of the program can delay it. It hears of
+Ctrl-C through a pipe that the interpreter's signal handler writes to at once, whatever the program
+is busy with; the space bar it reads itself; when the program dies its end of the wire closes. Each
+of these stops the arm within one cycle.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
+from flangeye.errors import FlangeyeError
+from flangeye.models.robots import RobotModel
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import Leg, Route
+from flangeye.motion.supervision import SafetyFault, Sample, Watch
+
+TOLD_NS = 200_000_000
+"""Between two states told to the program while the arm is under way [ns]."""
+
+
+class Charge(NamedTuple):
+    """What a guard is given.
+
+    Attributes:
+        open: Opens the arm.
+        model: The arm's model.
+        limits: What it must keep to.
+        alarm: File descriptor on which any byte stops the arm, or None.
+        keyboard: File descriptor on which a space stops the arm, or None.
+    """
+
+    open: Callable[[], Robot]
+    model: RobotModel
+    limits: MotionLimits
+    alarm: int | None = None
+    keyboard: int | None = None
+
+
+class Report(NamedTuple):
+    """What a guard tells the program.
+
+    Attributes:
+        what: ``opened``, ``state``, ``arrived``, ``samples``, ``stopped`` (by the operator) or
+            ``fault``.
+        content: A state, samples, or text for people.
+    """
+
+    what: str
+    content: Any = None
+
+
+def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> None:
+    """Guard an arm until the program lets go; the main function of the guard's process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the alarm tells, and sooner
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
+    keyboard = _terminal(charge.keyboard)
+    guard(wire, charge._replace(alarm=alarm.fileno(), keyboard=keyboard))
+
+
+def guard(wire: Connection, charge: Charge) -> None:
+    """Open the arm and guard it until the program lets go."""
+    try:
+        with charge.open() as robot:
+            Watchdog(robot, wire, charge).run()
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return  # the program is gone, and the arm was stopped when its context ended
+    except FlangeyeError as error:
+        wire.send(Report("fault", str(error)))
+    except Exception as error:  # a vendor's client may fail in any way
+        wire.send(Report("fault", f"the driver failed with {type(error).__name__}: {error}"))
+
+
+class Watchdog:
+    """One arm under guard."""
+
+    def __init__(self, robot: Robot, wire: Connection, charge: Charge) -> None:
+        self._robot, self._wire, self._charge = robot, wire, charge
+        self._watch = Watch(charge.model, charge.limits, isinstance(robot, MovedByHand))
+        self._legs: list[Leg] = []
+        self._told_ns = 0
+        self._barred: str | None = None
+        self._wanted: tuple[int, int] | None = None
+
+    def run(self) -> None:
+        """Watch the arm, cycle by cycle, until the program closes the wire."""
+        self._open()
+        while self._obey():
+            self._cycle()
+            self._tell_samples()
+
+    def _open(self) -> None:
+        try:
+            state = self._robot.state()
+            self._watch.judge(state)
+            self._watch.check_model(state)
+            self._wire.send(Report("opened", (self._robot.name, self._robot.period, state)))
+        except (SafetyFault, DeviceError) as fault:
+            self._bar(str(fault))
+
+    def _cycle(self) -> None:
+        """Watch the arm for one of its cycles."""
+        try:
+            self._robot.wait_cycle()
+            if by := self._operator():
+                self._halt()
+                self._wire.send(Report("stopped", by))
+            state = self._robot.state()
+            if self._watch.judge(state):
+                self._next_leg(state)
+            elif self._legs and state.time_ns - self._told_ns > TOLD_NS:
+                self._told_ns = state.time_ns
+                self._wire.send(Report("state", state))
+        except (SafetyFault, DeviceError) as fault:
+            self._bar(str(fault))
+
+    def _next_leg(self, state: RobotState) -> None:
+        self._legs.pop(0)
+        if self._legs:
+            self._set_off()
+        else:
+            self._watch.halted()
+            self._wire.send(Report("arrived", state))
+
+    def _set_off(self) -> None:
+        leg = self._legs[0]
+        self._watch.set_off(leg)
+        self._robot.move_joints(leg.joints, leg.speed, leg.acceleration)
+
+    def _halt(self) -> None:
+        self._legs = []
+        self._watch.halted()
+        self._robot.stop()
+
+    def _bar(self, reason: str) -> None:
+        """Stop, and move no more: a safety fault is not outlived."""
+        self._legs = []
+        self._watch.halted()
+        try:
+            self._robot.stop()
+        except DeviceError as lost:
+            reason = reason if reason == str(lost) else f"{reason}; stopping it: {lost}"
+        if self._barred is None:
+            self._barred = reason
+            self._wire.send(Report("fault", reason))
+
+    def _operator(self) -> str | None:
+        """Say who asked for a stop."""
+        watched = [fd for fd in (self._charge.alarm, self._charge.keyboard) if fd is not None]
+        ready = select.select(watched, [], [], 0)[0] if watched else []
+        said = {fd: os.read(fd, 64) for fd in ready}
+        if said.get(self._charge.alarm or -1):
+            return "Ctrl-C"
+        return "the space bar" if b" " in said.get(self._charge.keyboard or -1, b"") else None
+
+    def _obey(self) -> bool:
+        """Do what the program asks; return whether it is still there."""
+        while self._wire.poll(0):
+            request, content = self._wire.recv()
+            if request == "close":
+                return False
+            if request == "go" and self._barred is None:
+                self._go(content)
+            elif request == "stop":
+                self._halt_if_possible()
+            elif request == "samples":
+                self._wanted = content
+        return True
+
+    def _tell_samples(self) -> None:
+        """Answer for an interval once it is over, or when no more will come of it."""
+        if self._wanted is None:
+            return
+        start_ns, end_ns = self._wanted
+        samples = self._watch.samples
+        over = bool(samples) and samples[-1].time_ns >= end_ns
+        if over or self._barred is not None:
+            self._wire.send(Report("samples", _during(samples, start_ns, end_ns)))
+            self._wanted = None
+
+    def _go(self, route: Route) -> None:
+        self._legs = list(route.legs)
+        try:
+            self._set_off()
+        except DeviceError as lost:
+            self._bar(str(lost))
+
+    def _halt_if_possible(self) -> None:
+        try:
+            self._halt()
+        except DeviceError as lost:
+            self._bar(str(lost))
+
+
+def _during(samples: Any, start_ns: int, end_ns: int) -> list[Sample]:
+    """Return the samples of an interval, and the nearest on either side of it."""
+    times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    first = max(int(np.searchsorted(times, start_ns, side="right")) - 1, 0)
+    last = int(np.searchsorted(times, end_ns, side="left"))
+    return list(samples)[first : last + 1]
+
+
+def _terminal(keyboard: int | None) -> int | None:
+    """Open the terminal again: a file descriptor means nothing in another process."""
+    if keyboard is None:
+        return None
+    try:
+        return os.open("/dev/tty", os.O_RDONLY | os.O_NONBLOCK)
+    except OSError:
+        return None

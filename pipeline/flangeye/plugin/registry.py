@@ -1,0 +1,267 @@
+"""Find the installed plugins and what they offer."""
+
+from __future__ import annotations
+
+import difflib
+import gc
+import importlib
+from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from typing import Any, TypeVar
+
+import pluggy
+
+from flangeye.errors import FlangeyeError
+from flangeye.plugin import hookspecs
+from flangeye.plugin.installed import installed_plugins
+from flangeye.plugin.stage import Part, Plugin, Siblings, Stage
+
+
+class PluginNotFoundError(FlangeyeError, LookupError):
+    """No installed plugin offers what a recipe asks for."""
+
+
+class DuplicatePluginError(FlangeyeError):
+    """Two plugins offer the same name."""
+
+
+Kind = TypeVar("Kind", Stage, Part)
+
+
+class Offered(MutableMapping[str, Kind]):
+    """Stages or parts by name, each imported when it is asked for."""
+
+    def __init__(self, sort: type[Kind]) -> None:
+        self._sort: type[Kind] = sort
+        self._held: dict[str, Kind | str] = {}
+
+    def put(self, name: str, place: str) -> None:
+        """Note that ``name`` is at ``module:attribute``."""
+        self._held[name] = place
+
+    def __setitem__(self, name: str, plugin: Kind) -> None:
+        self._held[name] = plugin
+
+    def __delitem__(self, name: str) -> None:
+        del self._held[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._held)
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._held
+
+    def __getitem__(self, name: str) -> Kind:
+        """Return the plugin ``name``.
+
+        Raises:
+            KeyError: None of this name is offered.
+            PluginNotFoundError: It cannot be imported, or is not where it is said to be.
+        """
+        held = self._held[name]
+        if isinstance(held, str):
+            held = self._held[name] = self._imported(name, held)
+        return held
+
+    def _imported(self, name: str, place: str) -> Kind:
+        module, _, attribute = place.partition(":")
+        try:
+            with _collector_paused():
+                found = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # a vendor's import may fail in any way
+            raise PluginNotFoundError(
+                f"'{name}' cannot be imported from {place} ({type(error).__name__}: {error})"
+            ) from error
+        plugins: tuple[object, ...] = found if isinstance(found, tuple) else (found,)
+        for plugin in plugins:
+            if isinstance(plugin, self._sort) and plugin.name == name:
+                return plugin
+        raise PluginNotFoundError(f"{place} is no {self._sort.__name__.lower()} '{name}'")
+
+
+@dataclass
+class Registry:
+    """What the installed plugins offer, and the plugins that could not be loaded.
+
+    Attributes:
+        hooks: The plugins themselves, to be told about runs.
+        stages: Name -> stage.
+        parts: Name -> part.
+        broken: Entry point name -> why it could not be loaded.
+        owners: Stage or part name -> entry point that offers it.
+        installed: Entry point name -> version of the package it comes from.
+        renamed: Former name -> present name of stages and parts.
+        outdated: The former names that were asked for.
+    """
+
+    hooks: pluggy.PluginManager
+    stages: Offered[Stage] = field(default_factory=lambda: Offered(Stage))
+    parts: Offered[Part] = field(default_factory=lambda: Offered(Part))
+    broken: dict[str, Exception] = field(default_factory=dict)
+    owners: dict[str, str] = field(default_factory=dict)
+    installed: dict[str, str] = field(default_factory=dict)
+    renamed: dict[str, str] = field(default_factory=dict)
+    outdated: set[str] = field(default_factory=set)
+
+    def stage(self, name: str) -> Stage:
+        """Return the stage ``name``.
+
+        Raises:
+            PluginNotFoundError: Names the nearest stages, and the plugins that failed to load.
+        """
+        name = self._present(name)
+        if name not in self.stages:
+            raise self._missing("stage", name)
+        return self.stages[name]
+
+    def part(self, name: str) -> Part:
+        """Return the part ``name``.
+
+        Raises:
+            PluginNotFoundError: Names the nearest parts, and the plugins that failed to load.
+        """
+        name = self._present(name)
+        if name not in self.parts:
+            raise self._missing("part", name)
+        return self.parts[name]
+
+    def exports(self) -> list[Stage]:
+        """Return the formats that ask for the camera's pose alone, in the order of their offering.
+
+        An export that asks for more, such as the robot, is a step of a recipe only.
+        """
+        exports = [stage for stage in self.stages.values() if stage.kind == "export"]
+        return [stage for stage in exports if set(stage.needs) == {"pose"}]
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind, by the name a recipe gives them."""
+        return {
+            name.partition(".")[2]: self.parts[name]
+            for name in sorted(self.parts)
+            if name.startswith(f"{part.kind}.") and name != part.name
+        }
+
+    def notes(self) -> list[str]:
+        """Return a line for each former name that was asked for."""
+        return [
+            f"{old} is now called {self.renamed[old]}; the old name works in this version only"
+            for old in sorted(self.outdated)
+        ]
+
+    def _present(self, name: str) -> str:
+        if name in self.renamed:
+            self.outdated.add(name)
+        return self.renamed.get(name, name)
+
+    def versions(self) -> dict[str, str]:
+        """Return each loaded plugin's entry point and the version of what installed it."""
+        return {
+            plugin: version
+            for plugin, version in self.installed.items()
+            if plugin not in self.broken
+        }
+
+    def _missing(self, sort: str, name: str) -> PluginNotFoundError:
+        offered = list(self.stages if sort == "stage" else self.parts)
+        same_kind = sorted(n for n in offered if n.startswith(name.partition(".")[0] + "."))
+        near = difflib.get_close_matches(name, same_kind, n=3, cutoff=0.7) or same_kind
+        near = near or difflib.get_close_matches(name, offered, n=3)
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        failed = "".join(
+            f"; plugin '{plugin}' could not be loaded ({type(error).__name__}: {error})"
+            for plugin, error in self.broken.items()
+        )
+        return PluginNotFoundError(f"no {sort} '{name}'{hint}{failed}")
+
+    def everything(self) -> dict[str, Plugin]:
+        """Return every stage and part; what cannot be imported is noted in ``broken``."""
+        found: dict[str, Plugin] = {}
+        for offered in (self.stages, self.parts):
+            for name in offered:
+                try:
+                    found[name] = offered[name]
+                except PluginNotFoundError as error:
+                    self.broken[self.owners[name]] = error
+        return found
+
+    def _own(self, owner: str, name: str) -> None:
+        if name in self.owners:
+            raise DuplicatePluginError(
+                f"plugins '{self.owners[name]}' and '{owner}' both offer '{name}'; "
+                "uninstall one of them"
+            )
+        self.owners[name] = owner
+
+    def register(self, owner: str, plugin: object) -> None:
+        """Add one plugin module and all it offers."""
+        self.hooks.register(plugin, name=owner)
+        self.hooks.check_pending()
+        hooks = self.hooks.hook
+        for hook, places in (
+            (hooks.flangeye_stages, self.stages),
+            (hooks.flangeye_parts, self.parts),
+        ):
+            for implementation in hook.get_hookimpls():
+                if implementation.plugin is plugin:
+                    self._add(owner, implementation.function(), places)
+
+    def _add(self, owner: str, offers: Any, places: Offered[Any]) -> None:
+        if isinstance(offers, Mapping):
+            for name, place in offers.items():
+                if ":" not in place:
+                    self.renamed[name] = place
+                    continue
+                self._own(owner, name)
+                places.put(name, place)
+            return
+        for offered in offers:
+            self._own(owner, offered.name)
+            self.renamed.update(dict.fromkeys(offered.formerly, offered.name))
+            (self.stages if isinstance(offered, Stage) else self.parts)[offered.name] = offered
+
+
+def load_registry() -> Registry:
+    """Load every plugin of the entry-point group; a broken one does not stop the others.
+
+    Raises:
+        DuplicatePluginError: Two plugins offer the same stage or part.
+    """
+    hooks = pluggy.PluginManager(hookspecs.NAME)
+    hooks.add_hookspecs(hookspecs)
+    registry = Registry(hooks)
+    with _collector_paused():
+        for entry_point in sorted(installed_plugins(), key=_builtin_first):
+            _load(registry, entry_point)
+    return registry
+
+
+def _load(registry: Registry, entry_point: EntryPoint) -> None:
+    distribution = entry_point.dist
+    registry.installed[entry_point.name] = distribution.version if distribution else "unknown"
+    try:
+        registry.register(entry_point.name, entry_point.load())
+    except DuplicatePluginError:
+        raise
+    except Exception as error:  # a vendor's import may fail in any way
+        registry.broken[entry_point.name] = error
+
+
+@contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Leave the garbage collector off: modules stay, so looking through them finds nothing."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
+
+
+def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:
+    return (entry_point.name != "builtin", entry_point.name)

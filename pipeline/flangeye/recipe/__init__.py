@@ -1,0 +1,1 @@
+"""From a YAML recipe to checked steps: header, steps, overrides, JSON Schema."""

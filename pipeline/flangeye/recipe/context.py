@@ -1,0 +1,224 @@
+"""What a recipe's header offers its stages, by type: models, targets, configuration, devices.
+
+What a section should have given and could not is there as None, so that a mistake in it is told
+once, where it was made, and not again by every step that needs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.devices import RobotDriver, ScannerDriver
+from flangeye.errors import RecipeError
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.models.configuration import CARRIERS, LINK, Configuration
+from flangeye.models.factory import as_built
+from flangeye.models.loading import load_model
+from flangeye.models.model import read_model
+from flangeye.models.robots import FlangeDetails, RobotModel, SecondRobot
+from flangeye.models.scanners import ScannerData, ScannerModel
+from flangeye.models.standards import FlangeStandard, load_standard
+from flangeye.models.targets import Flange, Sphere, flange_of, wrist_circle_of
+from flangeye.models.urdf import robot_from_urdf
+from flangeye.recipe.header import (
+    ConfigurationSection,
+    FeatureSection,
+    Header,
+    LimitsSection,
+    PlaceSection,
+    RobotSection,
+    ScannerSection,
+)
+from flangeye.units import SI
+
+LIMITS = "{box: {centre: [500 mm, 0 mm, 400 mm], size: [800 mm, 800 mm, 800 mm]}}"
+
+Context = dict[type, Any]
+Complain = Callable[[Sequence[Hashable], str], None]
+
+
+def context_of(header: Header, folder: Path, complain: Complain) -> Context:
+    """Return what the sections of a recipe offer, each mistake told.
+
+    Args:
+        header: The sections.
+        folder: Of the recipe; files it names are beside it.
+        complain: Told each mistake: where, and what.
+    """
+    context: Context = {t.Seed: header.seed}
+    offer = partial(_offer, context, complain)
+    if header.workspace:
+        context[t.Box] = t.Box(header.workspace.centre, header.workspace.size)  # type: ignore[arg-type]
+    if sphere := header.feature.sphere:
+        context[Sphere] = Sphere(radius=sphere.diameter / 2, centre_in_flange=sphere.centre)
+    if (robot := header.robot) and (robot.model or robot.urdf):
+        place = ("robot", "model" if robot.model else "urdf")
+        offer(RobotModel, place, lambda: _arm(robot, header.feature.standard, folder))
+    if scanner := header.scanner:
+        offer(ScannerData, ("scanner", "model"), lambda: _scanner(scanner, folder))
+        if context[ScannerData] is None or isinstance(context[ScannerData], ScannerModel):
+            context[ScannerModel] = context[ScannerData]
+    if second := header.second_robot:
+        place = ("second_robot", "model")
+        offer(SecondRobot, place, lambda: SecondRobot(_model(second.model, folder)))
+    offer(Configuration, ("configuration",), lambda: _configuration(header, context))
+    if _plate_named(header, context):
+        offer(Flange, ("feature",), lambda: _flange(header, context.get(RobotModel), folder))
+    _devices(header, context, complain)
+    return context
+
+
+def _offer(
+    context: Context,
+    complain: Complain,
+    offered: type,
+    keys: Sequence[Hashable],
+    make: Callable[[], Any],
+) -> None:
+    context[offered] = None
+    try:
+        context[offered] = make()
+    except RecipeError as error:
+        for line in str(error).splitlines():
+            complain(keys, line)
+
+
+def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotModel:
+    if section.model:
+        robot = _model(section.model, folder)
+        return as_built(robot, folder / section.factory) if section.factory else robot
+    packages = {name: folder / path for name, path in section.packages.items()}
+    path = folder / str(section.urdf)
+    return robot_from_urdf(path, section.base, section.flange, standard, packages)
+
+
+def _model(name: str, folder: Path) -> RobotModel:
+    robot: RobotModel = load_model("robots", name, folder)
+    return robot
+
+
+def _scanner(section: ScannerSection, folder: Path) -> ScannerData:
+    if section.model:
+        scanner: ScannerData = load_model("scanners", section.model, folder)
+        return scanner
+    near, far = map(SI, section.range) if section.range else (None, None)
+    return ScannerData(model=str(section.name), near=near, far=far)
+
+
+def _plate_named(header: Header, context: Context) -> bool:
+    feature, robot = header.feature, context.get(RobotModel)
+    asked = _plate(header)
+    return any((feature.standard, feature.wrist_circle, asked, robot and robot.flange.standard))
+
+
+def _plate(header: Header) -> str | None:
+    robot = header.robot
+    return robot.flange if robot and not robot.urdf else None
+
+
+def _flange(header: Header, robot: RobotModel | None, folder: Path) -> Flange:
+    feature = header.feature
+    _refuse_two(feature)
+    details = robot.flange if robot else FlangeDetails(standard=_plate(header))
+    if not feature.wrist_circle:
+        return flange_of(details, _standard(str(feature.standard or details.standard), folder))
+    if robot is None:
+        raise RecipeError(
+            "wrist_circle: how far it lies behind the flange's face is in the robot's file "
+            "(flange.thickness); name the robot's model"
+        )
+    return wrist_circle_of(details, feature.wrist_circle)
+
+
+def _refuse_two(feature: FeatureSection) -> None:
+    if feature.standard and feature.wrist_circle:
+        raise RecipeError("give either a standard or a wrist_circle, not both")
+    if feature.sphere and feature.wrist_circle:
+        raise RecipeError("give either a sphere or a wrist_circle, not both")
+
+
+def _standard(designation: str, folder: Path) -> FlangeStandard:
+    if designation.endswith((".yaml", ".yml")):
+        return read_model(folder / designation, FlangeStandard)
+    return load_standard(designation)
+
+
+def _configuration(header: Header, context: Context) -> Configuration:
+    """Return the configuration of a recipe, its frames filled in and checked."""
+    section = header.configuration
+    cameras, targets = CARRIERS[section.name]
+    camera, target = section.camera or cameras[0], section.target or targets[0]
+    if LINK in cameras:
+        _require_link(camera, context)
+    elif camera not in cameras:
+        raise RecipeError(f"{section.name}: the camera is carried by {cameras[0]}, not by {camera}")
+    if target not in targets:
+        allowed = " or ".join(targets)
+        raise RecipeError(f"{section.name}: the target is carried by {allowed}, not by {target}")
+    return Configuration(section.name, camera, target, _place(section))
+
+
+def _require_link(camera: str, context: Context) -> None:
+    if RobotModel not in context:
+        raise RecipeError(
+            "eye-on-arm: where a link is follows from the arm's kinematics; name the robot's model"
+        )
+    robot: RobotModel | None = context[RobotModel]
+    links = [f"{LINK}{i + 1}" for i in range(len(robot.joints) if robot else 0)]
+    if robot and camera not in links:
+        raise RecipeError(
+            f"eye-on-arm: the camera is carried by a link, {links[0]} to {links[-1]}, not by "
+            f"{camera}; write for example camera: {links[len(links) // 2 - 1]}"
+        )
+
+
+def _place(section: ConfigurationSection) -> Any:
+    if isinstance(section.place, PlaceSection):
+        return rigid(rotation_from_rpy(*section.place.rpy), np.asarray(section.place.position))
+    return np.eye(4) if section.place == "known" else None
+
+
+def _check_limits(limits: LimitsSection, robot: RobotModel, complain: Complain) -> None:
+    """Hold limits against the arm they are for: what it cannot do is a slip of the pen."""
+    if limits.joint_speed > robot.joint_speed:
+        complain(
+            ("robot", "limits", "joint_speed"),
+            f"at most {np.degrees(robot.joint_speed):.4g} deg/s for a {robot.model}, "
+            f"not {np.degrees(limits.joint_speed):.4g} deg/s",
+        )
+    low = np.asarray(limits.box.centre) - np.asarray(limits.box.size) / 2
+    high = low + np.asarray(limits.box.size)
+    nearest, most = float(np.linalg.norm(np.clip(0.0, low, high))), 4 * robot.length
+    if nearest > robot.length or np.any(high - low > most):
+        complain(
+            ("robot", "limits", "box"),
+            f"is no box for a {robot.model}, which reaches {robot.length:.2f} m from its base: "
+            f"each side is at most {most:.2f} m, and some of it is within reach",
+        )
+
+
+def _devices(header: Header, context: Context, complain: Complain) -> None:
+    """Offer the devices the header names, not yet opened, and the limits of the arm."""
+    robot, scanner = header.robot, header.scanner
+    if robot and robot.driver:
+        if robot.limits is None:
+            complain(("robot",), "a robot with a driver needs limits, for example " + LIMITS)
+        context[RobotDriver] = RobotDriver(
+            robot.driver.part.name,
+            partial(robot.driver, context.get(RobotModel)),
+            robot.driver.part.interactive,
+            robot.driver.part.simulated,
+        )
+        context[LimitsSection] = robot.limits
+        if robot.limits and (model := context.get(RobotModel)):
+            _check_limits(robot.limits, model, complain)
+    if scanner and scanner.driver:
+        context[ScannerDriver] = ScannerDriver(
+            scanner.driver.part.name, partial(scanner.driver, context.get(ScannerModel))
+        )

@@ -1,0 +1,221 @@
+"""The sections of a recipe above its steps, as people write them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema
+
+from flangeye.plugin.stage import BoundPart, Choose
+from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
+
+
+class Section(BaseModel):
+    """Base of a recipe's sections."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        arbitrary_types_allowed=True,
+        defer_build=True,
+    )
+
+
+Positive = Annotated[Length, Field(gt=0)]
+
+
+class BoxSection(Section):
+    """A box along the axes of the robot's base."""
+
+    centre: tuple[Length, Length, Length]
+    size: tuple[Positive, Positive, Positive]
+
+
+class LimitsSection(Section):
+    """What the arm must keep to; required where a driver is named, for a real arm may be there."""
+
+    box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
+    speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Of the flange.")
+    acceleration: Acceleration = param("300 mm/s^2", gt=0, le=3.0, description="Of the flange.")
+    joint_speed: AngularSpeed = param("30 deg/s", gt=0, description="Of every joint.")
+    joints: tuple[tuple[Angle, Angle], ...] | None = Field(
+        None, description="Lower and upper angle of each joint; the model's own when not given."
+    )
+
+
+class NamedSection(Section):
+    """A section whose one word is its model: ``robot: ur10e``."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_a_word(cls, given: Any) -> Any:
+        return {"model": given} if isinstance(given, str) else given
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        word = {"type": "string", "description": "A model's name."}
+        return {"anyOf": [handler(core_schema), word]}
+
+
+class SecondRobotSection(NamedSection):
+    """The arm that carries the target before the first one's camera."""
+
+    model: str = Field(description="A model of data/robots, or a .yaml file of your own.")
+
+
+class RobotSection(NamedSection):
+    """Which arm, and how to reach it; its plate alone where an archive has the flange's poses."""
+
+    model: str | None = Field(
+        None, description="A model that 'flangeye robots' lists, or a .yaml file of your own."
+    )
+    urdf: str | None = Field(None, description="A URDF file, instead of a model; xacro expanded.")
+    base: str | None = Field(
+        None, description="With urdf: the link that is the controller's base; found if not given."
+    )
+    flange: str | None = Field(
+        None,
+        description="Designation of the plate, such as ISO 9409-1-50-4-M6. With urdf: the link at "
+        "the plate's face, z outwards, found if not given; the plate is feature's standard.",
+    )
+    packages: dict[str, str] = Field(
+        default_factory=dict, description="With urdf: folders of the packages its meshes are in."
+    )
+    factory: str | None = Field(
+        None,
+        description="A UR's factory calibration, so that the arm is as it was built: the "
+        "controller's calibration.conf, or the ROS driver's kinematics .yaml.",
+    )
+    driver: Annotated[BoundPart, Choose("robot")] | None = Field(
+        None, description="How to reach the real arm, for example {ur_rtde: {host: 192.168.1.10}}."
+    )
+    limits: LimitsSection | None = Field(None, description="What the arm must keep to.")
+
+    @model_validator(mode="after")
+    def _names_something(self) -> RobotSection:
+        if self.model and self.urdf:
+            raise ValueError("give either a model or a urdf, not both")
+        if self.urdf and self.factory:
+            raise ValueError(
+                "a urdf brings its own calibration: make it with the file, xacro ur.urdf.xacro "
+                "kinematics_params:=FILE, or name a model, model: ur5e, with factory"
+            )
+        if not self.urdf and (self.base or self.packages):
+            raise ValueError("base and packages say where things are in a urdf; name it")
+        if not (self.model or self.urdf or self.flange):
+            raise ValueError(
+                "name the arm: model: ur10e ('flangeye robots' lists them), urdf: arm.urdf, or, "
+                "where the flange's poses are recorded, its plate alone: flange: "
+                "ISO 9409-1-50-4-M6"
+            )
+        return self
+
+
+class ScannerSection(NamedSection):
+    """Which scanner, and how to reach it; a name and a range do for an archive."""
+
+    model: str | None = Field(
+        None, description="A model that 'flangeye scanners' lists, or a .yaml file of your own."
+    )
+    name: str | None = Field(None, description="What to call a scanner that has no model.")
+    range: tuple[Length, Length] | None = Field(
+        None, description="Nearest and farthest it sees; archives in another unit are noticed."
+    )
+    driver: Annotated[BoundPart, Choose("scanner")] | None = Field(
+        None, description="How to reach the real scanner, for example {watched_folder: {path: …}}."
+    )
+
+    @model_validator(mode="after")
+    def _names_something(self) -> ScannerSection:
+        if bool(self.model) == bool(self.name):
+            raise ValueError(
+                "name the scanner: model: phoxi-m ('flangeye scanners' lists them), or one that "
+                "has no model: {name: ACME 3000, range: [300 mm, 900 mm]}"
+            )
+        if self.range and not 0 <= self.range[0] < self.range[1]:
+            raise ValueError("range: the nearest comes first, for example [300 mm, 900 mm]")
+        return self
+
+
+class SphereSection(Section):
+    """A calibration sphere that the flange carries."""
+
+    diameter: Length = Field(gt=0)
+    centre: tuple[Length, Length, Length] = Field(
+        description="Where its centre is in the flange frame: origin in the face, z outwards."
+    )
+
+
+class FeatureSection(Section):
+    """Which circle to look for; by default the flange the robot's file names."""
+
+    standard: str | None = Field(
+        None, description="Designation such as ISO 9409-1-50-4-M6, or a .yaml file of your own."
+    )
+    wrist_circle: Length | None = Field(
+        None, description="Diameter of the wrist's outer circle, for scanners too coarse for a rim."
+    )
+    sphere: SphereSection | None = Field(
+        None, description="A calibration sphere on the flange, to be looked for in its place."
+    )
+
+
+class PlaceSection(Section):
+    """Where the target is, in the frame that carries it."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"),
+        description="Roll, pitch, yaw; the target's z points towards the scanner.",
+    )
+
+
+class ConfigurationSection(Section):
+    """Who carries the camera and who the target; what has to be found follows."""
+
+    name: Literal["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"] = "eye-on-base"
+    camera: str | None = Field(
+        None,
+        description="Frame that carries the camera: base, flange, or link1, link2, … for "
+        "eye-on-arm.",
+    )
+    target: str | None = Field(
+        None, description="Frame that carries the target: flange, base or flange2."
+    )
+    place: Literal["known", "unknown"] | PlaceSection = Field(
+        "known",
+        description="Where the target is in that frame: known (at the origin, as the robot's own "
+        "circles are), unknown (a marker), or its position and rpy.",
+    )
+
+
+class WorkspaceSection(BoxSection):
+    """Where the work is, in the robot's base; errors are reported over this box."""
+
+
+class LogSection(Section):
+    """What goes into run.mcap besides the results, which always do."""
+
+    clouds: Literal["preview", "full"] = Field(
+        "preview", description="Raw scans: thinned for viewing, or whole, to segment again later."
+    )
+
+
+class Header(Section):
+    """A recipe, its steps not yet checked."""
+
+    title: str = Field(description="One line for people.")
+    description: str = Field("", description="More lines for people.")
+    robot: RobotSection | None = None
+    second_robot: SecondRobotSection | None = None
+    scanner: ScannerSection | None = None
+    configuration: ConfigurationSection = Field(default_factory=ConfigurationSection)
+    feature: FeatureSection = Field(default_factory=FeatureSection)
+    workspace: WorkspaceSection | None = None
+    seed: int = Field(0, ge=0, description="The only source of randomness.")
+    log: LogSection = Field(default_factory=LogSection)
+    steps: list[Any] = Field(min_length=1, description="Stages in order, each with parameters.")

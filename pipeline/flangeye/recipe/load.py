@@ -1,0 +1,307 @@
+"""Read a recipe: YAML in, checked steps out, every mistake at once with its line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from flangeye.errors import RecipeError
+from flangeye.files.bundled import bundled
+from flangeye.files.regular import read_text
+from flangeye.files.validation import sentence
+from flangeye.files.yaml_lines import MAX_BYTES, Document, parse_yaml, read_yaml
+from flangeye.plugin.registry import PluginNotFoundError, Registry
+from flangeye.plugin.stage import Params, Part, Siblings, Stage
+from flangeye.recipe.context import Context, context_of
+from flangeye.recipe.header import Header
+from flangeye.recipe.overrides import apply_override
+from flangeye.recipe.steps import SECTIONS, Step, StepOrder
+
+PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
+"""What stands for sections that a recipe must have, where they are wrong."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe that was checked whole and can run.
+
+    Attributes:
+        name: File name without its suffix.
+        header: The sections, as written.
+        steps: The checked steps.
+        context: What stages may ask for by type: robot, scanner, flange, sphere, workspace, seed.
+        text: The recipe as the person wrote it.
+    """
+
+    name: str
+    header: Header
+    steps: tuple[Step, ...]
+    context: dict[type, Any]
+    text: str
+
+    def resolved(self) -> str:
+        """Return the recipe as YAML with every default and override written out."""
+        return self._resolved
+
+    @cached_property
+    def _resolved(self) -> str:
+        data = self.header.model_dump(mode="json", exclude_none=True)
+        data["steps"] = [
+            {step.stage.name: step.params.model_dump(mode="json", exclude_none=True)}
+            if step.params
+            else step.stage.name
+            for step in self.steps
+        ]
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def recipe_names() -> dict[str, Path]:
+    """Return the bundled recipes: name -> path, sorted."""
+    root = bundled("recipes")
+    found = {str(p.relative_to(root).with_suffix("")): p for p in root.rglob("*.yaml")}
+    return dict(sorted(found.items()))
+
+
+def find_recipe(name: str) -> Path:
+    """Return the path of a recipe given as a path or as a bundled name.
+
+    Raises:
+        RecipeError: Neither exists; names the nearest bundled recipes.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    known = recipe_names()
+    if name in known:
+        return known[name]
+    if path.suffix in (".yaml", ".yml") or path.is_dir():
+        raise RecipeError(f"{name}: no such recipe file; {_near_file(path, known)}")
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(near)}?" if near else "'flangeye recipes' lists them"
+    raise RecipeError(f"no recipe '{name}'; {hint}")
+
+
+def _near_file(path: Path, known: Iterable[str]) -> str:
+    """Say which recipe file, beside a path that does not exist or bundled, may be meant."""
+    folder = path if path.is_dir() else path.parent
+    if not folder.is_dir():
+        return f"there is no folder {folder}"
+    files = sorted(str(file) for file in folder.glob("*.y*ml"))
+    near = difflib.get_close_matches(str(path), files, n=3)
+    near = near or difflib.get_close_matches(path.stem, known, n=1)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    return f"{folder} holds {', '.join(files[:5]) or 'no recipe'}; 'flangeye recipes' lists others"
+
+
+def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
+    """Read and check a recipe without running it.
+
+    Args:
+        path: The YAML file.
+        registry: The plugins on offer.
+        overrides: ``steps.2.inlier=0.2 mm`` and the like, validated as if written in the file.
+
+    Raises:
+        RecipeError: Names every mistake found, not only the first.
+    """
+    document = read_yaml(path)
+    return _Checker(document, registry, path.parent).check(
+        path.stem, read_text(path, MAX_BYTES, RecipeError), overrides
+    )
+
+
+def parse_recipe(text: str, name: str, registry: Registry) -> Recipe:
+    """Check a recipe given as text, as a log holds it; see :func:`load_recipe`."""
+    return _Checker(parse_yaml(text, name), registry, Path()).check(name, text, ())
+
+
+class _Checker:
+    """Collects every mistake of one recipe; also the context of its validation."""
+
+    def __init__(self, document: Document, registry: Registry, folder: Path) -> None:
+        self.folder = folder
+        self._document = document
+        self._registry = registry
+        self._overridden: list[tuple[Hashable, ...]] = []
+        self._left_out: list[tuple[Hashable, ...]] = []
+        self._mistakes: list[str] = []
+
+    def part(self, name: str) -> Part:
+        """Return a part by name; parameters that choose parts ask here."""
+        return self._registry.part(name)
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind; parts that have to know them ask here."""
+        return self._registry.siblings(part)
+
+    def check(self, name: str, text: str, overrides: Sequence[str]) -> Recipe:
+        data = self._document.data
+        if not isinstance(data, dict):
+            raise RecipeError(
+                f"{self._document.name}:1: a recipe is a mapping with 'title' and 'steps'"
+            )
+        self._overridden = [apply_override(data, override) for override in overrides]
+        header = self._header(data)
+        context = self._context(header)
+        entries = data.get("steps")
+        steps = self._steps(entries if isinstance(entries, list) else [], context)
+        if self._mistakes:
+            raise RecipeError("\n".join(self._mistakes))
+        return Recipe(name, header, tuple(steps), context, text)
+
+    def complain(self, keys: Sequence[Hashable], message: str) -> None:
+        """Note one mistake at a path of keys."""
+        overridden = any(tuple(keys[: len(path)]) == path for path in self._overridden)
+        source = "--set " if overridden else f"{self._document.name}:{self._document.line(keys)}: "
+        self._mistakes.append(f"{source}{'.'.join(map(str, keys))}: {message}")
+
+    def _header(self, data: dict[Hashable, Any]) -> Header:
+        """Return the sections without what is wrong in them, each mistake told."""
+        rest = deepcopy(data)
+        while True:
+            try:
+                return Header.model_validate(rest, context=self)
+            except ValidationError as error:
+                new = [e for e in error.errors() if not self._follows(e["loc"])]
+                self._explain((), new, Header)
+                self._left_out += [
+                    e["loc"] for e in error.errors() if e["type"] != "extra_forbidden"
+                ]
+                leave_out(rest, [e["loc"] for e in error.errors()])
+
+    def _follows(self, keys: tuple[Hashable, ...]) -> bool:
+        """Return whether a mistake follows from what was left out at or below its place."""
+        return any(left_out[: len(keys)] == keys for left_out in self._left_out)
+
+    def _context(self, header: Header) -> Context:
+        """Return what the sections offer; what a broken one would offer is there as None."""
+        broken = {left_out[0] for left_out in self._left_out}
+
+        def complain(keys: Sequence[Hashable], message: str) -> None:
+            if not (len(keys) == 1 and keys[0] in broken):
+                self.complain(keys, message)
+
+        context = context_of(header, self.folder, complain)
+        for offered, source in SECTIONS.items():
+            if broken.intersection(source.sections):
+                context.setdefault(offered, None)
+        return context
+
+    def _steps(self, entries: list[Any], context: Context) -> list[Step]:
+        order = StepOrder(self.complain, context)
+        steps = []
+        for index, entry in enumerate(entries):
+            named = self._named(index, entry)
+            if named is None:
+                order.lose_track()
+                continue
+            name, raw = named
+            stage = self._stage(index, name)
+            order.visit(index, name, stage)
+            params = self._params(index, stage, raw) if stage else None
+            if stage and (params or stage.params is None):
+                order.require(index, name, params)
+                steps.append(Step(index, stage, params))
+        order.finish()
+        self._check_arm(steps)
+        return steps
+
+    def _check_arm(self, steps: Sequence[Step]) -> None:
+        """Refuse to plan for the corrected arm with a pose that was not found for it."""
+        last = [s for s in steps if s.stage.kind in ("solve", "refine")][-1:]
+        for step in steps:
+            asks = getattr(step.params, "arm", None) == "corrected"
+            if asks and last and not getattr(last[0].params, "corrects_arm", False):
+                self.complain(
+                    ("steps", step.index, step.stage.name, "arm"),
+                    f"the corrected arm is asked for, and {last[0].stage.name} gives the pose for "
+                    "the arm as its controller reports it alone; write arm: as-reported, or let "
+                    "solve.robust: {joint_offsets: auto} find the arm's error, with no refine "
+                    "step after it that changes the pose",
+                )
+
+    def _named(self, index: int, entry: Any) -> tuple[str, Any] | None:
+        if isinstance(entry, str):
+            return entry, {}
+        if isinstance(entry, dict) and len(entry) == 1:
+            ((name, raw),) = entry.items()
+            return name, {} if raw is None else raw
+        self.complain(
+            ("steps", index), "a step is a stage's name, or one mapping {name: parameters}"
+        )
+        return None
+
+    def _stage(self, index: int, name: str) -> Stage | None:
+        try:
+            return self._registry.stage(name)
+        except PluginNotFoundError as error:
+            self.complain(("steps", index), str(error))
+            return None
+
+    def _params(self, index: int, stage: Stage, raw: Any) -> Params | None:
+        at = ("steps", index, stage.name)
+        if stage.params is None:
+            if raw:
+                self.complain(at, f"{stage.name} takes no parameters")
+            return None
+        if not isinstance(raw, dict):
+            self.complain(at, "parameters are a mapping, for example {inlier: 0.2 mm}")
+            return None
+        try:
+            return stage.params.model_validate(raw, context=self)
+        except ValidationError as error:
+            self._explain(at, error.errors(), stage.params)
+            return None
+
+    def _explain(
+        self, at: tuple[Hashable, ...], errors: Iterable[Any], model: type[BaseModel]
+    ) -> None:
+        for details in errors:
+            keys = (*at, *details["loc"])
+            self.complain(keys, sentence(details, model, self._given(keys, details["input"])))
+
+    def _given(self, keys: Sequence[Hashable], parsed: Any) -> Any:
+        """Return what the person wrote at ``keys``, before any of it was converted."""
+        there = _existing(self._document.data, tuple(keys))
+        return _at(self._document.data, keys) if len(there) == len(keys) else parsed
+
+
+def leave_out(data: dict[Hashable, Any], paths: Iterable[tuple[Hashable, ...]]) -> None:
+    """Take the deepest part of each path that exists out of a recipe's data."""
+    gone: list[tuple[Hashable, ...]] = []
+    for path in paths:
+        if any(path[: len(each)] == each for each in gone):
+            continue
+        there = _existing(data, path)
+        if not there:
+            data[path[0]] = PLACEHOLDERS[path[0]]
+            continue
+        gone.append(there)
+        del _at(data, there[:-1])[there[-1]]
+        if there[0] in PLACEHOLDERS:
+            data[there[0]] = PLACEHOLDERS[there[0]]
+
+
+def _existing(data: Any, path: tuple[Hashable, ...]) -> tuple[Hashable, ...]:
+    """Return as much of a path as leads somewhere."""
+    for depth in range(len(path)):
+        try:
+            _at(data, path[: depth + 1])
+        except (KeyError, IndexError, TypeError):
+            return path[:depth]
+    return path
+
+
+def _at(data: Any, path: Iterable[Hashable]) -> Any:
+    for key in path:
+        data = data[key]
+    return data

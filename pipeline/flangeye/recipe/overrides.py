@@ -1,0 +1,103 @@
+"""``--set steps.2.inlier='0.2 mm'``: change one value of a recipe before it is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+from flangeye.errors import RecipeError
+from flangeye.files.yaml_lines import parse_value
+from flangeye.plugin.stage import KINDS
+
+Keys = tuple[Hashable, ...]
+
+
+def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
+    """Set one value in a recipe's data; return the path of keys it went to.
+
+    A step goes by its place, its name or both: ``steps.2.inlier``, ``fit.rim.inlier`` and
+    ``steps.2.fit.rim.inlier`` are one. ``steps.3=solve.svd`` puts another stage in a step's place,
+    with its own defaults.
+
+    Raises:
+        RecipeError: The text is not PATH=VALUE, or the path leads nowhere.
+    """
+    path, equals, text = override.partition("=")
+    if not equals or not path:
+        raise RecipeError(
+            f"--set {override}: write PATH=VALUE, for example steps.2.inlier='0.2 mm'"
+        )
+    value = parse_value(text, f"--set {path}")
+    index, below = _step(data, path)
+    if index is None:
+        keys: Keys = tuple(path.split("."))
+    elif below:
+        keys = ("steps", index, _opened(data["steps"], index), *below.split("."))
+    else:
+        _exchange(data["steps"], index, value, path)
+        return ("steps", index)
+    _put(data, keys, value, path)
+    return keys
+
+
+def _put(data: Any, keys: Keys, value: Any, path: str) -> None:
+    node = data
+    for key in keys[:-1]:
+        if isinstance(node, dict) and node.get(key) is None:
+            node[key] = {}
+        node = node[key]
+        if isinstance(node, list) and key != "steps":
+            raise RecipeError(f"--set {path}: '{key}' is a list; set it whole")
+        if not isinstance(node, (dict, list)):
+            raise RecipeError(f"--set {path}: '{key}' holds a single value, nothing below it")
+    node[keys[-1]] = value
+
+
+def _step(data: dict[Hashable, Any], path: str) -> tuple[int | None, str]:
+    """Return which step a path speaks of, if any, and what is below the step's name in it."""
+    steps = data.get("steps")
+    names = [_name(entry) for entry in steps] if isinstance(steps, list) else []
+    if path.startswith("steps."):
+        place, _, below = path.removeprefix("steps.").partition(".")
+        if place not in map(str, range(len(names))):
+            numbers = f"steps are 0 to {len(names) - 1}"
+            raise RecipeError(f"--set {path}: no step '{place}'; {numbers}")
+        return int(place), f"{below}.".removeprefix(f"{names[int(place)]}.").removesuffix(".")
+    meant = [i for i, name in enumerate(names) if name and f"{path}.".startswith(f"{name}.")]
+    if len(meant) > 1:
+        places = " or ".join(f"steps.{i}" for i in meant)
+        raise RecipeError(f"--set {path}: more than one step has that name; write {places}")
+    if meant:
+        return meant[0], path[len(names[meant[0]]) + 1 :]
+    _refuse_unknown_step(path, names)
+    return None, ""
+
+
+def _refuse_unknown_step(path: str, names: Sequence[str]) -> None:
+    kinds = {name.partition(".")[0] for name in names if name} | set(KINDS)
+    if names and path.partition(".")[0] in kinds:
+        raise RecipeError(
+            f"--set {path}: the recipe has no such step; its steps: {', '.join(names)}"
+        )
+
+
+def _name(entry: Any) -> str:
+    return str(entry if isinstance(entry, str) else next(iter(entry), "")) if entry else ""
+
+
+def _opened(steps: list[Any], index: int) -> str:
+    """Return the name of a step's stage; a step that is a bare name becomes a mapping."""
+    if isinstance(steps[index], str):
+        steps[index] = {steps[index]: {}}
+    return _name(steps[index])
+
+
+def _exchange(steps: list[Any], index: int, value: Any, path: str) -> None:
+    """Put another stage in a step's place; the same one keeps its parameters."""
+    if not isinstance(value, (str, dict)):
+        raise RecipeError(
+            f"--set {path}: give a stage, for example {path}=solve.svd, or a parameter of the "
+            f"step, for example {path}.inlier='0.2 mm'"
+        )
+    if value != _name(steps[index]):
+        steps[index] = value

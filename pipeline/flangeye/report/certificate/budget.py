@@ -1,0 +1,305 @@
+r"""The uncertainty of a point that the calibration maps, contribution by contribution.
+
+The calibration's own uncertainty is that of six correlated quantities, a rotation
+:math:`\varphi` and a translation :math:`\tau` about the point :math:`q` of ``result.json``. A
+point :math:`p` is moved by :math:`\varphi \times (p - q) + \tau`, so the sensitivities are
+:math:`-[p - q]_\times` and one. Whoever *uses* the matrix adds what happens anew at every point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import hat
+from flangeye.maths.statistics import corners_of, excess_variance
+from flangeye.maths.uncertainty import (
+    correlation_of,
+    coverage_factor,
+    effective_freedom,
+    propagated,
+)
+from flangeye.models.scanners import ScannerModel
+from flangeye.result import ObservationResult, Result, TransformResult
+from flangeye.types import Floats
+
+PROBABILITY = 0.95
+EXPANSION = 23e-6
+"""Of aluminium, of which most arms are made, per kelvin: larger than that of steel."""
+NAMED = 0.3
+"""Correlations larger than this are named."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the person says of the place, for it is not measured.
+
+    Attributes:
+        temperature: Of the air [°C], or None.
+        spread: Between the coldest and the warmest moment of use [K], or None.
+        place: Where it was done.
+        operator: Who did it.
+    """
+
+    temperature: float | None = None
+    spread: float | None = None
+    place: str = ""
+    operator: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One row of a budget.
+
+    Attributes:
+        name: The input quantity.
+        kind: How it was evaluated: A from a series of measurements, B otherwise.
+        standard: Its standard uncertainty [rad or m].
+        unit: ``rad`` or ``m``.
+        sensitivity: (3,) derivative of the point's coordinates by it.
+        freedom: Degrees of freedom; infinite where it is taken as known.
+        evidence: Where the figure comes from.
+    """
+
+    name: str
+    kind: Literal["A", "B"]
+    standard: float
+    unit: Literal["rad", "m"]
+    sensitivity: Floats
+    freedom: float
+    evidence: str
+
+    @property
+    def size(self) -> float:
+        """How far it alone moves the point, one standard uncertainty [m]."""
+        return float(np.linalg.norm(self.sensitivity) * self.standard)
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """What is known of one point.
+
+    Attributes:
+        point: (3,) in the parent frame [m].
+        contributions: The input quantities.
+        correlation: (n, n) among them.
+    """
+
+    point: Floats
+    contributions: Sequence[Contribution]
+    correlation: Floats
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(3, 3) of the point [m^2]."""
+        sensitivities = np.stack([c.sensitivity for c in self.contributions], axis=1)
+        return propagated(sensitivities, self._standard, self.correlation)
+
+    @property
+    def standard(self) -> Floats:
+        """(3,) combined standard uncertainty along x, y, z [m]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def freedom(self) -> Floats:
+        """(3,) effective degrees of freedom along x, y, z."""
+        freedoms = np.array([c.freedom for c in self.contributions])
+        rows = np.stack([c.sensitivity * c.standard for c in self.contributions], axis=1)
+        return np.array([effective_freedom(row, freedoms) for row in rows])
+
+    @property
+    def coverage(self) -> Floats:
+        """(3,) coverage factors k for 95 % along x, y, z."""
+        return np.array([coverage_factor(f, PROBABILITY) for f in self.freedom])
+
+    @property
+    def expanded(self) -> Floats:
+        """(3,) expanded uncertainties along x, y, z [m]."""
+        return np.asarray(self.coverage * self.standard)
+
+    @property
+    def correlated(self) -> list[tuple[str, str, float]]:
+        """Pairs of contributions whose correlation is worth naming, largest first."""
+        names = [c.name for c in self.contributions]
+        pairs = zip(*np.triu_indices(len(names), 1), strict=True)
+        found = [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
+        return sorted((x for x in found if abs(x[2]) >= NAMED), key=lambda x: -abs(x[2]))
+
+    @property
+    def _standard(self) -> Floats:
+        return np.array([c.standard for c in self.contributions])
+
+
+def budget_of(result: Result) -> Budget:
+    """Return the budget of the calibration alone, at the corner of the work that is known least.
+
+    Raises:
+        StageError: The run gave no calibration, or nothing says where the work is.
+    """
+    _, estimate = _estimate_of(result)
+    point = _worst_corner(result, estimate)
+    standard, correlation = correlation_of(np.array(estimate.covariance))
+    lever = -hat(point - np.array(estimate.about))
+    evidence = _evidence(result)
+    rows = [
+        *(("Rotation about", axis, "rad", lever[:, i]) for i, axis in enumerate("xyz")),
+        *(("Translation along", axis, "m", np.eye(3)[i]) for i, axis in enumerate("xyz")),
+    ]
+    return Budget(
+        point,
+        [
+            Contribution(f"{what} {axis}", "A", u, unit, c, np.inf, evidence)  # type: ignore[arg-type]
+            for (what, axis, unit, c), u in zip(rows, standard.tolist(), strict=True)
+        ],
+        correlation,
+    )
+
+
+def use_budget_of(
+    result: Result, scanner: ScannerModel | None, conditions: Conditions = Conditions()
+) -> Budget:
+    """Return the budget of one point that is scanned and then driven to."""
+    calibration = budget_of(result)
+    parts = [
+        *_of_calibration(calibration),
+        *_of_one_pose(result),
+        *(_each_axis(*_distortion(scanner)) if scanner else ()),
+        *(
+            _each_axis(*_expansion(calibration.point, conditions.spread))
+            if conditions.spread
+            else ()
+        ),
+    ]
+    correlation = np.eye(len(parts))
+    correlation[:3, :3] = correlation_of(calibration.covariance)[1]
+    return Budget(calibration.point, parts, correlation)
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of the calibration's variance at the work one cause explains."""
+
+    cause: str
+    standard: float
+    evidence: str
+
+
+def shares_of(result: Result) -> list[Share]:
+    """Return what the calibration's uncertainty comes from, by least squares over the centres.
+
+    Scans and poses that differ from capture to capture average out; the rest is common to all
+    captures: joint zeros, a tilt of every normal, what few poses leave unknown of the noise.
+    """
+    _, estimate = _estimate_of(result)
+    used = [o for o in result.observations if o.used and o.covariance is not None]
+    point = _worst_corner(result, estimate)
+    total = float(np.sum(budget_of(result).standard ** 2))
+    if len(used) < 3:
+        return [Share("all causes", np.sqrt(total), _evidence(result))]
+    scans, arm, noise = _averaged(used, estimate, point)
+    scale = min(1.0, total / (scans + arm))
+    n = len(used)
+    return [
+        Share("scans, fit by fit", np.sqrt(scale * scans), f"covariances of {n} fitted centres"),
+        Share(
+            "arm, pose by pose", np.sqrt(scale * arm),
+            f"residuals beyond them, {np.sqrt(noise) * 1e3:.3f} mm per axis over {n} poses",
+        ),
+        Share(
+            "common to all poses", np.sqrt(max(total - scale * (scans + arm), 0.0)),
+            "correlated: the arm's joint zeros, a tilt common to all normals, few poses",
+        ),
+    ]  # fmt: skip
+
+
+def _averaged(
+    used: Sequence[ObservationResult], estimate: TransformResult, point: Floats
+) -> tuple[float, float, float]:
+    """Return the variances [m^2] at ``point`` from the scans and the arm, and the arm's own."""
+    turn = np.array(estimate.matrix)[:3, :3]
+    own = turn @ np.array([o.covariance for o in used]) @ turn.T
+    places = np.array([o.tcp_in_base for o in used], dtype=float)
+    residuals = np.array([o.residual_in_base for o in used], dtype=float)
+    noise = excess_variance(residuals, own)
+    weights = np.linalg.inv(own + max(noise, 1e-14) * np.eye(3))
+    rows = _motions(places, np.array(estimate.about))
+    information = np.einsum("nia,nij,njb->ab", rows, weights, rows)
+    gains = np.linalg.pinv(information) @ rows.transpose(0, 2, 1) @ weights
+    moved = _motions(point[None], np.array(estimate.about))[0] @ gains
+    scans = np.einsum("nia,nab,nib->", moved, own, moved)
+    return float(scans), float(noise * np.sum(moved**2)), noise
+
+
+def _motions(points: Floats, about: Floats) -> Floats:
+    """Return (N, 3, 6): how points move with a perturbation (rotation, translation)."""
+    return np.concatenate(
+        [-hat(points - about), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2
+    )
+
+
+def _estimate_of(result: Result) -> tuple[str, TransformResult]:
+    found = next(iter(result.transforms.items()), None)
+    if found is None:
+        why = f": {result.refused}" if result.refused else ""
+        raise StageError(f"the run gave no calibration, so there is nothing to certify{why}")
+    return found
+
+
+def _worst_corner(result: Result, estimate: TransformResult) -> Floats:
+    if result.workspace is None:
+        raise StageError("nothing says where the work is: give the recipe a 'workspace'")
+    box = result.workspace
+    corners = corners_of(np.array(box.centre), np.array(box.size))
+    motions = _motions(corners, np.array(estimate.about))
+    variances = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
+    return np.asarray(corners[int(variances.argmax())])
+
+
+def _evidence(result: Result) -> str:
+    used = sum(o.used for o in result.observations)
+    return f"{result.method or 'solver'}, {used} poses; covariance in result.json"
+
+
+def _of_calibration(budget: Budget) -> list[Contribution]:
+    return [
+        Contribution(f"Calibration, {axis}", "A", float(u), "m", unit, np.inf, "the table above")
+        for axis, u, unit in zip("xyz", budget.standard, np.eye(3), strict=True)
+    ]
+
+
+def _of_one_pose(result: Result) -> list[Contribution]:
+    """Return what one scan at one pose adds, from the errors on poses held out."""
+    held, box = result.holdout, result.workspace
+    if held is None or box is None:
+        return []
+    poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
+    beyond = max(held.rms**2 - box.predicted_rms**2, 0.0)
+    evidence = f"held-out error {held.rms * 1e3:.3f} mm rms beyond the calibration's own"
+    return _each_axis("Arm and scan at one pose", "A", np.sqrt(beyond / 3), evidence, 3 * poses)
+
+
+def _distortion(scanner: ScannerModel) -> tuple[str, Literal["B"], float, str]:
+    error = scanner.calibration_error
+    evidence = f"{scanner.maker} {scanner.model}: {error * 1e3:g} mm rms over the volume"
+    return "Scanner's smooth distortion", "B", error / np.sqrt(3), evidence
+
+
+def _expansion(point: Floats, spread: float) -> tuple[str, Literal["B"], float, str]:
+    half = EXPANSION * float(np.linalg.norm(point)) * spread / 2
+    evidence = f"{spread:g} K between extremes, {EXPANSION * 1e6:g} µm/(m K), rectangular"
+    return "Arm's thermal expansion", "B", half / np.sqrt(3) / np.sqrt(3), evidence
+
+
+def _each_axis(
+    name: str, kind: Literal["A", "B"], standard: float, evidence: str, freedom: float = np.inf
+) -> list[Contribution]:
+    """Return a contribution of equal size and independent along x, y and z."""
+    return [
+        Contribution(f"{name}, {axis}", kind, float(standard), "m", unit, freedom or 1.0, evidence)
+        for axis, unit in zip("xyz", np.eye(3), strict=True)
+    ]

@@ -1,0 +1,120 @@
+"""The certificate as one HTML file that prints on one or two sheets, and as PDF."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from flangeye.errors import FlangeyeError, StageError
+from flangeye.files.bundled import VERSION
+from flangeye.files.written import write_whole
+from flangeye.files.yaml_lines import parse_yaml
+from flangeye.log.read import read_run
+from flangeye.models.loading import load_model
+from flangeye.models.scanners import ScannerModel
+from flangeye.report.account import provenance_of
+from flangeye.report.certificate.budget import Conditions, budget_of, shares_of, use_budget_of
+from flangeye.report.facts import Facts, facts_of
+from flangeye.report.summary import transform_text
+from flangeye.report.units import degrees, millimetres
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def write_certificate(run: Path, path: Path | None, conditions: Conditions) -> Path:
+    """Write the certificate of a run and return its path.
+
+    Args:
+        run: The run's folder or its ``run.mcap``.
+        path: The file; by default ``certificate.html`` beside the log.
+        conditions: What the person says of the place.
+
+    Raises:
+        StageError: There is no log, no calibration in it, or the file cannot be written.
+    """
+    log = run / "run.mcap" if run.is_dir() else run
+    page = render(facts_of(read_run(log)), conditions)
+    path = path or log.parent / "certificate.html"
+    write_whole(path, page)
+    return path
+
+
+def print_pdf(page: Path) -> Path | None:
+    """Print a page to a PDF beside it, with Chromium; None where there is none.
+
+    Raises:
+        StageError: Chromium is there and does not print.
+    """
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        return None
+    out = page.with_suffix(".pdf")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer"]
+    command = [browser, *options, f"--print-to-pdf={out.resolve()}", page.resolve().as_uri()]
+    try:
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+    except (subprocess.SubprocessError, OSError) as error:
+        raise StageError(f"{out}: {browser} does not print: {error}") from None
+    return out
+
+
+def render(facts: Facts, conditions: Conditions) -> str:
+    """Return the page as text."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"mm": millimetres, "deg": degrees}
+    return environment.get_template("certificate.html.j2").render(_content(facts, conditions))
+
+
+def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
+    result = facts.result
+    header = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
+    scanner = _scanner(header)
+    return {
+        "result": result,
+        "budget": budget_of(result),
+        "shares": shares_of(result),
+        "use": use_budget_of(result, scanner, conditions),
+        "transform": transform_text(*next(iter(result.transforms.items()))),
+        "objects": _objects(header, scanner),
+        "conditions": conditions,
+        "used": sum(o.used for o in result.observations),
+        "provenance": provenance_of(facts),
+        "version": VERSION,
+    }
+
+
+def _objects(header: dict[str, Any], scanner: ScannerModel | None) -> list[tuple[str, str]]:
+    """Return what was calibrated with what: name and value."""
+    robot, feature = header.get("robot") or {}, header.get("feature") or {}
+    rows = {
+        "Robot": str(robot.get("model", "")),
+        "Scanner": f"{scanner.maker} {scanner.model}" if scanner else "",
+        "Target": str(feature.get("standard") or feature.get("sphere") or "the robot's flange"),
+        "Configuration": str((header.get("configuration") or {}).get("name", "eye-on-base")),
+        "Serial": str(_serial(header.get("scanner") or {})),
+    }
+    return [(name, value) for name, value in rows.items() if value]
+
+
+def _serial(section: dict[str, Any]) -> str:
+    driver = section.get("driver")
+    settings = next(iter(driver.values()), None) if isinstance(driver, dict) else None
+    return str(settings.get("serial", "")) if isinstance(settings, dict) else ""
+
+
+def _scanner(header: dict[str, Any]) -> ScannerModel | None:
+    model = (header.get("scanner") or {}).get("model")
+    try:
+        return load_model("scanners", model) if model else None
+    except FlangeyeError:  # the file of the run's machine need not be on this one
+        return None

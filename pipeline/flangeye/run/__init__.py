@@ -1,0 +1,1 @@
+"""Running a checked recipe: runner, session, restart from a log, replay, run folder."""

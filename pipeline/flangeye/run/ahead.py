@@ -1,0 +1,82 @@
+"""Work on the next items while the last is looked at: ordered, bounded, the same answers."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a call gave, or raised, and what it took.
+
+    Attributes:
+        value: What it gave; None if it raised.
+        error: What it raised.
+        seconds: What it took.
+    """
+
+    value: Any
+    error: Exception | None
+    seconds: float
+
+    @classmethod
+    def of(cls, call: Callable[[], Any]) -> Done:
+        """Make a call."""
+        start = time.perf_counter()
+        try:
+            value, error = call(), None
+        except Exception as raised:
+            value, error = None, raised
+        return cls(value, error, time.perf_counter() - start)
+
+    def result(self) -> Any:
+        """Return what the call gave, or raise what it raised."""
+        if self.error is not None:
+            raise self.error
+        return self.value
+
+
+def cores() -> int:
+    """Return how many threads may compute: the cores of this process, or what OpenMP is told."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(mine or 1, int(told)) if told.isdigit() and int(told) else mine or 1
+
+
+def worked_ahead(
+    items: Iterator[T], work: Callable[[T], R], workers: int
+) -> Iterator[tuple[T, Callable[[], R]]]:
+    """Yield each item in order with what gives its result, or raises what the work raised.
+
+    Items are pulled in this thread and worked on in others, as many as there are workers and one
+    that waits: what is held in memory does not grow with the number of items. Whoever stops
+    pulling has no work begun beyond that.
+    """
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="flangeye")
+    waiting: deque[tuple[T, Future[R]]] = deque()
+    try:
+        while (pulled := Done.of(partial(next, items))).error is None:
+            waiting.append((pulled.value, pool.submit(work, pulled.value)))
+            if len(waiting) > workers:
+                yield _first(waiting)
+        while waiting:
+            yield _first(waiting)
+        if not isinstance(pulled.error, StopIteration):
+            pulled.result()  # what ended the items is raised after what they were
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _first(waiting: deque[tuple[T, Future[R]]]) -> tuple[T, Callable[[], R]]:
+    item, future = waiting.popleft()
+    return item, future.result

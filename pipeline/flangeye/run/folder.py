@@ -1,0 +1,143 @@
+"""The folder a run leaves behind: log, result, calibration, resolved recipe, report."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from flangeye.errors import FlangeyeError
+from flangeye.files.written import write_whole
+from flangeye.log.record import dump_result
+from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
+from flangeye.result import Result, TransformResult
+
+EXPORTS = "exports"
+"""Where in the folder the files for other programs are."""
+
+
+HEADER = """\
+# Maps child coordinates to parent coordinates; metres and radians.
+# For the arm as its controller reports it; what stands under corrected_arm holds for the arm with
+# that correction alone, and never without it.
+"""
+
+
+class FolderError(FlangeyeError):
+    """The run's folder cannot be made or written."""
+
+
+class RunFolder:
+    """One run's files.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, recipe: str, out: Path | None) -> RunFolder:
+        """Make ``out``, or ``runs/<time>_<recipe>``.
+
+        Raises:
+            FolderError: It cannot be made, or it already holds files.
+        """
+        path = out or _unused(Path("runs") / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{recipe}")
+        try:
+            if path.is_dir() and any(path.iterdir()):
+                raise FolderError(f"{path}: already holds files; name a new or empty folder")
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FolderError(f"{path}: cannot be made: {error.strerror or error}") from None
+        return cls(path)
+
+    @property
+    def log(self) -> Path:
+        """The MCAP log."""
+        return self.path / "run.mcap"
+
+    def write(self, result: Result, resolved: str) -> None:
+        """Write everything but the log and the report.
+
+        Raises:
+            FolderError: A file cannot be written.
+        """
+        self._write("recipe.resolved.yaml", resolved)
+        self._write("result.json", dump_result(result.model_dump(mode="json")))
+        if result.transforms and not result.refused:
+            self._write("calibration.yaml", calibration_yaml(result))
+        for name, text in result.exports.items():
+            self._write(f"{EXPORTS}/{name}", text)
+
+    def discard(self) -> None:
+        """Remove the folder: the run never got as far as a result worth keeping."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        parent = self.path.parent
+        if parent.name == "runs" and parent.is_dir() and not any(parent.iterdir()):
+            parent.rmdir()
+
+    def _write(self, name: str, text: str) -> None:
+        write_whole(self.path / name, text, FolderError)
+
+
+def calibration_yaml(result: Result) -> str:
+    """Return the calibration as other programs take it: translation, quaternion, rpy, matrix.
+
+    The poses are those for the arm as its controller reports it. Where an error of the arm was
+    found, ``corrected_arm`` has the poses for it corrected, and the correction they hold with.
+    """
+    document: dict[str, Any] = {"status": result.status, **_poses(result.transforms)}
+    answers = result.answers
+    if answers and answers.as_reported.expected_rms is not None:
+        document["expected_rms_at_the_work_m"] = answers.as_reported.expected_rms
+    if answers and answers.corrected:
+        document["corrected_arm"] = {
+            **_poses(answers.corrected.transforms),
+            "expected_rms_at_the_work_m": answers.corrected.expected_rms,
+            "correction": answers.corrected.correction.model_dump(exclude_none=True)
+            if answers.corrected.correction
+            else None,
+        }
+    document["recipe_hash"] = result.provenance.recipe_hash
+    return HEADER + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
+
+
+def _poses(transforms: Mapping[str, TransformResult]) -> dict[str, Any]:
+    return {name: _pose(name, estimate) for name, estimate in transforms.items()}
+
+
+def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
+    matrix = np.array(estimate.matrix)
+    parent, _, child = name.partition("_T_")
+    open_directions = (
+        {"unobservable_rotation_translation": estimate.unobservable}
+        if estimate.unobservable
+        else {}
+    )
+    return {
+        "parent": parent,
+        "child": child,
+        "translation_m": matrix[:3, 3].tolist(),
+        "quaternion_xyzw": quaternion_from_rotation(matrix[:3, :3]).tolist(),
+        "rpy_rad": rpy_from_rotation(matrix[:3, :3]).tolist(),
+        "matrix": matrix.tolist(),
+        "covariance_rotation_translation": estimate.covariance,
+        "covariance_about_m": estimate.about,
+        "sigma_rotation_rad": estimate.sigma[:3],
+        "sigma_translation_m": estimate.sigma[3:],
+        **open_directions,
+    }
+
+
+def _unused(path: Path) -> Path:
+    candidate, n = path, 2
+    while candidate.exists():
+        candidate, n = path.with_name(f"{path.name}-{n}"), n + 1
+    return candidate

@@ -1,0 +1,143 @@
+"""What a run came to, and the ``result.json`` that tells it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flangeye import result as r
+from flangeye import types as t
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import DEFAULT, Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.models.workspace import work_of
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe
+from flangeye.run.stopwatch import Stopwatch
+
+
+@dataclass
+class Outcome:
+    """What a run came to.
+
+    Attributes:
+        source: Where the captures came from.
+        calibration: What the solver gave; a ``VerifiedHandEye`` when every verification passed.
+        verifications: By step label.
+        rejections: Captures set aside before solving.
+        refused: Why the calibration was refused.
+        seen: The observations that reached the solver.
+        scan: The scan of the workpiece.
+        seam: What was planned from it.
+        weld: What the torch did.
+        exports: What export steps wrote.
+    """
+
+    source: t.Source
+    calibration: t.HandEye | None = None
+    verifications: dict[str, t.Verification] = field(default_factory=dict)
+    rejections: list[t.Rejection] = field(default_factory=list)
+    refused: str | None = None
+    seen: list[t.Observation] = field(default_factory=list)
+    scan: t.WorkpieceScan | None = None
+    seam: t.Seam | None = None
+    weld: t.WeldReport | None = None
+    exports: list[t.ExportedFile] = field(default_factory=list)
+
+    @property
+    def status(self) -> str:
+        """``refused``, ``verified`` or ``unverified``."""
+        if self.refused:
+            return "refused"
+        return "verified" if isinstance(self.calibration, t.VerifiedHandEye) else "unverified"
+
+    def pairs(self) -> Sequence[t.Pair]:
+        """Return every observation, with its residual when there is a calibration."""
+        if self.calibration:
+            return self.calibration.pairs
+        nothing = np.zeros(3)
+        return [t.Pair(o, nothing, used=False, reason="refused before solving") for o in self.seen]
+
+
+@dataclass
+class Truths:
+    """What a simulation knows, kept from every stage until the answer is final.
+
+    Attributes:
+        cell: The true unknowns.
+        seams: The true seams by name, (N, 3) in ``base`` [m].
+    """
+
+    cell: t.Truth | None = None
+    seams: Mapping[str, t.Array] = field(default_factory=dict)
+
+
+def result_of(
+    outcome: Outcome,
+    recipe: Recipe,
+    registry: Registry,
+    watch: Stopwatch,
+    truths: Truths = Truths(),  # noqa: B008  never written to
+) -> r.Result:
+    """Return the document of a run that ended, refused or not."""
+    calibration, pairs = outcome.calibration, outcome.pairs()
+    scan = outcome.scan and replace(outcome.scan, truth=truths.seams)
+    holdout = r.holdout_result(outcome.verifications)
+    known = calibration.as_reported().correction if calibration else None
+    result = r.Result(
+        title=recipe.header.title,
+        status=outcome.status,
+        refused=outcome.refused,
+        transforms=r.transforms_result(calibration),
+        correction=r.correction_result(known),
+        answers=r.answers_result(calibration, holdout),
+        observations=r.observations_result(pairs, outcome.rejections),
+        holdout=holdout,
+        verifications=r.verifications_result(outcome.verifications),
+        seam=r.seam_result(outcome.seam, scan),
+        weld=r.weld_result(outcome.weld, scan),
+        notes=_notes(outcome),
+        exports={file.name: file.text for file in outcome.exports},
+        timing=_timing(watch),
+        provenance=_provenance(outcome, recipe, registry),
+    )
+    given = recipe.context.get(t.Box)
+    box = work_of(calibration, outcome.source, given) if calibration else None
+    if calibration and box:
+        result.method = calibration.method
+        result.workspace = r.workspace_result(calibration, box)
+        if truth := truths.cell:
+            result.truth = r.truth_result(calibration, truth, box, _robots(recipe))
+    return result
+
+
+def _robots(recipe: Recipe) -> tuple[Configuration, Arm | None]:
+    robot = recipe.context.get(RobotModel)
+    return recipe.context.get(Configuration) or DEFAULT, Arm(robot) if robot else None
+
+
+def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:
+    return {
+        label: r.StageTiming(seconds=seconds, calls=watch.calls[label])
+        for label, seconds in sorted(watch.seconds.items())
+    }
+
+
+def _notes(outcome: Outcome) -> list[str]:
+    """Return what the steps after the source want people to know."""
+    told = (outcome.calibration, outcome.scan)
+    return [note for value in told if value is not None for note in value.notes]
+
+
+def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Provenance:
+    return r.Provenance(
+        versions=r.library_versions(),
+        plugins=registry.versions(),
+        recipe=recipe.name,
+        recipe_hash=r.sha256(recipe.resolved()),
+        input_hash=outcome.source.fingerprint,
+        seed=recipe.header.seed,
+        notes=[*outcome.source.notes, *_notes(outcome)],
+    )

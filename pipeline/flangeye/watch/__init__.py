@@ -1,5 +1,0 @@
-"""``flangeye watch``: a run as it goes, in the terminal and in Foxglove; all of it from its log."""
-
-from flangeye.watch.command import watch_run
-
-__all__ = ["watch_run"]

@@ -1,0 +1,141 @@
+"""Archive: the sessions of a folder compared, a log looked at capture by capture, batches."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import app, ui
+
+from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.log.read import RunLog
+from flangeye.report.units import millimetres
+from flangeye.result import Result
+from flangeye_ui.desk import Desk
+from flangeye_ui.layout import command_line, page
+from flangeye_ui.run_page import FLANGE, SCAN
+from flangeye_ui.scene import draw_cloud
+
+COLUMNS = [
+    {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
+    for key, label in (
+        ("run", "Run"), ("status", "Status"), ("used", "Poses used"), ("held", "Held-out rms, mm"),
+        ("predicted", "Predicted rms, mm"), ("note", "Note"),
+    )
+]  # fmt: skip
+POINTS = 5_000
+
+
+def add(desk: Desk) -> None:
+    """Add the page, and serve the folder's own reports to it."""
+    for name in ("runs", "batches"):
+        (desk.folder / name).mkdir(exist_ok=True)
+        app.add_static_files(f"/{name}", desk.folder / name)
+
+    @ui.page("/archive")
+    def archive() -> None:
+        with page("Archive"):
+            rows = [row_of(run) for run in desk.runs()]
+            if not rows:
+                ui.label("There is no run in this folder yet.")
+                return
+            ui.table(columns=COLUMNS, rows=rows, row_key="run").classes("w-full").props("dense")
+            _reports(desk)
+            Scrubber(desk)
+            command_line(desk.command("show", f"runs/{rows[0]['run']}/run.mcap"))
+
+
+def row_of(run: Path) -> dict[str, Any]:
+    """Return one line of the table; a run without a result, or an unreadable one, says so."""
+    path = run / "result.json"
+    if not path.exists():
+        return {"run": run.name, "status": "unfinished", "note": "ended before its result"}
+    try:
+        result = Result.model_validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        return {"run": run.name, "status": "unreadable", "note": str(error).splitlines()[0]}
+    held, box = result.holdout, result.workspace
+    used = sum(o.used for o in result.observations)
+    return {
+        "run": run.name,
+        "status": result.status,
+        "used": f"{used} of {len(result.observations)}",
+        "held": millimetres(held.rms) if held else "",
+        "predicted": millimetres(box.predicted_rms) if box else "",
+        "note": result.refused or "",
+    }
+
+
+def _reports(desk: Desk) -> None:
+    pages = [*desk.folder.glob("runs/*/report.html"), *desk.folder.glob("batches/*/*.html")]
+    with ui.row().classes("gap-4"):
+        for path in sorted(pages):
+            where = path.relative_to(desk.folder)
+            ui.link(str(where), f"/{where}", new_tab=True)
+
+
+class Scrubber:
+    """A log, capture by capture."""
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._log: RunLog | None = None
+        runs = [r.name for r in desk.runs()]
+        ui.label("Look at a log").classes("text-h6")
+        ui.select(
+            runs, value=runs[0], label="Run", on_change=lambda e: self._open(e.value)
+        ).classes("w-full")
+        self._slider = ui.slider(
+            min=0, max=1, step=1, value=0, on_change=lambda e: self._at(e.value)
+        )
+        self._slider.props('aria-label="Capture" label')
+        self._told = ui.label().props('role="status"')
+        self._scene = ui.scene(width=600, height=360, background_color="#eef1f5").classes("w-full")
+        ui.timer(0.05, lambda: self._open(runs[0]), once=True)
+
+    async def _open(self, run: str) -> None:
+        self._log, self._told.text = None, "reading …"
+        try:
+            facts = await asyncio.to_thread(self._desk.read, self._desk.folder / "runs" / run)
+            self._log = facts.log
+        except FlangeyeError as error:
+            self._told.text = str(error)
+            return
+        self._slider.props(f"max={max(len(self._log.poses) - 1, 0)}")
+        self._slider.value = 0
+        self._at(0)
+
+    def _at(self, index: int) -> None:
+        """Show one capture: the flange in it, and what became of it."""
+        if self._log is None or not self._log.poses:
+            return
+        capture = list(self._log.poses)[int(index)]
+        self._told.text = f"capture {capture}: {fate_of(self._log, capture)}"
+        self._scene.clear()
+        for entry in self._log.of_kind("segment"):
+            if entry.capture == capture and isinstance(entry.value, t.FlangeCloud):
+                self._cloud(entry.value)
+
+    def _cloud(self, flange: t.FlangeCloud) -> None:
+        xyz = flange.cloud.points()
+        thin = xyz[:: max(1, len(xyz) // POINTS)].astype(np.float64)
+        draw_cloud(self._scene, thin, FLANGE)
+        at = np.asarray(flange.centre)
+        draw_cloud(self._scene, at[None], SCAN)
+        self._scene.move_camera(*(at - 0.15 * at / np.linalg.norm(at)).tolist(), *at.tolist())
+
+
+def fate_of(log: RunLog, capture: str) -> str:
+    """Return what became of a capture, in words."""
+    for rejection in log.rejections:
+        if rejection.id == capture:
+            return f"set aside by {rejection.stage}: {rejection.reason}"
+    calibration = log.calibration()
+    for pair in calibration.pairs if calibration else ():
+        if pair.observation.id == capture:
+            residual = f"residual {millimetres(float(np.linalg.norm(pair.residual)))} mm"
+            return f"{'used' if pair.used else 'not used'}, {pair.reason or residual}"
+    return "kept for verification, or not solved"

@@ -1,0 +1,178 @@
+"""Cell: choose what stands there; the recipe grows beside it, checked as one types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+from nicegui import ui
+
+from flangeye.files.bundled import bundled
+from flangeye.plugin.stage import Stage
+from flangeye.recipe.load import find_recipe, recipe_names
+from flangeye_ui.desk import Desk, Mistake, at
+from flangeye_ui.layout import command_line, mistake, page
+
+CONFIGURATIONS = ["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"]
+
+
+def add(desk: Desk) -> None:
+    """Add the page."""
+
+    @ui.page("/")
+    def cell() -> None:
+        with page("Cell"), ui.row().classes("w-full gap-6 items-start"):
+            Form(desk)
+
+
+class Form:
+    """The form and the recipe: two views of one file."""
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        with ui.column().classes("col-12 col-md-5 gap-2"):
+            self._start_from()
+            self.fields()
+        with ui.column().classes("col-12 col-md gap-2"):
+            ui.label("Recipe").classes("text-h6")
+            self._yaml = ui.textarea(value=desk.text, on_change=self._typed)
+            self._yaml.classes("w-full").props(
+                'outlined autogrow input-class="font-mono" aria-label="Recipe in YAML"'
+            )
+            self.verdict()
+            command_line(desk.command("check", desk.recipe_path.name))
+
+    @ui.refreshable_method
+    def verdict(self) -> None:
+        """Say whether the recipe can run, and everything that is wrong with it."""
+        _, mistakes = self._desk.check()
+        if not mistakes:
+            ui.label("The recipe is sound.").classes("text-positive").props('role="status"')
+        for each in mistakes:
+            mistake(f"line {each.line}: {each.path}: {each.text}" if each.line else each.text)
+
+    @ui.refreshable_method
+    def fields(self) -> None:
+        """Show the header and every step, with what is wrong at each field."""
+        data, (_, mistakes) = self._desk.data(), self._desk.check()
+        self._header(data, mistakes)
+        for index, entry in enumerate(data.get("steps") or []):
+            self._step(index, entry, mistakes)
+        stages = sorted(self._desk.registry.stages)
+        ui.select(stages, label="Add a step", with_input=True, on_change=self._add).classes(
+            "w-full"
+        )
+
+    def _start_from(self) -> None:
+        def take(event: Any) -> None:
+            self._write(yaml.safe_load(find_recipe(event.value).read_text(encoding="utf-8")))
+
+        names = list(recipe_names())
+        ui.select(names, label="Start from a recipe", with_input=True, on_change=take).classes(
+            "w-full"
+        )
+
+    def _header(self, data: dict[str, Any], mistakes: list[Mistake]) -> None:
+        ui.input(
+            "Title", value=str(data.get("title", "")),
+        ).on("change", lambda e: self._set(["title"], e.args)).classes("w-full")  # fmt: skip
+        for section, label in (("robot", "Arm"), ("scanner", "Scanner")):
+            chosen = (data.get(section) or {}).get("model")
+            known = sorted(p.stem for p in (bundled("data") / f"{section}s").glob("*.yaml"))
+            self._choice(label, [section, "model"], chosen, known)
+            self._mistakes(mistakes, section)
+        standard = (data.get("feature") or {}).get("standard")
+        self._choice("Flange", ["feature", "standard"], standard, _standards())
+        self._mistakes(mistakes, "feature")
+        name = (data.get("configuration") or {}).get("name", CONFIGURATIONS[0])
+        self._choice("Configuration", ["configuration", "name"], name, CONFIGURATIONS)
+        self._mistakes(mistakes, "configuration")
+
+    def _choice(self, label: str, path: list[str], chosen: Any, known: list[str]) -> None:
+        options = known if chosen in (None, *known) else [chosen, *known]
+        ui.select(
+            options, label=label, value=chosen, on_change=lambda e: self._set(path, e.value)
+        ).classes("w-full")
+
+    def _step(self, index: int, entry: Any, mistakes: list[Mistake]) -> None:
+        name = next(iter(entry)) if isinstance(entry, dict) else str(entry)
+        given = (entry[name] if isinstance(entry, dict) else None) or {}
+        stage = self._desk.registry.stages.get(name)
+        with ui.expansion(f"{index}. {name}").classes("w-full").props("dense"):
+            if stage:
+                ui.label(stage.summary).classes("text-caption")
+                self._parameters(index, name, stage, given)
+            ui.button("Remove", on_click=lambda: self._remove(index)).props("flat dense")
+        self._mistakes(mistakes, f"steps.{index}")
+
+    def _parameters(self, index: int, name: str, stage: Stage, given: dict[str, Any]) -> None:
+        """Show a field for each parameter, as the recipe's schema has it."""
+        for field, info in (stage.params.model_fields if stage.params else {}).items():
+            value = given.get(field)
+            shown = "" if value is None else value if isinstance(value, str) else yaml.safe_dump(
+                value, default_flow_style=True, width=1000
+            ).removesuffix("...\n").strip()  # fmt: skip
+            path = ["steps", index, name, field]
+            default = "required" if info.is_required() else f"default {info.default}"
+            ui.input(field, value=shown, placeholder=default).on(
+                "change", lambda e, path=path: self._set(path, e.args)
+            ).classes("w-full").props("dense").tooltip(info.description or "")
+
+    def _mistakes(self, mistakes: list[Mistake], *paths: str) -> None:
+        for text in at(mistakes, *paths):
+            mistake(text)
+
+    def _set(self, path: list[Any], value: Any) -> None:
+        data = self._desk.data()
+        if path[0] == "steps":
+            _put_step(data["steps"], path, _plain(value))
+        elif len(path) == 1:
+            data[path[0]] = value
+        else:
+            data[path[0]] = {**(data.get(path[0]) or {}), path[1]: value}
+        self._write(
+            {k: data[k] for k in [*[x for x in data if x != "steps"], "steps"] if k in data}
+        )
+
+    def _add(self, event: Any) -> None:
+        data = self._desk.data()
+        data["steps"] = [*(data.get("steps") or []), event.value]
+        self._write(data)
+
+    def _remove(self, index: int) -> None:
+        data = self._desk.data()
+        del data["steps"][index]
+        self._write(data)
+
+    def _write(self, data: dict[str, Any]) -> None:
+        self._desk.edit(data)
+        self._yaml.value = self._desk.text
+        self.fields.refresh()
+
+    def _typed(self, event: Any) -> None:
+        self._desk.text = event.value
+        self.verdict.refresh()
+        self.fields.refresh()
+
+
+def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:
+    _, index, name, field = path
+    entry = steps[index]
+    given = dict((entry[name] if isinstance(entry, dict) else None) or {})
+    given.pop(field, None)
+    if value not in (None, ""):
+        given[field] = value
+    steps[index] = {name: given} if given else name
+
+
+def _plain(text: str) -> Any:
+    """Return what is typed as YAML would have it; text that is no YAML stays text."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _standards() -> list[str]:
+    table = yaml.safe_load((bundled("data") / "standards" / "iso9409-1.yaml").read_text("utf-8"))
+    return [plate["designation"] for plate in table["plates"]]

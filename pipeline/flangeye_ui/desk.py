@@ -1,0 +1,143 @@
+"""What all pages of one server share: the folder, the recipe, the run under way."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flangeye.errors import FlangeyeError, StageError
+from flangeye.log.read import read_run
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe, load_recipe
+from flangeye.report.facts import Facts, facts_of
+from flangeye_ui.process import RunProcess
+
+NEW = """title: My cell
+robot: {model: ur5e}
+scanner: {model: phoxi-m}
+steps:
+  - acquire.simulated
+  - segment.flange
+  - fit.rim
+  - solve.robust
+  - verify.holdout
+"""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One thing that is wrong with the recipe.
+
+    Attributes:
+        line: In the YAML, from 1; 0 where none is named.
+        path: The field, such as ``steps.2.fit.rim.inlier``; empty where none is named.
+        text: What is wrong.
+    """
+
+    line: int
+    path: str
+    text: str
+
+
+class Desk:
+    """The state behind the pages; one a server, so that two pages show the same.
+
+    Attributes:
+        folder: Where recipes and runs are.
+        registry: The plugins.
+        run: The run that was started here last, if any.
+        owner: The page that started it.
+    """
+
+    def __init__(self, folder: Path, registry: Registry) -> None:
+        self.folder, self.registry = folder, registry
+        self.run: RunProcess | None = None
+        self.owner = ""
+        if not self.recipe_path.exists():
+            self.recipe_path.write_text(NEW, encoding="utf-8")
+
+    @property
+    def recipe_path(self) -> Path:
+        """The recipe that the pages work on."""
+        return self.folder / "cell.yaml"
+
+    @property
+    def text(self) -> str:
+        """The recipe as it is on disk."""
+        return self.recipe_path.read_text(encoding="utf-8")
+
+    @text.setter
+    def text(self, text: str) -> None:
+        self.recipe_path.write_text(text, encoding="utf-8")
+
+    def data(self) -> dict[str, Any]:
+        """Return the recipe as data; empty while it is no mapping."""
+        try:
+            data = yaml.safe_load(self.text)
+        except yaml.YAMLError:
+            return {}
+        return data if isinstance(data, dict) else {}
+
+    def edit(self, data: dict[str, Any]) -> None:
+        """Write the recipe from data."""
+        self.text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+    def check(self) -> tuple[Recipe | None, list[Mistake]]:
+        """Return the checked recipe, or everything that is wrong with it."""
+        try:
+            return load_recipe(self.recipe_path, self.registry), []
+        except FlangeyeError as error:
+            return None, [_mistake(line) for line in str(error).splitlines()]
+
+    def runs(self) -> list[Path]:
+        """Return the folders of all runs, newest first."""
+        logs = self.folder.glob("runs/*/run.mcap")
+        return [p.parent for p in sorted(logs, key=lambda p: p.stat().st_mtime, reverse=True)]
+
+    def read(self, run: Path) -> Facts:
+        """Return what a run's log says.
+
+        Raises:
+            StageError: It cannot be read: damaged, or written by another version.
+        """
+        try:
+            return facts_of(read_run(run / "run.mcap"))
+        except ValueError as error:
+            what = str(error).splitlines()[0]
+            raise StageError(f"{run.name}/run.mcap: cannot be read: {what}") from None
+
+    def command(self, *words: str) -> str:
+        """Return a command line of flangeye, to copy."""
+        return " ".join(["flangeye", *words])
+
+    def start(self, move: bool, owner: str) -> None:
+        """Start the recipe as the command line does."""
+        self.run, self.owner = RunProcess(self.folder, self.recipe_path.name, move), owner
+
+    def resume(self, run: Path, move: bool, owner: str) -> None:
+        """Go on with a run that ended early."""
+        self.run, self.owner = RunProcess(self.folder, None, move, run), owner
+
+    def page_gone(self, page: str, why: str = "the page was closed") -> None:
+        """Stop an arm that moves for a page that is not there any more."""
+        if self.run and self.run.moves and page == self.owner:
+            self.run.stop(why)
+
+
+def _mistake(line: str) -> Mistake:
+    found = re.match(r"^[^:]*:(\d+)(?::\d+)?: (?:([\w.]+): )?(.*)$", line)
+    if not found:
+        return Mistake(0, "", line)
+    return Mistake(int(found[1]), found[2] or "", found[3])
+
+
+def at(mistakes: list[Mistake], *paths: str) -> Iterator[str]:
+    """Yield what is wrong at a field or within it."""
+    for mistake in mistakes:
+        if any(mistake.path == p or mistake.path.startswith(f"{p}.") for p in paths):
+            yield mistake.text

@@ -1,0 +1,185 @@
+"""Plan: the arm, its box, the scanner and the poses in 3D; nothing moves."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from nicegui import events, ui
+
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.recipe.load import Recipe
+from flangeye.types import Floats
+from flangeye_ui.desk import Desk
+from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.scene import draw_arm, draw_box, draw_frustum
+
+ROW = re.compile(r"^(\d{4})\s+(\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(\d+) deg\s+(.*)$")
+HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""How an arm of six joints is drawn that has not said where it stands."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """One row of the plan that the command prints.
+
+    Attributes:
+        id: Of the capture.
+        role: What it is for.
+        place: (3,) of the flange in the base [m].
+        way: How the arm gets there, how long it takes, or why it is barred.
+    """
+
+    id: str
+    role: str
+    place: Floats
+    way: str
+
+    @property
+    def barred(self) -> bool:
+        """Whether there is no way."""
+        return self.way.startswith("barred")
+
+
+def add(desk: Desk) -> None:
+    """Add the page."""
+
+    @ui.page("/plan")
+    def plan() -> None:
+        with page("Plan"):
+            ui.label("Nothing moves on this page.")
+            recipe, mistakes = desk.check()
+            if recipe is None:
+                mistake(f"The recipe has {len(mistakes)} mistakes; see the page Cell.")
+                return
+            Planner(desk, recipe)
+
+
+class Planner:
+    """The drawing and the plan beside it."""
+
+    def __init__(self, desk: Desk, recipe: Recipe) -> None:
+        self._desk, self._recipe = desk, recipe
+        with ui.row().classes("w-full gap-4"):
+            with ui.column().classes("col-12 col-md-7"):
+                self._scene = ui.scene(width=640, height=460, background_color="#eef1f5").classes(
+                    "w-full"
+                )
+                self._draw()
+            with ui.column().classes("col-12 col-md gap-2"):
+                self._guess()
+                ui.button("Check every pose and way", on_click=self._plan)
+                self._told = ui.column().classes("w-full")
+        command_line(desk.command("run", desk.recipe_path.name))
+
+    def _draw(self) -> None:
+        robot, scanner = (self._recipe.context.get(m) for m in (RobotModel, ScannerModel))
+        if robot is not None:
+            joints = HOME if Arm(robot).n == 6 else np.zeros(Arm(robot).n)
+            draw_arm(self._scene, robot, joints)
+        limits = self._recipe.header.robot and self._recipe.header.robot.limits
+        if limits:
+            draw_box(self._scene, np.array(limits.box.centre), np.array(limits.box.size), "#d68910")
+        view = self._view()
+        if view is not None and scanner is not None and robot is not None:
+            self._scanner(scanner, view(Arm(robot), scanner))
+        self._scene.move_camera(1.5, -1.3, 1.1, 0.2, 0, 0.45)
+
+    def _view(self) -> Any:
+        return getattr(self._recipe.steps[0].params, "view", None)
+
+    def _scanner(self, scanner: ScannerModel, base_T_camera: Floats) -> None:
+        draw_frustum(self._scene, scanner, base_T_camera)
+        with self._scene:
+            ball = self._scene.sphere(0.05).move(*base_T_camera[:3, 3].tolist())
+            ball.material("#3a7ebf").draggable()
+        self._scene.on_drag_end(lambda e: self._dragged(e))
+
+    def _dragged(self, event: events.SceneDragEventArguments) -> None:
+        self._place([f"{1e3 * v:.0f} mm" for v in (event.x, event.y, event.z)])
+
+    def _guess(self) -> None:
+        """Let the person say where the scanner stands, by number or by dragging its ball."""
+        data = self._desk.data()
+        view = (_first(data) or {}).get("view") or {}
+        position = (view.get("guess") or {}).get("position") if isinstance(view, dict) else None
+        if not position:
+            ui.label("This recipe guesses no place of the scanner, so there is nothing to drag.")
+            return
+        ui.input(
+            "Where the scanner stands (x, y, z in the base)", value=", ".join(map(str, position))
+        ).on("change", lambda e: self._place([x.strip() for x in e.args.split(",")])).classes(
+            "w-full"
+        )
+        ui.label(
+            "Or drag the blue ball. A tape measure is good enough. Instead of a guess, "
+            "view: {shown: {joints: [...]}} takes three poses that face the scanner."
+        ).classes("text-caption")
+
+    def _place(self, position: list[str]) -> None:
+        data = self._desk.data()
+        first = _first(data) or {}
+        guess = {**(first["view"]["guess"]), "position": position}
+        name = next(iter(data["steps"][0]))
+        data["steps"][0] = {name: {**first, "view": {"guess": guess}}}
+        self._desk.edit(data)
+        ui.navigate.reload()
+
+    async def _plan(self) -> None:
+        """Ask the command line for the plan: without --move it shows it and nothing moves."""
+        self._told.clear()
+        with self._told:
+            ui.spinner()
+        if self._recipe.steps[0].stage.name != "acquire.live":
+            text = "this recipe drives no arm: its poses are those of its recordings or simulation"
+        else:
+            text = await asyncio.to_thread(_planned, self._desk)
+        self._told.clear()
+        with self._told:
+            self._show(text)
+
+    def _show(self, text: str) -> None:
+        stops = stops_of(text)
+        for line in text.splitlines():
+            if line.startswith("error: "):
+                mistake(line.removeprefix("error: "))
+        ui.code(text, language="text").classes("w-full overflow-x-auto")
+        for stop in stops:
+            with self._scene:
+                colour = "#d64545" if stop.barred else "#2e9e5b"
+                self._scene.sphere(0.012).move(*stop.place.tolist()).material(colour)
+        if any(stop.barred for stop in stops):
+            ui.label("Red poses are barred; the last column says why.")
+
+
+def stops_of(text: str) -> list[Stop]:
+    """Return the stops in a plan as the command prints it."""
+    rows = filter(None, map(ROW.match, text.splitlines()))
+    return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[7]) for r in rows]
+
+
+def _planned(desk: Desk) -> str:
+    command = [sys.executable, "-P", "-m", "flangeye.cli", "run", desk.recipe_path.name]
+    try:
+        done = subprocess.run(
+            command, cwd=desk.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+            timeout=300,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return "error: the plan took longer than five minutes"
+    return done.stdout + done.stderr
+
+
+def _first(data: dict[str, Any]) -> dict[str, Any] | None:
+    steps = data.get("steps") or []
+    if not steps or not isinstance(steps[0], dict):
+        return None
+    given = next(iter(steps[0].values()))
+    return given if isinstance(given, dict) else None

@@ -1,0 +1,134 @@
+"""A run as a process of the command line, and what its log says while it goes."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.log import foxglove
+from flangeye.log.watch.tail import Message, follow
+from flangeye.log.watch.view import View
+from flangeye.types import Floats
+
+POINTS = 20_000
+"""Of a scan that are sent to the page."""
+DIE_WITH_PARENT = 1
+"""``PR_SET_PDEATHSIG`` of Linux: a run does not outlive its page's server."""
+
+
+class RunProcess:
+    """``flangeye run``, started, followed and stopped.
+
+    Attributes:
+        path: The run's folder.
+        moves: Whether it may move an arm.
+        view: What its log has said so far.
+        cloud: (N, 3) the newest scan, thinned, in the camera [m]; and the flange in it.
+        places: (3,) of the flange in the base [m], by capture; those set aside are named.
+        stopped: Why it was stopped from here; empty where it was not.
+    """
+
+    def __init__(
+        self, folder: Path, recipe: str | None, move: bool, resume: Path | None = None
+    ) -> None:
+        self.path = folder / "runs" / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
+        self.moves, self.stopped = move, ""
+        self.view = View(self.path.name)
+        self.cloud: Floats = np.zeros((0, 3))
+        self.flange: Floats = np.zeros((0, 3))
+        self.arrived = 0
+        self.places: dict[str, list[float]] = {}
+        self.set_aside: set[str] = set()
+        what = ["--resume", str(resume)] if resume else [str(recipe)]
+        out = str(self.path.relative_to(folder))
+        self.words = ["run", *what, "--out", out, *(["--move"] if move else [])]
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "flangeye.cli", *self.words],
+            cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            text=True, start_new_session=True, preexec_fn=_die_with_parent,
+        )  # fmt: skip
+        self.said: list[str] = []
+        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._follow, daemon=True).start()
+
+    @property
+    def code(self) -> int | None:
+        """The exit code; None while it goes."""
+        return self._process.poll()
+
+    def stop(self, why: str) -> None:
+        """Stop it as Ctrl-C does: the arm's guard hears it at once."""
+        if self.code is None:
+            self.stopped = why
+            self._process.send_signal(signal.SIGINT)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None  # noqa: S101  it was asked for above
+        with self._process.stdout as said:
+            for line in said:
+                self.said.append(line.rstrip())
+
+    def _follow(self) -> None:
+        log = self.path / "run.mcap"
+        while not log.exists() and self.code is None:
+            time.sleep(0.05)
+        try:
+            for message in follow(log, self._wait):
+                self.view.take(message)
+                self._mark(message)
+                self._show(message)
+            self.view.ended = True
+        except (FlangeyeError, _EndedError):
+            return
+
+    def _wait(self) -> None:
+        if self.code is not None:
+            raise _EndedError
+        time.sleep(0.05)
+
+    def _mark(self, message: Message) -> None:
+        """Keep where the flange has been, and what was set aside."""
+        if message.channel.topic == "/capture" and self.view.arm:
+            self.places[json.loads(message.data)["id"]] = self.view.arm[0]
+        elif message.channel.topic == "/rejection":
+            self.set_aside.add(json.loads(message.data)["id"])
+
+    def _show(self, message: Message) -> None:
+        """Keep the newest scan and the flange in it, thin enough for a page."""
+        topic = message.channel.topic
+        if message.channel.schema != "foxglove.PointCloud":
+            return
+        thin = thinned(message.data)
+        if topic == "/capture/cloud":
+            self.cloud, self.flange = thin, np.zeros((0, 3))
+        elif ".segment." in topic:
+            self.flange = thin
+        self.arrived += 1
+
+
+def thinned(data: bytes) -> Floats:
+    """Return (N, 3) points of a logged cloud, few enough for a page."""
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+    xyz = foxglove.points_of(PointCloud.FromString(data))
+    cloud = t.PointCloud(t.CAMERA, xyz).points()
+    return cloud[:: max(1, len(cloud) // POINTS)].astype(np.float64)
+
+
+class _EndedError(Exception):
+    """The run ended and its log will not grow."""
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(DIE_WITH_PARENT, signal.SIGINT)

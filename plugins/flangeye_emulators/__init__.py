@@ -1,0 +1,68 @@
+"""What stands in for hardware: simulated cells, and controllers, scanners and fingers on loopback.
+
+Offered to the engine as a vendor's plugin is. Nothing here runs on a real cell.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from flangeye import hookimpl
+
+if TYPE_CHECKING:
+    from flangeye.models.emulator import Emulator, EmulatorOptions
+
+STAGES = {
+    "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
+    "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
+    "acquire_simulated_marker",
+    "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"
+    "acquire_simulated_session",
+    "acquire.simulated_images": "flangeye_emulators.acquire.simulated_images:"
+    "acquire_simulated_images",
+    "scan.simulated": "flangeye_emulators.scan.simulated:scan_simulated",
+}
+
+PARTS = {
+    "scanner.emulator": "flangeye_emulators.scanner.loopback:scanner_loopback",
+    "robot.emulator": "flangeye_emulators.robot.loopback:robot_loopback",
+    "robot.simulated": "flangeye_emulators.robot.simulated:robot_simulated",
+    "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
+    # Their former names.
+    "scanner.loopback": "scanner.emulator",
+    "robot.loopback": "robot.emulator",
+}
+
+
+@hookimpl
+def flangeye_stages() -> Mapping[str, str]:
+    """Offer the simulated stages."""
+    return STAGES
+
+
+@hookimpl
+def flangeye_parts() -> Mapping[str, str]:
+    """Offer the simulated parts."""
+    return PARTS
+
+
+def _serve_ur(options: "EmulatorOptions") -> None:
+    from flangeye_emulators.controllers.ur.server import serve
+
+    serve(options)
+
+
+def _serve_aubo(options: "EmulatorOptions") -> None:
+    from flangeye_emulators.controllers.aubo.server import serve
+
+    serve(options)
+
+
+@hookimpl
+def flangeye_emulators() -> Iterable["Emulator"]:
+    """Offer controllers of Universal Robots and of AUBO."""
+    from flangeye.models.emulator import Emulator
+
+    return (
+        Emulator("ur", "Universal Robots", _serve_ur),
+        Emulator("aubo", "AUBO", _serve_aubo),
+    )

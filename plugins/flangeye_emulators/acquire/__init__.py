@@ -1,0 +1,1 @@
+"""``acquire.simulated*``: captures from simulated cells, whose truth is known."""

@@ -1,0 +1,232 @@
+"""What simulated sessions of any configuration have in common: parameters, and the plan."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.targets import Flange
+from flangeye.plugin.stage import Params
+from flangeye.types import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    Floats,
+    Observation,
+    PoseFeature,
+    Poses,
+    Source,
+    Transform,
+    Truth,
+    by_frame,
+)
+from flangeye.units import Angle, Length, param
+from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
+from flangeye_emulators.world.session import (
+    Cast,
+    Places,
+    Stands,
+    View,
+    as_built,
+    close_loop,
+    draw_stands,
+    home_of,
+    really,
+    seen_from,
+    visible,
+)
+
+VERSION = 1
+"""Raised whenever the same parameters would give other captures."""
+UNSEEN = 60
+"""Poses that take no part and show what a calibration is worth, where the arm is not as it says."""
+HOME = ("0 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")
+
+
+class PlaceParams(Params):
+    """A pose, in the frame of what carries it."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw."
+    )
+
+    @property
+    def matrix(self) -> Floats:
+        """(4, 4)."""
+        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+
+
+class SessionParams(Params):
+    """What simulated sessions have in common."""
+
+    poses: int = Field(20, ge=3, description="How many captures.")
+    home: tuple[Angle, ...] = param(HOME, description="Joints of the first arm at the first pose.")
+    second_home: tuple[Angle, ...] = param(HOME, description="Those of the second arm.")
+    spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
+    distance: Length = param("650 mm", gt=0, description="Camera to target at the first pose.")
+    camera: PlaceParams | None = Field(
+        None,
+        description="The camera's true place in what carries it; by default wherever it has to be "
+        "to see the target at the first pose.",
+    )
+    place: PlaceParams = Field(
+        default_factory=PlaceParams,
+        description="The target's true place in what carries it, where the recipe does not know "
+        "it; with camera it follows from the first pose.",
+    )
+    facing: Angle = param(
+        "50 deg", gt=0, description="Largest angle between the target's z and the view."
+    )
+    robot_rotation: Angle = param(
+        "0.0115 deg", ge=0, description="Noise of a reported pose about each axis; 0.2 mrad."
+    )
+    robot_position: Length = param("0.05 mm", ge=0, description="And along each axis.")
+    arm: ArmErrors = Field(
+        default_factory=ArmErrors,
+        description="How far the arms are from what their controllers say; by default by the "
+        "noise of the pose alone.",
+    )
+    four_axes: bool = Field(
+        False, description="The first arm's flange only moves, and turns about the vertical."
+    )
+    in_turns: bool = Field(
+        False, description="Of two arms, one rests at its first pose while the other moves."
+    )
+
+
+def noise_free(
+    camera_T_target: Floats, index: int, poses: Poses, joints: Floats | None
+) -> Observation:
+    """Return what a camera without noise sees at a pose, beside what the controllers report."""
+    seen = PoseFeature(Transform(CAMERA, TARGET, camera_T_target), np.zeros((6, 6)))
+    return Observation(f"exact-{index}", seen, poses, joints)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSession:
+    """A session that was planned: what the arms report, where they are, where all is."""
+
+    configuration: Configuration
+    reported: Stands
+    actual: Stands
+    places: Places
+    unseen: tuple[Observation, ...] = ()
+
+    @property
+    def truth(self) -> Truth:
+        """The unknowns as they are."""
+        places = self.places
+        values = [places.x, *([places.y] if self.configuration.other_base else []), places.z]
+        camera, *others = (
+            Transform.named(name, value)
+            for name, value in zip(self.configuration.unknowns, values, strict=False)
+        )
+        return Truth(camera, tuple(others), self.unseen)
+
+    def where(self, chosen: NDArray[np.intp]) -> PlannedSession:
+        """Return the session with some of its poses."""
+        return replace(self, reported=self.reported.where(chosen), actual=self.actual.where(chosen))
+
+    def noise_free(self) -> tuple[Observation, ...]:
+        """Return what a camera without noise sees at each pose, beside what the arms report."""
+        seen = seen_from(self.actual, self.places)
+        return tuple(noise_free(pose, i, *self.poses(i)) for i, pose in enumerate(seen))
+
+    def poses(self, i: int) -> tuple[Poses, Floats | None]:
+        """Return what the controllers report at a pose, and the joints."""
+        stands = self.reported
+        second = None
+        if self.configuration.other_base:
+            second = Transform(BASE2, FLANGE2, stands.target[i])
+        joints = None if stands.joints is None else stands.joints[i]
+        return by_frame(Transform(BASE, FLANGE, stands.flange[i]), second), joints
+
+
+def plan_session(
+    robot: RobotModel,
+    second: SecondRobot | None,
+    configuration: Configuration,
+    given: tuple[SessionParams, View],
+    rng: np.random.Generator,
+) -> PlannedSession:
+    """Draw the arms' poses, and put camera and target where the loop closes.
+
+    Args:
+        robot: The first arm.
+        second: The second one, where the configuration has two.
+        configuration: Who carries what.
+        given: What the recipe says, and what the camera can see.
+        rng: Draws poses and their noise.
+
+    Raises:
+        StageError: A second arm is missing, or the camera does not see the target at enough poses.
+    """
+    params, view = given
+    if configuration.other_base and second is None:
+        raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
+    other = Arm(second.model) if second and configuration.other_base else None
+    cast = Cast(configuration, Arm(robot), other, params.four_axes, params.in_turns)
+    known = configuration.place
+    place = params.place.matrix if known is None else np.asarray(known)
+    camera = params.camera.matrix if params.camera else None
+    home = np.asarray(params.home)
+    closed_by_arm = camera is not None and known is not None and other is None
+    if closed_by_arm and camera is not None:
+        home = home_of(cast.first, place @ invert(camera @ view.first()))
+    stands = draw_stands(cast, (home, np.asarray(params.second_home)), params.spread, rng)
+    places = close_loop(stands, view, configuration, camera, place)
+    if closed_by_arm and camera is not None:
+        places = Places(camera, np.eye(4), place)
+    found = visible(stands, places, view, params.poses)
+    planned = PlannedSession(configuration, found, found, places)
+    if not params.arm.is_default:
+        drawn = ImperfectArm(robot, 1.0, rng.spawn(1)[0], params.arm)
+        draw = rng.spawn(1)[0]
+        other_drawn = ImperfectArm(second.model, 1.0, draw, params.arm) if second else None
+        return _as_built(planned, (drawn, other_drawn), params, rng)
+    session = planned.where(np.arange(params.poses))
+    return replace(session, actual=really(session.actual, configuration, _noise(params), rng))
+
+
+def _noise(params: SessionParams) -> tuple[float, float]:
+    return params.robot_rotation, params.robot_position
+
+
+def _as_built(
+    planned: PlannedSession,
+    arms: tuple[ImperfectArm, ImperfectArm | None],
+    params: SessionParams,
+    rng: np.random.Generator,
+) -> PlannedSession:
+    """Return a session as planned with arms that are not what they report, and poses beyond it."""
+    configuration, count = planned.configuration, params.poses
+    every = planned.where(np.arange(min(count + UNSEEN, len(planned.reported.camera))))
+    built = replace(every, actual=as_built(every.reported, configuration, arms))
+    session = built.where(np.arange(count))
+    shaken = really(session.actual, configuration, _noise(params), rng)
+    return replace(session, actual=shaken, unseen=built.noise_free()[count:])
+
+
+def source_of(
+    session: PlannedSession, robot: RobotModel, seed: int, *models: Params | Flange
+) -> Source:
+    """Return where a session's captures come from: made of the models and parameters alone."""
+    configuration = session.configuration
+    made_of = [robot.model, configuration.describe(), *(m.model_dump(mode="json") for m in models)]
+    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
+    note = f"simulated: {configuration.name}, {len(session.reported.camera)} poses"
+    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,), truth=session.truth)

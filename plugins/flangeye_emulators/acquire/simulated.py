@@ -1,0 +1,263 @@
+"""``acquire.simulated``: captures from a cell whose truth is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import invert
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.models.targets import Flange, Sphere, plate_of
+from flangeye.motion.planning import Plan, Site, poses_near
+from flangeye.motion.reach import Reach
+from flangeye.plugin.stage import BoundPart, Choose, Params, stage
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    Box,
+    Capture,
+    Captures,
+    Floats,
+    Observation,
+    PointCloud,
+    Role,
+    Seed,
+    Source,
+    Transform,
+    Truth,
+    by_frame,
+)  # fmt: skip
+from flangeye.units import param
+from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
+from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
+from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.raycast import Body, Image
+from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
+from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.time_of_flight import TimeOfFlight
+
+EPOCH_NS = 1_704_067_200_000_000_000
+"""When simulated runs begin: 2024-01-01, 00:00 UTC."""
+
+INTERVAL_NS = 4_000_000_000
+"""From one exposure to the next."""
+
+FEWEST = 3
+"""Poses without which no camera pose can be found."""
+
+UNSEEN_TILT = 0.3
+"""Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
+
+VERSION = 1
+"""Raised whenever the same parameters would give other captures."""
+
+
+class SimulatedParams(Params):
+    """Parameters of ``acquire.simulated``."""
+
+    poses: Annotated[BoundPart, Choose("plan")] = param(
+        {"grid": {}}, description="Where the robot goes."
+    )
+    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
+    verification: int = Field(
+        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+    )
+    robot_errors: float = Field(
+        1.0, ge=0, description="Scale of the arm's errors and of its repeatability."
+    )
+    arm: ArmErrors = Field(
+        default_factory=ArmErrors, description="How far the arm is from what its controller says."
+    )
+    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    resolution: float = Field(
+        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+    )
+    outliers: float = Field(
+        0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."
+    )
+
+
+@stage("acquire.simulated")
+def acquire_simulated(
+    robot: RobotModel,
+    scanner: ScannerModel,
+    flange: Flange,
+    seed: Seed,
+    params: SimulatedParams,
+    sphere: Sphere | None = None,
+) -> Captures:
+    """Scan a simulated arm that moves its flange through the scanner's view.
+
+    The reported poses are the nominal kinematics of the commanded joints; the arm that is scanned
+    has joint zeros of its own. Captures for verification come first. Each scan is made when it is
+    asked for.
+
+    Args:
+        robot: The arm.
+        scanner: What looks at it.
+        flange: What to look for; a robot that is asked for its wrist circle carries its own plate.
+        seed: Decides poses, errors and noise.
+        params: See :class:`SimulatedParams`.
+        sphere: A calibration sphere on the flange, where the recipe's feature has one.
+
+    Raises:
+        StageError: Fewer than three poses are possible.
+    """
+    plate = flange if flange.bore else plate_of(robot)
+    planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
+    base_T_camera = params.camera.base_T_camera
+    reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
+    site = _site(reach, scanner, base_T_camera)
+    plan: Plan = params.poses(site, _rng(planning))
+    poses = list(plan.poses)
+    _refuse_too_few(len(poses), plan.wanted, reach, robot, scanner)
+    checks = _checks(plan, site, params.verification, _rng(checking))
+    others = [] if params.arm.is_default else _unseen(plan, site, _rng(checking.spawn(1)[0]))
+    of_arm, of_scanner = errors.spawn(2)
+    arm = ImperfectArm(robot, params.robot_errors, _rng(of_arm), params.arm)
+    visited = np.array([*checks, *(pose.joints for pose in poses), *others])
+    angles, count = arm.angles(visited), len(checks) + len(poses)
+    session = _Session(
+        Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera, arm,
+        visited[:count], angles[:count], len(checks), params, of_scanner,
+    )  # fmt: skip
+    source = Source(
+        fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
+        notes=_notes(len(poses), plan.wanted, robot, scanner),
+        workspace=Box(plan.centre, plan.size),
+        truth=Truth(
+            Transform(BASE, CAMERA, base_T_camera),
+            unseen=_exactly(arm, visited[count:], angles[count:], base_T_camera),
+        ),
+    )
+    look = partial(session.look, rng=_rng(later))
+    return Captures(session.captures(noise), source, len(session.joints), look)
+
+
+def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
+    centre = middle_of_view(scanner, base_T_camera)
+    return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
+
+
+def _refuse_too_few(
+    found: int, wanted: int, reach: Reach, robot: RobotModel, scanner: ScannerModel
+) -> None:
+    if found >= FEWEST:
+        return
+    why = ", ".join(f"{count} {reason}" for reason, count in reach.refused.most_common())
+    raise StageError(
+        f"acquire.simulated: {robot.model} can show its flange to {scanner.model} at "
+        f"{found} of {wanted} planned poses, {FEWEST} are needed ({why}); "
+        "move camera.position, or the plan's centre, or make its size or tilt smaller"
+    )
+
+
+def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[Floats]:
+    """Return joints for the captures that verify, near the middle of the workspace."""
+    found = poses_near(plan.centre, count, site, rng)
+    if len(found) < count:
+        raise StageError(
+            f"acquire.simulated: no pose for verification near the middle of the workspace "
+            f"({_mm(plan.centre)}); move the plan's centre, or set verification: 0"
+        )
+    return [pose.joints for pose in found]
+
+
+def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
+    """Return joints of poses all over the workspace that take no part."""
+    spread = plan.size / 2, UNSEEN_TILT
+    return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
+
+
+def _exactly(
+    arm: ImperfectArm, joints: Floats, angles: Floats, base_T_camera: Floats
+) -> tuple[Observation, ...]:
+    """Return what a scanner without noise sees at those poses."""
+    reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in arm.reported(joints)]
+    seen = invert(base_T_camera) @ arm.flange(angles)
+    return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
+
+
+def _notes(found: int, wanted: int, robot: RobotModel, scanner: ScannerModel) -> tuple[str, ...]:
+    left_out = wanted - found
+    note = f"simulated: {robot.model} before {scanner.model}, {found} poses"
+    return (note + (f"; {left_out} more were planned and are not possible" if left_out else ""),)
+
+
+def _fingerprint(seed: int, *models: BaseModel | None) -> str:
+    given = [model.model_dump(mode="json") for model in models if model is not None]
+    text = json.dumps([VERSION, seed, given], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _mm(point: Floats) -> str:
+    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"
+
+
+@dataclass(frozen=True, eq=False)
+class _Session:
+    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled."""
+
+    cell: Cell
+    scanner: ScannerModel
+    base_T_camera: Floats
+    arm: ImperfectArm
+    joints: Floats
+    angles: Floats
+    checks: int
+    params: SimulatedParams
+    of_scanner: np.random.SeedSequence
+
+    def captures(self, noise: np.random.SeedSequence) -> Iterator[Capture]:
+        """Make the captures, each when it is asked for."""
+        of_covers, *of_captures = noise.spawn(1 + len(self.joints))
+        eye = self._eye()
+        covered = self._covered(_rng(of_covers))
+        around = self.cell.around()
+        for index, joints in enumerate(self.joints):
+            rng = _rng(of_captures[index])
+            frames, flange = self.arm.stand(self.angles[index], rng)
+            cover = [self.cell.board(flange)] if index in covered else []
+            bodies = around + self.cell.arm(frames, flange) + cover
+            xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
+            yield self._capture(index, xyz, self.arm.reported(joints))
+
+    def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
+        """Scan other bodies, given in ``base``, with the same scanner from the same place."""
+        return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
+
+    def _eye(self) -> StructuredLight | TimeOfFlight:
+        """Return the scanner; its distortion is the same each time."""
+        rng = _rng(self.of_scanner)
+        return scanner_of(self.scanner, self.params.resolution, self.params.noise, rng)
+
+    def _covered(self, rng: np.random.Generator) -> set[int]:
+        """Draw the calibration captures in which a board hides the flange."""
+        calibration = np.arange(self.checks, len(self.joints))
+        count = round(self.params.outliers * len(calibration))
+        return set(rng.permutation(calibration)[:count].tolist())
+
+    def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
+        role: Role = "verification" if index < self.checks else "calibration"
+        return Capture(
+            id=f"{index:04d}",
+            cloud=PointCloud(CAMERA, xyz),
+            poses=by_frame(Transform(BASE, FLANGE, base_T_flange)),
+            joints=self.joints[index],
+            time_ns=EPOCH_NS + (index + 1) * INTERVAL_NS,
+            role=role,
+        )
+
+
+def _rng(sequence: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.default_rng(sequence)

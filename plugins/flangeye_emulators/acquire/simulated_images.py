@@ -1,0 +1,194 @@
+"""``acquire.simulated_images``: a printed target seen by a camera, in any configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flangeye.errors import StageError
+from flangeye.models.boards import Board, Dictionary, Kind
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params, stage
+from flangeye.types import CAMERA, Capture, Captures, Floats, Image, PointCloud, Seed
+from flangeye.units import Length, param
+from flangeye_emulators.acquire.planned_session import (
+    VERSION,
+    PlannedSession,
+    SessionParams,
+    plan_session,
+    source_of,
+)
+from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board
+from flangeye_emulators.world.board_scan import camera_of, sheet_of, uncovered
+from flangeye_emulators.world.raycast import Scene
+from flangeye_emulators.world.scanner import scanner_of
+from flangeye_emulators.world.session import View, seen_from
+from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.time_of_flight import TimeOfFlight
+
+NEAREST, FARTHEST = 0.2, 2.0
+"""Where a camera without a scanner is in focus [m]."""
+COVERED = (0.05, 0.35)
+"""A cover begins this share of the board's smaller side away from its middle."""
+
+
+class BoardParams(Params):
+    """The target as it was really printed; the step that fits it says what is believed of it."""
+
+    kind: Kind = Field("charuco", description="charuco, checkerboard, or one marker alone.")
+    columns: int = Field(7, ge=1, description="Squares from left to right; 1 for a marker.")
+    rows: int = Field(5, ge=1, description="Squares from top to bottom; 1 for a marker.")
+    square: Length = param("30 mm", gt=0, description="Edge of a square, or of the marker.")
+    marker: Length = param("22 mm", gt=0, description="Edge of a ChArUco board's markers.")
+    dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
+    id: int = Field(0, ge=0, description="Which marker, where it is one alone.")
+
+    @model_validator(mode="after")
+    def _fits(self) -> BoardParams:
+        if self.kind == "charuco" and self.marker >= self.square:
+            raise ValueError("the markers of a ChArUco board are smaller than its squares")
+        if self.kind != "marker" and min(self.columns, self.rows) < 3:
+            raise ValueError("a board has at least 3 x 3 squares")
+        return self
+
+    @property
+    def board(self) -> Board:
+        """The print."""
+        if self.kind == "marker":
+            return Board("marker", 1, 1, self.square, 0.0, self.dictionary, self.id)
+        size = self.columns, self.rows, self.square
+        return Board(self.kind, *size, self.marker, self.dictionary)
+
+
+class LensParams(Params):
+    """The camera: what it is told to be is what it is."""
+
+    size: tuple[int, int] = Field((1280, 1024), description="Columns and rows of the image [px].")
+    focal_length: float = Field(1400.0, gt=0, description="In both directions [px].")
+    distortion: tuple[float, ...] = Field(
+        (-0.12, 0.08, 0.0005, -0.0003, 0.0), max_length=14, description="OpenCV's coefficients."
+    )
+
+    def camera(self, blur: float, noise: float, shade: float) -> BoardCamera:
+        """Return the camera, its principal point in the middle of the image."""
+        (width, height), f = self.size, self.focal_length
+        matrix = np.array([[f, 0, width / 2 - 0.5], [0, f, height / 2 - 0.5], [0, 0, 1]])
+        return BoardCamera(matrix, self.size, np.array(self.distortion), blur, noise, shade)
+
+
+class ImagesParams(SessionParams):
+    """Parameters of ``acquire.simulated_images``."""
+
+    board: BoardParams = Field(default_factory=BoardParams, description="The print, as it is.")
+    lens: LensParams = Field(
+        default_factory=LensParams, description="The camera; the scanner's own with depth."
+    )
+    depth: bool = Field(
+        False,
+        description="The recipe's scanner scans the target too: each image is its own, and comes "
+        "with an organised cloud.",
+    )
+    resolution: float = Field(
+        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+    )
+    blur: float = Field(0.7, gt=0, description="Standard deviation of the lens's blur [px].")
+    noise: float = Field(3.0, ge=0, description="Standard deviation of a pixel's grey value.")
+    shade: float = Field(
+        0.4, ge=0, lt=1, description="Share of the light missing at the darker side of each image."
+    )
+    covered: float = Field(
+        0.15, ge=0, le=1, description="Share of captures in which a side of the target is covered."
+    )
+
+
+@stage("acquire.simulated_images")
+def acquire_simulated_images(
+    robot: RobotModel,
+    configuration: Configuration,
+    seed: Seed,
+    params: ImagesParams,
+    second: SecondRobot | None = None,
+    scanner: ScannerModel | None = None,
+) -> Captures:
+    """Take images of a printed target in any configuration, with or without its depth.
+
+    Raises:
+        StageError: The camera does not see the target at enough poses, or depth is asked for and
+            the recipe names no scanner.
+    """
+    rng = np.random.default_rng([VERSION, seed])
+    eye = _eye(scanner, params, rng)
+    camera = params.lens.camera(params.blur, params.noise, params.shade)
+    near, far = NEAREST, FARTHEST
+    if eye is not None:
+        camera = camera_of(eye.pixels, camera)
+        near, far = eye.scanner.near, eye.scanner.far
+    view = View(params.distance, near, far, _field(camera), params.facing)
+    session = plan_session(robot, second, configuration, (params, view), rng)
+    studio = _CellScene(params.board.board, camera, eye, session)
+    covers = _covers(params, rng)
+
+    def captures() -> Iterator[Capture]:
+        for i, target in enumerate(seen_from(session.actual, session.places)):
+            image, cloud = studio.shot(target, covers[i], rng)
+            poses, joints = session.poses(i)
+            yield Capture(f"{i:04d}", cloud, poses, joints, image=image)
+
+    return Captures(captures(), source_of(session, robot, seed, params), params.poses)
+
+
+def _eye(
+    scanner: ScannerModel | None, params: ImagesParams, rng: np.random.Generator
+) -> StructuredLight | TimeOfFlight | None:
+    if not params.depth:
+        return None
+    if scanner is None:
+        raise StageError(
+            "acquire.simulated_images: depth needs the recipe's 'scanner' section: {model: …}"
+        )
+    return scanner_of(scanner, params.resolution, 1.0, rng)
+
+
+def _field(camera: BoardCamera) -> tuple[float, float]:
+    """Return the full angles of view, horizontal and vertical [rad]."""
+    focal = np.diag(camera.camera_matrix)[:2]
+    across, down = 2 * np.arctan(np.array(camera.size) / 2 / focal)
+    return float(across), float(down)
+
+
+def _covers(params: ImagesParams, rng: np.random.Generator) -> list[Cover | None]:
+    """Return what lies over the target in each capture."""
+    chosen = rng.permutation(params.poses)[: round(params.covered * params.poses)]
+    side = min(params.board.board.size)
+    return [
+        Cover(rng.uniform(0, 2 * np.pi), side * rng.uniform(*COVERED)) if i in chosen else None
+        for i in range(params.poses)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _CellScene:
+    """What is needed to take images."""
+
+    board: Board
+    camera: BoardCamera
+    eye: StructuredLight | TimeOfFlight | None
+    session: PlannedSession
+
+    def shot(
+        self, camera_T_target: Floats, cover: Cover | None, rng: np.random.Generator
+    ) -> tuple[Image, PointCloud]:
+        """Return the image and, with depth, the organised cloud."""
+        image = render_board(self.board, camera_T_target, self.camera, rng, cover)
+        if self.eye is None:
+            return image, PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))
+        scene = Scene([sheet_of(self.board).moved(camera_T_target)])
+        cloud = PointCloud(CAMERA, self.eye.scan(scene, rng))
+        if cover is not None:
+            cloud = uncovered(cloud, self.board, camera_T_target, cover)
+        return image, cloud

@@ -1,0 +1,150 @@
+"""Simulated sessions of every configuration: of a marker as poses, of circles as scans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.maths.geometry import rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.scanners import ScannerModel
+from flangeye.models.targets import Flange
+from flangeye.plugin.stage import stage
+from flangeye.types import (
+    CAMERA,
+    FLANGE,
+    TARGET,
+    Capture,
+    Captures,
+    Floats,
+    Observation,
+    Observations,
+    PointCloud,
+    PoseFeature,
+    Seed,
+    Transform,
+)  # fmt: skip
+from flangeye.units import Angle, Length, param
+from flangeye_emulators.acquire.planned_session import (
+    VERSION,
+    PlannedSession,
+    SessionParams,
+    plan_session,
+    source_of,
+)
+from flangeye_emulators.world import materials
+from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.flange_mesh import flange_mesh
+from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.scanner import before_camera, scanner_of
+from flangeye_emulators.world.session import (
+    View,
+    seen_from,
+)
+
+
+class MarkerParams(SessionParams):
+    """Parameters of ``acquire.simulated_marker``."""
+
+    field: tuple[Angle, Angle] = param(("50 deg", "40 deg"), description="Angles of view.")
+    marker_rotation: Angle = param("0.05 deg", gt=0, description="Noise of the marker's pose.")
+    marker_position: Length = param("0.1 mm", gt=0, description="And of its place.")
+    outliers: float = Field(0.0, ge=0, lt=1, description="Share of captures that see it wrongly.")
+
+
+class ScanParams(SessionParams):
+    """Parameters of ``acquire.simulated_session``."""
+
+    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    resolution: float = Field(
+        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+    )
+
+
+@stage("acquire.simulated_marker")
+def acquire_simulated_marker(
+    robot: RobotModel,
+    configuration: Configuration,
+    seed: Seed,
+    params: MarkerParams,
+    second: SecondRobot | None = None,
+) -> Observations:
+    """Measure a marker's pose in any configuration: poses with noise, no images.
+
+    Raises:
+        StageError: The camera does not see the marker at enough poses.
+    """
+    rng = np.random.default_rng([VERSION, seed])
+    view = View(params.distance, 0.3, 2.0, params.field, params.facing)
+    session = plan_session(robot, second, configuration, (params, view), rng)
+    seen = seen_from(session.actual, session.places)
+    noise = np.repeat([params.marker_rotation, params.marker_position], 3)
+    errors = noise * rng.standard_normal((len(seen), 6))
+    wrong = rng.permutation(len(seen))[: round(params.outliers * len(seen))]
+    errors[wrong] += np.repeat([0.5, 0.1], 3) * rng.standard_normal((len(wrong), 6))
+    seen[:, :3, :3] = rotation_exp(errors[:, :3]) @ seen[:, :3, :3]
+    seen[:, :3, 3] += errors[:, 3:]
+    features = [PoseFeature(Transform(CAMERA, TARGET, m), np.diag(noise**2)) for m in seen]
+    found = [Observation(f"{i:04d}", f, *session.poses(i)) for i, f in enumerate(features)]
+    return Observations(found, source_of(session, robot, seed, params), len(found))
+
+
+@stage("acquire.simulated_session")
+def acquire_simulated_session(  # noqa: PLR0913  what it asks the runner for
+    robot: RobotModel,
+    scanner: ScannerModel,
+    flange: Flange,
+    configuration: Configuration,
+    seed: Seed,
+    params: ScanParams,
+    second: SecondRobot | None = None,
+) -> Captures:
+    """Scan a circle in any configuration: the flange's own, or one like it on the base.
+
+    Raises:
+        StageError: The camera does not see it at enough poses.
+    """
+    rng = np.random.default_rng([VERSION, seed])
+    view = View(params.distance, scanner.near, scanner.far, scanner.field_of_view, params.facing)
+    session = plan_session(robot, second, configuration, (params, view), rng)
+    eye = scanner_of(scanner, params.resolution, params.noise, rng)
+    stage_set = _Set(robot, second.model if second else None, flange, session)
+
+    def captures() -> Iterator[Capture]:
+        for i in range(params.poses):
+            camera = session.actual.camera[i] @ session.places.x
+            cloud = PointCloud(CAMERA, eye.scan(before_camera(stage_set.bodies(i), camera), rng))
+            poses, joints = session.poses(i)
+            yield Capture(f"{i:04d}", cloud, poses, joints)
+
+    return Captures(captures(), source_of(session, robot, seed, params, flange), params.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """The bodies of a session."""
+
+    robot: RobotModel
+    second: RobotModel | None
+    flange: Flange
+    session: PlannedSession
+
+    def bodies(self, i: int) -> list[Body]:
+        """Return what there is to see at a pose, in ``base``."""
+        actual, places = self.session.actual, self.session.places
+        if self.second is not None and actual.second is not None:
+            other = self._arm(self.second, actual.second[i], actual.target[i])
+            return [body.moved(places.y) for body in other]
+        if self.session.configuration.target == FLANGE and actual.joints is not None:
+            return self._arm(self.robot, actual.joints[i], actual.flange[i])
+        finish = materials.FINISHES[self.flange.details.finish]
+        return [Body(flange_mesh(self.flange), finish).moved(actual.target[i] @ places.z)]
+
+    def _arm(self, robot: RobotModel, joints: Floats, flange: Floats) -> list[Body]:
+        nowhere = np.zeros(3)
+        return Cell(robot, self.flange, nowhere, nowhere).arm(Arm(robot).frames(joints), flange)

@@ -1,0 +1,200 @@
+"""The arm itself: it goes where a motion takes it, within its limits, and feels what it touches."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from flangeye.models.robots import RobotModel
+from flangeye.types import Floats
+from flangeye_emulators.controllers.chain import Chain, Stance, UnreachableError
+from flangeye_emulators.controllers.compliance import ForceMode
+from flangeye_emulators.controllers.contact import Surface
+from flangeye_emulators.controllers.motion import Motion, stop
+
+BRAKES = 10.0
+"""Deceleration of the joints in a stop nobody planned [rad/s^2]. The maker measures 0.16 to 0.53 s
+from 3.2 rad/s (UR5 manual, stop category 0): 6 to 20 rad/s^2."""
+
+HOLD_TIME = 0.1
+"""Time in which a pause or a protective stop takes the arm from full speed to none, on its path."""
+
+SLIDER_TIME = 0.4
+"""Time in which the speed slider's full range takes effect."""
+
+SPEED_MARGIN = 1.05
+"""A joint that should move faster than its limit, and this much, stops the arm."""
+
+HISTORY = 1.0
+"""How far back joint angles and forces are kept [s]."""
+
+
+class MotionFault(Exception):
+    """Why the arm had to stop by itself; it is braking already."""
+
+
+class SimulatedArm:
+    """An arm that moves in cycles.
+
+    Attributes:
+        chain: Its kinematics as the controller knows them.
+        speed_limits: (n,) [rad/s].
+        cycle: Length of one cycle [s].
+        surfaces: What the tool may touch.
+        force_mode: Force control, when it is on.
+        slider: Share of full speed that is asked for, 0 to 1.
+        held: Whether a pause or a stop keeps the arm on its path at rest.
+        stance: Joints, tool pose, Jacobian.
+        speeds: (n,) of the joints [rad/s].
+        twist: (6,) of the tool in base [m/s, rad/s].
+        wrench: (6,) of the surroundings on the tool, in base, as touched [N, Nm].
+        felt: (6,) the same, less what counts as none.
+        history: (joints, wrench) of the last cycles, the present last.
+        zeros: (n,) true joint angles minus reported ones [rad]: what calibration has to live with.
+    """
+
+    def __init__(
+        self, robot: RobotModel, speed_limits: Floats, cycle: float, joints: Floats, zeros: Floats
+    ) -> None:
+        """Stand still at ``joints`` (n,)."""
+        self.chain = Chain(robot)
+        self.speed_limits, self.cycle, self.zeros = speed_limits, cycle, zeros
+        self.surfaces: list[Surface] = []
+        self.force_mode: ForceMode | None = None
+        self.slider, self.held = 1.0, False
+        self._tare = np.zeros(6)
+        self.history: deque[tuple[Floats, Floats]] = deque(maxlen=round(HISTORY / cycle))
+        self._fraction = 1.0
+        self._motion: Motion | None = None
+        self._braking = False
+        self._claimed = False
+        self.stance = self.chain.stance(np.array(joints, dtype=np.float64))
+        self.speeds, self.twist = np.zeros(len(joints)), np.zeros(6)
+        self._feel()
+
+    def put(self, joints: Floats) -> None:
+        """Stand at ``joints`` (n,) at once: the start of a simulation, not a motion."""
+        self._motion, self._braking = None, False
+        self.stance = self.chain.stance(np.array(joints, dtype=np.float64))
+        self.speeds, self.twist = np.zeros(len(joints)), np.zeros(6)
+        self._feel()
+
+    def set_tool(self, flange_T_tcp: Floats) -> None:
+        """Take another point (4, 4) as the tool's; the arm does not move."""
+        self.chain.flange_T_tcp = flange_T_tcp
+        self.stance = self.chain.stance(self.stance.joints)
+
+    def zero_force(self) -> None:
+        """Let the present wrench count as none."""
+        self._tare = self.wrench
+
+    @property
+    def standing(self) -> bool:
+        """Whether no joint moves."""
+        return not self.speeds.any()
+
+    @property
+    def fraction(self) -> float:
+        """Share of full speed in force now, 0 to 1."""
+        return self._fraction
+
+    def true_flange(self) -> Floats:
+        """Return where the flange really is: ``base_T_flange`` (4, 4), joint errors included."""
+        return self.chain.flange(self.stance.joints + self.zeros)
+
+    def drive(self, motion: Motion) -> None:
+        """Let ``motion`` move the arm in this cycle; it must be said again in every cycle."""
+        if self._motion is not motion:
+            self._motion, self._braking = motion, False
+        self._claimed = True
+
+    def step(self) -> None:
+        """Advance one cycle. A motion that nobody drives any more ends in braking.
+
+        Raises:
+            MotionFault: A limit was met: a joint's range or speed, or reach. The arm brakes.
+        """
+        if self._motion is not None and not (self._claimed or self.held or self._braking):
+            self._brake()
+        self._claimed = False
+        try:
+            self._move()
+        except MotionFault:
+            self.force_mode = None
+            self._brake()
+            self._move()
+            raise
+        finally:
+            self._feel()
+
+    def _move(self) -> None:
+        dt = self.cycle * self._next_fraction()
+        if self._motion is None and self.force_mode is None:
+            self.speeds, self.twist = np.zeros_like(self.speeds), np.zeros(6)
+            return
+        if self._motion is None:
+            self._go_to(self.stance.base_T_tcp, dt)
+            return
+        self._go_to(self._motion.step(dt, self.stance), dt)
+        if self._motion.done:
+            self._motion, self._braking = None, False
+
+    def _next_fraction(self) -> float:
+        """Move the speed share towards what is wanted: fast to a halt, slower otherwise."""
+        if self._braking:
+            return 1.0
+        wanted, time = (0.0, HOLD_TIME) if self.held else (self.slider, SLIDER_TIME)
+        step = self.cycle / time
+        self._fraction += min(max(wanted - self._fraction, -step), step)
+        return self._fraction
+
+    def _go_to(self, target: Floats, dt: float) -> None:
+        try:
+            stance = self._stance_at(target, dt)
+        except UnreachableError as error:
+            raise MotionFault(str(error)) from None
+        if not self._braking:
+            self._check(stance.joints)
+        self.speeds = (stance.joints - self.stance.joints) / self.cycle
+        self.twist = stance.jacobian @ self.speeds
+        self.stance = stance
+
+    def _stance_at(self, target: Floats, dt: float) -> Stance:
+        if self._braking:
+            return self.chain.stance(np.clip(target, self.chain.lower, self.chain.upper))
+        if target.ndim == 1:
+            stance = self.chain.stance(target)
+            if self.force_mode is None:
+                return stance
+            target = stance.base_T_tcp
+        if self.force_mode is not None:
+            here = self.stance.base_T_tcp
+            target = self.force_mode.yielding(here, target, self.felt, dt)
+        return self.chain.solve(target, self.stance)
+
+    def _check(self, joints: Floats) -> None:
+        """Refuse joints that are out of their ranges or would have to move too fast."""
+        outside = (joints < self.chain.lower) | (joints > self.chain.upper)
+        if outside.any():
+            i = int(outside.argmax())
+            raise MotionFault(f"joint {i} is at its limit, {np.degrees(joints[i]):.1f} deg")
+        share = np.abs(joints - self.stance.joints) / (self.cycle * self.speed_limits)
+        i = int(share.argmax())
+        if share[i] > SPEED_MARGIN:
+            speed = np.degrees(share[i] * self.speed_limits[i])
+            raise MotionFault(
+                f"joint {i} would turn at {speed:.0f} deg/s, limit "
+                f"{np.degrees(self.speed_limits[i]):.0f} deg/s: near a singularity, or too fast"
+            )
+
+    def _brake(self) -> None:
+        self._motion, self._braking = stop(self.speeds, BRAKES, False), True
+
+    def _feel(self) -> None:
+        position = self.stance.base_T_tcp[:3, 3]
+        self.wrench = np.zeros(6)
+        for surface in self.surfaces:
+            self.wrench[:3] += surface.force(position, self.twist[:3])
+        self.felt = self.wrench - self._tare
+        self.history.append((self.stance.joints, self.felt))

@@ -1,0 +1,150 @@
+"""The other end of the control channel: faults on command, and what no real robot would tell."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.types import Floats
+from flangeye_emulators.controllers.contact import Surface
+
+PORT = 29998
+"""Of the control channel. It is here, for a client needs nothing of what serves it."""
+
+PATIENCE = 5.0
+"""Longest wait for an answer [s]."""
+
+
+class EmulatorTruth(NamedTuple):
+    """Where the arm really is.
+
+    Attributes:
+        base_T_flange: (4, 4)
+        joints: (n,) true angles [rad]: reported ones plus the errors of the joints' zeros.
+        speed: Of the fastest joint [rad/s]; zero where the arm stands.
+        time: Of the controller [s], as RTDE's timestamp.
+    """
+
+    base_T_flange: Floats
+    joints: Floats
+    speed: float
+    time: float
+
+
+class EmulatorControl:
+    """A connection to the control channel of a controller on loopback.
+
+    ``with LoopbackControl("127.0.0.5") as control: control.fault("freeze=3 s")``
+    """
+
+    def __init__(self, host: str, port: int = PORT, patience: float = PATIENCE) -> None:
+        """Connect.
+
+        Args:
+            host: Address of the controller.
+            port: Of its control channel.
+            patience: Longest wait for an answer [s].
+
+        Raises:
+            StageError: Nothing answers there.
+        """
+        try:
+            self._socket = socket.create_connection((host, port), timeout=patience)
+        except OSError as error:
+            raise StageError(
+                f"no controller on loopback at {host}:{port} ({error.strerror or error}); "
+                f"start one: flangeye emulator ur5e --host {host}"
+            ) from None
+        self._lines = self._socket.makefile("rw", encoding="utf-8", newline="\n")
+
+    def ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+        """Return the answer to one request.
+
+        Raises:
+            StageError: It was refused, or the connection ended.
+        """
+        try:
+            self._lines.write(json.dumps({"do": action, **arguments}) + "\n")
+            self._lines.flush()
+            line = self._lines.readline()
+        except OSError as error:
+            raise StageError(f"the controller on loopback does not answer: {error}") from None
+        if not line:
+            raise StageError("the controller on loopback has ended")
+        answer: dict[str, Any] = json.loads(line)
+        if not answer.pop("ok"):
+            raise StageError(f"loopback: {answer['error']}")
+        return answer
+
+    def truth(self) -> EmulatorTruth:
+        """Return where the arm really is now."""
+        said = self.ask("truth")
+        return EmulatorTruth(
+            np.array(said["base_T_flange"]),
+            np.array(said["joints"]),
+            said["speed"],
+            said["time"],
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return the controller's modes, by name."""
+        return self.ask("state")
+
+    def log(self) -> list[str]:
+        """Return what happened: commands, programs, stops with their reasons."""
+        return [f"{time:.3f} {what}" for time, what in self.ask("log")["lines"]]
+
+    def figures(self) -> dict[str, float]:
+        """Return how punctual the control cycle was, and the process's CPU time [s]."""
+        return self.ask("figures")
+
+    def fault(self, text: str) -> None:
+        """Let something go wrong: ``NAME[=DURATION][@WHEN]``, for example ``freeze=3 s@moving``."""
+        self.ask("fault", fault=text)
+
+    def clear(self) -> None:
+        """End what can be ended: dead, frozen, slow network; local control; faults to come."""
+        self.ask("clear")
+
+    def reset(self) -> None:
+        """Be as after switching on, without faults; open connections stay open."""
+        self.ask("reset")
+
+    def set_surfaces(self, *surfaces: Surface) -> None:
+        """Let there be these surfaces and no others."""
+        self.ask(
+            "surfaces",
+            surfaces=[
+                {
+                    "point": surface.point.tolist(),
+                    "normal": surface.normal.tolist(),
+                    "stiffness": surface.stiffness,
+                    "damping": surface.damping,
+                }
+                for surface in surfaces
+            ],
+        )
+
+    def put(self, joints: Sequence[float] | Floats) -> None:
+        """Stand at joint angles [rad] at once."""
+        self.ask("put", joints=[float(angle) for angle in joints])
+
+    def unlock_after(self, seconds: float) -> None:
+        """Let a protective stop be unlocked earlier than a real one [s]."""
+        self.ask("unlock-after", seconds=seconds)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,79 @@
+"""What can go wrong with any controller and its network, on command."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Protocol
+
+from flangeye_emulators.controllers.faults import Kind
+from flangeye_emulators.controllers.network import Network
+
+DEFAULT_LATENCY = 0.1
+"""[s]"""
+
+
+class Stoppable(Protocol):
+    """A controller that can stop by itself."""
+
+    def protective_stop(self, why: str) -> None:
+        """Stop, and say why."""
+
+    def emergency_stop(self, why: str) -> None:
+        """Cut the power."""
+
+
+class FaultInjector:
+    """Causes faults, and ends those that can be ended.
+
+    * ``protective-stop``, ``singularity``, ``joint-limit``: a protective stop, with that reason.
+    * ``emergency-stop``: the button is pressed, the power goes.
+    * ``drop``: every connection is reset, once.
+    * ``die``: connections are reset and nobody answers any more, for good or for a duration.
+    * ``freeze``: connections stay open and nothing comes through, for good or for a duration.
+    * ``latency``: every byte comes late by a duration, in both directions.
+
+    The arm goes on with what it was doing when the network fails, as a real one does.
+
+    Attributes:
+        kinds: The faults by name.
+    """
+
+    def __init__(self, box: Stoppable, network: Network) -> None:
+        self._network = network
+        self._dead = False
+        self._revival: asyncio.Task[None] | None = None
+        self.kinds = {
+            "protective-stop": Kind(lambda _: box.protective_stop("on command")),
+            "singularity": Kind(lambda _: box.protective_stop("near a singularity, on command")),
+            "joint-limit": Kind(lambda _: box.protective_stop("a joint's limit, on command")),
+            "emergency-stop": Kind(lambda _: box.emergency_stop("on command")),
+            "drop": Kind(lambda _: network.drop()),
+            "die": Kind(self._die, takes_seconds=True),
+            "freeze": Kind(self._freeze, takes_seconds=True),
+            "latency": Kind(self._slow_down, takes_seconds=True),
+        }
+
+    def clear(self) -> None:
+        """End a dead, frozen or slow network."""
+        self._network.latency = 0.0
+        self._network.freeze(False)
+        self._revive()
+
+    def _die(self, seconds: float | None) -> None:
+        self._network.kill()
+        self._dead = True
+        if seconds is not None:
+            asyncio.get_running_loop().call_later(seconds, self._revive)
+
+    def _revive(self) -> None:
+        if self._dead:
+            self._dead = False
+            self._revival = asyncio.get_running_loop().create_task(self._network.listen())
+
+    def _freeze(self, seconds: float | None) -> None:
+        self._network.freeze(True)
+        if seconds is not None:
+            asyncio.get_running_loop().call_later(seconds, self._network.freeze, False)
+
+    def _slow_down(self, seconds: float | None) -> None:
+        self._network.latency = DEFAULT_LATENCY if seconds is None else seconds

@@ -1,0 +1,91 @@
+"""What drives an arm from one motion to the next: moves that begin at rest, and velocities."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
+from flangeye_emulators.controllers.motion import Motion, Speed, stop
+
+Plan = Callable[[], Motion]
+"""Makes a motion from where the arm stands when its turn comes."""
+
+
+class Mover:
+    """An arm with a queue of moves, or a velocity.
+
+    Attributes:
+        arm: The arm.
+        begun: How many moves have begun.
+    """
+
+    def __init__(self, arm: SimulatedArm) -> None:
+        self.arm, self.begun = arm, 0
+        self._queue: deque[Plan] = deque()
+        self._motion: Motion | None = None
+        self._cycles_left = math.inf
+
+    @property
+    def waiting(self) -> int:
+        """How many moves have not begun."""
+        return len(self._queue)
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a motion goes on."""
+        return self._motion is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything moves, or will."""
+        return self.under_way or self.waiting > 0 or not self.arm.standing
+
+    def append(self, plan: Plan) -> None:
+        """Let a move follow those that are there; it begins when the arm stands."""
+        if isinstance(self._motion, Speed):
+            self._motion = None
+        self._queue.append(plan)
+
+    def go_on(self, twist: Floats, acceleration: float, seconds: float) -> None:
+        """Take a twist (6,) for some time, in place of everything else; then brake."""
+        if not isinstance(self._motion, Speed):
+            self._motion = Speed(self.arm.twist, twist, acceleration, in_space=True)
+        self._queue.clear()
+        self._motion.target, self._motion.acceleration = np.array(twist), acceleration
+        self._cycles_left = round(seconds / self.arm.cycle)
+
+    def halt(self, deceleration: float | None = None, in_space: bool = True) -> None:
+        """Come to rest, straight on or in joint angles; as fast as it can where nothing is said."""
+        self._queue.clear()
+        self._motion = None
+        if deceleration is not None and not self.arm.standing:
+            velocity = self.arm.twist if in_space else self.arm.speeds
+            self._motion, self._cycles_left = stop(velocity, deceleration, in_space), math.inf
+
+    def step(self) -> None:
+        """Advance one cycle.
+
+        Raises:
+            MotionFault: The arm met a limit; it brakes, and nothing is left to do.
+        """
+        if isinstance(self._motion, Speed):
+            self._cycles_left -= 1
+            if self._cycles_left < 0:
+                self._motion = None
+        if self._queue and self._motion is None and self.arm.standing:
+            self._motion = self._queue.popleft()()
+            self.begun += 1
+        if self._motion is not None:
+            self.arm.drive(self._motion)
+        try:
+            self.arm.step()
+        except MotionFault:
+            self.halt()
+            raise
+        if self._motion is not None and self._motion.done:
+            self._motion = None

@@ -1,0 +1,261 @@
+"""The control box: power, safety, the program it runs, and the arm, advanced cycle by cycle."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from flangeye.models.robots import RobotModel
+from flangeye.types import Floats
+from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
+from flangeye_emulators.controllers.poses import pose_vector
+from flangeye_emulators.controllers.ur.models import control_box_of, joint_speeds_of
+from flangeye_emulators.controllers.ur.program import Program, ProgramError
+from flangeye_emulators.controllers.ur.state import Registers, RobotMode, Runtime, SafetyMode
+
+FORCE_LIMIT = 150.0
+"""Force on the tool that stops the arm [N]: the safety limit e-Series arms are shipped with."""
+
+UNLOCK_AFTER = 5.0
+"""A protective stop cannot be unlocked earlier [s]: the dashboard server's manual."""
+
+
+class RefusedError(Exception):
+    """The controller does not do what it was asked; the words are the dashboard's."""
+
+
+class URController:
+    """A control box with its arm.
+
+    Attributes:
+        robot: Which arm.
+        box: Which generation of control box.
+        cycle: Length of its control cycle [s].
+        arm: The arm.
+        time: Since it was switched on [s]; the cycle's number times its length.
+        registers: The general-purpose registers.
+        robot_mode: Power and brakes.
+        safety: Which stop is in force.
+        runtime: Whether a program runs.
+        remote_control: Whether programs may come through the network.
+        unlock_after: Time before a protective stop can be unlocked [s].
+        digital_outputs: Bits: standard 0-7, configurable 8-15, tool 16-17.
+        analog_outputs: Two ratios, 0 to 1.
+        payload: Mass [kg] and centre of gravity (3,) [m].
+        log: (time, what happened), the last thousand.
+    """
+
+    def __init__(self, robot: RobotModel, joints: Floats, zeros: Floats) -> None:
+        """Switch on, with the arm standing at ``joints`` (6,) [rad]."""
+        self.robot, self.box = robot, control_box_of(robot)
+        self.cycle = self.box.cycle
+        speeds = joint_speeds_of(robot)
+        self.arm = SimulatedArm(robot, speeds, self.box.cycle, joints, zeros)
+        self.registers = Registers()
+        self.robot_mode, self.safety = RobotMode.RUNNING, SafetyMode.NORMAL
+        self.runtime = Runtime.STOPPED
+        self.remote_control = True
+        self.unlock_after = UNLOCK_AFTER
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.payload: tuple[float, Floats] = (0.0, np.zeros(3))
+        self.log: deque[tuple[float, str]] = deque(maxlen=1000)
+        self._program: Program | None = None
+        self._resumable = True
+        self._cycles = self._program_began = self._stopped_at = 0
+        self._watchdog: tuple[int, float] | None = None
+        self._input_times = [0.0] * Registers.COUNT
+        self._posed, self._pose = self.arm.stance, pose_vector(self.arm.stance.base_T_tcp)
+
+    @property
+    def time(self) -> float:
+        """Time since it was switched on [s]."""
+        return self._cycles * self.box.cycle
+
+    @property
+    def program_time(self) -> float:
+        """How long the present program has been running [s]."""
+        if self._program is None:
+            return 0.0
+        return (self._cycles - self._program_began) * self.box.cycle
+
+    def note(self, what: str) -> None:
+        """Write a line into the log."""
+        self.log.append((self.time, what))
+
+    def step(self) -> None:
+        """Advance one control cycle."""
+        self._cycles += 1
+        self._check_watchdog()
+        self._run_program()
+        try:
+            self.arm.step()
+        except MotionFault as fault:
+            self._resumable = False
+            self.protective_stop(str(fault))
+        if float(np.linalg.norm(self.arm.wrench[:3])) > FORCE_LIMIT:
+            self.protective_stop(f"the tool meets more than {FORCE_LIMIT:g} N")
+
+    def _run_program(self) -> None:
+        if self._program is None or self.runtime is not Runtime.PLAYING:
+            return
+        try:
+            goes_on = self._program.cycle()
+        except ProgramError as error:
+            self.stop_program(f"runtime error: {error}")
+            return
+        if not goes_on:
+            self.stop_program("the program ended")
+
+    def _check_watchdog(self) -> None:
+        if self._watchdog is None or self.runtime is not Runtime.PLAYING:
+            return
+        register, longest = self._watchdog
+        if self.time - self._input_times[register] > longest:
+            self.stop_program(f"watchdog: input_int_register_{register} was not renewed")
+
+    def set_watchdog(self, register: int, frequency: float) -> None:
+        """Stop the program when an integer input is renewed more slowly than [Hz]; 0 for never."""
+        self._watchdog = (register, 1.0 / frequency) if frequency > 0 else None
+        self._input_times[register] = self.time
+
+    def set_input_int(self, register: int, value: int) -> None:
+        """Write an integer input register, as a client does."""
+        self.registers.input_int[register] = value
+        self._input_times[register] = self.time
+
+    # Programs
+
+    def load(self, program: Program, name: str) -> None:
+        """Run a program in place of the present one.
+
+        Raises:
+            RefusedError: There is no power, a stop is in force, or the control is local.
+        """
+        self._require_ready()
+        self.note(f"program {name}")
+        self._program, self._resumable = program, True
+        self._program_began, self._watchdog = self._cycles, None
+        self.arm.force_mode = None
+        self.runtime, self.arm.held = Runtime.PLAYING, False
+
+    def stop_program(self, why: str) -> None:
+        """End the program; an arm that moves brakes."""
+        if self._program is not None:
+            self.note(f"program stopped: {why}")
+        self._program, self._watchdog = None, None
+        self.arm.force_mode = None
+        self.runtime = Runtime.STOPPED
+        self.arm.held = self.safety is not SafetyMode.NORMAL
+
+    def pause(self) -> None:
+        """Hold the program; the arm comes to rest on its path.
+
+        Raises:
+            RefusedError: No program runs.
+        """
+        if self.runtime is not Runtime.PLAYING:
+            raise RefusedError("Failed to execute: pause")
+        self.runtime, self.arm.held = Runtime.PAUSED, True
+
+    def play(self) -> None:
+        """Go on with a paused program.
+
+        Raises:
+            RefusedError: None is paused, it cannot go on from here, or a stop is in force.
+        """
+        paused = self.runtime is Runtime.PAUSED and self._resumable
+        if not paused or self.safety is not SafetyMode.NORMAL or not self.remote_control:
+            raise RefusedError("Failed to execute: play")
+        self.runtime, self.arm.held = Runtime.PLAYING, False
+
+    def _require_ready(self) -> None:
+        if not self.remote_control:
+            raise RefusedError("the robot is in local control")
+        if self.safety is not SafetyMode.NORMAL:
+            raise RefusedError(f"safety mode {self.safety.name}")
+        if self.robot_mode is not RobotMode.RUNNING:
+            raise RefusedError(f"robot mode {self.robot_mode.name}")
+
+    # Safety and power
+
+    def protective_stop(self, why: str) -> None:
+        """Stop the arm on its path, brakes where it cannot stay on it, and hold the program."""
+        if self.safety is not SafetyMode.NORMAL:
+            return
+        self.note(f"protective stop: {why}")
+        self.safety, self._stopped_at = SafetyMode.PROTECTIVE_STOP, self._cycles
+        self.arm.held = True
+        if self.runtime is Runtime.PLAYING:
+            self.runtime = Runtime.PAUSED
+
+    def unlock(self) -> None:
+        """Release a protective stop; the program stays paused.
+
+        Raises:
+            RefusedError: It is too early.
+        """
+        if self.safety is not SafetyMode.PROTECTIVE_STOP:
+            return
+        since = (self._cycles - self._stopped_at) * self.box.cycle
+        if since < self.unlock_after:
+            raise RefusedError(
+                f"Cannot unlock protective stop until {self.unlock_after:g}s after occurrence. "
+                "Always inspect cause of protective stop before unlocking"
+            )
+        self.safety = SafetyMode.NORMAL
+        self.arm.held = self.runtime is Runtime.PAUSED
+        self.note("protective stop unlocked")
+
+    def emergency_stop(self, why: str) -> None:
+        """Cut the power; the program ends."""
+        self.note(f"emergency stop: {why}")
+        self.safety = SafetyMode.ROBOT_EMERGENCY_STOP
+        self.power_off()
+
+    def release_emergency_stop(self) -> None:
+        """Pull the button out again; the power stays off."""
+        if self.safety is SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.safety = SafetyMode.NORMAL
+
+    def power_off(self) -> None:
+        """End the program and cut the power."""
+        self.stop_program("power off")
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def power_on(self) -> None:
+        """Give power; the brakes stay on."""
+        if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.IDLE
+
+    def release_brakes(self) -> None:
+        """Be ready to move."""
+        if self.safety is SafetyMode.NORMAL:
+            self.robot_mode = RobotMode.RUNNING
+            self.arm.held = self.runtime is Runtime.PAUSED
+
+    def reset(self, joints: Floats) -> None:
+        """Be as after switching on: no program, no stop, power, remote control."""
+        self.safety, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
+        self.remote_control = True
+        self.stop_program("reset")
+        self.arm.slider = 1.0
+        self.arm.put(joints)
+
+    def modes(self) -> Mapping[str, Any]:
+        """Return its modes by name, for the control channel."""
+        return {
+            "robot_mode": self.robot_mode.name,
+            "safety": self.safety.name,
+            "runtime": self.runtime.name,
+            "remote_control": self.remote_control,
+        }
+
+    def tcp_pose(self) -> Floats:
+        """Return the tool's pose (6,) in base, as the pendant shows it."""
+        if self._posed is not self.arm.stance:
+            self._posed, self._pose = self.arm.stance, pose_vector(self.arm.stance.base_T_tcp)
+        return self._pose

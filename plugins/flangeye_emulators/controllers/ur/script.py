@@ -1,0 +1,80 @@
+"""The registers of ur_rtde's control script, and what its threads share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_emulators.controllers.ur.controller import URController
+from flangeye_emulators.controllers.ur.orders import Orders
+from flangeye_emulators.controllers.ur.program import Program, Thread
+from flangeye_emulators.controllers.ur.urscript import Move
+
+PROGRESS_REGISTER = 2
+
+
+class ControlScript(Program):
+    """The control script as its commands see it: arguments, answers, progress, threads.
+
+    Attributes:
+        box: The controller it runs on.
+        path: Moves that were written into the script.
+        orders: What the threads of the script are to do.
+        internal: A command the script gives itself while the client gives none.
+    """
+
+    def __init__(self, box: URController, offset: int, path: Sequence[Move]) -> None:
+        """Run on ``box``; ``offset`` is 24 for a client that uses the upper registers."""
+        super().__init__(box.arm)
+        self.box, self.path, self.offset = box, path, offset
+        self.orders = Orders()
+        self.internal = 0
+        self._writes = self._operation = 0
+
+    def integer(self, index: int) -> int:
+        """Return an integer argument; 0 is the command itself."""
+        return self.box.registers.input_int[self.offset + index]
+
+    def number(self, index: int) -> float:
+        """Return a float argument."""
+        return self.box.registers.input_double[self.offset + index]
+
+    def numbers(self, index: int, count: int = 6) -> Floats:
+        """Return float arguments (count,), from ``index`` on."""
+        first = self.offset + index
+        return np.array(self.box.registers.input_double[first : first + count])
+
+    def give_integer(self, value: int) -> None:
+        """Answer with an integer."""
+        self.box.registers.output_int[self.offset + 1] = int(value)
+
+    def give_numbers(self, values: Floats) -> None:
+        """Answer with floats (count,)."""
+        for i, value in enumerate(values.tolist()):
+            self.box.registers.output_double[self.offset + i] = value
+
+    def show_progress(self, value: int | None) -> None:
+        """Show how far an operation in the background is; None when there is none.
+
+        Bits 0-14 the progress, 15 whether one runs, 16-22 a count of writes, 24-30 of operations.
+        """
+        self._writes = (self._writes + 1) % 128
+        if value == 0:
+            self._operation = (self._operation + 1) % 128
+        word = self._writes << 16 | self._operation << 24
+        if value is not None:
+            word |= 1 << 15 | min(value, 0x7FFF)
+        self.box.registers.output_int[self.offset + PROGRESS_REGISTER] = word
+
+    def in_background(self, operation: Thread) -> Thread:
+        """Wrap a thread so that its progress shows."""
+        self.show_progress(0)
+        yield from operation
+        self.show_progress(None)
+
+    def abandon_move(self) -> None:
+        """Kill the move in the background, if there is one."""
+        if self.kill("move"):
+            self.show_progress(None)

@@ -1,0 +1,1 @@
+"""``robot.simulated`` and ``robot.emulator``: arms without hardware."""

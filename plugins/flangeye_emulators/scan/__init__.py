@@ -1,0 +1,1 @@
+"""``scan.simulated``: a simulated workpiece."""

@@ -1,0 +1,1 @@
+"""``scanner.emulator``: a scanner that sees a simulated cell."""

@@ -1,0 +1,170 @@
+"""``scanner.emulator``: scans the simulated cell around the arm of a controller on loopback.
+
+Where the arm really is, joints' errors included, comes over the controller's control channel; the
+recipe's driver of the robot never sees it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
+from flangeye.errors import FlangeyeError
+from flangeye.models.loading import load_model
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params, part
+from flangeye.types import BASE, CAMERA, PointCloud, Transform, Truth
+from flangeye.units import Duration, Length, param
+from flangeye_emulators.controllers.client import EmulatorControl
+from flangeye_emulators.world.scanner import CameraPose, scanner_of
+from flangeye_emulators.world.scene import CellScene, Stance
+from flangeye_plugins.scanner.opened import OpenScanner
+
+LOOKS = 3
+"""How often the arm's place is asked for during one exposure: at its ends and in its middle."""
+
+SAME_ARM = 1e-3
+"""Largest distance of the controller's flange from where the robot's model puts it [m]."""
+
+
+class LoopbackParams(Params):
+    """Parameters of ``scanner.emulator``."""
+
+    host: str = Field("127.0.0.1", description="Where the controller on loopback listens.")
+    robot: str = Field("ur5e", description="What it moves: a model of data/robots, or a file.")
+    camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
+    workspace: tuple[Length, Length, Length] = param(
+        ("300 mm", "300 mm", "200 mm"), description="The wall and the stand are beside this box."
+    )
+    seed: int = Field(0, ge=0, description="Draws noise, distortion and dropped frames.")
+    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    resolution: float = Field(
+        0.35, gt=0, le=1, description="Scale of columns and rows; 1 takes seconds a scan."
+    )
+    exposure: Duration = param("300 ms", ge=0, le=2.0, description="While it must stand still.")
+    latency: Duration = param(
+        "200 ms", ge=0, le=3.0, description="From the end of the exposure to the data."
+    )
+    dropped: float = Field(0.0, ge=0, le=1, description="Share of the exposures that get lost.")
+    lost_after: int | None = Field(
+        None, ge=0, description="Exposures after which the scanner is gone, as if unplugged."
+    )
+
+
+@part("scanner.emulator", formerly=("scanner.loopback",))
+def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scanner:
+    """Scan the simulated cell around a controller on loopback.
+
+    Args:
+        model: Which scanner to be.
+        params: See :class:`LoopbackParams`.
+
+    Raises:
+        DeviceError: There is no model, no controller, or the controller moves another arm.
+    """
+    if model is None:
+        raise DeviceError(
+            "scanner.emulator: the recipe must say which scanner to be: scanner.model"
+        )
+    try:
+        control = EmulatorControl(params.host, patience=PATIENCE)
+    except FlangeyeError as error:
+        raise DeviceError(f"scanner.emulator: {error}") from None
+    scanner = LoopbackScanner(model, params, control)
+    try:
+        scanner.require_same_arm()
+    except DeviceError:
+        scanner.close()
+        raise
+    return scanner
+
+
+class LoopbackScanner(OpenScanner):
+    """A simulated scanner. Motion during an exposure smears the scan.
+
+    Attributes:
+        truth: Where it really stands.
+    """
+
+    def __init__(
+        self, model: ScannerModel, params: LoopbackParams, control: EmulatorControl
+    ) -> None:
+        """Set up the cell.
+
+        Args:
+            model: Which scanner to be.
+            params: Of the driver.
+            control: Open control channel of the controller.
+        """
+        faults, distortion = np.random.default_rng(params.seed).spawn(2)
+        eye = scanner_of(model, params.resolution, params.noise, distortion)
+        rows, columns = eye.pixels.directions.shape[:2]
+        facts = {"unit": "m", "layout": f"organised, {columns} x {rows}", "simulated": "yes"}
+        super().__init__(f"simulated {model.model}, seed {params.seed}", facts)
+        base_T_camera = params.camera.base_T_camera
+        self.truth = Truth(Transform(BASE, CAMERA, base_T_camera))
+        self._control, self._params, self._faults = control, params, faults
+        self._studio = CellScene(
+            load_model("robots", params.robot), eye, base_T_camera, np.asarray(params.workspace)
+        )
+        self._count = 0
+
+    def require_same_arm(self) -> None:
+        """Raise DeviceError when the controller moves another arm than the one to be scanned."""
+        off = self._studio.disagreement(self._stance())
+        if not off < SAME_ARM:
+            raise DeviceError(
+                f"scanner.emulator: the controller at {self._params.host} does not move the "
+                f"model {self._params.robot}: set robot to what it moves"
+            )
+
+    def expose(self) -> Callable[[], Scan]:
+        """Look at the arm for as long as the exposure lasts."""
+        self._require_present()
+        self._count += 1
+        index, dropped = self._count, self._faults.random() < self._params.dropped
+        started = time.time_ns()
+        stances = self._stances()
+        ended = time.time_ns()
+
+        def transfer() -> Scan:
+            xyz = self._studio.scan(stances, (self._params.seed, index))
+            _wait_until(ended * 1e-9 + self._params.latency)
+            if dropped:
+                raise FrameDropped(f"{self.name}: frame {index} was lost on its way")
+            return Scan(PointCloud(CAMERA, xyz), started, ended)
+
+        return transfer
+
+    def close(self) -> None:
+        """Let go of the controller."""
+        self._control.close()
+
+    def _require_present(self) -> None:
+        after = self._params.lost_after
+        if after is not None and self._count >= after:
+            raise DeviceError(f"{self.name}: gone after {after} exposures, as lost_after says")
+
+    def _stances(self) -> list[Stance]:
+        """Return where the arm was, at even times over the exposure."""
+        began = time.time()
+        stances = []
+        for after in np.linspace(0.0, self._params.exposure, LOOKS):
+            _wait_until(began + after)
+            stances.append(self._stance())
+        return stances
+
+    def _stance(self) -> Stance:
+        try:
+            truth = self._control.truth()
+        except (FlangeyeError, ValueError, OSError) as error:
+            raise DeviceError(f"{self.name}: lost: {error}") from None
+        return Stance(truth.joints, truth.base_T_flange)
+
+
+def _wait_until(moment: float) -> None:
+    time.sleep(max(0.0, moment - time.time()))

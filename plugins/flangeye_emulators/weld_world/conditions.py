@@ -1,0 +1,90 @@
+"""The conditions under which a weld is judged: what is wrong in the world, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from flangeye_emulators.weld_world.settings import WorldParams
+
+
+class Condition(NamedTuple):
+    """A world, and how the weld is told to be.
+
+    Attributes:
+        world: What is true, by section.
+        settings: Of the controller, beside its defaults.
+        planned: Shift [m] and turn [rad] of the plan.
+        belief: What the files say of the tool, beside its defaults.
+        half_angle: Of the groove [rad], as planned too, where it is not the usual one.
+    """
+
+    world: Mapping[str, Mapping[str, Any]] = {}
+    settings: Mapping[str, Any] = {}
+    planned: tuple[float, float] = (3e-3, 0.01745)
+    belief: Mapping[str, Any] = {}
+    half_angle: float | None = None
+
+    @property
+    def truth(self) -> WorldParams:
+        """The world's parameters."""
+        return WorldParams.model_validate(self.world)
+
+
+CONDITIONS: Mapping[str, Condition] = {
+    "nothing wrong": Condition(),
+    "images 30 % dropped, noise 0.03 mm": Condition(
+        {"clock": {"dropped": 0.3}, "finger": {"noise": "0.03 mm"}}
+    ),
+    "arm lag 200 ms + dead time 100 ms": Condition(
+        {"arm": {"lag": "200 ms", "dead_time": "100 ms"}}
+    ),
+    "arm wavy 0.3 mm": Condition(
+        {"arm": {"wave": "0.3 mm"}}, {"arm_sigma": "0.3 mm"}
+    ),
+    "arm backlash 0.1 mm": Condition({"arm": {"backlash": "0.1 mm"}}),
+    "finger gain +10 %": Condition({"finger": {"gain": 0.1}}),
+    "finger gain -10 %": Condition({"finger": {"gain": -0.1}}),
+    "finger gain +20 %": Condition({"finger": {"gain": 0.2}}),
+    "finger gain -20 %": Condition({"finger": {"gain": -0.2}}),
+    "finger gain drifts 10 % in 60 s": Condition({"finger": {"drift": 0.1}}),
+    "tag's rest off 0.2 mm": Condition({"finger": {"rest": ["0 mm", "0.2 mm", "0 mm"]}}),
+    "finger play 0.3 mm": Condition({"finger": {"play": "0.3 mm"}}),
+    "finger hysteresis 10 %": Condition({"finger": {"hysteresis": 0.1}}),
+    "torch 0.5 mm aside": Condition(
+        {"tool": {"torch": ["0 mm", "0.5 mm"]}}, belief={"torch_sigma": 0.3e-3}
+    ),
+    "tool yaw 1 deg": Condition(
+        {"tool": {"yaw": "1 deg"}}, belief={"torch_sigma": 0.35e-3}
+    ),
+    "heat: seam moves 2 mm": Condition(
+        {"heat": {"shift": "2 mm"}}, {"distortion": "0.3 mm", "max_error": "2 mm"}
+    ),
+    "heat: 1 mm around the torch": Condition(
+        {"heat": {"local": "1 mm"}}, {"distortion": "0.5 mm", "max_error": "2.5 mm"}
+    ),
+    "seam wavy 1 mm per 10 mm": Condition({"workpiece": {"wave": "1 mm"}}),
+    "20 mm/s": Condition({}, {"speed": "20 mm/s"}),
+    "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms": Condition(
+        {"arm": {"lag": "100 ms", "dead_time": "60 ms"}, "clock": {"latency": "100 ms"}},
+        {"speed": "20 mm/s"},
+    ),
+    "plan 10 mm, 5 deg wrong, reach 20 mm": Condition(
+        {}, {"reach": "20 mm", "astray": "30 mm", "inset": "20 mm"}, (10e-3, 0.0873)
+    ),
+    "tack weld 1 mm, spatter 0.05 mm": Condition(
+        {"workpiece": {"tacks": [{"start": "60 mm"}], "spatter": "0.05 mm"}}
+    ),
+    "tip noise 0.1 mm": Condition({"finger": {"noise": "0.1 mm"}}),
+    "groove half angle 60 deg, known": Condition(
+        {"finger": {"friction": 0.0}}, half_angle=1.0472
+    ),
+    "groove half angle 60 deg, planned 40 deg": Condition(
+        {"workpiece": {"half_angle": "20 deg"}, "finger": {"friction": 0.0}}
+    ),
+    "finger half as stiff axially": Condition(
+        {"finger": {"axial": 0.5, "friction": 0.0}}
+    ),
+    "tag hidden 0.6 s": Condition({"clock": {"hidden": ["12 s", "12.6 s"]}}),
+}  # fmt: skip
+"""By name, as the table shows them."""

@@ -1,0 +1,132 @@
+"""A weld in the plane of the work: a controller against a world, without images and joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_emulators.weld_world.arm import ArmResponse
+from flangeye_emulators.weld_world.clock import Shutter
+from flangeye_emulators.weld_world.settings import WorldParams
+from flangeye_emulators.weld_world.world import Nominal, WeldWorld
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.motion import Command, ToolPose, Touch
+
+
+class Row(NamedTuple):
+    """One cycle; lengths [m], angles [rad], times [s], all but ``advance`` and ``bound`` true.
+
+    Attributes:
+        time: [s].
+        torch_s: Arc length of the torch on the true seam.
+        torch: How far it is to the left of it.
+        tip: How far the tip is to the left of the seam.
+        robot: How far the reported end point is to the left of the seam.
+        turn: Angular velocity commanded.
+        advance: The tip's progress, as the controller has it.
+        bound: The controller's bound of the torch's error.
+        band: The same for 95 % of the seam.
+    """
+
+    time: float
+    torch_s: float
+    torch: float
+    tip: float
+    robot: float
+    turn: float
+    advance: float
+    bound: float
+    band: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What happened.
+
+    Attributes:
+        controller: As it ended.
+        rows: (K, 9) columns as :class:`Row` has them.
+        phases: K names.
+        length: Of the true seam [m].
+    """
+
+    controller: Controller
+    rows: Floats
+    phases: tuple[str, ...]
+    length: float
+
+    def column(self, name: str) -> Floats:
+        """Return a column (K,) by its name in :class:`Row`."""
+        return np.asarray(self.rows[:, Row._fields.index(name)])
+
+    @property
+    def beside(self) -> Floats:
+        """(K,) whether the torch was between the ends of the seam, and could weld."""
+        s, lit = self.column("torch_s"), getattr(self.controller, "lit", 0.0)
+        return np.asarray((s > (0.0 if lit is None else lit)) & (s < self.length))
+
+    @property
+    def errors(self) -> Floats:
+        """(M,) the torch's distances from the true seam, where it was beside it [m]."""
+        return np.asarray(np.abs(self.column("torch")[self.beside]))
+
+    @property
+    def done(self) -> bool:
+        """Whether the weld was reported done."""
+        return self.controller.phase == "done"
+
+
+@dataclass(frozen=True)
+class Start:
+    """How a trial begins and how its time passes.
+
+    Attributes:
+        position: (3,) of the tip, undeformed, as reported [m].
+        angle: Of the tool [rad].
+        period: Of a cycle [s].
+        longest: When it is broken off [s].
+    """
+
+    position: tuple[float, float, float]
+    angle: float = 0.0
+    period: float = 8e-3
+    longest: float = 120.0
+
+
+def run_trial(
+    controller: Controller, nominal: Nominal, truth: WorldParams, start: Start, seed: int
+) -> Trial:
+    """Let a controller weld in a world, and watch where the torch really is."""
+    world = WeldWorld(nominal, truth, [seed, 0])
+    rng = np.random.default_rng([seed, 1])
+    shutter: Shutter[Floats] = Shutter(truth.clock, rng)
+    pose = ToolPose(1.0, np.asarray(start.position, dtype=np.float64), start.angle)
+    arm = ArmResponse(truth.arm, pose, start.period)
+    noise = truth.finger.noise * np.array([1.0, 1.0, 6.0])
+    rows: list[Row] = []
+    phases: list[str] = []
+    while arm.pose.time < start.longest and controller.phase not in ("done", "stopped"):
+        age = arm.pose.time - pose.time
+        shown = world.settle(arm.pose)
+        if shutter.due(age) and not shutter.hidden(age):
+            shutter.expose(arm.pose.time, age, shown + noise * rng.standard_normal(3))
+        seen = shutter.arrived(arm.pose.time)
+        command = controller.step(arm.pose, [Touch(*seen)] if seen else [])
+        rows.append(_row(world, arm.pose, controller, command))
+        phases.append(controller.phase)
+        arm.go(command)
+    return Trial(controller, np.array(rows), tuple(phases), world.groove.root.length)
+
+
+def _row(world: WeldWorld, pose: ToolPose, controller: Controller, command: Command) -> Row:
+    root, s = world.groove.root, world.contact.s
+    place = root.at(s)
+    tip = float((world.tip[:2] - place.point) @ place.normal)
+    robot = float((pose.position[:2] - place.point) @ place.normal)
+    return Row(
+        pose.time, world.torch_s, world.off, tip, robot, command.turn, controller.tip,
+        controller.bound, controller.band,
+    )  # fmt: skip

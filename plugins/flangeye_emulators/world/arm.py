@@ -1,0 +1,173 @@
+"""An arm that does not stand quite where it says, as real ones do not."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import Joint, RobotModel
+from flangeye.plugin.stage import Params
+from flangeye.types import Floats
+from flangeye.units import Angle, Length, param
+
+REPEATABILITY = 3.6
+"""Data sheets give the mean plus three standard deviations of the distance from the mean position
+(ISO 9283): 3.6 times the deviation along one axis, when all three are alike."""
+DOWN = np.array([0.0, 0.0, -1.0])
+"""Where things fall, in ``base``."""
+
+
+class ErrorSizes(NamedTuple):
+    """How large an arm's errors are; what is drawn has these standard deviations [rad, m]."""
+
+    zeros: float
+    lengths: float = 0.0
+    twists: float = 0.0
+    eccentricity: float = 0.0
+    sag: float = 0.0
+    backlash: float = 0.0
+    drift: float = 0.0
+
+
+REAL = ErrorSizes(1e-3, 0.15e-3, 0.2e-3, 0.4e-3, 2e-3, 0.1e-3, 0.1e-3)
+"""Sizes at which simulated sessions leave what published recordings of such arms leave after a
+plain fit: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
+
+
+class ArmErrors(Params):
+    """How far the simulated arm is from what its controller believes."""
+
+    quality: Literal["kind", "real"] = Field(
+        "kind",
+        description="kind: joint zeros as small as the robot's joint_accuracy, nothing else; "
+        "real: as published recordings show arms to be. The sizes below replace single ones.",
+    )
+    zeros: Angle | None = param(None, ge=0, description="Of the joints' zeros; real: 1 mrad.")
+    lengths: Length | None = param(
+        None, ge=0, description="Of each Denavit-Hartenberg length and offset; real: 0.15 mm."
+    )
+    twists: Angle | None = param(None, ge=0, description="Of each link's twist; real: 0.2 mrad.")
+    eccentricity: Angle | None = param(
+        None,
+        ge=0,
+        description="Amplitude of each encoder's error, one wave per turn; real: 0.4 mrad.",
+    )
+    sag: Angle | None = param(
+        None,
+        ge=0,
+        description="By what a joint gives way for each metre of horizontal lever of what hangs "
+        "on it; real: 2 mrad.",
+    )
+    backlash: Angle | None = param(
+        None, ge=0, description="Play of a joint, from one side to the other; real: 0.1 mrad."
+    )
+    drift: Angle | None = param(
+        None,
+        ge=0,
+        description="How far a joint's zero moves while the arm warms up; real: 0.1 mrad.",
+    )
+
+    def sizes(self, robot: RobotModel) -> ErrorSizes:
+        """Return the sizes for an arm."""
+        preset = REAL if self.quality == "real" else ErrorSizes(robot.joint_accuracy)
+        given = {name: getattr(self, name) for name in ErrorSizes._fields}
+        return preset._replace(**{name: x for name, x in given.items() if x is not None})
+
+    @property
+    def is_default(self) -> bool:
+        """Whether nothing was asked for."""
+        return self == ArmErrors()
+
+
+class ImperfectArm:
+    """An arm with joint zeros, lengths, encoders and elasticity of its own; a rail is perfect.
+
+    The first joint's zero is right by definition: it is what fixes the base's x axis, and an error
+    of it could not be told from a turn of the base.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        scale: float,
+        rng: np.random.Generator,
+        errors: ArmErrors | None = None,
+    ) -> None:
+        """Draw the arm's errors; ``scale`` multiplies every one, 0 gives a perfect arm."""
+        sizes = ErrorSizes(*(scale * np.array((errors or ArmErrors()).sizes(robot))))
+        self._believed = Arm(robot)
+        self._scatter = scale * robot.repeatability / REPEATABILITY
+        n, turns = self._believed.n, ~self._believed.slides
+        self.zeros = sizes.zeros * rng.standard_normal(n) * turns
+        self.zeros[0] = 0.0
+        self._actual = Arm(_as_built(robot, sizes, rng))
+        self._phases = rng.uniform(0, 2 * np.pi, n)
+        self._eccentricity, self._sag, self._backlash = np.outer(sizes[3:6], turns)
+        self._drift = sizes.drift * rng.standard_normal(n) * turns
+        self._drift[0] = 0.0
+
+    def reported(self, joints: Floats) -> Floats:
+        """Return ``base_T_flange`` (..., 4, 4) as the controller computes it, joints (..., n)."""
+        return self._believed.flange(joints)
+
+    def angles(self, joints: Floats) -> Floats:
+        """Return the angles (N, n) the joints really have at N poses visited in this order [rad].
+
+        Args:
+            joints: (N, n) as commanded and reported [rad].
+        """
+        came_from = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
+        warm = 1 - np.exp(-3 * np.linspace(0, 1, len(joints)))
+        angles = joints + self.zeros + self._eccentricity * np.sin(joints + self._phases)
+        angles = angles - self._backlash / 2 * came_from + warm[:, None] * self._drift
+        return np.asarray(angles + self._sag * self._levers(angles))
+
+    def flange(self, angles: Floats) -> Floats:
+        """Return where the flange really is on average, (..., 4, 4), at angles (..., n) [rad]."""
+        return self._actual.flange(angles)
+
+    def frames(self, angles: Floats) -> Floats:
+        """Return where the links really are, (..., n + 1, 4, 4), at angles (..., n) [rad]."""
+        return self._actual.frames(angles)
+
+    def stand(self, angles: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Return link frames (..., n + 1, 4, 4) and flange (..., 4, 4), as they are this once.
+
+        Args:
+            angles: (..., n) really, of :meth:`angles` [rad].
+            rng: Draws what does not repeat.
+        """
+        base_T_flange = self.flange(angles)
+        base_T_flange[..., :3, 3] += self._scatter * rng.standard_normal((*angles.shape[:-1], 3))
+        return self.frames(angles), base_T_flange
+
+    def _levers(self, angles: Floats) -> Floats:
+        """Return (N, n) gravity's torque about each joint over the weight that hangs on it [m].
+
+        The weight is taken to be spread evenly over the links' origins beyond the joint.
+        """
+        frames = self._actual.frames(angles)
+        axes, origins = self._actual.axes(angles)
+        n = self._actual.n
+        carried = [frames[:, i + 1 :, :3, 3].mean(axis=1) - origins[:, i] for i in range(n)]
+        falling = np.cross(axes, np.stack(carried, axis=1))
+        return np.asarray(falling @ DOWN)
+
+
+def _as_built(robot: RobotModel, sizes: ErrorSizes, rng: np.random.Generator) -> RobotModel:
+    """Return the arm with the lengths and twists that it really has."""
+    joints = tuple(_altered(j, robot.convention == "urdf", sizes, rng) for j in robot.joints)
+    return robot.model_copy(update={"joints": joints})
+
+
+def _altered(joint: Joint, urdf: bool, sizes: ErrorSizes, rng: np.random.Generator) -> Joint:
+    lengths, twists = sizes.lengths * rng.standard_normal(3), sizes.twists * rng.standard_normal(3)
+    if urdf:
+        return joint.model_copy(
+            update={"xyz": tuple(joint.xyz + lengths), "rpy": tuple(joint.rpy + twists)}
+        )
+    a, d, alpha = joint.a + lengths[0], joint.d + lengths[1], joint.alpha + twists[0]
+    return joint.model_copy(update={"a": a, "d": d, "alpha": alpha})

@@ -1,0 +1,81 @@
+"""A workpiece on a bench, among things that lie about."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.seam_geometry import distances_to_line
+from flangeye.models.workpiece import Workpiece
+from flangeye.types import Floats
+from flangeye_emulators.world import materials
+from flangeye_emulators.world.mesh import Mesh, box, capsule
+from flangeye_emulators.world.raycast import Body
+
+MARGIN = 0.25
+"""From the workpiece's box to the edge of the bench, to each side [m]."""
+THICKNESS = 0.04
+NEAREST = 0.045
+"""From a seam to the middle of anything that lies about: it may touch the part, not the groove."""
+ATTEMPTS = 200
+
+
+def bench_with(
+    workpiece: Workpiece,
+    base_T_part: Floats,
+    clutter: int,
+    covered: float,
+    rng: np.random.Generator,
+) -> list[Body]:
+    """Return the bodies of the scene, in ``base``.
+
+    Args:
+        workpiece: What is to be welded.
+        base_T_part: (4, 4) where it lies; the bench is right below it.
+        clutter: How many things lie about, some of them against the workpiece.
+        covered: Share of the workpiece, from its end with the largest x, under a sheet.
+        rng: Draws the clutter.
+    """
+    part = Mesh(workpiece.vertices, workpiece.triangles).moved(base_T_part)
+    low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
+    top = float(low[2])
+    bench = box([*(low[:2] - MARGIN), top - THICKNESS], [*(high[:2] + MARGIN), top])
+    bodies = [Body(bench, materials.TABLE), Body(part, materials.METAL)]
+    seams = [
+        s.points @ base_T_part[:3, :3].T + base_T_part[:3, 3] for s in workpiece.seams.values()
+    ]
+    for _ in range(clutter):
+        bodies.append(_thing(_free_place(low, high, seams, rng), top, rng))
+    return bodies + ([_sheet(workpiece, base_T_part, covered)] if covered > 0 else [])
+
+
+def _free_place(low: Floats, high: Floats, seams: list[Floats], rng: np.random.Generator) -> Floats:
+    """Return (2,) a place around the workpiece that is not over a seam."""
+    for _ in range(ATTEMPTS):
+        place = rng.uniform(low[:2] - MARGIN / 2, high[:2] + MARGIN / 2)
+        flat = [seam * [1.0, 1.0, 0.0] for seam in seams]
+        at = np.array([[*place, 0.0]])
+        if all(distances_to_line(at, seam)[0] > NEAREST for seam in flat):
+            break
+    return np.asarray(place)
+
+
+def _thing(place: Floats, floor: float, rng: np.random.Generator) -> Body:
+    """Return a block or a rod on the bench."""
+    size = rng.uniform(0.01, 0.03, 3)
+    pose = rigid(rotation_from_rpy(0.0, 0.0, rng.uniform(0, np.pi)), np.array([*place, floor]))
+    if rng.random() < 0.6:
+        block = box([-size[0], -size[1], 0.0], [size[0], size[1], 2 * size[2]])
+        return Body(block.moved(pose), materials.PAINTED)
+    radius = float(size[0]) / 2
+    ends = np.array([[-size[1] - 0.02, 0, radius], [size[1] + 0.02, 0, radius]])
+    return Body(capsule(ends[0], ends[1], radius).moved(pose), materials.RUBBER)
+
+
+def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> Body:
+    """Return a sheet that hides one end of the workpiece."""
+    low, high = workpiece.vertices.min(axis=0), workpiece.vertices.max(axis=0)
+    edge = high[0] - covered * (high[0] - low[0])
+    above = high[2] + 0.03
+    sheet = box([edge, low[1] - 0.02, above], [high[0] + 0.02, high[1] + 0.02, above + 0.002])
+    return Body(sheet.moved(base_T_part), materials.WALL)

@@ -1,0 +1,114 @@
+"""The cell that is simulated: an arm on a table, a wall, a stand with a disc that is no flange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.maths.geometry import rotation_from_rpy
+from flangeye.models.robots import RobotModel
+from flangeye.models.targets import Flange, Sphere
+from flangeye.motion.clearance import ArmVolume
+from flangeye.types import Floats
+from flangeye_emulators.world import materials
+from flangeye_emulators.world.flange_mesh import flange_mesh, wrist_mesh
+from flangeye_emulators.world.mesh import (
+    COARSE,
+    Mesh,
+    box,
+    capsule,
+    circle,
+    lathe,
+    merged,
+    region,
+)  # fmt: skip
+from flangeye_emulators.world.raycast import Body
+from flangeye_emulators.world.target import sphere_mesh, stub_mesh
+
+DECOY = 1.15
+"""Radii of the disc on the stand over those of the flange: near, and not to be taken for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """The things that stand around, in ``base``, and the arm among them.
+
+    Attributes:
+        robot: The arm.
+        flange: What it carries.
+        centre: (3,) middle of the workspace [m].
+        size: (3,) of the workspace [m].
+        sphere: What the flange carries besides, if anything.
+    """
+
+    robot: RobotModel
+    flange: Flange
+    centre: Floats
+    size: Floats
+    sphere: Sphere | None = None
+
+    def around(self) -> list[Body]:
+        """Return what does not move."""
+        x, y = self.centre[:2]
+        far = x + self.size[0] / 2 + 0.13
+        return [
+            Body(box([-0.4, y - 0.9, -0.04], [far + 0.3, y + 0.9, 0.0]), materials.TABLE),
+            Body(box([far, y - 0.9, 0.0], [far + 0.02, y + 0.9, 0.7]), materials.WALL),
+            *self._stand(),
+        ]
+
+    def arm(self, frames: Floats, base_T_flange: Floats) -> list[Body]:
+        """Return the arm and its flange.
+
+        Args:
+            frames: (n + 1, 4, 4) ``base_T_link``.
+            base_T_flange: (4, 4) where the flange really is.
+        """
+        volume = ArmVolume(self.robot)
+        links = [
+            capsule(start, end, radius)
+            for (start, end), radius in zip(volume.axes(frames), volume.radii, strict=True)
+        ]
+        return [
+            *([Body(merged(links), materials.PAINTED)] if links else []),
+            *(body.moved(base_T_flange) for body in self._at_flange()),
+        ]
+
+    def _at_flange(self) -> list[Body]:
+        """Return what moves with the flange, in ``flange``."""
+        finish = materials.FINISHES[self.flange.details.finish]
+        plate = Body(flange_mesh(self.flange), finish)
+        wrist = Body(wrist_mesh(self.flange), materials.PAINTED)
+        if self.sphere is None:
+            return [plate, wrist]
+        ball = Body(sphere_mesh(self.sphere), materials.MATT)
+        return [plate, wrist, ball, Body(stub_mesh(self.sphere), finish)]
+
+    def board(self, base_T_flange: Floats) -> Body:
+        """Return a board held before the flange, so that nothing of it can be seen."""
+        half, away = 4 * self.flange.outer, 0.06
+        if self.sphere is not None:
+            away += self.sphere.centre_in_flange[2] + self.sphere.radius
+        sheet = Body(box([-half, -half, away], [half, half, away + 0.003]), materials.WALL)
+        return sheet.moved(base_T_flange)
+
+    def _stand(self) -> list[Body]:
+        """Return a post with a ring of nearly the flange's size, beside the workspace."""
+        foot = self.centre + np.array([0.05, self.size[1] / 2 + 0.1, 0.0])
+        top = max(float(self.centre[2] - self.size[2] / 2 - 0.03), 0.05)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_rpy(0.12, -0.1, 0.0)
+        pose[:3, 3] = [foot[0], foot[1], top]
+        ring = Body(_ring(self.flange), materials.POLISHED).moved(pose)
+        low = np.array([foot[0], foot[1], 0.0])
+        post = capsule(low, np.array([foot[0], foot[1], top - 0.03]), 0.015)
+        return [ring, Body(post, materials.RUBBER)]
+
+
+def _ring(flange: Flange) -> Mesh:
+    outer = DECOY * flange.outer
+    inner = DECOY * (flange.bore or flange.outer / 2)
+    face = region(circle(outer, COARSE), [circle(inner, COARSE)], 0.0)
+    sides = [(inner, 0.0), (inner, -0.01), (outer, -0.01), (outer, 0.0)]
+    return merged([face, lathe(sides, COARSE)])

@@ -1,0 +1,46 @@
+"""Where a simulated scanner stands, and what it is by its principle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params
+from flangeye.types import BASE, CAMERA, Floats, Transform
+from flangeye.units import Angle, Length, param
+from flangeye_emulators.world.raycast import Body, Scene
+from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.time_of_flight import TimeOfFlight
+
+
+class CameraPose(Params):
+    """Where the scanner stands, in ``base``."""
+
+    position: tuple[Length, Length, Length] = param(
+        ("600 mm", "-12.5 mm", "1000 mm"), description="The paper's (17): 1 m above the table."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
+    )
+
+    @property
+    def base_T_camera(self) -> Floats:
+        """(4, 4), translation in [m]."""
+        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+
+
+def scanner_of(
+    scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
+) -> StructuredLight | TimeOfFlight:
+    """Return the scanner, with the distortion that ``rng`` draws for it."""
+    kind = StructuredLight if scanner.principle == "structured light" else TimeOfFlight
+    return kind(scanner, resolution, noise, rng)
+
+
+def before_camera(bodies: Sequence[Body], base_T_camera: Floats) -> Scene:
+    """Return the bodies, given in ``base``, as they stand before the camera."""
+    camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix
+    return Scene([body.moved(camera_T_base) for body in bodies])

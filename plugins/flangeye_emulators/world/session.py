@@ -1,0 +1,264 @@
+"""A simulated session of any configuration: where the arms go, and where everything really is.
+
+The loop is closed at a first pose: with camera and target where the recipe puts them, the place
+that is left over follows. Around it joints are drawn at random, and those kept at which the camera
+sees the target. Arrays only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import LINK, Configuration
+from flangeye.types import BASE, FLANGE, FLANGE2, Floats
+from flangeye_emulators.world.arm import ImperfectArm
+
+DRAWS = 4000
+"""Joint vectors tried."""
+FIELD = 0.75
+"""Share of the field of view, to either side, in which the target's centre stays."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the camera can see.
+
+    Attributes:
+        distance: To the target at the first pose [m].
+        near: Least distance [m].
+        far: Largest distance [m].
+        field: Full angles of view, horizontal and vertical [rad].
+        facing: Largest angle between the target's z and the line to the camera [rad].
+    """
+
+    distance: float
+    near: float
+    far: float
+    field: tuple[float, float]
+    facing: float
+
+    def first(self) -> Floats:
+        """Return (4, 4) camera_T_target at the first pose: ahead, and facing the camera."""
+        return rigid(rotation_from_rpy(np.pi, 0.0, 0.0), np.array([0.0, 0.0, self.distance]))
+
+    def sees(self, poses: Floats) -> NDArray[np.bool_]:
+        """Return which of (N, 4, 4) camera_T_target are in view."""
+        x, y, z = poses[:, :3, 3].T
+        half = np.tan(np.asarray(self.field) / 2) * FIELD
+        away = np.linalg.norm(poses[:, :3, 3], axis=1)
+        cosine = -(poses[:, :3, 2] * poses[:, :3, 3]).sum(axis=1) / np.maximum(away, 1e-9)
+        inside = (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)
+        in_range = (z > self.near) & (z < self.far)
+        return np.asarray(inside & in_range & (cosine > np.cos(self.facing)))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where things are, truly: X, Y and Z of the loop, each (4, 4)."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Stands:
+    """N poses of the arms.
+
+    Attributes:
+        joints: (N, n) of the first arm [rad]; None where it is no arm of the catalogue.
+        second: (N, m) of the second arm [rad]; None where there is none.
+        camera: (N, 4, 4) where the camera is carried, in ``base``.
+        flange: (N, 4, 4) base_T_flange.
+        target: (N, 4, 4) where the target is carried, in its arm's base.
+    """
+
+    joints: Floats | None
+    second: Floats | None
+    camera: Floats
+    flange: Floats
+    target: Floats
+
+    def where(self, chosen: NDArray[np.intp]) -> Stands:
+        """Return some of the poses."""
+        joints = None if self.joints is None else self.joints[chosen]
+        second = None if self.second is None else self.second[chosen]
+        carried = (self.camera[chosen], self.flange[chosen], self.target[chosen])
+        return Stands(joints, second, *carried)
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """Who takes part.
+
+    Attributes:
+        configuration: Who carries what.
+        first: The first arm.
+        second: The second one, where there is one.
+        four_axes: Whether the first arm's flange only moves and turns about the base's z.
+        in_turns: Whether of two arms one rests at its first pose while the other moves.
+    """
+
+    configuration: Configuration
+    first: Arm
+    second: Arm | None
+    four_axes: bool = False
+    in_turns: bool = False
+
+
+def draw_stands(
+    cast: Cast, home: tuple[Floats, Floats], spread: float, rng: np.random.Generator
+) -> Stands:
+    """Return the first pose, and others drawn around it, in view or not.
+
+    Args:
+        cast: The arms.
+        home: Joints of the first and the second arm at the first pose [rad].
+        spread: Largest change of any joint [rad].
+        rng: Draws the joints.
+    """
+    joints = _around(home[0], spread, rng)
+    if cast.in_turns:
+        joints[::2] = home[0]
+    frames, flange = cast.first.frames(joints), cast.first.flange(joints)
+    if cast.four_axes:
+        flange = _of_four_axes(flange[0], spread, rng)
+    second = None if cast.second is None else _around(home[1], spread, rng)
+    if cast.in_turns and second is not None:
+        second[1::2] = home[1]
+    carried: dict[str, Floats] = {BASE: np.tile(np.eye(4), (DRAWS, 1, 1)), FLANGE: flange}
+    if cast.second is not None and second is not None:
+        carried[FLANGE2] = cast.second.flange(second)
+    camera = cast.configuration.camera
+    if camera.startswith(LINK):
+        carried[camera] = frames[:, int(camera.removeprefix(LINK))]
+    known = None if cast.four_axes else joints
+    return Stands(known, second, carried[camera], flange, carried[cast.configuration.target])
+
+
+def _around(home: Floats, spread: float, rng: np.random.Generator) -> Floats:
+    changes = rng.uniform(-spread, spread, (DRAWS, len(home)))
+    changes[0] = 0.0
+    return np.asarray(home + changes)
+
+
+def _of_four_axes(first: Floats, spread: float, rng: np.random.Generator) -> Floats:
+    """Return poses of an arm whose flange moves in space and turns about the vertical."""
+    turns = rotation_exp(np.outer(rng.uniform(-spread, spread, DRAWS), [0.0, 0.0, 1.0]))
+    out = np.tile(first, (DRAWS, 1, 1))
+    out[1:, :3, :3] = turns[1:] @ first[:3, :3]
+    out[1:, :3, 3] += rng.uniform(-0.15, 0.15, (DRAWS - 1, 3))
+    return out
+
+
+def close_loop(
+    stands: Stands, view: View, configuration: Configuration, camera: Floats | None, place: Floats
+) -> Places:
+    """Return where everything is, such that the camera sees the target at the first pose.
+
+    Args:
+        stands: The arms' poses, the first of which counts.
+        view: How the camera sees the target there.
+        configuration: Says what there is to close the loop with.
+        camera: (4, 4) of the camera in what carries it; None for wherever it has to be.
+        place: (4, 4) of the target in what carries it, unless that closes the loop.
+    """
+    a, b, seen = stands.camera[0], stands.target[0], view.first()
+    identity = np.eye(4)
+    if camera is None:
+        return Places(invert(a) @ b @ place @ invert(seen), identity, place)
+    if configuration.other_base:
+        return Places(camera, a @ camera @ seen @ invert(b @ place), place)
+    return Places(camera, identity, invert(b) @ a @ camera @ seen)
+
+
+def home_of(arm: Arm, base_T_flange: Floats) -> Floats:
+    """Return joints (n,) that reach a pose.
+
+    Raises:
+        StageError: There are none.
+    """
+    found = arm.inverse(base_T_flange)
+    if not len(found):
+        raise StageError(
+            "the arm cannot reach a pose at which the camera sees the target; move camera, place "
+            "or distance"
+        )
+    return np.asarray(found[0])
+
+
+def seen_from(stands: Stands, places: Places) -> Floats:
+    """Return (N, 4, 4) camera_T_target."""
+    world = places.y @ stands.target @ places.z
+    return np.asarray(invert(stands.camera @ places.x) @ world)
+
+
+def visible(stands: Stands, places: Places, view: View, count: int) -> Stands:
+    """Return the poses at which the camera sees the target, ``count`` at least.
+
+    Raises:
+        StageError: There are too few.
+    """
+    found = np.flatnonzero(view.sees(seen_from(stands, places)))
+    if len(found) < count:
+        raise StageError(
+            f"the camera sees the target at {len(found)} of {DRAWS} poses drawn, and {count} are "
+            "needed; make spread smaller, or move home, camera or place"
+        )
+    return stands.where(found)
+
+
+def disturbed(poses: Floats, noise: tuple[float, float], rng: np.random.Generator) -> Floats:
+    """Return (N, 4, 4) poses moved in their own frames by noise [rad, m]."""
+    out = poses.copy()
+    turns, shifts = rng.standard_normal((2, len(poses), 3))
+    out[:, :3, :3] = poses[:, :3, :3] @ rotation_exp(noise[0] * turns)
+    out[:, :3, 3] += (poses[:, :3, :3] @ (noise[1] * shifts)[..., None])[..., 0]
+    return out
+
+
+def as_built(
+    stands: Stands, configuration: Configuration, arms: tuple[ImperfectArm, ImperfectArm | None]
+) -> Stands:
+    """Return where arms that are not what they report stand when they report ``stands``.
+
+    Args:
+        stands: As reported, in the order of their visit.
+        configuration: Who carries what.
+        arms: The first, and the second where there is one.
+
+    Raises:
+        StageError: The poses are none of an arm of the catalogue.
+    """
+    if stands.joints is None:
+        raise StageError("an arm of four axes has no joints to be wrong; leave 'arm' out")
+    first, other = arms
+    angles, carried = first.angles(stands.joints), {BASE: stands.camera * 0 + np.eye(4)}
+    carried[FLANGE] = first.flange(angles)
+    if configuration.camera.startswith(LINK):
+        link = int(configuration.camera.removeprefix(LINK))
+        carried[configuration.camera] = first.frames(angles)[:, link]
+    if other is not None and stands.second is not None:
+        carried[FLANGE2] = other.flange(other.angles(stands.second))
+    camera, target = carried[configuration.camera], carried[configuration.target]
+    return replace(stands, camera=camera, target=target, flange=carried[FLANGE])
+
+
+def really(
+    stands: Stands,
+    configuration: Configuration,
+    noise: tuple[float, float],
+    rng: np.random.Generator,
+) -> Stands:
+    """Return where the arms really stand when they report ``stands``; bases do not move."""
+    carried = ((configuration.camera, stands.camera), (configuration.target, stands.target))
+    camera, target = (m if frame == BASE else disturbed(m, noise, rng) for frame, m in carried)
+    flange = camera if configuration.camera == FLANGE else stands.flange
+    flange = target if configuration.target == FLANGE else flange
+    return replace(stands, camera=camera, target=target, flange=flange)

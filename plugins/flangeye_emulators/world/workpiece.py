@@ -1,0 +1,170 @@
+"""The sample workpieces: plates with a V-groove, straight and curved, and the files they ship as.
+
+``python -m flangeye_emulators.world.workpiece data/workpieces`` makes the files again.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from flangeye.types import Floats
+from flangeye_emulators.world.mesh import Mesh
+
+LENGTH, WIDTH, HEIGHT = 0.2, 0.13, 0.024
+"""Of the plates [m]: x along the groove, y across, z up; the origin is amid the lower face."""
+DEPTH, HALF_ANGLE = 0.010, float(np.radians(40.0))
+"""Of the grooves: how deep the root lies [m], and what a wall leans from the vertical."""
+RIB = (0.030, 0.050)
+"""Where a rib stands on the plate, in y [m]: it tells one end and one side from the other."""
+RIB_HEIGHT, RIB_SPAN = 0.012, (-0.07, 0.0)
+"""Its height, and where its sloping ends begin and end, in x [m]."""
+STEP = 0.002
+"""Between stations along a curved groove [m]."""
+
+
+@dataclass(frozen=True)
+class Plate:
+    """One sample workpiece.
+
+    Attributes:
+        name: Of its files.
+        title: For people.
+        root: y of the groove's root at x, (N,) to (N,) [m]; its slope at both ends is zero.
+        straight: Whether two stations are enough.
+        ribbed: Whether it has the rib; without, it can be slid or turned and look the same.
+    """
+
+    name: str
+    title: str
+    root: Callable[[Floats], Floats]
+    straight: bool = False
+    ribbed: bool = True
+
+    def stations(self) -> Floats:
+        """Return (S,) x of the cross-sections [m]."""
+        ends = [-LENGTH / 2, *_rib_corners(), LENGTH / 2]
+        if not self.straight:
+            ends += np.arange(-LENGTH / 2, LENGTH / 2, STEP).tolist()
+        return np.unique(np.round(ends, 9))
+
+    def seam(self) -> Floats:
+        """Return (S, 3) points along the root [m]."""
+        x = np.array([-LENGTH / 2, LENGTH / 2]) if self.straight else self.stations()
+        return np.column_stack([x, self.root(x), np.full(len(x), HEIGHT - DEPTH)])
+
+    def mesh(self) -> Mesh:
+        """Return the closed surface: a sheet of cross-sections over a flat underside."""
+        top = self._sheet()
+        bottom = top * [1.0, 1.0, 0.0]
+        return _solid(top, bottom)
+
+    def _sheet(self) -> Floats:
+        """Return (S, 9, 3): corners of each cross-section's upper side, in the order of y."""
+        x = self.stations()
+        root = self.root(x)
+        slope = np.gradient(root, x) if not self.straight else np.zeros(len(x))
+        aside = np.stack([-slope, np.ones(len(x))], axis=1) / np.hypot(slope, 1.0)[:, None]
+        half = DEPTH * np.tan(HALF_ANGLE)
+        foot = HEIGHT + 0.0 * x
+        top = HEIGHT + (_rib_height(x) if self.ribbed else 0.0 * x)
+        middle = np.stack([x, root], axis=1)
+        lines = [
+            np.column_stack([x, 0 * x - WIDTH / 2, foot]),
+            np.column_stack([middle - half * aside, foot]),
+            np.column_stack([middle, foot - DEPTH]),
+            np.column_stack([middle + half * aside, foot]),
+            *(np.column_stack([x, 0 * x + y, foot]) for y in (RIB[0] - 0.004,)),
+            *(np.column_stack([x, 0 * x + y, top]) for y in RIB),
+            *(np.column_stack([x, 0 * x + y, foot]) for y in (RIB[1] + 0.004, WIDTH / 2)),
+        ]
+        return np.stack(lines, axis=1)
+
+
+def _rib_corners() -> tuple[float, ...]:
+    start, end = RIB_SPAN
+    return start, start + RIB_HEIGHT, end - RIB_HEIGHT, end
+
+
+def _rib_height(x: Floats) -> Floats:
+    return np.interp(x, _rib_corners(), (0.0, RIB_HEIGHT, RIB_HEIGHT, 0.0))
+
+
+def _solid(top: Floats, bottom: Floats) -> Mesh:
+    """Close the space between two (S, K, 3) sheets, the one above the other."""
+    stations, corners = top.shape[:2]
+    index = np.arange(stations * corners).reshape(stations, corners)
+    under = index + stations * corners
+    edges = [index[:, 0], index[-1, :], index[::-1, -1], index[0, ::-1]]
+    loop = np.concatenate([edge[:-1] for edge in edges])
+    skirt = np.stack([loop, loop + stations * corners])
+    triangles = [_quads(index), _quads(under)[:, ::-1], _quads(np.c_[skirt, skirt[:, :1]])]
+    vertices = np.concatenate([top.reshape(-1, 3), bottom.reshape(-1, 3)])
+    return Mesh(vertices, np.concatenate(triangles).astype(np.int32))
+
+
+def _quads(grid: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return (T, 3) triangles of a grid of indices, anticlockwise seen along row x column."""
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+
+
+STRAIGHT = Plate(
+    "v-straight",
+    "Plate with a straight V-groove",
+    lambda x: np.full(len(x), -0.015),
+    straight=True,
+)
+CURVED = Plate(
+    "v-curved",
+    "Plate with a curved V-groove",
+    lambda x: -0.02 + 0.0075 * (1 + np.cos(2 * np.pi * x / LENGTH)),
+)
+PLATES = (STRAIGHT, CURVED)
+
+
+def write_files(folder: Path) -> None:
+    """Write every sample as a binary STL and the YAML file of its seam, in millimetres."""
+    for plate in PLATES:
+        write_stl(folder / f"{plate.name}.stl", plate.mesh())
+        (folder / f"{plate.name}.yaml").write_text(_description(plate), encoding="utf-8")
+
+
+def write_stl(path: Path, mesh: Mesh, per_metre: float = 1000.0) -> None:
+    """Write triangles as binary STL, in a unit of which ``per_metre`` are a metre."""
+    corners = mesh.vertices[mesh.triangles] * per_metre
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets = np.zeros(len(corners), dtype=kind)
+    facets["normal"], facets["corners"] = normals, corners
+    header = b"made by flangeye, unit mm".ljust(80)
+    path.write_bytes(header + np.uint32(len(facets)).tobytes() + facets.tobytes())
+
+
+def _description(plate: Plate) -> str:
+    seam = {
+        "name": "groove",
+        "points": [[round(float(1e3 * v), 6) for v in point] for point in plate.seam()],
+        "opening": [0, 0, 1],
+        "half_angle": f"{np.degrees(HALF_ANGLE):.6g} deg",
+        "half_width": f"{1e3 * DEPTH * np.tan(HALF_ANGLE):.6g} mm",
+    }
+    described = {
+        "title": plate.title,
+        "cad": f"{plate.name}.stl",
+        "unit": "mm",
+        "seams": [seam],
+        "source": "made by python -m flangeye_emulators.world.workpiece",
+    }
+    return yaml.safe_dump(described, sort_keys=False, default_flow_style=None, width=100)
+
+
+if __name__ == "__main__":
+    write_files(Path(sys.argv[1]))

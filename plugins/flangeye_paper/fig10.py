@@ -1,0 +1,91 @@
+"""Figure 10: calibration error by the number of poses, at 1 mm of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flangeye_paper.drawing import (
+    AXIS_COLOURS,
+    BOUND,
+    METHODS,
+    PRINTED,
+    dress,
+    legend,
+    logarithmic,
+    sheet,
+)
+from flangeye_paper.fig9 import realised
+from flangeye_paper.printed import AXES, WITHIN_TEN, WITHIN_TWENTY
+from flangeye_paper.tables import Row, columns, read_sessions, write_csv
+
+ORACLE = "algorithm-1-oracle"
+SHOWN = (5, 10, 20, 40, 75)
+
+
+def fig10(batches: Path, out: Path) -> None:
+    """Write fig10.csv, fig10_summary.csv and fig10.png.
+
+    Args:
+        batches: Folder with the batches fig10_<method>.
+        out: Folder for the files.
+    """
+    rows = [
+        {"method": method, "poses": int(session.number("steps.0.poses")), **realised(session)}
+        for method in METHODS
+        for session in read_sessions(batches / f"fig10_{method}")
+        if session.accepted
+    ]
+    write_csv(out / "fig10.csv", rows)
+    write_csv(out / "fig10_summary.csv", [_summary(rows, poses) for poses in SHOWN])
+    _draw(rows).save(out / "fig10.png")
+
+
+def _summary(rows: Sequence[Row], poses: int) -> dict[str, Any]:
+    """Return the emulation's errors as printed, and every method's at the work."""
+    here = {r["method"]: r for r in rows if r["poses"] == poses}
+    oracle = here[ORACLE]
+    printed = {
+        f"{axis} {'mm' if len(axis) == 1 else 'deg'}": oracle[f"{axis}_std"] for axis in AXES
+    }
+    at_work = {
+        f"workspace rms mm: {METHODS[method].label}": here[method]["workspace_rms"]
+        if method in here
+        else None
+        for method in METHODS
+    }
+    return {"poses": poses, **printed, **at_work, "bound mm": oracle["workspace_bound"]}
+
+
+def _draw(rows: Sequence[Row]) -> Any:
+    page = sheet(1, 3, 10.5, 3.4)
+    oracle = [r for r in rows if r["method"] == ORACLE]
+    for panel, axes, unit in ((page.panels[0], AXES[:3], "mm"), (page.panels[1], AXES[3:], "deg")):
+        for axis in axes:
+            colour = AXIS_COLOURS[axis]
+            panel.plot(*columns(oracle, "poses", f"{axis}_std"), color=colour, label=axis)
+        dress(panel, f"emulated as printed, in {unit}", "poses", f"standard deviation [{unit}]")
+        panel.set_ylim(bottom=0)
+        legend(panel)
+    for poses, limit, above in ((10, WITHIN_TEN, 3), (20, WITHIN_TWENTY, -10)):
+        page.panels[0].plot([poses, 75], [limit, limit], ":", color=PRINTED.colour)
+        page.panels[0].annotate(
+            f"below {limit:g} mm within {poses}, says the paper", (poses, limit), fontsize=7,
+            xytext=(2, above), textcoords="offset points", color=PRINTED.colour,
+        )  # fmt: skip
+    _at_work(page.panels[2], rows)
+    return page
+
+
+def _at_work(panel: Any, rows: Sequence[Row]) -> None:
+    for method, look in METHODS.items():
+        mine = [r for r in rows if r["method"] == method]
+        poses, rms = columns(mine, "poses", "workspace_rms")
+        panel.plot(poses, rms, color=look.colour, label=look.label)
+    mine = [r for r in rows if r["method"] == "all-data"]
+    poses, rms = columns(mine, "poses", "workspace_bound")
+    panel.plot(poses, rms, "--", color=BOUND.colour, linewidth=1.0, label=BOUND.label)
+    logarithmic(panel, 0.2, 0.5, 1, 2, 5)
+    dress(panel, "at the work: over the workspace, rms", "poses", "error [mm]")
+    legend(panel)

@@ -1,0 +1,146 @@
+"""Figure 11: calibration error by the number of poses, on the published recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flangeye.files.arrays import read_npz
+from flangeye.types import Floats
+from flangeye_paper.drawing import AXIS_COLOURS, dress, legend, sheet
+from flangeye_paper.printed import AXES
+from flangeye_paper.stored_results import stored_file
+from flangeye_paper.tables import Row, columns, read_sessions, write_csv
+
+FIRST_STORED = 5
+"""The authors' loop tells its first error once five poses are there."""
+
+ROBOTS = {"aubo": "Aubo i5", "ur5": "UR5", "franka": "Franka"}
+TOLD = {"aubo": "< 0.28 mm, 0.25 deg", "ur5": "< 0.28 mm, 0.25 deg", "franka": "< 0.4 mm, 0.6 deg"}
+"""Section 3.2.3: what the translation and rotation errors converge to."""
+
+
+class Runs(NamedTuple):
+    """Many runs of Algorithm 1 on one recording.
+
+    Attributes:
+        poses: (K,) poses seen.
+        errors: (R, K, 6) of each run, mm and deg; NaN before the first finite cost.
+        others_rms: (R,) residual of the last answers on the poses outside their pools [mm].
+    """
+
+    poses: list[int]
+    errors: Floats
+    others_rms: Floats | None = None
+
+
+def fig11(batches: Path, archive: Path, out: Path) -> None:
+    """Write fig11.csv, fig11_summary.csv and fig11.png.
+
+    Args:
+        batches: Folder with the batch fig11_aubo.
+        archive: The published folder.
+        out: Folder for the files.
+    """
+    runs = {("aubo", "run again"): rerun(batches / "fig11_aubo")}
+    runs |= {(robot, "stored"): stored(archive, robot) for robot in ROBOTS}
+    rows = [row for (robot, source), many in runs.items() for row in _rows(robot, source, many)]
+    write_csv(out / "fig11.csv", rows)
+    write_csv(out / "fig11_summary.csv", [_summary(*key, many) for key, many in runs.items()])
+    _draw(runs).save(out / "fig11.png")
+
+
+def stored(archive: Path, robot: str) -> Runs:
+    """Return the authors' 50 runs on one robot."""
+    file = stored_file(archive, robot)
+    shifts, turns = (read_npz(file, name, (None, None, 3)) for name in ("arr_1", "arr_2"))
+    poses = list(range(FIRST_STORED, FIRST_STORED + shifts.shape[1]))
+    return Runs(poses, np.concatenate([shifts, turns], axis=2))
+
+
+def rerun(batch: Path) -> Runs:
+    """Return the runs of a batch of verify.algorithm_1_by_iteration."""
+    sessions = [s for s in read_sessions(batch) if s.accepted]
+    found = [s.figures("verify.algorithm_1_by_iteration") for s in sessions]
+    poses = sorted({int(name[2:]) for name in found[0] if name.startswith("x_")})
+    scale = [1e3] * 3 + [float(np.degrees(1.0))] * 3
+    errors = [
+        [
+            [f.get(f"{axis}_{n:02d}", np.nan) * k for axis, k in zip(AXES, scale, strict=True)]
+            for n in poses
+        ]
+        for f in found
+    ]
+    return Runs(poses, np.array(errors), np.array([f["others_rms"] * 1e3 for f in found]))
+
+
+def _rows(robot: str, source: str, runs: Runs) -> list[Row]:
+    means, deviations = np.nanmean(runs.errors, axis=0), np.nanstd(runs.errors, axis=0)
+    return [
+        {
+            "robot": robot,
+            "source": source,
+            "poses": n,
+            **{f"{axis}_mean": float(means[k, i]) for i, axis in enumerate(AXES)},
+            **{f"{axis}_std": float(deviations[k, i]) for i, axis in enumerate(AXES)},
+        }
+        for k, n in enumerate(runs.poses)
+    ]
+
+
+def _summary(robot: str, source: str, runs: Runs) -> Row:
+    """Return what the last answers of all runs come to."""
+    last = runs.errors[:, -1]
+    norms = np.linalg.norm(last[:, :3], axis=1)
+    deviations = last.std(axis=0)
+    return {
+        "recording": f"{ROBOTS[robot]}, {source}",
+        "runs": len(norms),
+        "the paper": TOLD[robot],
+        "translation mean mm": float(norms.mean()),
+        "worst mm": float(norms.max()),
+        **{
+            f"{axis} {'mm' if i < 3 else 'deg'}": f"{last[:, i].mean():+.2f} ± {deviations[i]:.2f}"
+            for i, axis in enumerate(AXES)
+        },
+    }
+
+
+def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
+    page = sheet(2, 3, 10.5, 6.0)
+    for column, robot in enumerate(ROBOTS):
+        for row, axes, unit in ((0, AXES[:3], "mm"), (1, AXES[3:], "deg")):
+            panel = page.panels[3 * row + column]
+            _bands(panel, _rows(robot, "stored", runs[robot, "stored"]), axes)
+            if (robot, "run again") in runs:
+                _edges(panel, _rows(robot, "run again", runs[robot, "run again"]), axes)
+            what = "stored (bands) and run again (lines)" if column == 0 else "stored"
+            dress(panel, f"{ROBOTS[robot]}, {what}", "poses", f"mean ± deviation [{unit}]")
+            panel.set_xlim(5, 45)
+            panel.set_ylim((-2, 2) if row == 0 else (-0.7, 0.7))
+            if column == 2:
+                legend(panel, loc="upper right", ncols=3)
+    return page
+
+
+def _bands(panel: Any, rows: Sequence[Row], axes: Sequence[str]) -> None:
+    for axis in axes:
+        poses, mean, deviation = map(
+            np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
+        )
+        panel.plot(poses, mean, color=AXIS_COLOURS[axis], linewidth=1.0, label=axis)
+        panel.fill_between(
+            poses, mean - deviation, mean + deviation, color=AXIS_COLOURS[axis], alpha=0.2, lw=0
+        )
+
+
+def _edges(panel: Any, rows: Sequence[Row], axes: Sequence[str]) -> None:
+    for axis in axes:
+        poses, mean, deviation = map(
+            np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
+        )
+        for edge in (mean - deviation, mean + deviation):
+            panel.plot(poses, edge, "--", color=AXIS_COLOURS[axis], linewidth=0.9)

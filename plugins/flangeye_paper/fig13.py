@@ -1,0 +1,119 @@
+"""Figure 13 and what the paper does not measure: how far the torch is from the true seam."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flangeye_paper.drawing import dress, legend, sheet
+from flangeye_paper.tables import Row, read_sessions, write_csv
+from flangeye_paper.welds import SeenWeld, seen
+
+WORKPIECES = ("straight", "curved")
+TOUCH, PLAN, PRINTED = "by touch", "the plan alone", "Algorithm 2 as printed"
+ACROSS = "by touch, started across the seam: from 160 mm on"
+BRIDGED = "by touch, 20 mm of wall missing: there"
+
+PARTS = {ACROSS: (0.16, np.inf), BRIDGED: (0.09, 0.11)}
+"""Which part of the seam is looked at, by arc length [m]: after four tool lengths; in the gap."""
+
+MODE = "steps.5.mode"
+PATHS = (("robot", "#d97706"), ("tip", "#1d4ed8"), ("torch", "#be123c"))
+SHOWN = ((TOUCH, "#be123c"), (PLAN, "#64748b"), (PRINTED, "#d97706"))
+
+Welds = Mapping[str, Sequence[SeenWeld]]
+"""By how the seam was followed."""
+
+
+def fig13(batches: Path, out: Path) -> None:
+    """Write fig13.csv and fig13.png.
+
+    Args:
+        batches: Folder with the batches fig13_…, fig13-others_…, fig13-gap_…, fig13-across_….
+        out: Folder for the files.
+    """
+    welds = {name: _welds(batches, name) for name in WORKPIECES}
+    write_csv(out / "fig13.csv", [row for name in WORKPIECES for row in _rows(name, welds[name])])
+    _draw(welds).save(out / "fig13.png")
+
+
+def _welds(batches: Path, workpiece: str) -> Welds:
+    """Return the welds of a workpiece by how it was followed."""
+    others = read_sessions(batches / f"fig13-others_{workpiece}")
+    sessions = {
+        TOUCH: read_sessions(batches / f"fig13_{workpiece}"),
+        PLAN: [s for s in others if s.row[MODE] == "vision"],
+        PRINTED: [s for s in others if s.row[MODE] == "as_printed"],
+        ACROSS: read_sessions(batches / f"fig13-across_{workpiece}"),
+        BRIDGED: read_sessions(batches / f"fig13-gap_{workpiece}"),
+    }
+    return {name: [seen(session) for session in listed] for name, listed in sessions.items()}
+
+
+def _rows(workpiece: str, welds: Welds) -> Iterable[Row]:
+    for name, listed in welds.items():
+        yield {"workpiece": workpiece, "followed": name, **_figures(name, listed)}
+
+
+def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
+    """Return the figures over all welds that were followed in one way."""
+    part = PARTS.get(name, (0.0, np.inf))
+    found = [weld.deviation(part) for weld in welds]
+    every = np.concatenate(found)
+    touched = name not in (PLAN, PRINTED)
+    return {
+        "welds": str(len(welds)),
+        "to the end": str(sum(weld.report.completed for weld in welds)),
+        "rms mm": _mm(np.sqrt(np.mean(every**2))),
+        "worst weld's rms mm": _mm(max(np.sqrt(np.mean(e**2)) for e in found)),
+        "largest mm": _mm(every.max()),
+        "turn rate deg/s": f"{np.degrees(max(np.abs(w.report.turn).max() for w in welds)):.1f}",
+        "step at the end mm": _mm(max(w.end_step for w in welds)) if touched else "",
+        "back on the seam after mm": (
+            f"{max(w.recovery for w in welds) * 1e3:.0f}" if name == ACROSS else ""
+        ),
+        "contact regained": str(sum(w.regained for w in welds)) if name == BRIDGED else "",
+    }
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.3f}"
+
+
+def _draw(welds: Mapping[str, Welds]) -> Any:
+    """Draw the paths in the plane, and the torch's distance from the true seam, by workpiece."""
+    page = sheet(2, 2, 9.0, 5.4)
+    for column, workpiece in enumerate(WORKPIECES):
+        _paths(page.panels[column], workpiece, welds[workpiece][TOUCH][0])
+        _distance(page.panels[2 + column], welds[workpiece])
+    legend(page.panels[0], loc="lower right", ncols=2)
+    legend(page.panels[2], loc="upper right")
+    return page
+
+
+def _paths(panel: Any, workpiece: str, weld: SeenWeld) -> None:
+    report, truth = weld.report, weld.truth
+    start, x = truth[0], truth[-1] - truth[0]
+    x = x / np.linalg.norm(x)
+    axes = np.stack([x, np.cross(report.opening, x)], axis=1) * 1e3
+    panel.plot(*((truth - start) @ axes).T, color="black", linewidth=2.5, label="true seam")
+    panel.plot(*((report.planned - start) @ axes).T, color="#64748b", ls=":", label="planned")
+    for name, colour in PATHS:
+        at = (getattr(report, name) - start) @ axes
+        panel.plot(*at.T, color=colour, linewidth=1.0, label=name)
+    dress(panel, f"paths, {workpiece} groove", "along [mm]", "across [mm]")
+
+
+def _distance(panel: Any, welds: Welds) -> None:
+    for name, colour in SHOWN:
+        for i, weld in enumerate(welds[name]):
+            off = weld.deviation() * 1e3
+            length = np.linalg.norm(weld.truth[-1] - weld.truth[0]) * 1e3
+            at = np.linspace(0, length, len(off))
+            panel.plot(at, off, color=colour, linewidth=0.8, label=None if i else name)
+    panel.set_yscale("log")
+    panel.set_ylim(1e-3, 1e2)
+    dress(panel, "torch from the true seam", "along [mm]", "distance [mm]")

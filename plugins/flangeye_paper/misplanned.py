@@ -1,0 +1,67 @@
+"""A seam whose planning error is chosen, to study what following it by touch makes of that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye import Params, stage
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
+from flangeye.models.workpiece import WorkpiecePath, load_workpiece
+from flangeye.types import CAMERA, Floats, PointCloud, Seam, Seed, VerifiedHandEye, WorkpieceScan
+from flangeye.units import Angle, Length, param
+
+SPACING = 1e-3
+"""Between two points of a seam [m]."""
+
+
+class LaidParams(Params):
+    """Parameters of ``scan.as_laid``."""
+
+    workpiece: WorkpiecePath = param("v-straight", description="One of data/workpieces.")
+    position: tuple[Length, Length, Length] = param(("600 mm", "0 mm", "250 mm"))
+    rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "20 deg"))
+
+    def seam(self) -> tuple[Floats, Floats, float | None]:
+        """Return the true seam (N, 3) its opening (3,), in base, and its half angle."""
+        (seam,) = load_workpiece(self.workpiece).seams.values()
+        pose = rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+        points = _dense(seam.points) @ pose[:3, :3].T + pose[:3, 3]
+        return points, pose[:3, :3] @ seam.opening, seam.half_angle
+
+
+@stage("scan.as_laid")
+def scan_as_laid(params: LaidParams) -> WorkpieceScan:
+    """Nothing is scanned: where the workpiece lies is known, for a study of the weld alone."""
+    points, _, _ = params.seam()
+    cloud = PointCloud(CAMERA, points.astype(np.float32))
+    return WorkpieceScan(cloud, f"{params.workpiece.stem}, as laid", (), {"groove": points})
+
+
+class MisplannedParams(LaidParams):
+    """Parameters of ``seam.misplanned``."""
+
+    shift: Length = param("3 mm", ge=0, description="In a direction of the plane drawn anew.")
+    turn: Angle = param("1 deg", ge=0, description="About the opening, to a side drawn anew.")
+
+
+@stage("seam.misplanned")
+def seam_misplanned(hand_eye: VerifiedHandEye, seed: Seed, params: MisplannedParams) -> Seam:
+    """Plan the true seam, but shifted and turned: an error of known size."""
+    points, opening, half_angle = params.seam()
+    rng = np.random.default_rng([seed, 13])
+    along = points[-1] - points[0]
+    along /= np.linalg.norm(along)
+    way = rng.uniform(0.0, 2.0 * np.pi)
+    shift = np.cos(way) * along + np.sin(way) * np.cross(opening, along)
+    turn = rotation_exp(rng.choice([-1.0, 1.0]) * params.turn * opening)
+    middle = points.mean(axis=0)
+    planned = (points - middle) @ turn.T + middle + params.shift * shift
+    each = np.tile(np.eye(3) * (params.shift / 2) ** 2, (len(points), 1, 1))
+    openings = np.tile(opening, (len(points), 1))
+    return Seam(planned, openings, each, half_angle, source="misplanned on purpose")
+
+
+def _dense(points: Floats) -> Floats:
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    ticks = np.linspace(0.0, along[-1], round(along[-1] / SPACING) + 1)
+    return np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)

@@ -1,0 +1,160 @@
+"""What Open3D up to 0.7 did to the paper's ICP, done again. Arrays only; an emulation.
+
+Up to version 0.7 (the data are of 2018-12 to 2019-06) Open3D found the normal of a neighbourhood
+with covariance A as a column of ``(A - l0 I)(A - l1 I)``, l0 >= l1 >= l2 its eigenvalues. Where the
+column belongs to an axis that lies in an exactly flat patch, the product is zero but for rounding,
+and what is left after normalising points anywhere in the patch (isl-org/Open3D issue 880, mended
+in 0.8.0). A CAD cloud's face is such a patch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.types import Floats
+
+Normals = Literal["open3d_0_7_normals", "sound"]
+
+NEIGHBOURS = 30
+"""As in the published scripts; their radius is 1 in the file's unit."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """When ICP ends: few steps, or changes of share and rms below a limit.
+
+    Attributes:
+        iterations: At most so many.
+        change: Of the matched share, and of their rms distance in the cloud's unit.
+    """
+
+    iterations: int
+    change: float
+
+
+def normals_of(points: Floats, radius: float, kind: Normals) -> Floats:
+    """Return the (N, 3) normals of a cloud from each point's neighbours.
+
+    Args:
+        points: (N, 3).
+        radius: Neighbours lie within it; at most 30 are used.
+        kind: Open3D's up to 0.7, or the direction in which the neighbourhood is thinnest.
+    """
+    covariances = _covariances(points, radius)
+    if kind == "sound":
+        return np.asarray(np.linalg.eigh(covariances)[1][:, :, 0])
+    return _defective(covariances)
+
+
+def _covariances(points: Floats, radius: float) -> Floats:
+    """Return (N, 3, 3) as mean of products less product of means: the rounding is part of it."""
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(points).query(points, k=NEIGHBOURS, distance_upper_bound=radius)
+    near = np.isfinite(distance)
+    sums, products = np.zeros_like(points), np.zeros((len(points), 3, 3))
+    for k in range(NEIGHBOURS):  # one after the other, as the library added them up
+        point = np.where(near[:, k, None], points[np.where(near[:, k], index[:, k], 0)], 0.0)
+        sums += point
+        products += point[:, :, None] * point[:, None, :]
+    count = near.sum(axis=1)[:, None]
+    mean = sums / count
+    return np.asarray(products / count[:, :, None] - mean[:, :, None] * mean[:, None, :])
+
+
+def _defective(covariances: Floats) -> Floats:
+    """Return the first column of ``(A - l0 I)(A - l1 I)``, normalised; z where it is zero."""
+    largest, middle = _upper_eigenvalues(covariances)
+    identity = np.eye(3)
+    column = covariances[:, :, 0] - middle[:, None] * identity[0]
+    shifted = covariances - largest[:, None, None] * identity
+    product = sum(shifted[:, :, k] * column[:, k, None] for k in range(3))
+    length = np.linalg.norm(product, axis=1, keepdims=True)
+    scaled = product / np.where(length > 0, length, 1.0)
+    return np.asarray(np.where(length > 0, scaled, identity[2]))
+
+
+def _upper_eigenvalues(matrices: Floats) -> tuple[Floats, Floats]:
+    """Return the largest and middle eigenvalue of (N, 3, 3) by Cardano's formula (Smith 1961)."""
+    diagonal = np.einsum("nii->ni", matrices)
+    off = matrices[:, 0, 1] ** 2 + matrices[:, 0, 2] ** 2 + matrices[:, 1, 2] ** 2
+    mean = diagonal.sum(axis=1) / 3
+    spread = np.sqrt((((diagonal - mean[:, None]) ** 2).sum(axis=1) + 2 * off) / 6)
+    scaled = (matrices - mean[:, None, None] * np.eye(3)) / np.maximum(spread, 1e-300)[
+        :, None, None
+    ]
+    angle = np.arccos(np.clip(np.linalg.det(scaled) / 2, -1, 1)) / 3
+    largest = mean + 2 * spread * np.cos(angle)
+    smallest = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
+    is_diagonal = off == 0
+    largest = np.where(is_diagonal, diagonal.max(axis=1), largest)
+    smallest = np.where(is_diagonal, diagonal.min(axis=1), smallest)
+    return largest, 3 * mean - largest - smallest
+
+
+@dataclass(frozen=True, eq=False)
+class IcpFit:
+    """Where ICP ended.
+
+    Attributes:
+        motion: (4, 4) that takes the source onto the target.
+        iterations: How many steps it took.
+        share: Of the source's points that matched.
+        rms: Distance of the matched pairs.
+    """
+
+    motion: Floats
+    iterations: int
+    share: float
+    rms: float
+
+
+def icp(
+    source: Floats, target: Floats, normals: Floats, distance: float, stop: Stop
+) -> IcpFit | None:
+    """Point-to-plane ICP as Open3D does it, from the identity; None when too little matches.
+
+    Args:
+        source: (N, 3).
+        target: (M, 3), in the same unit.
+        normals: (M, 3) of the target.
+        distance: Pairs further apart do not match.
+        stop: When it ends.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(target)
+    motion, moved = np.eye(4), source
+    matched, nearest, share, rms = _matches(tree, moved, distance)
+    for done in range(1, stop.iterations + 1):
+        if matched.sum() < 6:
+            return None
+        step = _step(moved[matched], target[nearest], normals[nearest])
+        motion, moved = step @ motion, moved @ step[:3, :3].T + step[:3, 3]
+        before = (share, rms)
+        matched, nearest, share, rms = _matches(tree, moved, distance)
+        if max(abs(before[0] - share), abs(before[1] - rms)) < stop.change:
+            return IcpFit(motion, done, share, rms)
+    return IcpFit(motion, stop.iterations, share, rms)
+
+
+def _matches(
+    tree: object, points: Floats, distance: float
+) -> tuple[NDArray[np.bool_], NDArray[np.intp], float, float]:
+    gap, index = tree.query(points, distance_upper_bound=distance)  # type: ignore[attr-defined]
+    near = np.isfinite(gap)
+    rms = float(np.sqrt((gap[near] ** 2).mean())) if near.any() else 0.0
+    return near, index[near], float(near.mean()), rms
+
+
+def _step(moved: Floats, near: Floats, normals: Floats) -> Floats:
+    """Return the (4, 4) Gauss-Newton step; its three angles are read as roll, pitch and yaw."""
+    distances = np.einsum("ni,ni->n", moved - near, normals)
+    jacobian = np.hstack([np.cross(moved, normals), normals])
+    x = np.linalg.solve(jacobian.T @ jacobian, -jacobian.T @ distances)
+    return rigid(rotation_from_rpy(*x[:3]), x[3:])

@@ -1,0 +1,229 @@
+"""``acquire.archive``: recorded scans and robot poses, through a reader for their layout."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from flangeye import StageError, stage
+from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.recording import (
+    Archive,
+    Recording,
+    check_distinct_clouds,
+    check_poses,
+    digests_of,
+    fingerprint_of,
+)
+from flangeye.log.read import is_log, read_run
+from flangeye.log.record import adapter
+from flangeye.models.cloud_unit import (
+    check_unit,
+    detect_unit,
+    median_distance,
+    unit_note,
+)
+from flangeye.models.scanners import ScannerData
+from flangeye.types import (
+    FLANGE,
+    ArchivePath,
+    Capture,
+    Captures,
+    Image,
+    PointCloud,
+    Source,
+    Transform,
+)
+from flangeye_plugins.acquire.camera import CameraParams, image_of_cloud, read_image
+from flangeye_plugins.acquire.opening import (
+    OpeningParams,
+    archive_path,
+    log_source,
+    open_archive,
+    poses_of,
+    skipped_note,
+)
+
+StatedUnit = Literal["auto", "m", "mm", "in"]
+
+
+class ArchiveParams(OpeningParams):
+    """Which archive, in which unit, and how strictly."""
+
+    unit: StatedUnit = Field(
+        "auto",
+        description="Unit of the clouds. auto: what the layout says, else metres or millimetres, "
+        "whichever fits the scanner's range; either is reported.",
+    )
+    unreadable: Literal["refuse", "reject"] = Field(
+        "refuse",
+        description="What to do about a cloud that cannot be read: refuse the archive, or set the "
+        "capture aside and report it.",
+    )
+    camera: CameraParams | None = Field(
+        None,
+        description="The camera that took the images beside the clouds; not needed where a cloud "
+        "is organised as its image, for then it tells.",
+    )
+
+
+@stage("acquire.archive")
+def acquire_archive(
+    scanner: ScannerData | None, archive: ArchivePath, params: ArchiveParams
+) -> Captures:
+    """Replay recorded scans and robot poses: a folder in a known layout, or a run.mcap.
+
+    Everything but the inside of the clouds is checked before the first capture is given; the
+    clouds are read one at a time as they are asked for, verification first.
+    """
+    path = archive_path("acquire.archive", archive, params)
+    if is_log(path):
+        return _replay(path)
+    recorded = open_archive(path, params)
+    usable, notes = _usable(recorded, params.unreadable)
+    check_poses(recorded.root, usable)
+    digests = digests_of(r.cloud for r in usable if r.cloud)
+    check_distinct_clouds(usable, digests)
+    scanner = scanner or ScannerData(model="the scanner")
+    unit, unit_told = _unit(recorded, usable, params.unit, scanner)
+    images = [r.image for r in usable if r.image]
+    digests |= digests_of([*recorded.files, *images])
+    source = Source(
+        fingerprint_of(recorded.root, digests),
+        (
+            f"archive: {recorded.layout}, {recorded.root}",
+            *recorded.notes,
+            *notes,
+            unit_told,
+            *_camera_note(usable, params.camera),
+        ),
+    )
+    return Captures(
+        _captures(usable, unit, scanner, params.camera), source, total=len(usable), recorded=True
+    )
+
+
+def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[str]]:
+    """Return the recordings whose cloud can be read, verification first, and what to tell."""
+    with_cloud = [r for r in archive.recordings if r.cloud]
+    if not any(r.role == "calibration" for r in with_cloud):
+        centres = sum(r.centre_in_camera is not None for r in archive.recordings)
+        cure = f"; acquire.centres can use its {centres} ready-made centres" if centres else ""
+        raise StageError(
+            f"{archive.root}: holds {len(archive.recordings)} poses, but no cloud to calibrate "
+            f"with{cure}"
+        )
+    notes = skipped_note(archive, lambda r: r.cloud is not None, "cloud")
+    readable: list[Recording] = []
+    for recording, cloud in _clouds(with_cloud):
+        try:
+            # What is set aside must be known now, so then the inside is looked at too.
+            check_cloud_file(cloud) if unreadable == "refuse" else read_cloud(cloud)
+        except StageError as error:
+            if unreadable == "refuse":
+                raise
+            notes.append(f"set aside '{recording.id}': {error}")
+        else:
+            readable.append(recording)
+    return sorted(readable, key=lambda r: r.role != "verification"), notes
+
+
+def _clouds(recordings: Iterable[Recording]) -> Iterator[tuple[Recording, Path]]:
+    for recording in recordings:
+        if recording.cloud is not None:
+            yield recording, recording.cloud
+
+
+def _unit(
+    archive: Archive, usable: Sequence[Recording], stated: StatedUnit, scanner: ScannerData
+) -> tuple[LengthUnit, str]:
+    """Return the unit of the clouds and the note that reports it."""
+    path, raw = _first_distance(archive.root, usable)
+    unit: LengthUnit
+    if stated != "auto":
+        unit, how = stated, "as stated"
+    elif archive.cloud_unit is not None:
+        unit, how = archive.cloud_unit, "as the layout says"
+    else:
+        unit, how = detect_unit(path, raw, scanner), "detected"
+    distance = raw / PER_METRE[unit]
+    check_unit(path, distance, unit, scanner)
+    return unit, unit_note(unit, how, distance, scanner)
+
+
+def _first_distance(root: Path, usable: Sequence[Recording]) -> tuple[Path, float]:
+    """Return the first cloud with a finite point, and its median distance in its own unit."""
+    for _, path in _clouds(usable):
+        raw = median_distance(read_cloud(path))
+        if math.isfinite(raw):
+            return path, raw
+    raise StageError(f"{root}: none of its {len(usable)} clouds has a finite point (all NaN)")
+
+
+def _captures(
+    usable: Iterable[Recording],
+    unit: LengthUnit,
+    scanner: ScannerData,
+    camera: CameraParams | None,
+) -> Iterator[Capture]:
+    """Read one cloud at a time, and the image beside it."""
+    for recording, path in _clouds(usable):
+        cloud = read_cloud(path, unit)
+        check_unit(path, median_distance(cloud), unit, scanner)
+        yield Capture(
+            recording.id,
+            cloud,
+            poses_of(recording),
+            recording.joints,
+            recording.time_ns,
+            recording.role,
+            _image(recording, cloud, camera),
+        )
+
+
+def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> list[str]:
+    """Return what to tell of the images' camera, by the first one; nothing where it is stated."""
+    first = next((r for r in usable if r.image), None)
+    if camera is not None or first is None or first.image is None or first.cloud is None:
+        return []
+    image = image_of_cloud(read_image(first.image), read_cloud(first.cloud))
+    if image is None:
+        return [
+            f"left out the images, such as {first.image.name}: no pinhole camera fits the clouds "
+            "under them; write camera: {focal_length: [fx, fy], principal_point: [cx, cy]}"
+        ]
+    (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
+    told = f"focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, {cy:.1f} px"
+    return [f"camera of the images: {told}, by the clouds under them"]
+
+
+def _image(recording: Recording, cloud: PointCloud, camera: CameraParams | None) -> Image | None:
+    if recording.image is None:
+        return None
+    pixels = read_image(recording.image)
+    if camera is not None:
+        return camera.image(pixels)
+    return image_of_cloud(pixels, cloud)
+
+
+def _replay(path: Path) -> Captures:
+    """Return the captures of a log of ours."""
+    log = read_run(path)
+    if not log.has_full_clouds:
+        raise StageError(
+            f"{path}: holds no whole scans; record with log: {{clouds: full}}, or use "
+            "flangeye run --from to start at a later step"
+        )
+    recordings = [_of_log(name, meta) for name, meta in log.poses.items()]
+    return Captures(
+        log.readings(), log_source(log, recordings), total=len(recordings), recorded=True
+    )
+
+
+def _of_log(name: str, meta: Mapping[str, Any]) -> Recording:
+    pose: Transform = adapter(Transform).validate_python(meta["poses"][FLANGE])
+    return Recording(name, {FLANGE: pose.matrix}, role=meta["role"])

@@ -1,0 +1,82 @@
+"""Images from files, and the calibration of the camera that took them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flangeye import Params, StageError
+from flangeye.files.images import MAX_FILE, ImageError, decode_image
+from flangeye.files.regular import read_regular
+from flangeye.types import Image, PointCloud
+
+Grey = NDArray[np.uint8]
+
+PINHOLE = 0.3
+"""Root mean square by which a cloud's points may miss their pixels for a pinhole camera [px]."""
+
+
+class CameraParams(Params):
+    """The calibration of the camera that took the images."""
+
+    focal_length: tuple[float, float] = Field(description="fx and fy of the camera's matrix [px].")
+    principal_point: tuple[float, float] = Field(description="cx and cy [px].")
+    distortion: tuple[float, ...] = Field(
+        (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
+    )
+
+    def image(self, pixels: Grey) -> Image:
+        """Return the pixels with the camera that took them."""
+        (fx, fy), (cx, cy) = self.focal_length, self.principal_point
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Image(pixels, matrix, np.array(self.distortion))
+
+
+def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
+    """Return an image with the camera that the organised cloud under it implies.
+
+    Each point lies on its pixel's ray: u = fx x / z + cx, and v alike, are linear in the unknowns.
+
+    Args:
+        pixels: (H, W) grey values.
+        cloud: Its points in ``camera``, in any unit.
+
+    Returns:
+        None where the cloud is not organised as the image, or no pinhole camera fits it.
+    """
+    if cloud.xyz.shape[:-1] != pixels.shape:
+        return None
+    known = np.isfinite(cloud.xyz).all(axis=2) & (cloud.xyz[..., 2] > 0)
+    rays = cloud.xyz[known][:, :2] / cloud.xyz[known][:, 2:]
+    (fx, cx), miss_u = _line(rays[:, 0], np.nonzero(known)[1])
+    (fy, cy), miss_v = _line(rays[:, 1], np.nonzero(known)[0])
+    if not np.hypot(miss_u, miss_v) <= PINHOLE:
+        return None
+    return Image(pixels, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+
+
+def _line(rays: NDArray[np.float32], pixels: NDArray[np.intp]) -> tuple[tuple[float, float], float]:
+    """Return slope and offset of pixels over rays, and what remains, rms [px]."""
+    if len(rays) < 3:
+        return (1.0, 0.0), float("inf")
+    rows = np.stack([rays.astype(np.float64), np.ones(len(rays))], axis=1)
+    found = np.linalg.lstsq(rows, pixels.astype(np.float64), rcond=None)[0]
+    miss = rows @ found - pixels
+    return (float(found[0]), float(found[1])), float(np.sqrt(np.mean(miss**2)))
+
+
+def read_image(path: Path) -> Grey:
+    """Return the grey values (H, W) of an image file.
+
+    Raises:
+        StageError: It is missing or damaged.
+    """
+    import cv2
+
+    try:
+        return decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_GRAYSCALE).astype(np.uint8)
+    except ImageError as error:
+        raise StageError(f"{path}: {error}") from None

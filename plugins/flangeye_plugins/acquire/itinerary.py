@@ -1,0 +1,200 @@
+"""Where a live session sends the arm, and how it gets there; all checked before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.models.targets import Flange
+from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between, poses_near
+from flangeye.motion.reach import Margins, Reach
+from flangeye.motion.route import Barred, Route, Router
+from flangeye.plugin.stage import BoundPart
+from flangeye.types import Floats, Observation, Role
+
+FEWEST = 3
+"""Poses without which no camera pose can be found."""
+
+
+class Stop(NamedTuple):
+    """A pose to scan at.
+
+    Attributes:
+        id: Of the capture that is taken there.
+        role: What it is for.
+        pose: Where, and the joints that do it.
+    """
+
+    id: str
+    role: Role
+    pose: PlannedPose
+
+
+class Itinerary:
+    """The stops of a session: those for verifying first, then the plan's.
+
+    Attributes:
+        outcomes: What became of the captures so far, by id; plans that choose as they go look here.
+        centre: (3,) middle of the work, in ``base`` [m].
+        size: (3,) of the work [m].
+        total: How many stops there are at most.
+    """
+
+    def __init__(
+        self, reach: Reach, base_T_camera: Floats, scanner: ScannerModel, router: Router
+    ) -> None:
+        """Take the place; see :func:`itinerary_of`."""
+        self.outcomes: Mapping[str, Observation | None] = {}
+        self._reach, self._router = reach, router
+        centre = middle_of_view(scanner, base_T_camera)
+        self._site = Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints, self._lost)
+        self._planned: list[str] = []
+        self._checks: list[PlannedPose] = []
+        self._plan = Plan([], 0, centre, np.zeros(3))
+
+    def plan(self, poses: BoundPart, verification: int, seed: int) -> None:
+        """Plan the stops.
+
+        Raises:
+            StageError: No stop for verifying is possible.
+        """
+        planning, checking = np.random.SeedSequence(seed).spawn(2)
+        self._plan = poses(self._site, np.random.default_rng(planning))
+        rng = np.random.default_rng(checking)
+        self._checks = poses_near(self._plan.centre, verification, self._site, rng)
+        if len(self._checks) < verification:
+            raise StageError(
+                f"acquire.live: no pose for verification near the middle of the work "
+                f"({_mm(self._plan.centre)}): {self.why_not()}; move the plan's centre, widen "
+                "robot.limits, or set verification: 0"
+            )
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) middle of the work, in ``base`` [m]."""
+        return self._plan.centre
+
+    @property
+    def size(self) -> Floats:
+        """(3,) of the work [m]."""
+        return self._plan.size
+
+    @property
+    def total(self) -> int:
+        """How many stops there are at most."""
+        return len(self._checks) + self._plan.wanted
+
+    def stops(self) -> Iterator[Stop]:
+        """Yield the stops in order; a plan may choose each when it is asked for."""
+        for index, pose in enumerate(self._checks):
+            yield Stop(f"{index:04d}", "verification", pose)
+        for index, pose in enumerate(self._plan.poses, len(self._checks)):
+            self._planned.append(f"{index:04d}")
+            yield Stop(self._planned[-1], "calibration", pose)
+
+    def way(self, start: Floats, stop: Stop) -> Route | Barred:
+        """Return the way to a stop from joint angles (n,)."""
+        return self._router.route(start, stop.pose.joints)
+
+    def why_not(self) -> str:
+        """Say why poses were impossible, and how often."""
+        counts = self._reach.refused.most_common()
+        return ", ".join(f"{count} {reason}" for reason, count in counts) or "none was tried"
+
+    def shown(self, start: Floats | None) -> str:
+        """Return the plan for people: every stop, the way to it, and what it takes.
+
+        Args:
+            start: (n,) where the arm stands [rad]; None where it does not answer.
+
+        Raises:
+            StageError: Fewer than three poses are possible.
+        """
+        rows, seconds, here = [], 0.0, start
+        stops = list(self.stops())
+        self.require_enough(len(stops) - len(self._checks))
+        for stop in stops:
+            way = None if here is None else self.way(here, stop)
+            rows.append(self._row(stop, way))
+            if not isinstance(way, Barred):
+                seconds += way.seconds if way else 0.0
+                here = stop.pose.joints
+        return "\n".join([
+            f"{len(stops)} stops, {seconds:.0f} s under way; {self._plan.wanted} were wanted "
+            f"({self.why_not()} left out)",
+            "stop  for           flange at (mm, base)    tilt  way       time",
+            *rows,
+        ])  # fmt: skip
+
+    def require_enough(self, found: int) -> None:
+        """Refuse a plan of fewer than three poses.
+
+        Raises:
+            StageError: Says why the others are impossible.
+        """
+        if found < FEWEST:
+            raise StageError(
+                f"acquire.live: {found} of {self._plan.wanted} planned poses are possible, "
+                f"{FEWEST} are needed ({self.why_not()}); correct the view, move the plan's "
+                "centre, or widen robot.limits"
+            )
+
+    def _row(self, stop: Stop, way: Route | Barred | None) -> str:
+        pose = stop.pose.base_T_flange
+        tilt = angle_between(pose[:3, 2], self._site.eye - pose[:3, 3])
+        place = " ".join(f"{1e3 * x:7.1f}" for x in pose[:3, 3])
+        return f"{stop.id}  {stop.role:12}  {place}  {np.degrees(tilt):3.0f} deg  {_told(way)}"
+
+    def _lost(self) -> set[int]:
+        """Return the places in the plan of poses that told nothing."""
+        return {
+            place
+            for place, capture in enumerate(self._planned)
+            if self.outcomes.get(capture, capture) is None
+        }
+
+
+def itinerary_of(
+    robot: RobotModel,
+    scanner: ScannerModel,
+    flange: Flange,
+    base_T_camera: Floats,
+    margins: Margins,
+    start: Floats | None,
+) -> Itinerary:
+    """Return an itinerary without stops, for a scanner that is roughly at ``base_T_camera``.
+
+    It begins at ``start`` (n,), where the arm stands [rad], if that is known.
+
+    Raises:
+        StageError: The arm cannot show its flange to the scanner at all.
+    """
+    radius = max(flange.outer, flange.details.wrist / 2)
+    reach = Reach(robot, scanner, base_T_camera, radius, margins)
+    if start is not None:
+        reach.start_from(start)
+    centre = middle_of_view(scanner, base_T_camera)
+    if reach.facing(centre) is None:
+        reasons = ", ".join(reach.refused) or "no posture is possible"
+        raise StageError(
+            f"acquire.live: {robot.model} cannot show its flange to {scanner.model} at "
+            f"{_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
+        )
+    return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
+
+
+def _told(way: Route | Barred | None) -> str:
+    if way is None:
+        return "not known"
+    if isinstance(way, Barred):
+        return f"barred: {way.reason}"
+    return f"{'by home' if way.via else 'direct':8}  {way.seconds:4.1f} s"
+
+
+def _mm(point: Floats) -> str:
+    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"

@@ -1,0 +1,298 @@
+"""``acquire.live``: a real arm, a real scanner, one pose at a time until the solver has enough."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import (
+    DeviceError,
+    FrameDropped,
+    KnowsTruth,
+    MotionAllowed,
+    RobotDriver,
+    RobotState,
+    Scan,
+    Scanner,
+    ScannerDriver,
+)
+from flangeye.errors import NothingMoved, StageError
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.models.targets import Flange
+from flangeye.motion.arm import WatchedArm, watched
+from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.reach import Margins
+from flangeye.motion.route import Barred
+from flangeye.motion.supervision import Sample
+from flangeye.plugin.stage import BoundPart, Choose, Params, stage
+from flangeye.recipe.header import LimitsSection
+from flangeye.types import (
+    BASE,
+    FLANGE,
+    Box,
+    Capture,
+    Captures,
+    Floats,
+    Journal,
+    Rejection,
+    Resumed,
+    Seed,
+    Source,
+    Transform,
+    by_frame,
+)
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
+
+HOW_TO_MOVE = "\nnothing moved: --move lets the arm go"
+
+
+class LiveParams(Params):
+    """Parameters of ``acquire.live``."""
+
+    view: Annotated[BoundPart, Choose("view")] = Field(
+        description="Where the scanner roughly is: {guess: {position: …}} or {shown: {joints: …}}."
+    )
+    poses: Annotated[BoundPart, Choose("plan")] = param(
+        {"next_best": {}}, description="Where the robot goes."
+    )
+    verification: int = Field(
+        1, ge=0, description="Captures that are kept from solving, near the workspace's middle."
+    )
+    joint_margin: Angle = param(
+        "5 deg", ge=0, description="Poses keep this far from the limits of the joints."
+    )
+    singularity: float = Field(
+        0.05,
+        ge=0,
+        lt=1,
+        description="Poses keep away from singularities: smallest singular value of the Jacobian, "
+        "lengths in units of the arm's reach.",
+    )
+    moved: Length = param(
+        "0.05 mm", gt=0, description="A scan during which the flange moved by more is set aside."
+    )
+
+
+@stage("acquire.live")
+def acquire_live(  # noqa: PLR0913  what it asks the runner for
+    robot: RobotModel,
+    scanner: ScannerModel,
+    flange: Flange,
+    arm: RobotDriver,
+    eye: ScannerDriver,
+    limits: LimitsSection,
+    motion: MotionAllowed,
+    seed: Seed,
+    journal: Journal,
+    params: LiveParams,
+    resumed: Resumed | None = None,
+) -> Captures:
+    """Drive an arm through planned poses and scan its flange at each.
+
+    Every pose and every way is checked before anything moves. The arm is watched by a process of
+    its own and stops on any safety fault. While a scan is transferred, logged and fitted, the arm
+    is already on its way to the next pose. When the solver has enough, the arm stops.
+
+    Args:
+        robot: The arm's model.
+        scanner: The scanner's model.
+        flange: What to look for.
+        arm: Opens the arm.
+        eye: Opens the scanner.
+        limits: What the arm must keep to.
+        motion: Whether it may move at all; if not, the plan is shown.
+        seed: Decides the poses.
+        journal: Hears where the arm is.
+        params: See :class:`LiveParams`.
+        resumed: What an earlier run already took.
+
+    Raises:
+        StageError: Fewer than three poses are possible, or a device cannot be opened.
+        NothingMoved: Motion was not asked for; the message is the plan.
+    """
+    allowed = limits_of(limits, robot)
+    margins = Margins(allowed, params.joint_margin, params.singularity)
+    base_T_camera = params.view(Arm(robot), scanner)
+
+    def planned(start: Floats | None) -> Itinerary:
+        itinerary = itinerary_of(robot, scanner, flange, base_T_camera, margins, start)
+        itinerary.plan(params.poses, params.verification, seed)
+        return itinerary
+
+    if not motion.allowed:
+        start = _where(arm, robot, allowed)
+        raise NothingMoved(planned(start).shown(start) + HOW_TO_MOVE)
+    with ExitStack() as opening:
+        guard = opening.enter_context(watched(arm, robot, allowed, partial(journal, "arm")))
+        require_inside(guard.state, allowed)
+        opened = opening.enter_context(eye.open())
+        itinerary = planned(guard.state.joints)
+        release = opening.pop_all()
+    done = resumed.done if resumed else frozenset()
+    session = LiveSession(itinerary, guard, opened, params.moved, done)
+    return LiveCaptures(session, _source(session, arm, eye), release)
+
+
+def _source(session: LiveSession, arm: RobotDriver, eye: ScannerDriver) -> Source:
+    """Return what is known of a session before its first capture."""
+    itinerary, scanner = session.itinerary, session.scanner
+    return Source(
+        fingerprint=_fingerprint(arm, eye, scanner),
+        notes=(f"live: {session.arm.name} and {scanner.name}",),
+        workspace=Box(itinerary.centre, itinerary.size),
+        truth=scanner.truth if isinstance(scanner, KnowsTruth) else None,
+    )
+
+
+def require_inside(state: RobotState, allowed: MotionLimits) -> None:
+    """Refuse an arm that stands where it must not go: there is no checked way from there.
+
+    Raises:
+        StageError: Says where it stands, and what is allowed.
+    """
+    where = allowed.outside(state.base_T_flange.translation) or allowed.beyond(state.joints)
+    if where:
+        raise StageError(
+            f"the arm stands beyond robot.limits, {where}: move it inside by its pendant, or widen "
+            "the limits"
+        )
+
+
+def _where(arm: RobotDriver, robot: RobotModel, allowed: MotionLimits) -> Floats | None:
+    """Return the joint angles at which the arm stands; None where it does not answer."""
+    try:
+        with watched(arm, robot, allowed) as opened:
+            require_inside(opened.state, allowed)
+            return opened.state.joints
+    except DeviceError:
+        return None
+
+
+def _fingerprint(arm: RobotDriver, eye: ScannerDriver, scanner: Scanner) -> str:
+    """Return what names this session: a live one is never repeated."""
+    text = f"{arm.name} {eye.name} {scanner.name} {time.time_ns()}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class LiveCaptures(Captures):
+    """Captures that are taken when they are asked for; closing them stops the arm."""
+
+    def __init__(self, session: LiveSession, source: Source, release: ExitStack) -> None:
+        super().__init__(session.captures(), source, session.itinerary.total)
+        session.itinerary.outcomes = self.outcomes
+        self._release = release
+
+    def close(self) -> None:
+        """Stop the arm; let go of arm and scanner."""
+        super().close()
+        self._release.close()
+
+
+@dataclass(frozen=True, eq=False)
+class LiveSession:
+    """One visit to every stop.
+
+    Attributes:
+        itinerary: The stops.
+        arm: Goes there.
+        scanner: What looks at the flange.
+        moved: A scan during which the flange moved by more is set aside [m].
+        done: Captures that were taken before.
+    """
+
+    itinerary: Itinerary
+    arm: WatchedArm
+    scanner: Scanner
+    moved: float
+    done: frozenset[str]
+
+    def captures(self) -> Iterator[Capture | Rejection]:
+        """Take the captures; while one is transferred and fitted the arm is under way again."""
+        taken: Callable[[], Capture | Rejection] | None = None
+        for stop in self.itinerary.stops():
+            if stop.id in self.done:
+                continue
+            way = self.itinerary.way(self.arm.state.joints, stop)
+            if isinstance(way, Barred):
+                yield _rejected(stop, f"no way there: {way.reason}")
+                continue
+            self.arm.go(way)
+            if taken:
+                yield taken()
+            self.arm.wait()
+            taken = self._expose(stop)
+        if taken:
+            yield taken()
+
+    def _expose(self, stop: Stop) -> Callable[[], Capture | Rejection]:
+        """Expose at a stop; what is returned waits for the data."""
+        began = time.time_ns()
+        try:
+            transfer = self.scanner.expose()
+        except FrameDropped as dropped:
+            return partial(_rejected, stop, str(dropped))
+        return partial(self._capture, stop, transfer, self.arm.during(began, time.time_ns()))
+
+    def _capture(
+        self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[Sample]
+    ) -> Capture | Rejection:
+        """Return the capture, if the arm stood still during the exposure."""
+        try:
+            scan = transfer()
+        except FrameDropped as dropped:
+            return _rejected(stop, str(dropped))
+        during = within(samples, scan.started_ns, scan.ended_ns)
+        if not during:
+            return _rejected(
+                stop, "the exposure began before the arm was there, or ended on another clock"
+            )
+        moved = movement(during)
+        if moved > self.moved:
+            return _rejected(
+                stop,
+                f"the flange moved {moved * 1e3:.2f} mm during the exposure, "
+                f"allowed {self.moved * 1e3:.2f} mm",
+            )
+        middle = during[len(during) // 2]
+        return Capture(
+            id=stop.id,
+            cloud=scan.cloud,
+            poses=by_frame(Transform(BASE, FLANGE, middle.base_T_flange)),
+            joints=middle.joints,
+            time_ns=scan.ended_ns,
+            role=stop.role,
+            image=scan.image,
+        )
+
+
+def within(samples: Sequence[Sample], start_ns: int, end_ns: int) -> list[Sample]:
+    """Return the samples of an exposure, one on either side; none when they do not cover it."""
+    if not samples or samples[0].time_ns > start_ns or samples[-1].time_ns < end_ns:
+        return []
+    times = np.array([sample.time_ns for sample in samples])
+    first = int(np.searchsorted(times, start_ns, side="right")) - 1
+    last = int(np.searchsorted(times, end_ns, side="left"))
+    return list(samples[first : last + 1])
+
+
+def movement(samples: Sequence[Sample]) -> float:
+    """Return how far a point 0.1 m off the flange's centre moved at most [m]."""
+    poses = np.array([sample.base_T_flange for sample in samples])
+    moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    turns = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    return float((moves + 0.1 * turns).max())
+
+
+def _rejected(stop: Stop, reason: str) -> Rejection:
+    return Rejection(stop.id, "acquire.live", reason)

@@ -1,0 +1,136 @@
+"""What ``acquire.archive`` and ``acquire.centres`` share: find the archive and read its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from flangeye import BoundPart, Choose, Params, RecipePath, StageError
+from flangeye.files.recording import (
+    Archive,
+    Recording,
+    check_ids,
+    check_poses,
+    digests_of,
+    fingerprint_of,
+)
+from flangeye.files.scans import with_companion
+from flangeye.log.read import RunLog
+from flangeye.types import (
+    BASE,
+    BASE2,
+    FLANGE2,
+    ArchivePath,
+    Feature,
+    Observation,
+    Poses,
+    Source,
+    Transform,
+)
+from flangeye.units import param
+
+NAMED_AT_MOST = 12
+"""Ids a note lists in full; of more, the rest is counted."""
+
+
+class OpeningParams(Params):
+    """Which archive, and how it is laid out."""
+
+    path: RecipePath | None = Field(
+        None, description="The archive; --archive on the command line comes before it."
+    )
+    reader: Annotated[BoundPart, Choose("reader")] = param(
+        "auto", description="Layout of the archive; auto finds out and reports it."
+    )
+    leave_out: tuple[str, ...] = Field((), description="Ids of poses to leave out.")
+
+
+def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
+    """Return where the archive is.
+
+    Raises:
+        StageError: Nobody said, or it is not there.
+    """
+    path = given.path or params.path
+    if path is None:
+        raise StageError(f"{stage}: no archive given; add --archive PATH, or path: in the recipe")
+    if not path.exists():
+        raise StageError(f"{path}: does not exist")
+    return path
+
+
+def open_archive(path: Path, params: OpeningParams) -> Archive:
+    """Return the poses and files at ``path``, those left out gone.
+
+    Raises:
+        StageError: The reader cannot read it, it holds no poses, or two have one name.
+    """
+    archive: Archive = params.reader(path)
+    check_ids(archive)
+    recordings = [with_companion(recording) for recording in archive.recordings]
+    archive = replace(archive, recordings=recordings)
+    if not params.leave_out:
+        return archive
+    known = {recording.id for recording in archive.recordings}
+    for name in params.leave_out:
+        if name not in known:
+            raise StageError(f"{archive.root}: leave_out: there is no pose '{name}'")
+    kept = [r for r in archive.recordings if r.id not in params.leave_out]
+    note = f"left out as the recipe says: {', '.join(params.leave_out)}"
+    return replace(archive, recordings=kept, notes=(*archive.notes, note))
+
+
+def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:
+    """Return a note on the poses to calibrate with that lack something; none if none do."""
+    poses = [r for r in archive.recordings if r.role == "calibration"]
+    skipped = [r.id for r in poses if not has(r)]
+    if not skipped:
+        return []
+    return [f"skipped {len(skipped)} of {len(poses)} poses, without a {what}: {_listed(skipped)}"]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - NAMED_AT_MOST
+    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
+
+
+_BASES = {FLANGE2: BASE2}
+"""Frames that are not placed from the first arm's base."""
+
+
+def poses_of(recording: Recording) -> Poses:
+    """Return the recording's poses as the values stages see."""
+    return {
+        frame: Transform(_BASES.get(frame, BASE), frame, m) for frame, m in recording.poses.items()
+    }
+
+
+def observation_of(recording: Recording, feature: Feature) -> Observation:
+    """Return a ready-made feature with all that the recording says of the arms."""
+    return Observation(
+        recording.id,
+        feature,
+        poses_of(recording),
+        recording.joints,
+    )
+
+
+def log_source(log: RunLog, recordings: Sequence[Recording]) -> Source:
+    """Return where what a log of ours holds comes from: the log, and what it says of itself.
+
+    Args:
+        log: The log.
+        recordings: The poses that are taken from it.
+
+    Raises:
+        StageError: No calibration can be made from these poses.
+    """
+    check_poses(log.path, recordings)
+    source = log.source or Source(fingerprint="")
+    note = f"archive: {log.path}, a log of flangeye"
+    fingerprint = fingerprint_of(log.path.parent, digests_of([log.path]))
+    return replace(source, fingerprint=fingerprint, notes=(note, *source.notes))

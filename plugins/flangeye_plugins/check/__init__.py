@@ -1,0 +1,26 @@
+"""Checks: mistakes in recordings that ``flangeye doctor`` can name."""
+
+from flangeye_plugins.check.changes import moved, tool
+from flangeye_plugins.check.motion import motion
+from flangeye_plugins.check.order import clock, order
+from flangeye_plugins.check.outliers import flips, outlier
+from flangeye_plugins.check.pose_conventions import convention, direction
+from flangeye_plugins.check.size import size
+from flangeye_plugins.check.stale import identity, repeated
+from flangeye_plugins.check.units import units
+
+CHECKS = (
+    identity,
+    repeated,
+    units,
+    direction,
+    convention,
+    order,
+    clock,
+    flips,
+    outlier,
+    moved,
+    tool,
+    size,
+    motion,
+)

@@ -1,0 +1,190 @@
+"""Lengths in other units than was said: positions of the arm, or of the target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye import part
+from flangeye.doctor.diagnosis import Arms, Finding, Findings, RecordedSession
+from flangeye.maths.pose_corrections import scaled
+from flangeye.types import Floats
+from flangeye_plugins.check.as_recorded import fit_of, named
+from flangeye_plugins.check.equations import equations_of
+from flangeye_plugins.check.fitting import fit
+from flangeye_plugins.check.significance import Significance, best_of
+
+UNITS: Mapping[str, float] = {
+    "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
+}  # fmt: skip
+"""In metres."""
+_METRES: Mapping[str, float] = {"m": 1.0, **UNITS}
+STANDING = 1e-9
+"""With so small positions the target does not move: no unit, if that explains samples better."""
+ARMS = (0.1, 4.0)
+"""Median distance of a flange from its base [m], from the smallest arm to the largest."""
+
+
+class Alternative(NamedTuple):
+    """Another unit of some of the lengths.
+
+    Attributes:
+        session: As it would be.
+        said: Unit they were read in.
+        meant: Unit they may be in.
+        arms: Whose positions; None for the target's.
+    """
+
+    session: RecordedSession
+    said: str
+    meant: str
+    arms: Arms | None
+
+
+@part("check.units")
+def units(session: RecordedSession) -> Findings:
+    """Positions of the arm or of the target are in another unit than was said."""
+    session.require_samples()
+    tried = list(_alternatives(session))
+    evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
+    if evidence.probability < 1 and tried[evidence.which].said:
+        yield _finding(session, tried[evidence.which], evidence)
+    elif session.uses_poses and (both := _both(session)) is not None:
+        yield both
+
+
+def _alternatives(session: RecordedSession) -> Iterator[Alternative]:
+    """Give other units of the arms' positions, and of the target's where that is not the same.
+
+    A link's place follows from the arm's model, in metres: then it is not.
+    """
+    for said, meant, factor in _ratios():
+        if session.uses_poses:
+            for arms in session.arms:
+                yield Alternative(_of_arm(session, arms, factor), said, meant, arms)
+        if session.links is not None:
+            yield Alternative(_of_target(session, factor, meant), said, meant, None)
+    if session.uses_poses:
+        yield Alternative(_of_arm(session, "both", STANDING), "", "", "both")
+
+
+def _of_arm(session: RecordedSession, arms: Arms, factor: float) -> RecordedSession:
+    def change(poses: Floats) -> Floats:
+        return scaled(poses, factor)
+
+    return session.corrected(change, arms, scale=_number(factor))
+
+
+def _ratios() -> Iterator[tuple[str, str, float]]:
+    """Give (as read, as meant) of a unit, and what lengths are then multiplied with."""
+    given = set[float]()
+    for said, meant in (
+        *(("m", unit) for unit in UNITS), *((unit, "m") for unit in UNITS),
+        ("mm", "inches"), ("inches", "mm"),
+    ):  # fmt: skip
+        factor = round(_METRES[meant] / _METRES[said], 12)
+        if factor not in given:
+            yield said, meant, factor
+        given.add(factor)
+
+
+def _finding(session: RecordedSession, found: Alternative, evidence: Significance) -> Finding:
+    said, meant = found.said, found.meant
+    if found.arms is None or (found.arms == "both" and _rather_target(session, said, meant)):
+        return _of_targets_unit(session, found, evidence)
+    whose = named(found.arms, session)
+    factor = _METRES[meant] / _METRES[said]
+    what = f"{whose} positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
+    corrected_session = found.session
+    after = fit_of(corrected_session).misfit()
+    return Finding("unit", what, corrected_session.step(), (), evidence.before, after,
+                   evidence.probability, evidence.gain, corrected_session)  # fmt: skip
+
+
+def _of_targets_unit(
+    session: RecordedSession, found: Alternative, evidence: Significance
+) -> Finding:
+    """Say that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
+    said, meant = found.said, found.meant
+    if found.arms is not None:
+        said, meant = meant, said
+    factor = _METRES[meant] / _METRES[said]
+    corrected_session = _of_target(session, factor, meant)
+    what = f"the target's positions were read in {said} and are in {meant}"
+    after = fit_of(corrected_session).misfit()
+    return Finding("unit", f"{what} (a factor of {factor:.6g})", corrected_session.step(), (),
+                   evidence.before, after, evidence.probability, evidence.gain,
+                   corrected_session)  # fmt: skip
+
+
+def _rather_target(session: RecordedSession, said: str, meant: str) -> bool:
+    """Return whose lengths are wrong: of arm and target, the one that they make more plausible."""
+    if session.links is not None:
+        return False
+    factor = _METRES[meant] / _METRES[said]
+    arm = _outside(_distance_of_arm(session) * factor, ARMS) + _outside(
+        _distance_of_target(session), session.reach
+    )
+    target = _outside(_distance_of_arm(session), ARMS) + _outside(
+        _distance_of_target(session) / factor, session.reach
+    )
+    return target < arm
+
+
+def _of_target(session: RecordedSession, factor: float, unit: str) -> RecordedSession:
+    """Return the session with the target's positions times ``factor``."""
+    corrected_session = replace(session, centres=session.centres * factor)
+    if session.acquire == "acquire.archive" and unit in ("m", "mm"):
+        return corrected_session.with_changes(unit=unit)
+    return corrected_session.read_with(target_scale=_number(factor))
+
+
+def _both(session: RecordedSession) -> Finding | None:
+    """Arm and target agree with each other, and both are in the same wrong unit."""
+    distance, target = _distance_of_arm(session), _distance_of_target(session)
+    ranges = _outside(distance, ARMS), _outside(target, session.reach)
+    if min(ranges) < np.log(3):  # one of them at least is as it should be
+        return None
+    unit = min(UNITS, key=lambda u: _outside(distance * UNITS[u], ARMS))
+    factor = UNITS[unit]
+    if _outside(distance * factor, ARMS) > 0:
+        return None
+    corrected_session = replace(session, centres=session.centres * factor).corrected(
+        lambda poses: scaled(poses, factor), scale=_number(factor), target_scale=_number(factor)
+    )
+    what = (
+        f"robot and target agree, but the flange is {distance:.4g} m from the base and the target "
+        f"{target:.4g} m from the camera: both are in {unit}"
+    )
+    before, after = fit_of(session).misfit(), fit_of(corrected_session).misfit()
+    return Finding(
+        "unit",
+        what,
+        corrected_session.step(),
+        (),
+        before,
+        after,
+        corrected_session=corrected_session,
+    )
+
+
+def _distance_of_arm(session: RecordedSession) -> float:
+    return float(np.median(np.linalg.norm(session.poses[:, :3, 3], axis=1)))
+
+
+def _distance_of_target(session: RecordedSession) -> float:
+    return float(np.nanmedian(np.linalg.norm(session.centres, axis=1)))
+
+
+def _outside(distance: float, allowed: tuple[float, float]) -> float:
+    """Return by how many e-folds a distance is outside a range; 0 inside."""
+    low, high = np.log(allowed)
+    value = np.log(max(distance, 1e-12))
+    return float(max(low - value, value - high, 0.0))
+
+
+def _number(factor: float) -> float:
+    return float(f"{factor:.10g}")

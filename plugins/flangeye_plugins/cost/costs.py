@@ -1,0 +1,68 @@
+"""One number from a pose error: the paper's ``||.||_cost`` (sections 2.1.4 and 4.2), in metres."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, part
+from flangeye.maths.geometry import rotation_log
+from flangeye.types import Floats, PoseError
+from flangeye.units import Length, param
+
+Place = Literal["work", "camera"]
+
+_AT = "Where the translation is taken: at the work, or at the camera's origin as in the paper."
+
+
+class TranslationParams(Params):
+    """Parameters of ``cost.translation``."""
+
+    at: Place = Field("work", description=_AT)
+
+
+class AxesParams(Params):
+    """Parameters of ``cost.axes``."""
+
+    axes: tuple[Literal["x", "y", "z"], ...] = Field(
+        ("x", "y"), min_length=1, description="The axes that count."
+    )
+    frame: Literal["base", "camera"] = Field("base", description="Whose axes they are.")
+    at: Place = Field("work", description=_AT)
+
+
+class WorkRadiusParams(Params):
+    """Parameters of ``cost.work_radius``."""
+
+    radius: Length = param("300 mm", ge=0, description="How far from there the work reaches.")
+    at: Place = Field("work", description=_AT)
+
+
+@part("cost.translation")
+def cost_translation(error: PoseError, params: TranslationParams) -> float:
+    """The length of the translation error; the paper's cost."""
+    return float(np.linalg.norm(displacement(error, params.at)))
+
+
+@part("cost.axes")
+def cost_axes(error: PoseError, params: AxesParams) -> float:
+    """The translation error along chosen axes only: x and y for a tool that yields along z."""
+    moved = displacement(error, params.at)
+    if params.frame == "base":
+        moved = error.base_R_camera @ moved
+    return float(np.linalg.norm([moved["xyz".index(axis)] for axis in params.axes]))
+
+
+@part("cost.work_radius")
+def cost_work_radius(error: PoseError, params: WorkRadiusParams) -> float:
+    """Translation together with rotation times a radius: section 4.2, for small angles."""
+    lever = params.radius * rotation_log(error.motion[:3, :3])
+    return float(np.linalg.norm([*displacement(error, params.at), *lever]))
+
+
+def displacement(error: PoseError, place: Place) -> Floats:
+    """Return the (3,) translation of the error at a place, in ``camera`` [m]."""
+    at = error.at if place == "work" else np.zeros(3)
+    return np.asarray(error.motion[:3, :3] @ at + error.motion[:3, 3] - at)

@@ -1,1 +1,0 @@
-"""Robots, scanners and sensors, each behind the same Protocol; see README.md."""

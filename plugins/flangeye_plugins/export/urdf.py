@@ -1,0 +1,126 @@
+"""A URDF: the joints from what carries the camera to its mount and on to its optical frame.
+
+Calibrations find the optical frame (z along the view); a camera's own URDF hangs by its mount link:
+``base_T_mount = base_T_optical inv(mount_T_optical)``. Metres; rpy is Rz(y) Ry(p) Rx(r).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.files.paths import RecipePath
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.types import CalibratedPose, ExportedFile, Floats
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.export.writing import FRAME, FramesParams, fixed
+
+
+class OpticalParams(Params):
+    """Where the optical frame is in the mount link."""
+
+    position: tuple[Length, Length, Length] = param(
+        ("0 mm", "0 mm", "0 mm"), description="Of the optical frame's origin in the mount link."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("-90 deg", "0 deg", "-90 deg"),
+        description="Roll, pitch, yaw; by default z ahead along the mount's x, as in REP 103.",
+    )
+
+    @property
+    def matrix(self) -> Floats:
+        """``mount_T_optical`` (4, 4) [m]."""
+        return rigid(rotation_from_rpy(*self.rpy), np.array(self.position))
+
+
+class UrdfParams(FramesParams):
+    """The frames, and how the camera's mount link and its optical frame lie to each other."""
+
+    mount: str = Field("camera_link", pattern=FRAME, description="The camera's mount link.")
+    child: str = Field(
+        "camera_optical_frame", pattern=FRAME, description="The camera's optical frame."
+    )
+    mount_T_optical: OpticalParams | None = Field(
+        None, description="Where the optical frame is in the mount link, if that is known."
+    )
+    camera_urdf: RecipePath | None = Field(
+        None, description="The camera's own URDF (xacro already run), which tells the same."
+    )
+
+
+@stage("export.urdf")
+def export_urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
+    """Write URDF joints: the mount link's, where the camera's URDF is known, and the optical's."""
+    mount_T_optical = _mount_T_optical(params)
+    carrier, found = params.carrier(pose), pose.transform.matrix
+    if mount_T_optical is None:
+        joints = _joint(carrier, params.child, found)
+    else:
+        joints = _joint(carrier, params.mount, found @ np.linalg.inv(mount_T_optical))
+        if params.camera_urdf is None:  # which has the second joint itself
+            joints += _joint(params.mount, params.child, mount_T_optical)
+    remarks = "".join(f"  <!-- {line.replace('--', '- -')} -->\n" for line in pose.remarks)
+    text = f'<?xml version="1.0"?>\n<robot name="{params.name}">\n{remarks}{joints}</robot>\n'
+    return ExportedFile(f"{params.name}.urdf", text, "copy the joints, or include the file")
+
+
+def _joint(parent: str, child: str, matrix: Floats) -> str:
+    numbers = fixed(CONVENTIONS["rpy"].numbers(matrix))
+    return f"""  <link name={quoteattr(child)}/>
+  <joint name={quoteattr(child + "_joint")} type="fixed">
+    <parent link={quoteattr(parent)}/>
+    <child link={quoteattr(child)}/>
+    <origin xyz="{" ".join(numbers[:3])}" rpy="{" ".join(numbers[3:])}"/>
+  </joint>
+"""
+
+
+def _mount_T_optical(params: UrdfParams) -> Floats | None:
+    if params.camera_urdf is not None:
+        return _chain(params.camera_urdf, params.mount, params.child)
+    return params.mount_T_optical.matrix if params.mount_T_optical else None
+
+
+def _chain(file: Path, mount: str, optical: str) -> Floats:
+    """Return ``mount_T_optical`` (4, 4) along the fixed joints of a URDF.
+
+    Raises:
+        StageError: The file cannot be read, or no fixed joints lead from one link to the other.
+    """
+    try:
+        joints = ElementTree.parse(file).getroot().findall("joint")
+    except (OSError, ElementTree.ParseError) as error:
+        raise StageError(f"{file}: cannot be read: {error}") from None
+    above = {_link(joint, "child"): joint for joint in joints if joint.get("type") == "fixed"}
+    pose, link = np.eye(4), optical
+    while link != mount:
+        if link not in above:
+            known = ", ".join(sorted(above)) or "none"
+            raise StageError(
+                f"{file}: no fixed joints lead from '{mount}' to '{optical}'; links with a fixed "
+                f"joint: {known}; run xacro first if the file holds macros"
+            )
+        joint = above.pop(link)
+        pose, link = _origin(file, joint) @ pose, _link(joint, "parent")
+    return pose
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    found = joint.find(end)
+    return "" if found is None else found.get("link", "")
+
+
+def _origin(file: Path, joint: ElementTree.Element) -> Floats:
+    origin = joint.find("origin")
+    given = {} if origin is None else origin.attrib
+    text = f"{given.get('xyz', '0 0 0')} {given.get('rpy', '0 0 0')}"
+    try:
+        return CONVENTIONS["rpy"].matrix([float(number) for number in text.split()])
+    except ValueError as error:
+        raise StageError(f"{file}: joint '{joint.get('name')}': {error}; run xacro first") from None

@@ -1,0 +1,1 @@
+"""``fit.*``: circle centre or marker pose with covariance."""

@@ -1,0 +1,235 @@
+"""Printed targets: ChArUco boards, checkerboards, and single ArUco or AprilTag markers."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flangeye import Params, stage
+from flangeye.maths.geometry import rotation_log
+from flangeye.models.boards import Board, Dictionary
+from flangeye.types import CAMERA, TARGET, Capture, Image, PoseFeature, Rejected, Transform
+from flangeye.units import Length, param
+from flangeye_plugins.fit.corners import Corners, find_corners
+from flangeye_plugins.fit.planar import (
+    PlanarPose,
+    points_of,
+    pose_from_points,
+    poses_from_pixels,
+    reprojection,
+    scale_of,
+)
+
+CERTAIN = float(np.log(1000))
+"""Logarithm of how many times likelier than the other the better of two poses must be."""
+SIZE_SIGMAS = 5.0
+SIZE_ERROR = 5e-3
+"""Share by which a print may be off and nobody needs to know."""
+FEWEST_POINTS = 4
+
+
+class TargetParams(Params):
+    """What fits of printed targets share."""
+
+    depth: Literal["auto", "off", "only"] = Field(
+        "auto",
+        description="Use the organised cloud under the image: where it gives the better pose, "
+        "never, or always.",
+    )
+    corner_noise: float = Field(
+        0.1, gt=0, description="Standard deviation to expect of a corner's coordinate [px]."
+    )
+    scanner_error: Length = param(
+        "0.06 mm",
+        ge=0,
+        description="Standard deviation along each axis of the scanner's own distortion, which a "
+        "single scan cannot show; added to the covariance by depth.",
+    )
+    max_error: float = Field(
+        1.0, gt=0, description="Largest standard deviation of the reprojection [px]."
+    )
+
+
+class DictionaryParams(TargetParams):
+    """What fits of targets with markers share."""
+
+    dictionary: Dictionary = Field(
+        "4X4_50", description="Family of the markers, as OpenCV names it."
+    )
+
+
+class CharucoParams(DictionaryParams):
+    """Parameters of ``fit.charuco``."""
+
+    columns: int = Field(ge=3, description="Squares from left to right.")
+    rows: int = Field(ge=3, description="Squares from top to bottom.")
+    square: Length = param(gt=0, description="Edge of a square, measured on the print.")
+    marker: Length = param(gt=0, description="Edge of a marker, measured on the print.")
+
+    @model_validator(mode="after")
+    def _fits(self) -> CharucoParams:
+        if self.marker >= self.square:
+            raise ValueError("the markers of a ChArUco board are smaller than its squares")
+        return self
+
+
+class CheckerboardParams(TargetParams):
+    """Parameters of ``fit.checkerboard``."""
+
+    columns: int = Field(ge=3, description="Squares from left to right, inner and outer.")
+    rows: int = Field(ge=3, description="Squares from top to bottom.")
+    square: Length = param(gt=0, description="Edge of a square, measured on the print.")
+
+    @model_validator(mode="after")
+    def _asymmetric(self) -> CheckerboardParams:
+        if (self.columns + self.rows) % 2 == 0:
+            raise ValueError(
+                f"a board of {self.columns} x {self.rows} squares looks the same after half a "
+                "turn; use one with an odd and an even number of squares, or a ChArUco board"
+            )
+        return self
+
+
+class MarkerParams(DictionaryParams):
+    """Parameters of ``fit.aruco``."""
+
+    id: int = Field(0, ge=0, description="Which marker of the dictionary.")
+    size: Length = param(gt=0, description="Edge of the black square, measured on the print.")
+
+
+@stage("fit.charuco")
+def fit_charuco(capture: Capture, params: CharucoParams) -> PoseFeature | Rejected:
+    """Find a ChArUco board: its pose from its corners, by image or by depth.
+
+    The frame has its origin in the middle of the board, x right, y up, z towards the camera.
+    """
+    board = Board(
+        "charuco", params.columns, params.rows, params.square, params.marker, params.dictionary
+    )
+    return fit_board(capture, board, params)
+
+
+@stage("fit.checkerboard")
+def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeature | Rejected:
+    """Find a checkerboard, all of it, that looks different after half a turn.
+
+    The frame has its origin in the middle of the board, x right, y up, z towards the camera; the
+    square at the top left is black.
+    """
+    return fit_board(
+        capture, Board("checkerboard", params.columns, params.rows, params.square), params
+    )
+
+
+@stage("fit.aruco")
+def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
+    """Find one ArUco or AprilTag marker.
+
+    Four corners tell little: a board with many gives a pose several times better. Seen nearly
+    frontally a marker has two poses that fit alike, and is set aside unless depth decides.
+    """
+    board = Board("marker", 1, 1, params.size, 0.0, params.dictionary, params.id)
+    return fit_board(capture, board, params)
+
+
+def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeature | Rejected:
+    """Return a board's pose with its covariance, or why there is none."""
+    if capture.image is None:
+        return Rejected("there is no image; printed targets are found in the scanner's image")
+    corners = find_corners(board, capture.image)
+    if isinstance(corners, Rejected):
+        return corners
+    by_depth = None if params.depth == "off" else _by_depth(corners, capture, board)
+    if isinstance(by_depth, Rejected):
+        return by_depth
+    if by_depth is not None:
+        size = float(np.hypot(*np.ptp(corners.points[:, :2], axis=0)))
+        by_depth = by_depth.blurred(params.scanner_error, params.scanner_error / size)
+    if by_depth is None and params.depth == "only":
+        return Rejected("the cloud has no depth at the corners; it must be organised as the image")
+    if by_depth is not None and params.depth == "only":
+        return _feature(by_depth, corners, capture.image, by_depth=True)
+    poses = poses_from_pixels(corners, capture.image, params.corner_noise)
+    chosen = _better(poses, by_depth, corners, params)
+    if isinstance(chosen, Rejected):
+        return chosen
+    return _feature(chosen, corners, capture.image, by_depth=chosen is by_depth)
+
+
+def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | Rejected | None:
+    """Return the pose by depth; None without depth, Rejected where the size contradicts it."""
+    image = capture.image
+    if image is None or capture.cloud.xyz.shape[:2] != image.pixels.shape[:2]:
+        return None
+    measured = points_of(corners, capture.cloud)
+    known = np.isfinite(measured).all(axis=1)
+    if known.sum() < FEWEST_POINTS:
+        return None
+    points, measured = corners.points[known], measured[known]
+    scale, sigma = scale_of(points, measured)
+    if abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_ERROR):
+        return Rejected(
+            f"by the scanner's depth the target is {scale:.4f} times as large as the recipe says: "
+            f"{board.square * 1e3:.4g} mm is {board.square * scale * 1e3:.4g} mm; measure the print"
+        )
+    return pose_from_points(points, measured)
+
+
+def _better(
+    poses: list[PlanarPose], by_depth: PlanarPose | None, corners: Corners, params: TargetParams
+) -> PlanarPose | Rejected:
+    """Return the pose with the smaller expected error over the target's corners."""
+    best = poses[0]
+    if best.noise > params.max_error:
+        return Rejected(
+            f"the corners fit to {best.noise:.2f} px only (limit {params.max_error:g} px): is the "
+            "camera's matrix right, and the target flat?"
+        )
+    if by_depth is not None:
+        best = min(poses, key=lambda pose: _apart(pose, by_depth))
+        if by_depth.error_at(corners.points) < best.error_at(corners.points):
+            return by_depth
+        return best
+    return _ambiguity(poses) or best
+
+
+def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
+    """Say so when another pose explains the corners nearly as well."""
+    if len(poses) < 2:
+        return None
+    best, other = poses[:2]
+    ratio = (other.misfit - best.misfit) / (2 * best.noise**2)
+    if ratio > CERTAIN:
+        return None
+    apart = np.degrees(_apart(best, other))
+    if apart < 0.1:  # both came to the same pose
+        return None
+    return Rejected(
+        f"two poses {apart:.1f} deg apart fit the corners alike (likelihoods 1 : "
+        f"{np.exp(min(ratio, 99)):.3g}): the target is seen too frontally, too small or too far; "
+        "tilt it by 15 deg and more"
+    )
+
+
+def _apart(first: PlanarPose, second: PlanarPose) -> float:
+    """Return the angle between two poses [rad]."""
+    turn = first.matrix[:3, :3].T @ second.matrix[:3, :3]
+    return float(np.linalg.norm(rotation_log(turn)))
+
+
+def _feature(pose: PlanarPose, corners: Corners, image: Image, by_depth: bool) -> PoseFeature:
+    misses = reprojection(corners, image, pose.matrix)[0].reshape(-1, 2)
+    figures = {
+        "corners": float(len(corners.pixels)),
+        "by_depth": float(by_depth),
+        "corner_noise_m" if by_depth else "corner_noise_px": pose.noise,
+        "reprojection_px": float(np.sqrt((misses**2).mean())),
+    }
+    return PoseFeature(
+        Transform(CAMERA, TARGET, pose.matrix),
+        pose.covariance,
+        figures,
+        np.hstack([corners.pixels, misses]),
+    )

@@ -1,0 +1,144 @@
+"""The corners of a printed board in an image, to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.models.boards import Board, charuco_of, dictionary_of
+from flangeye.types import Floats, Image, Rejected
+from flangeye_plugins.fit.edges import corners_of_square
+
+Grey = NDArray[np.uint8]
+
+FEWEST_CHARUCO = 6
+"""Corners of a ChArUco board below which too little of it is seen."""
+LEAST_CONTRAST = 0.3
+"""Between a square and those beside it, over that between black and white."""
+
+
+class Corners(NamedTuple):
+    """N corners.
+
+    Attributes:
+        pixels: (N, 2) in the image; the middle of the first pixel is (0, 0).
+        points: (N, 3) in ``target`` [m].
+    """
+
+    pixels: Floats
+    points: Floats
+
+
+def find_corners(board: Board, image: Image) -> Corners | Rejected:
+    """Find a board's corners in an image."""
+    grey = _grey(image)
+    finders = {"charuco": _charuco, "checkerboard": _checkerboard, "marker": _marker}
+    return finders[board.kind](board, grey, image)
+
+
+def _grey(image: Image) -> Grey:
+    import cv2
+
+    pixels = np.ascontiguousarray(image.pixels)
+    return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+
+
+def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
+    import cv2
+
+    detector = cv2.aruco.CharucoDetector(charuco_of(board))
+    corners, ids, _, markers = detector.detectBoard(grey)
+    count = 0 if ids is None else len(ids)
+    if count < FEWEST_CHARUCO:
+        seen = 0 if markers is None else len(markers)
+        return Rejected(
+            f"{count} corners of the ChArUco board found, at least {FEWEST_CHARUCO} are needed "
+            f"({seen} of its markers were)"
+        )
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    return Corners(pixels, board.inner_corners()[np.asarray(ids).ravel()])
+
+
+def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(dictionary_of(board), parameters)
+    corners, ids, _ = detector.detectMarkers(grey)
+    found = [] if ids is None else [int(each) for each in np.asarray(ids).ravel()]
+    if found.count(board.marker_id) != 1:
+        others = ", ".join(map(str, sorted(found))) or "none"
+        return Rejected(
+            f"marker {board.marker_id} found {found.count(board.marker_id)} times, once is needed "
+            f"(found: {others})"
+        )
+    pixels = np.asarray(corners[found.index(board.marker_id)], dtype=np.float64).reshape(4, 2)
+    return Corners(corners_of_square(grey, pixels, image), board.outer_corners())
+
+
+def _checkerboard(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
+    import cv2
+
+    pattern = (board.columns - 1, board.rows - 1)
+    flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCornersSB(grey, pattern, flags=flags)
+    if not found:  # slower, and seldom needed
+        flags |= cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(grey, pattern, flags=flags)
+    if not found:
+        return Rejected(f"no checkerboard of {board.columns} x {board.rows} squares found")
+    pixels = np.asarray(corners, dtype=np.float64).reshape(board.rows - 1, board.columns - 1, 2)
+    upright = Corners(_upright(pixels, grey).reshape(-1, 2), board.inner_corners())
+    wrong = _wrong_squares(upright, board, grey)
+    if wrong:
+        return Rejected(
+            f"{wrong} of the {board.columns} x {board.rows} squares are not as they should be: a "
+            "part of the board is covered or cut off, or it has more squares"
+        )
+    return upright
+
+
+def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
+    """Return how many squares are not darker, or lighter, than those beside them as they should.
+
+    A grid that is found one square beside the board's own, where a part is covered, has the sheet
+    about the board in the place of its outer squares.
+    """
+    import cv2
+
+    rows, columns = np.indices((board.rows, board.columns))
+    squares = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    middles = board.place((squares + 0.5) * board.square)
+    to_image = cv2.findHomography(corners.points[:, :2], corners.pixels)[0]
+    at = cv2.perspectiveTransform(middles[None, :, :2], to_image)[0]
+    values = np.array([_value(grey, pixel) for pixel in at]).reshape(rows.shape)
+    sense = np.where((rows + columns) % 2 == 0, -1.0, 1.0)
+    around = np.pad(values, 1, constant_values=np.nan)
+    beside = [around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]]
+    contrast = float(np.ptp(np.percentile(values, [20, 80])))
+    differs = sense * (values - np.nanmean(beside, axis=0))
+    return int((differs < LEAST_CONTRAST * contrast).sum())
+
+
+def _upright(pixels: Floats, grey: Grey) -> Floats:
+    """Return a grid of corners (rows, columns, 2) in the board's own order.
+
+    Detection may give them mirrored, or begin at the wrong end: seen from the front the board's
+    axes keep their sense, and its first square is black.
+    """
+    across, down = pixels[0, -1] - pixels[0, 0], pixels[-1, 0] - pixels[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0:
+        pixels = pixels[:, ::-1]
+    first = 1.5 * pixels[0, 0] - 0.5 * pixels[1, 1]
+    beside = 0.5 * (pixels[0, 0] + pixels[1, 1]) + 0.5 * (pixels[0, 0] - pixels[0, 1])
+    if _value(grey, first) > _value(grey, beside):
+        pixels = pixels[::-1, ::-1]
+    return pixels
+
+
+def _value(grey: Grey, at: Floats) -> float:
+    x, y = np.clip(np.round(at).astype(int), 1, np.array(grey.shape[::-1]) - 2)
+    return float(grey[y - 1 : y + 2, x - 1 : x + 2].mean())

@@ -1,0 +1,171 @@
+"""The pose of a flat target from its corners: by their pixels, or by their depth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import (
+    adjoint_shift,
+    covariance_at,
+    hat,
+    kabsch,
+    kabsch_covariance,
+    rigid,
+    rotation_exp,
+)
+from flangeye.types import Floats, Image, PointCloud
+from flangeye_plugins.fit.corners import Corners
+
+PRIOR_FREEDOM = 8
+"""What is expected of the corners' noise counts as much as so many coordinates."""
+BIAS = 0.02
+"""What detection moves all corners by alike [px]; measured on rendered boards of known place."""
+STEPS = 10
+REACH = 3
+"""Half the window about a corner whose points give its depth [px]."""
+FINITE = 0.6
+"""Share of that window that must have points."""
+
+
+class PlanarPose(NamedTuple):
+    """A pose of a flat target.
+
+    Attributes:
+        matrix: (4, 4) ``camera_T_target`` [m].
+        covariance: (6, 6), order (rotation, translation), left perturbation in ``camera``, the
+            translation taken at the target's origin.
+        noise: Standard deviation of a coordinate of a corner [px], or [m] by depth.
+        misfit: Sum of the squared errors, in the same unit.
+    """
+
+    matrix: Floats
+    covariance: Floats
+    noise: float
+    misfit: float
+
+    def blurred(self, position: float, angle: float) -> PlanarPose:
+        """Return the pose, known less well by a position [m] and an angle [rad] along each axis."""
+        return self._replace(
+            covariance=self.covariance + np.diag([angle**2] * 3 + [position**2] * 3)
+        )
+
+    def error_at(self, points: Floats) -> float:
+        """Return the expected error of points (N, 3) in ``target``, rms [m]."""
+        moved = points @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+        covariances = covariance_at(self.covariance, self.matrix[:3, 3], moved)
+        return float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean()))
+
+
+def poses_from_pixels(corners: Corners, image: Image, expected: float) -> list[PlanarPose]:
+    """Return the poses that a flat target's corners allow, the best first: one or two.
+
+    A plane seen in perspective has two poses that fit nearly alike, tilted towards and away from
+    the camera; the flatter the perspective the more alike (Collins & Bartoli 2014, IPPE). Both
+    are taken to their own least squares.
+
+    Args:
+        corners: In the image and on the target.
+        image: With the camera's matrix and distortion.
+        expected: Standard deviation of a corner's coordinate known beforehand [px].
+    """
+    import cv2
+
+    found, rotations, translations, _ = cv2.solvePnPGeneric(
+        corners.points, corners.pixels, image.camera_matrix, image.distortion,
+        flags=cv2.SOLVEPNP_IPPE,
+    )  # fmt: skip
+    starts = [
+        rigid(rotation_exp(_vector(r)), _vector(t))
+        for r, t in zip(rotations, translations, strict=True)
+    ]
+    poses = [_least_squares(corners, image, start, expected) for start in starts[:found]]
+    return sorted(poses, key=lambda pose: pose.misfit)
+
+
+def _vector(column: object) -> Floats:
+    return np.asarray(column, dtype=np.float64).ravel()
+
+
+def _least_squares(corners: Corners, image: Image, start: Floats, expected: float) -> PlanarPose:
+    """Refine a pose by Gauss-Newton on the reprojection errors."""
+    pose = start
+    for _ in range(STEPS):
+        errors, jacobian = reprojection(corners, image, pose)
+        step = np.asarray(-np.linalg.lstsq(jacobian, errors, rcond=None)[0], dtype=np.float64)
+        pose = rigid(rotation_exp(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
+    errors, jacobian = reprojection(corners, image, pose)
+    misfit, freedom = float(errors @ errors), len(errors) - 6
+    variance = (misfit + PRIOR_FREEDOM * expected**2) / (freedom + PRIOR_FREEDOM)
+    covariance = variance * np.linalg.inv(jacobian.T @ jacobian)
+    bias = BIAS * float(pose[2, 3] / image.camera_matrix[0, 0])
+    covariance[3:5, 3:5] += bias**2 * np.eye(2)
+    return PlanarPose(pose, 0.5 * (covariance + covariance.T), float(np.sqrt(variance)), misfit)
+
+
+def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, Floats]:
+    """Return errors (2N,) [px] and their derivatives (2N, 6) to rotation and translation.
+
+    An error is where the pose (4, 4) has a corner, minus where it was detected.
+    """
+    import cv2
+
+    turned = corners.points @ pose[:3, :3].T
+    none = np.zeros(3)
+    pixels, jacobian = cv2.projectPoints(
+        turned, none, pose[:3, 3], image.camera_matrix, image.distortion
+    )
+    to_position = np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+    to_rotation = -to_position @ hat(turned)
+    errors = np.asarray(pixels).reshape(-1, 2) - corners.pixels
+    derivatives = np.concatenate([to_rotation, to_position], axis=2)
+    return errors.ravel(), derivatives.reshape(-1, 6)
+
+
+def points_of(corners: Corners, cloud: PointCloud) -> Floats:
+    """Return where the scanner has the corners (N, 3) [m]; NaN where it has too few points.
+
+    The points about a corner are taken as a plane, linear in the pixel: the corner lies between
+    pixels, and many points are better than one.
+    """
+    return np.array([_point_at(cloud.xyz, pixel) for pixel in corners.pixels])
+
+
+def _point_at(xyz: NDArray[np.float32], pixel: Floats) -> Floats:
+    column, row = np.round(pixel).astype(int)
+    height, width = xyz.shape[:2]
+    if not (REACH <= column < width - REACH and REACH <= row < height - REACH):
+        return np.full(3, np.nan)
+    window = xyz[row - REACH : row + REACH + 1, column - REACH : column + REACH + 1]
+    points = window.reshape(-1, 3).astype(np.float64)
+    down, across = np.indices(window.shape[:2]).reshape(2, -1) - REACH
+    rows = np.stack([np.ones(len(points)), across + column - pixel[0], down + row - pixel[1]], 1)
+    known = np.isfinite(points).all(axis=1)
+    if known.mean() < FINITE:
+        return np.full(3, np.nan)
+    return np.asarray(np.linalg.lstsq(rows[known], points[known], rcond=None)[0][0])
+
+
+def pose_from_points(points: Floats, measured: Floats) -> PlanarPose:
+    """Return the pose that takes points (N, 3) in ``target`` onto those measured in ``camera``."""
+    rotation, translation = kabsch(points, measured)
+    errors = points @ rotation.T + translation - measured
+    misfit = float((errors**2).sum())
+    noise = float(np.sqrt(misfit / (3 * len(points) - 6)))
+    about_middle = kabsch_covariance(measured, noise)
+    shift = adjoint_shift(translation - measured.mean(axis=0))
+    covariance = shift @ about_middle @ shift.T
+    return PlanarPose(rigid(rotation, translation), covariance, noise, misfit)
+
+
+def scale_of(points: Floats, measured: Floats) -> tuple[float, float]:
+    """Return how much larger measured points (N, 3) are than those of the target, and its sigma."""
+    rotation, _ = kabsch(points, measured)
+    here = (points - points.mean(axis=0)) @ rotation.T
+    there = measured - measured.mean(axis=0)
+    spread = float((here**2).sum())
+    scale = float((here * there).sum()) / spread
+    noise = np.sqrt(((there - scale * here) ** 2).sum() / (3 * len(points) - 7))
+    return scale, float(noise / np.sqrt(spread))

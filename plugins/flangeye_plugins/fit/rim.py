@@ -1,0 +1,206 @@
+"""The default fit: the flange's face as a plane, its rim and bore as concentric circles in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flangeye import Params, stage
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.planes import Plane, fit_plane
+from flangeye.models.bolt_pattern import roll_angle
+from flangeye.models.targets import Flange
+from flangeye.types import CircleFeature, FlangeCloud, Floats, Rejected
+from flangeye.units import Length, param
+from flangeye_plugins.fit.face import disc_face
+from flangeye_plugins.fit.rings import Rings, find_rings
+from flangeye_plugins.fit.uncertainty import plane_covariance
+
+FEWEST_POINTS = 100
+OUTSIDE_PLATE = 0.85
+"""Where the plate has ended, in radii of a wrist circle: of the robots known, wrists are 75 to
+90 mm across and plates 63."""
+
+EDGE = 1e-3
+"""How far from an edge a point is beyond its influence [m]."""
+
+LEAST_NOISE = 3e-5
+"""Scanners round edges by this much, however small their noise is [m]."""
+
+
+class RimParams(Params):
+    """Parameters of ``fit.rim``."""
+
+    inlier: Length = param(
+        "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
+    )
+    min_coverage: float = Field(
+        0.3,
+        gt=0,
+        le=1,
+        description="Smallest share of the rim's circumference, and of the bore's, to be seen.",
+    )
+    radius_tolerance: Length = param(
+        "1.5 mm",
+        gt=0,
+        description="Largest difference of a fitted radius from the flange's: room for chamfers "
+        "and for what the scanner wears off an edge.",
+    )
+    plane_gate: Length = param(
+        "3 mm",
+        gt=0,
+        description="Half thickness of the slab about the rough plane in which the face is sought.",
+    )
+    behind: float = Field(
+        2.5,
+        gt=0,
+        description="How far behind the face a point of its edge may lie, in standard deviations "
+        "of the face's noise: farther back are chamfers and mixed pixels.",
+    )
+    before: float = Field(
+        6.0, gt=0, description="The same before the face, where there is nothing but noise."
+    )
+    scanner_error: Length = param(
+        "0.06 mm",
+        ge=0,
+        description="Standard deviation along each axis of the scanner's own distortion, which a "
+        "single scan cannot show: its calibration accuracy over root 3; added to the centre's "
+        "covariance.",
+    )
+    edge_bias: Length = param(
+        "0.05 mm",
+        ge=0,
+        description="Standard deviation of what shifts a whole edge unseen (chamfer, shadow); "
+        "added to the centre's covariance in the face.",
+    )
+    flatness: Length = param(
+        "0.04 mm",
+        ge=0,
+        description="Width of the band the face lies in (ISO 9409-1: 0.04 mm), which no number of "
+        "points averages out; added to the covariance across the face.",
+    )
+
+
+@stage("fit.rim")
+def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeature | Rejected:
+    """Fit the flange's rim and bore as concentric circles in its face.
+
+    A robust plane gives depth and normal; the outermost and innermost points of the face, sector
+    by sector, give two circles with one centre and free radii. The covariance has the edges'
+    scatter in the face, where neighbouring points err together, and the plane's across it. There
+    is no randomness. For a wrist circle the centre is moved along the normal by the plate's
+    thickness, to where the robot's flange frame has its origin.
+    """
+    points = cloud.cloud.xyz.astype(np.float64)
+    rough = Plane(cloud.centre, cloud.normal, 0.0)
+    face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
+    if face is None:
+        return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
+    flat = face.flatten(points[_on_face(face, points, params)])
+    if len(flat) < FEWEST_POINTS:
+        return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
+    start = face.flatten(cloud.centre[None])[0]
+    nominal = np.array(list(nominal_radii(flange).values()))
+    rings = find_rings(flat, nominal, start, params.inlier / 2)
+    problem = _why_not(rings, flange, params)
+    if problem:
+        return Rejected(problem)
+    plane = away_from_edges(points, face, rings, flange)
+    return _feature(points, plane, face, rings, flange, params)
+
+
+def nominal_radii(flange: Flange) -> dict[str, float]:
+    """Return the radii to expect by name: rim, and bore if the flange shows one [m]."""
+    return {"rim": flange.rim} | ({} if flange.bore is None else {"bore": flange.bore})
+
+
+def _ring_of(flange: Flange) -> tuple[float, float]:
+    # Before a wrist circle's plane stands the plate; only what is outside it is in the plane.
+    return (OUTSIDE_PLATE * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
+
+
+def _on_face(face: Plane, points: Floats, params: RimParams) -> NDArray[np.bool_]:
+    heights, sigma = face.heights(points), max(face.sigma, LEAST_NOISE)
+    return np.asarray((heights > -params.behind * sigma) & (heights < params.before * sigma))
+
+
+def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
+    """Return why the circles are not the flange's, or None."""
+    coverage = rings.coverage(params.inlier)
+    for k, (name, expected) in enumerate(nominal_radii(flange).items()):
+        if coverage[k] < params.min_coverage:
+            return (
+                f"{coverage[k]:.0%} of the {name} lies within {params.inlier * 1e3:g} mm of a "
+                f"circle, at least {params.min_coverage:.0%} is needed"
+            )
+        got = rings.circles.radii[k]
+        if abs(got - expected) > params.radius_tolerance:
+            return (
+                f"{name} radius {got * 1e3:.2f} mm, expected {expected * 1e3:.2f} mm "
+                f"within {params.radius_tolerance * 1e3:g} mm"
+            )
+    return None
+
+
+def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -> Plane:
+    """Return the face's plane from points a millimetre inside rim and bore.
+
+    Near an edge chamfers, mixed pixels and reflections pull points off the plane, and most of
+    them backwards: with 0.2 mm of noise they hide in it and move the plane by 0.015 mm.
+    """
+    offsets = face.flatten(points) - rings.circles.centre
+    radius = np.hypot(offsets[:, 0], offsets[:, 1])
+    rim, *bore = rings.circles.radii
+    inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
+    plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
+    # The face is near enough already for a few rounds of its own slab to settle it.
+    for _ in range(3):
+        near = inside & (np.abs(plane.heights(points)) < half)
+        if near.sum() < FEWEST_POINTS:
+            return face
+        plane = fit_plane(points[near], face.normal)
+    return plane
+
+
+def _feature(
+    points: Floats, plane: Plane, face: Plane, rings: Rings, flange: Flange, params: RimParams
+) -> CircleFeature:
+    """Return the circle, found in ``face``, in ``plane``, with all that is known of it."""
+    centre = face.lift(rings.circles.centre)
+    centre = centre - plane.heights(centre) * plane.normal
+    axes = basis_of_plane(plane.normal)
+    heights = plane.heights(points)
+    near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
+    about_centre = (points[near] - centre) @ axes[:2].T
+    of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
+    to_flange = flange.details.thickness if flange.bore is None else 0.0
+    return CircleFeature(
+        centre=centre + to_flange * plane.normal,
+        normal=plane.normal,
+        radii=dict(zip(nominal_radii(flange), rings.circles.radii.tolist(), strict=True)),
+        covariance=axes.T @ _centre_covariance(rings, of_plane, params) @ axes,
+        normal_covariance=axes[:2].T @ of_plane[:2, :2] @ axes[:2],
+        arc_coverage=float(rings.coverage(params.inlier)[0]),
+        roll=roll_angle(about_centre, flange),
+    )
+
+
+def _unevenness(flange: Flange, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of slopes and height that the face's tolerance allows.
+
+    A surface anywhere within a band has the band's width over root 12 as standard deviation; a
+    slope is that over the standard deviation of a disc's points along an axis, half its radius.
+    """
+    height = params.flatness**2 / 12
+    slope = height / (flange.rim / 2) ** 2
+    return np.diag([slope, slope, height])
+
+
+def _centre_covariance(rings: Rings, of_plane: Floats, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of the centre in the face's axes, the normal last [m^2]."""
+    covariance = params.scanner_error**2 * np.eye(3)
+    covariance[:2, :2] += params.edge_bias**2 * np.eye(2)
+    covariance[:2, :2] += rings.covariance(params.inlier / 2)[:2, :2]
+    covariance[2, 2] += of_plane[2, 2]
+    return covariance

@@ -1,0 +1,213 @@
+"""The centre of a calibration sphere, from the cap of it that a scanner sees."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, stage
+from flangeye.maths.circles import sectors
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.models.targets import Sphere
+from flangeye.types import CircleFeature, FlangeCloud, Floats, Indices, Rejected
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.fit.circles import cauchy_curvature, cauchy_weights
+from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance
+
+FEWEST_POINTS = 50
+RINGS = 3
+"""Rings about the line of sight in which, with the sectors, neighbouring points err together."""
+
+LEAST_SCALE = 1e-6
+"""Noise below which points are exact [m]."""
+
+
+class SphereParams(Params):
+    """Parameters of ``fit.sphere``."""
+
+    radius: Literal["known", "free"] = Field(
+        "known",
+        description="Hold the radius at that of the recipe's sphere, or fit it. On a cap a free "
+        "radius costs the depth of the centre most of its accuracy.",
+    )
+    max_incidence: Angle = param(
+        "60 deg", gt=0, description="Points seen more obliquely than this are left out."
+    )
+    min_coverage: float = Field(
+        0.4, gt=0, le=1, description="Smallest share of the cap within that angle to be seen."
+    )
+    radius_tolerance: Length = param(
+        "0.5 mm", gt=0, description="Largest difference of the fitted radius from the sphere's."
+    )
+    radius_error: Length = param(
+        "0.02 mm",
+        ge=0,
+        description="Standard deviation of the sphere's radius as the scanner sees it (make, "
+        "coating, penetration of light), when it is held; added to the covariance along the view.",
+    )
+    scanner_error: Length = param(
+        "0.06 mm",
+        ge=0,
+        description="Standard deviation along each axis of the scanner's own distortion, which a "
+        "single scan cannot show; added to the covariance.",
+    )
+
+
+class SphereFit(NamedTuple):
+    """A sphere fitted to points.
+
+    Attributes:
+        centre: (3,) [m].
+        radius: [m].
+        points: (N, 3) those within the incidence limit [m].
+        scale: Distance at which a point's weight is a half [m].
+    """
+
+    centre: Floats
+    radius: float
+    points: Floats
+    scale: float = LEAST_SCALE
+
+    @property
+    def residuals(self) -> Floats:
+        """(N,) how far outside the sphere each point lies [m]."""
+        return np.asarray(np.linalg.norm(self.points - self.centre, axis=1) - self.radius)
+
+    @property
+    def weights(self) -> Floats:
+        """(N,) what each point counts."""
+        return cauchy_weights(self.residuals, self.scale)
+
+    @property
+    def jacobian(self) -> Floats:
+        """(N, 4) derivative of the residuals to centre and radius."""
+        return sphere_jacobian(self.points, self.centre)
+
+
+@stage("fit.sphere")
+def fit_sphere(
+    cloud: FlangeCloud, sphere: Sphere, params: SphereParams
+) -> CircleFeature | Rejected:
+    """Fit a calibration sphere of known size to the cap that the scanner sees.
+
+    Robust least squares on the distance from the surface, over points seen within the incidence
+    limit: beyond it scanners smear and lose points. The radius is fitted too, to tell whether it
+    is the sphere at all; the centre is that of the known radius unless the recipe wants it free.
+    There is no randomness.
+    """
+    points = cloud.cloud.xyz.astype(np.float64)
+    if len(points) < FEWEST_POINTS:
+        return Rejected(f"{len(points)} points, at least {FEWEST_POINTS} are needed")
+    known = fit_cap(points, cloud.centre, sphere.radius, params.max_incidence, free=False)
+    free = fit_cap(known.points, known.centre, sphere.radius, params.max_incidence, free=True)
+    coverage = cap_coverage(known, params.max_incidence)
+    problem = _why_not(free, coverage, sphere, params)
+    if problem:
+        return Rejected(problem)
+    chosen = known if params.radius == "known" else free
+    return CircleFeature(
+        centre=chosen.centre,
+        normal=None,
+        radii={"sphere": free.radius},
+        covariance=_covariance(chosen, params),
+        normal_covariance=None,
+        arc_coverage=coverage,
+        centre_in_flange=np.array(sphere.centre_in_flange),
+    )
+
+
+def fit_cap(
+    points: Floats, start: Floats, radius: float, max_incidence: float, free: bool
+) -> SphereFit:
+    """Return the sphere that minimises the points' distances, far ones counting less and less.
+
+    Gauss-Newton with Cauchy weights; their scale is twice the residuals' own scatter. Which points
+    are seen within the limit depends on the centre, and is settled with it.
+
+    Args:
+        points: (N, 3) in ``camera`` [m].
+        start: (3,) rough centre [m].
+        radius: Of the sphere, or where to begin [m].
+        max_incidence: Largest angle of the surface's normal to the line of sight [rad].
+        free: Whether the radius is fitted.
+    """
+    fit = SphereFit(start, radius, points)
+    for _ in range(30):
+        seen = points[incidence_cosine(points, fit.centre) > np.cos(max_incidence)]
+        if len(seen) < 4:
+            break
+        fit = _scaled(fit._replace(points=seen))
+        jacobian = fit.jacobian if free else fit.jacobian[:, :3]
+        weighted = jacobian * fit.weights[:, None]
+        step = np.linalg.lstsq(weighted.T @ jacobian, -weighted.T @ fit.residuals, rcond=None)[0]
+        change = float(step[3]) if free else 0.0
+        fit = fit._replace(centre=fit.centre + step[:3], radius=fit.radius + change)
+        if np.abs(step).max() < 1e-9:
+            break
+    return _scaled(fit)
+
+
+def _scaled(fit: SphereFit) -> SphereFit:
+    sigma = SIGMA_OF_MAD * float(np.median(np.abs(fit.residuals)))
+    return fit._replace(scale=max(2 * sigma, LEAST_SCALE))
+
+
+def sphere_jacobian(points: Floats, centre: Floats) -> Floats:
+    """Return the (N, 4) derivative of the distances from a sphere to its centre and radius."""
+    offsets = points - centre
+    distance = np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
+    return np.hstack([-offsets / distance, -np.ones((len(points), 1))])
+
+
+def incidence_cosine(points: Floats, centre: Floats) -> Floats:
+    """Return the (N,) cosines between the sphere's normal at points and their lines of sight."""
+    offsets = points - centre
+    lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(points, axis=1)
+    return np.asarray(-np.einsum("ni,ni->n", offsets, points) / np.maximum(lengths, 1e-12))
+
+
+def cap_coverage(fit: SphereFit, max_incidence: float) -> float:
+    """Return the share of the cap within the limit that has points, in patches of equal width."""
+    patches = 2 * STRETCHES * RINGS
+    return len(np.unique(_patch(fit, 2 * STRETCHES, np.sin(max_incidence)))) / patches
+
+
+def _patch(fit: SphereFit, count: int, widest: float) -> Indices:
+    """Return which patch each point lies in: sectors about the line of sight, in rings."""
+    flat = (fit.points - fit.centre) @ basis_of_plane(fit.centre)[:2].T
+    share = (np.hypot(flat[:, 0], flat[:, 1]) / (widest * fit.radius)) ** 2
+    ring = np.minimum((RINGS * share).astype(np.intp), RINGS - 1)
+    return np.asarray(count * ring + sectors(flat, count))
+
+
+def _why_not(free: SphereFit, coverage: float, sphere: Sphere, params: SphereParams) -> str | None:
+    """Return why the fit is not the sphere, or None."""
+    if coverage < params.min_coverage:
+        return (
+            f"{coverage:.0%} of the cap seen within {np.degrees(params.max_incidence):g} deg, at "
+            f"least {params.min_coverage:.0%} is needed"
+        )
+    if abs(free.radius - sphere.radius) > params.radius_tolerance:
+        return (
+            f"sphere radius {free.radius * 1e3:.2f} mm, expected {sphere.radius * 1e3:.2f} mm "
+            f"within {params.radius_tolerance * 1e3:g} mm"
+        )
+    return None
+
+
+def _covariance(fit: SphereFit, params: SphereParams) -> Floats:
+    """Return the (3, 3) covariance of the centre [m^2]."""
+    held = params.radius == "known"
+    jacobian = fit.jacobian[:, :3] if held else fit.jacobian
+    cluster = _patch(fit, STRETCHES, np.sin(params.max_incidence))
+    curvature = cauchy_curvature(fit.residuals, fit.scale)
+    found = clustered_covariance(jacobian, fit.residuals, fit.weights, cluster, curvature)[:3, :3]
+    if held:
+        # What a larger sphere does: every residual smaller by the same amount.
+        weighted = jacobian * curvature[:, None]
+        moved = np.linalg.lstsq(weighted.T @ jacobian, weighted.sum(axis=0), rcond=None)[0]
+        found = found + params.radius_error**2 * np.outer(moved, moved)
+    return np.asarray(found + params.scanner_error**2 * np.eye(3))

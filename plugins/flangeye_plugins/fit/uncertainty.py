@@ -1,0 +1,63 @@
+"""How well a fit is known when neighbouring points err together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.circles import sectors
+from flangeye.types import Floats
+
+STRETCHES = 12
+"""Stretches of a rim that err independently, 30 degrees each: the correlation length of the
+residuals on the published clouds."""
+
+
+def clustered_covariance(
+    jacobian: Floats,
+    residual: Floats,
+    weights: Floats,
+    cluster: NDArray[np.intp],
+    curvature: Floats | None = None,
+) -> Floats:
+    """Return the (p, p) covariance of a weighted least-squares fit with correlated neighbours.
+
+    The sandwich estimator with clusters (Liang and Zeger 1986): residuals may be correlated in
+    any way inside a cluster and differ in size between clusters. Edge points do both: the pixel
+    grid, the chamfer and reflections shift whole stretches of an edge together, so that counting
+    every point as independent makes a centre look several times better than it is.
+
+    Args:
+        jacobian: (N, p) derivative of the residuals.
+        residual: (N,) at the solution.
+        weights: (N,) what each residual counted.
+        cluster: (N,) number of the cluster each residual belongs to, from zero.
+        curvature: (N,) derivative of ``weights * residual``, where the weights follow the
+            residuals; the weights if not given.
+    """
+    groups = int(cluster.max()) + 1
+    p = jacobian.shape[1]
+    each = (jacobian * (weights * residual)[:, None]).T
+    scores = np.stack([np.bincount(cluster, column, groups) for column in each], axis=1)
+    occupied = np.count_nonzero(np.bincount(cluster))
+    slope = weights if curvature is None else curvature
+    bread = np.linalg.pinv(jacobian.T @ (jacobian * slope[:, None]))
+    small_sample = occupied / max(occupied - p, 1)
+    return np.asarray(small_sample * bread @ (scores.T @ scores) @ bread)
+
+
+def plane_covariance(offsets: Floats, heights: Floats) -> Floats:
+    """Return the (3, 3) covariance of a plane's two slopes and of its height at the origin.
+
+    A face's unevenness is wider than a point, so the clusters are sectors of 15 degrees in three
+    rings.
+
+    Args:
+        offsets: (N, 2) points in the plane, about where the height is taken [m].
+        heights: (N,) residuals [m].
+    """
+    radius = np.hypot(offsets[:, 0], offsets[:, 1])
+    third = np.minimum((3 * radius / radius.max()).astype(np.intp), 2)
+    cluster = 2 * STRETCHES * third + sectors(offsets, 2 * STRETCHES)
+    jacobian = np.column_stack([-offsets, -np.ones(len(offsets))])
+    return clustered_covariance(jacobian, heights, np.ones(len(offsets)), cluster)

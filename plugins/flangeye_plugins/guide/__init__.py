@@ -1,0 +1,1 @@
+"""``guide.*``: procedures that guide a person through a measurement."""

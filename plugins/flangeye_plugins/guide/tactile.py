@@ -1,0 +1,168 @@
+"""``flangeye tactile calibrate``: a person, an arm and a finger find out how the finger moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from flangeye.devices import MotionAllowed, RobotDriver, TactileSensor
+from flangeye.errors import NothingMoved, StageError
+from flangeye.files.written import write_whole
+from flangeye.maths.geometry import rigid
+from flangeye.models.finger import Calibration, Finger
+from flangeye.models.model import read_model
+from flangeye.models.robots import RobotModel
+from flangeye.motion.limits import limits_of
+from flangeye.plugin.stage import part
+from flangeye.recipe.header import LimitsSection
+from flangeye.recipe.load import Recipe
+from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.weld.executor import Executor
+from flangeye_plugins.weld.finger_camera import LatestState
+from flangeye_plugins.weld.settings import WeldTactileParams
+from flangeye_plugins.weld.touch.calibration import Held, calibrate
+from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
+
+AT_REST = 40
+"""Readings of the undeformed finger."""
+
+EACH = 5
+"""Readings at each place with the tip held."""
+
+STROKE = 2e-3
+"""How far the robot moves, to both sides and down [m]."""
+
+SPEED = 5e-3
+"""Of these moves [m/s]."""
+
+PATIENT = 10.0
+"""Longest wait for the readings of one place [s]."""
+
+FREE = "Let the finger hang free, so that its tip touches nothing"
+HOLD = "Set the tip into a punch mark or a cone, so that it cannot slide; then keep clear"
+
+
+@part("guide.tactile")
+def guide_tactile(
+    recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path
+) -> str:
+    """Calibrate the finger of a recipe's weld.tactile step, and write its file anew.
+
+    Raises:
+        StageError: The recipe has no such step, or the readings allow no calibration.
+        NothingMoved: Motion was not asked for.
+    """
+    params = _weld_params(recipe)
+    finger: Finger = read_model(params.finger, Finger)
+    driver: RobotDriver = recipe.context[RobotDriver]
+    seed = recipe.header.seed
+    simulated = driver.simulated
+    if not (motion.allowed or simulated):
+        raise NothingMoved(
+            f"tactile calibrate: would move the arm by {STROKE * 1e3:.0f} mm to both sides and "
+            "down, with the tip held; nothing moved: add --move"
+        )
+    with ExitStack() as opened:
+        robot = opened.enter_context(driver.open())
+        latest = LatestState(robot.state())
+        sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
+        model: RobotModel = recipe.context[RobotModel]
+        limits = limits_of(recipe.context[LimitsSection], model)
+        readings = Readings(Executor(robot, latest, model, limits), sensor, finger)
+        ask(FREE)
+        rest = readings.take(AT_REST)
+        ask(HOLD)
+        held = list(readings.held())
+        name = robot.name
+    found = calibrate(rest, held, f"flangeye tactile calibrate, on {name}")
+    measured = found.lateral is not None
+    if not measured and finger.calibration is not None:
+        known = finger.calibration
+        found = found.model_copy(update={"lateral": known.lateral, "axial": known.axial})
+    calibrated = finger.model_copy(update={"calibration": found})
+    text = yaml.safe_dump(calibrated.model_dump(mode="json", exclude_none=True), sort_keys=False)
+    write_whole(out, text)
+    counts = f"{len(rest)} readings at rest, {len(held)} with the tip held"
+    return "\n".join([counts, *_told(found, measured), f"{out}: weld with it: finger: {out.name}"])
+
+
+def _told(found: Calibration, measured: bool) -> list[str]:
+    """Return what was found, for people."""
+    noise = ", ".join(f"{x * 1e3:.4f}" for x in found.noise)
+    rest = ", ".join(f"{x * 1e3:.3f}" for x in found.rest)
+    lines = [f"rest       tag at ({rest}) mm in the camera", f"noise      {noise} mm of the tip"]
+    if found.lateral is None or found.axial is None:
+        return [*lines, "stiffness  not known: the arm measures no force"]
+    stiffness = f"{found.lateral * 1e-3:.2f} N/mm across, {found.axial * 1e-3:.2f} N/mm along"
+    kept = "" if measured else ", as it was: the arm measures no force"
+    return [*lines, f"stiffness  {stiffness}{kept}"]
+
+
+def _weld_params(recipe: Recipe) -> WeldTactileParams:
+    for step in recipe.steps:
+        if isinstance(step.params, WeldTactileParams):
+            if RobotDriver not in recipe.context:
+                raise StageError(f"{recipe.name}: names no robot.driver to move the finger with")
+            return step.params
+    raise StageError(f"{recipe.name}: has no step weld.tactile, which names finger and sensor")
+
+
+class Readings:
+    """Takes readings of the finger at rest and at chosen places."""
+
+    def __init__(self, drive: Executor, sensor: TactileSensor, finger: Finger) -> None:
+        self._drive, self._sensor = drive, sensor
+        self._detector = TagDetector(finger)
+        self._flange_R_tool = finger.flange_R_tool
+
+    def take(self, count: int) -> list[TagReading]:
+        """Return new readings where the arm now stands, as many as come in time."""
+        found: list[TagReading] = []
+        began = self._drive.tick().time_ns
+        while self._drive.tick().time_ns - began < PATIENT * 1e9 and len(found) < count:
+            frame = self._sensor.frame()
+            # An image that was exposed before the arm stood still says nothing of this place.
+            if frame is not None and frame.time_ns >= began:
+                reading = self._detector.find(frame.image)
+                found += [reading] if reading is not None else []
+        return found
+
+    def held(self) -> Iterator[Held]:
+        """Move the arm about where it stands, the tip held; yield what is read at each place."""
+        start = self._drive.tick()
+        base_R_tool = start.base_T_flange.rotation @ self._flange_R_tool
+        for stroke in _strokes():
+            self._go(start.base_T_flange, base_R_tool @ stroke)
+            state = self._drive.tick()
+            moved = base_R_tool.T @ (
+                state.base_T_flange.translation - start.base_T_flange.translation
+            )
+            force = _difference(state.force, start.force)
+            for reading in self.take(EACH):
+                yield Held(reading, -moved, None if force is None else base_R_tool.T @ force)
+        self._go(start.base_T_flange, np.zeros(3))
+
+    def _go(self, start: Transform, by: Floats) -> None:
+        target = Transform(BASE, FLANGE, rigid(start.rotation, start.translation + by))
+        self._drive.shift(target, SPEED)
+
+
+def _strokes() -> Iterator[Floats]:
+    """Yield displacements of the robot (3,) in the tool's axes: to both sides, and down."""
+    for axis in (0, 1):
+        for way in (-1.0, -0.5, 0.5, 1.0):
+            yield np.eye(3)[axis] * way * STROKE
+    for way in (0.25, 0.5, 0.75, 1.0):
+        yield np.array([0.0, 0.0, -way * STROKE])
+
+
+def _difference(force: Any, tare: Any) -> Floats | None:
+    """Return the force (3,) since the start [N], if it is measured."""
+    if force is None or tare is None:
+        return None
+    return np.asarray(force[:3] - tare[:3], dtype=np.float64)

@@ -1,0 +1,138 @@
+"""``plan.next_best``: always the pose that promises to tell most about the matrix, at the work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.maths.geometry import hat, rigid, rotation_from_rpy
+from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between
+from flangeye.plugin.stage import Params, part
+from flangeye.types import Box, Floats
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.plan.grid import Point
+
+PRIOR = np.array([0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
+"""What is known before the first pose: standard deviations, rotation [rad], translation [m]."""
+
+BEYOND = 1.6
+"""Edges of the region that poses are chosen from, over the work's: levers are long there."""
+
+
+class NextBestParams(Params):
+    """Parameters of ``plan.next_best``."""
+
+    centre: Point | None = Field(None, description="Of the work; before the scanner if not given.")
+    size: Point = param(
+        ("300 mm", "300 mm", "200 mm"),
+        description="Edges of the work along the base's axes: where the matrix has to be right.",
+    )
+    region: Point | None = Field(
+        None, description="Edges of the box that poses are chosen from; 1.6 times the work's."
+    )
+    tilt: Angle = param(
+        "0.3 rad", ge=0, description="Largest roll, pitch and yaw away from facing the scanner."
+    )
+    facing: Angle = param(
+        "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
+    )
+    count: int = Field(30, ge=3, description="Poses after which it ends.")
+    candidates: int = Field(400, ge=10, description="Poses that are compared for each choice.")
+    noise: Length = param(
+        "0.15 mm", gt=0, description="Expected of a centre along each axis: scanner, fit and arm."
+    )
+    normal_noise: Angle = param("0.1 deg", gt=0, description="Expected of a normal.")
+
+
+@part("plan.next_best")
+def next_best(site: Site, rng: np.random.Generator, params: NextBestParams) -> Plan:
+    """Choose each pose when it is asked for: the one that will reduce the error at the work most.
+
+    Greedy A-optimal design (Pukelsheim 1993): of many poses drawn in the region, the one that
+    leaves the smallest expected square error over the work, given the poses visited before. Poses
+    that gave nothing do not count. Candidates are checked best first, so that inverse kinematics is
+    solved for a few only.
+
+    Args:
+        site: The place.
+        rng: Draws the candidates.
+        params: See :class:`NextBestParams`.
+    """
+    centre = site.centre if params.centre is None else np.asarray(params.centre)
+    size = np.asarray(params.size)
+    chooser = Chooser(site, rng, params, Box(centre, size))
+    return Plan(chooser.poses(), params.count, centre, size)
+
+
+class Chooser:
+    """Chooses poses one by one."""
+
+    def __init__(
+        self, site: Site, rng: np.random.Generator, params: NextBestParams, work: Box
+    ) -> None:
+        self._site, self._rng, self._params, self._work = site, rng, params, work
+        region = BEYOND * work.size if params.region is None else np.asarray(params.region)
+        self._region = Box(work.centre, region)
+        self._moved_by = levers(work.grid(3) - work.centre)
+        self._visited: list[Floats] = []
+
+    def poses(self) -> Iterator[PlannedPose]:
+        """Yield poses that the arm can take, the most telling of each moment."""
+        facing = self._site.facing(self._work.centre)
+        while facing is not None and len(self._visited) < self._params.count:
+            chosen = self._choose(facing)
+            if chosen is None:
+                return
+            self._visited.append(chosen.base_T_flange)
+            yield chosen
+
+    def _choose(self, facing: Floats) -> PlannedPose | None:
+        candidates = self._candidates(facing)
+        for index in np.argsort(self._expected_errors(candidates), kind="stable"):
+            joints = self._site.joints(candidates[index])
+            if joints is not None:
+                return PlannedPose(candidates[index], joints)
+        return None
+
+    def _candidates(self, facing: Floats) -> Floats:
+        """Draw (M, 4, 4) poses of the region that face the scanner."""
+        region, params = self._region, self._params
+        places = region.centre + region.size * self._rng.uniform(-0.5, 0.5, (params.candidates, 3))
+        turns = self._rng.uniform(-params.tilt, params.tilt, (params.candidates, 3))
+        drawn = (
+            rigid(rotation_from_rpy(*turn) @ facing, place)
+            for turn, place in zip(turns, places, strict=True)
+        )
+        faces = [
+            pose
+            for pose in drawn
+            if angle_between(pose[:3, 2], self._site.eye - pose[:3, 3]) <= params.facing
+        ]
+        return np.array(faces).reshape(-1, 4, 4)
+
+    def _expected_errors(self, candidates: Floats) -> Floats:
+        """Return the (M,) expected square error over the work after each candidate [m^2]."""
+        lost = self._site.lost()
+        counted = [pose for i, pose in enumerate(self._visited) if i not in lost]
+        known = np.diag(PRIOR**-2.0) + self._information(np.array(counted).reshape(-1, 4, 4)).sum(0)
+        covariance = np.linalg.inv(known + self._information(candidates))
+        moved = self._moved_by
+        return np.asarray(np.einsum("pai,mij,paj->m", moved, covariance, moved))
+
+    def _information(self, poses: Floats) -> Floats:
+        """Return the (M, 6, 6) Fisher information of poses (M, 4, 4), about the work's centre."""
+        of_centre = levers(poses[:, :3, 3] - self._work.centre)
+        axes = poses[:, :3, 2]
+        of_normal = np.concatenate([-hat(axes), np.zeros((len(axes), 3, 3))], axis=2)
+        return np.asarray(
+            np.einsum("mai,maj->mij", of_centre, of_centre) / self._params.noise**2
+            + np.einsum("mai,maj->mij", of_normal, of_normal) / self._params.normal_noise**2
+        )
+
+
+def levers(places: Floats) -> Floats:
+    """Return (N, 3, 6): how places (N, 3) move with rotation and translation about the origin."""
+    still = np.broadcast_to(np.eye(3), (len(places), 3, 3))
+    return np.concatenate([-hat(places), still], axis=2)

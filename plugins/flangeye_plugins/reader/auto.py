@@ -1,0 +1,57 @@
+"""Find out which reader knows a path: the built-in ones, and those of every installed plugin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from flangeye import StageError, part
+from flangeye.files.recording import Archive, NotThisLayout
+from flangeye.plugin.stage import BoundPart, Part, Siblings
+from flangeye_plugins.reader.ancorasir import ancorasir
+from flangeye_plugins.reader.folder import folder
+
+BUILT_IN: Siblings = {"ancorasir": ancorasir, "folder": folder}
+
+
+@part("reader.auto")
+def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
+    """Try every reader that is installed and take the one that knows the path; says which."""
+    bound = {name: _bound(reader) for name, reader in siblings.items()}
+    found, missed = _tried({name: reader for name, reader in bound.items() if reader}, path)
+    if len(found) == 1:
+        ((name, archive),) = found.items()
+        note = f"reader: {name}, chosen by what {archive.root} holds"
+        return replace(archive, notes=(note, *archive.notes))
+    if found:
+        raise StageError(
+            f"{path}: could be read by {' and '.join(found)}; choose one, for example "
+            f"reader: {next(iter(found))}"
+        )
+    untried = [name for name, reader in bound.items() if reader is None]
+    if untried:
+        missed.append(f"not tried, for a recipe must give their parameters: {', '.join(untried)}")
+    raise StageError(f"{path}: no reader knows this layout: {'; '.join(missed)}")
+
+
+def _bound(reader: Part) -> BoundPart | None:
+    """Return a reader with its default parameters, or None if some have no default."""
+    try:
+        return reader.bind()
+    except ValidationError:
+        return None
+
+
+def _tried(readers: Mapping[str, BoundPart], path: Path) -> tuple[dict[str, Archive], list[str]]:
+    """Return what each reader gave that knows the path, and the others' reasons."""
+    found: dict[str, Archive] = {}
+    missed: list[str] = []
+    for name, reader in readers.items():
+        try:
+            found[name] = reader(path)
+        except NotThisLayout as error:
+            missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
+    return found, missed

@@ -1,0 +1,180 @@
+"""``reader.corrected``: an archive whose poses were recorded with a mistake that is now known.
+
+``flangeye doctor`` names the mistake and gives the line to put into the recipe::
+
+    - acquire.archive: {reader: {corrected: {reader: folder, inverted: true}}}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from flangeye import BoundPart, Choose, Params, StageError, part
+from flangeye.doctor.diagnosis import Arms
+from flangeye.files.recording import Archive, Recording
+from flangeye.maths.pose_corrections import (
+    delayed,
+    inverted,
+    reread,
+    scaled,
+    sources,
+    transposed,
+    without_tool,
+)
+from flangeye.maths.pose_formats import EULER_ORDERS
+from flangeye.types import FLANGE, FLANGE2, Floats, Mask
+from flangeye.units import Duration, Length, param
+
+ROTATIONS = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
+
+Selected = tuple[Sequence[Recording], Floats, Mask]
+
+
+class CorrectedParams(Params):
+    """What was wrong; one level undoes it in the order of this list."""
+
+    reader: Annotated[BoundPart, Choose("reader")] = param(
+        description="Reads the archive as it was recorded."
+    )
+    arms: Arms = Field(
+        "both", description="Whose poses, where there are two arms; one arm alone is 'both'."
+    )
+    read_as: str | None = Field(None, description="How that reader read the rotations.")
+    written_as: str | None = Field(
+        None, description=f"How they were written: one of {', '.join(ROTATIONS[:3])}, or axes."
+    )
+    transposed: bool = Field(False, description="The rotations' matrices were transposed.")
+    scale: float = Field(1.0, gt=0, description="What the robot's positions are multiplied with.")
+    target_scale: float = Field(
+        1.0,
+        gt=0,
+        description="What positions of ready-made centres and markers are multiplied with.",
+    )
+    inverted: bool = Field(False, description="The poses are flange_T_base.")
+    target_offset: tuple[Length, Length, Length] = param(
+        ("0 mm", "0 mm", "0 mm"),
+        description="What was seen, from the point whose poses were recorded, in its frame.",
+    )
+    shift: int = Field(0, description="A scan belongs to the pose recorded so many later.")
+    shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
+    delay: Duration = param("0 ms", description="The scans were taken so long after their poses.")
+
+    @field_validator("read_as", "written_as")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None and value not in ROTATIONS:
+            raise ValueError(f"no rotation '{value}'; known: {', '.join(ROTATIONS)}")
+        return value
+
+    @model_validator(mode="after")
+    def _both(self) -> CorrectedParams:
+        if (self.read_as is None) != (self.written_as is None):
+            raise ValueError("read_as and written_as go together")
+        return self
+
+
+@part("reader.corrected")
+def corrected(path: Path, params: CorrectedParams) -> Archive:
+    """Read an archive with another reader, and undo a mistake in its poses."""
+    archive: Archive = params.reader(path)
+    recordings = [_alone(recording, params) for recording in archive.recordings]
+    if params.shift:
+        recordings = _shift(archive, recordings, params)
+    if params.delay:
+        recordings = _delay(archive, recordings, params)
+    note = "poses corrected as the recipe says"
+    return replace(archive, recordings=recordings, notes=(*archive.notes, note))
+
+
+def _alone(recording: Recording, params: CorrectedParams) -> Recording:
+    """Undo what concerns each pose by itself."""
+    spared = {"first": FLANGE2, "second": FLANGE}.get(params.arms)
+    poses = {
+        frame: pose if frame == spared else _corrected(pose, params)
+        for frame, pose in recording.poses.items()
+    }
+    centre, target = recording.centre_in_camera, recording.camera_T_target
+    return replace(
+        recording,
+        poses=poses,
+        centre_in_camera=None if centre is None else centre * params.target_scale,
+        camera_T_target=None if target is None else scaled(target, params.target_scale),
+    )
+
+
+def _corrected(pose: Floats, params: CorrectedParams) -> Floats:
+    """Return one arm's pose (4, 4) as it should be."""
+    poses = pose[None]
+    if params.read_as and params.written_as:
+        poses = reread(poses, params.read_as, params.written_as)
+    if params.transposed:
+        poses = transposed(poses)
+    poses = scaled(poses, params.scale)
+    if params.inverted:
+        poses = inverted(poses)
+    return np.asarray(without_tool(poses, -np.array(params.target_offset))[0])
+
+
+def _shift(
+    archive: Archive, recordings: Sequence[Recording], params: CorrectedParams
+) -> list[Recording]:
+    names = [r.id for r in recordings if r.role == "calibration"]
+    if params.shift_from is not None and params.shift_from not in names:
+        raise StageError(f"{archive.root}: shift_from: there is no pose '{params.shift_from}'")
+    start = names.index(params.shift_from) if params.shift_from else 0
+    source, kept = sources(len(names), params.shift, start)
+
+    def at_source(rows: Floats) -> Floats:
+        return rows[source]
+
+    return _replaced(recordings, at_source, kept, params.arms)
+
+
+def _delay(
+    archive: Archive, recordings: Sequence[Recording], params: CorrectedParams
+) -> list[Recording]:
+    times = np.array([r.time_ns for r in recordings if r.role == "calibration"]) * 1e-9
+    if (np.diff(times) <= 0).any():
+        raise StageError(f"{archive.root}: delay: the poses' times do not rise")
+    wanted = times + params.delay
+    kept = (wanted >= times[0]) & (wanted <= times[-1])
+
+    def later(rows: Floats) -> Floats:
+        if rows.ndim == 3:
+            return delayed(rows, times, params.delay)[0]
+        return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
+
+    return _replaced(recordings, later, kept, params.arms)
+
+
+def _replaced(
+    recordings: Sequence[Recording], change: Callable[[Floats], Floats], kept: Mask, arms: Arms
+) -> list[Recording]:
+    """Change what the arms reported, in its order; samples that get nothing are left out.
+
+    Args:
+        recordings: Those to calibrate with are changed.
+        change: Gives poses (N, 4, 4), or joints (N, n), of other moments.
+        kept: (N,) which of them have one.
+        arms: Whose.
+    """
+    calibration = [r for r in recordings if r.role == "calibration"]
+    changed = calibration
+    for frame in {"both": (FLANGE, FLANGE2), "first": (FLANGE,), "second": (FLANGE2,)}[arms]:
+        if all(frame in recording.poses for recording in calibration):
+            moved = change(np.array([recording.poses[frame] for recording in calibration]))
+            changed = [
+                replace(r, poses={**r.poses, frame: m}) for r, m in zip(changed, moved, strict=True)
+            ]
+    if arms != "second" and all(recording.joints is not None for recording in calibration):
+        turned = change(np.array([recording.joints for recording in calibration]))
+        changed = [replace(r, joints=m) for r, m in zip(changed, turned, strict=True)]
+    return [r for r in recordings if r.role != "calibration"] + [
+        recording for recording, has in zip(changed, kept, strict=True) if has
+    ]

@@ -1,0 +1,156 @@
+"""The simplest layout, for recordings of one's own: a folder of clouds and a file of poses.
+
+``poses.csv`` has a heading and a row for each cloud::
+
+    cloud,x_mm,y_mm,z_mm,qx,qy,qz,qw
+    scan_001.pcd,412.5,-120.0,310.2,0.0,1.0,0.0,0.0
+
+The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` (a file name);
+``x_m, y_m, z_m`` or ``x_mm, y_mm, z_mm``; ``qx, qy, qz, qw`` or a rotation vector
+``rx_rad, ry_rad, rz_rad``; and if wanted ``id`` (the cloud's name without its ending), ``role``
+(``calibration`` or ``verification``), ``time_ns`` and joint angles ``j1_rad, j2_rad, …``. The
+flange of a second arm, in that arm's own base, has the same columns with ``second_`` before their
+names (``second_x_mm, …, second_qw``).
+
+``poses.yaml`` or ``poses.json`` says the same, with the unit of the positions once::
+
+    unit: mm
+    poses:
+      - cloud: scan_001.pcd
+        position: [412.5, -120.0, 310.2]
+        quaternion_xyzw: [0.0, 1.0, 0.0, 0.0]
+
+There the second arm's pose is ``second:``, with a position and a rotation of its own.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, part
+from flangeye.files.clouds import PER_METRE, LengthUnit, write_cloud
+from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.maths.geometry import quaternion_from_rotation
+from flangeye.types import FLANGE, FLANGE2, Capture, Floats, Transform
+from flangeye_plugins.reader.folder_poses import SECOND, ArmPose, PoseRow, read_poses
+from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
+
+POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
+STRAY_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
+"""A file that ends so and that no pose names is a scan somebody forgot."""
+
+
+class FolderParams(Params):
+    """How to read a folder of clouds and poses."""
+
+    unit: Literal["m", "mm"] | None = Field(
+        None, description="Unit of the positions, where the file of poses does not say."
+    )
+
+
+@part("reader.folder")
+def folder(path: Path, params: FolderParams) -> Archive:
+    """Read a folder of clouds with poses.csv, poses.yaml or poses.json beside them."""
+    file = _poses_file(path)
+    poses, lines = read_poses(file)
+    unit = _unit(file, poses.unit, params.unit)
+    recordings = [
+        _recording(f"{file}:{line}", row, file.parent, unit)
+        for row, line in zip(poses.poses, lines, strict=True)
+    ]
+    if recordings:  # without any, that is what there is to say
+        _refuse_strays(file, recordings)
+    layout = f"folder, {file.name}"
+    return Archive(layout, file.parent, recordings, [file], cloud_unit=poses.cloud_unit)
+
+
+def write_folder(path: Path, captures: Iterable[Capture]) -> None:
+    """Write captures as such a folder: binary PCD clouds and ``poses.csv``, all in metres.
+
+    Args:
+        path: Folder to write into; it is made.
+        captures: At least one; with or without joint angles and a second arm, all of them alike.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for capture in captures:
+        write_cloud(path / f"{capture.id}.pcd", capture.cloud)
+        rows.append(_row_of(capture))
+    with (path / "poses.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _row_of(capture: Capture) -> dict[str, Any]:
+    joints = [] if capture.joints is None else capture.joints.tolist()
+    second = capture.poses.get(FLANGE2)
+    return {
+        "cloud": f"{capture.id}.pcd", "id": capture.id, "role": capture.role,
+        "time_ns": capture.time_ns, **_cells_of(capture.base_T_flange),
+        **{f"j{i}_rad": angle for i, angle in enumerate(joints, 1)},
+        **({} if second is None else _cells_of(second, SECOND)),
+    }  # fmt: skip
+
+
+def _cells_of(pose: Transform, prefix: str = "") -> dict[str, float]:
+    numbers = [*pose.translation.tolist(), *quaternion_from_rotation(pose.rotation).tolist()]
+    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    return {prefix + name: number for name, number in zip(names, numbers, strict=True)}
+
+
+def _poses_file(path: Path) -> Path:
+    if path.is_file() and path.name in POSE_FILES:
+        return path
+    found = [path / name for name in POSE_FILES if (path / name).is_file()]
+    if not found:
+        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in STRAY_SUFFIXES)
+        but = f"clouds ({clouds}), but " if clouds else ""
+        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(POSE_FILES)}")
+    if len(found) > 1:
+        raise StageError(f"{path}: holds {' and '.join(f.name for f in found)}; keep one of them")
+    return found[0]
+
+
+def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> LengthUnit:
+    if stated and param and stated != param:
+        raise StageError(f"{file}: positions are in {stated}, but the recipe says unit: {param}")
+    unit = stated or param
+    if unit is None:
+        raise StageError(
+            f"{file}: its positions have no unit; name the columns x_mm, y_mm, z_mm (or x_m, …), "
+            "write 'unit: mm' in YAML, or set reader: {folder: {unit: mm}}"
+        )
+    return unit
+
+
+def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
+    name = row.id or Path(row.cloud).stem
+    joints = None if row.joints_rad is None else np.array(row.joints_rad)
+    called = f"{where}: pose '{name}'"
+    poses = {FLANGE: _pose(called, row, unit)}
+    if row.second is not None:
+        poses[FLANGE2] = _pose(f"{called}, second", row.second, unit)
+    return Recording(name, poses, root / row.cloud, None, joints, row.role, row.time_ns)
+
+
+def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
+    position = np.array(row.position) / PER_METRE[unit]
+    if row.quaternion_xyzw is not None:
+        return pose_from_quaternion(where, position, row.quaternion_xyzw)
+    return pose_from_rotation_vector(where, position, row.rotation_vector_rad or ())
+
+
+def _refuse_strays(file: Path, recordings: Iterable[Recording]) -> None:
+    known = {recording.cloud for recording in recordings}
+    for path in sorted(file.parent.iterdir()):
+        if path.suffix.lower() in STRAY_SUFFIXES and path not in known:
+            raise StageError(
+                f"{path}: {file.name} has no pose for it; add it, or move the cloud away"
+            )

@@ -1,0 +1,144 @@
+"""Pair an arm's recorded poses with what a camera recorded on another clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError
+from flangeye.files.recording import MIN_CAPTURES
+from flangeye.maths.streams import (
+    Span,
+    apart,
+    clock_offset,
+    interpolated,
+    mean_pose,
+    offset_into,
+    standstills,
+)
+from flangeye.types import Floats
+from flangeye.units import Angle, Duration, Length, param
+
+Signal = tuple[Floats, Floats]
+"""Times (N,) [s] and how much moved there (N,), in any unit."""
+
+
+class PairingParams(Params):
+    """How the two are brought together."""
+
+    clock_offset: Duration | None = Field(
+        None,
+        description="To add to the camera's times to come to the arm's; estimated if not given.",
+    )
+    tolerance: Duration = param(
+        "100 ms", gt=0, description="Largest time between a measurement and the arm's next pose."
+    )
+    distance: Length = param(
+        "5 mm", gt=0, description="Of an arm that never stands still: how far apart its poses are."
+    )
+    angle: Angle = param("2 deg", gt=0, description="The same for turning; either will do.")
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A pose of the arm, and which measurements belong to it.
+
+    Attributes:
+        time: When [s], by the arm's clock.
+        pose: (4, 4) [m].
+        events: Which measurements, by their index; at least one.
+    """
+
+    time: float
+    pose: Floats
+    events: tuple[int, ...]
+
+
+def pair(
+    arm: tuple[Floats, Floats],
+    events: Floats,
+    signals: tuple[Signal, Signal] | None,
+    params: PairingParams,
+) -> tuple[list[Pair], list[str]]:
+    """Return the pairs in time, and what to tell of how they were made.
+
+    Args:
+        arm: Times (N,) [s] and poses (N, 4, 4) [m] of the arm.
+        events: (M,) times of the measurements, by the camera's clock [s].
+        signals: How the arm moved and how what the camera saw moved, if that is known.
+        params: The parameters.
+
+    Raises:
+        StageError: The two have no time in common.
+    """
+    spans = standstills(*arm)
+    offset, told = _offset(spans, events, signals, params)
+    moved = events + offset
+    overlap = (moved >= arm[0][0] - params.tolerance) & (moved <= arm[0][-1] + params.tolerance)
+    if not overlap.any():
+        raise StageError(
+            f"the arm's poses are from {arm[0][0]:.3f} to {arm[0][-1]:.3f} s, the measurements "
+            f"from {moved[0]:.3f} to {moved[-1]:.3f} s: they have no time in common; set "
+            "clock_offset"
+        )
+    pairs = _standing(arm, spans, moved)
+    if len(pairs) >= MIN_CAPTURES:
+        return pairs, [f"the arm stood still {len(pairs)} times with measurements; {told}"]
+    pairs = _passing(arm, moved, params)
+    return pairs, [f"the arm hardly stood still, so {len(pairs)} poses are interpolated; {told}"]
+
+
+def _offset(
+    spans: Sequence[Span],
+    events: Floats,
+    signals: tuple[Signal, Signal] | None,
+    params: PairingParams,
+) -> tuple[float, str]:
+    if params.clock_offset is not None:
+        return params.clock_offset, f"clock offset {params.clock_offset * 1e3:.1f} ms as given"
+    if signals is not None and min(len(times) for times, _ in signals) > 20:
+        offset, alike = clock_offset(*signals)
+        if alike > 0:
+            how = f"estimated by how both move (correlation {alike:.2f})"
+            return offset, f"clock offset {offset * 1e3:.1f} ms, {how}"
+    if len(spans) >= MIN_CAPTURES:
+        offset = offset_into(list(spans), events)
+        return offset, f"clock offset {offset * 1e3:.1f} ms, the least that fits the standstills"
+    return 0.0, "clock offset taken to be 0 ms: nothing tells it"
+
+
+def _standing(arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats) -> list[Pair]:
+    times, poses = arm
+    found = []
+    for span in spans:
+        within = np.flatnonzero((moved >= span.start) & (moved <= span.end))
+        if len(within):
+            # Its ends hold the last of one motion and the first of the next.
+            trim = 0.2 * (span.end - span.start)
+            held = poses[(times >= span.start + trim) & (times <= span.end - trim)]
+            found.append(Pair(span.middle, mean_pose(held), tuple(within.tolist())))
+    return found
+
+
+def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -> list[Pair]:
+    times, poses = arm
+    nearest = np.abs(times[_nearest(times, moved)] - moved) <= params.tolerance
+    usable = np.flatnonzero(nearest)
+    if not len(usable):
+        return []
+    before = np.clip(np.searchsorted(times, moved[usable]) - 1, 0, len(times) - 1)
+    after = np.clip(before + 1, 0, len(times) - 1)
+    sparse = times[after] - times[before] > 2 * params.tolerance
+    at = np.where(sparse, times[_nearest(times, moved[usable])], moved[usable])
+    between = interpolated(times, poses, at) if len(times) > 1 else poses[[0] * len(at)]
+    kept = apart(between, params.distance, params.angle)
+    return [Pair(float(at[i]), between[i], (int(usable[i]),)) for i in kept]
+
+
+def _nearest(times: Floats, at: Floats) -> Floats:
+    after = np.clip(np.searchsorted(times, at), 0, len(times) - 1)
+    before = np.clip(after - 1, 0, len(times) - 1)
+    return np.where(np.abs(times[before] - at) <= np.abs(times[after] - at), before, after)

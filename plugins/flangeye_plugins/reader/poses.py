@@ -1,0 +1,70 @@
+"""Robot poses as files give them, checked, as (4, 4) matrices in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye import StageError
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_quaternion
+from flangeye.types import Floats
+
+Numbers = Sequence[float] | Floats
+
+NORM_TOLERANCE = 1e-3
+"""Of quaternions and rotation matrices: four printed digits pass, a wrong order does not."""
+
+
+def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats:
+    """Return the pose of a position [m] and a unit quaternion xyzw.
+
+    Args:
+        where: What messages begin with: the file and the pose's name.
+        position: (3,) [m].
+        xyzw: (4,).
+
+    Raises:
+        StageError: A value is not finite, or the quaternion's norm is not 1.
+    """
+    q = _finite(where, xyzw)
+    norm = float(np.linalg.norm(q))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise StageError(
+            f"{where}: the quaternion's norm is {norm:.4g}; it must be 1 (within {NORM_TOLERANCE})"
+        )
+    return rigid(rotation_from_quaternion(q), _finite(where, position))
+
+
+def pose_from_rotation_vector(where: str, position: Numbers, vector: Numbers) -> Floats:
+    """Return the pose of a position [m] and a rotation vector [rad], as UR controllers give it.
+
+    Raises:
+        StageError: A value is not finite.
+    """
+    return rigid(rotation_exp(_finite(where, vector)), _finite(where, position))
+
+
+def pose_from_matrix(where: str, matrix: Floats) -> Floats:
+    """Return a (4, 4) pose [m] after a look at it.
+
+    Raises:
+        StageError: A value is not finite, or the rotation is not one.
+    """
+    m = _finite(where, matrix)
+    rotation = m[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > NORM_TOLERANCE or np.linalg.det(rotation) < 0 or tuple(m[3]) != (0, 0, 0, 1):
+        raise StageError(
+            f"{where}: is not a rigid transform (its rotation is {error:.2g} from orthonormal, "
+            f"at most {NORM_TOLERANCE} is allowed)"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    return rigid(u @ vt, m[:3, 3])
+
+
+def _finite(where: str, values: Numbers) -> Floats:
+    array = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise StageError(f"{where}: has values that are not finite")
+    return array

@@ -1,0 +1,384 @@
+"""ROS 2 bags, MCAP or SQLite, read without ROS.
+
+What the arm did comes from ``tf`` (``base`` and ``flange``), a ``PoseStamped`` topic, or joint
+angles with the arm's model; what the camera saw from ``PointCloud2``, ``Image`` with
+``CameraInfo``, a ``PoseStamped`` of the target, or ``tf`` of the target's frame. The standstills
+are found in the arm's motion, and clouds and poses are paired by time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, RecipeError, StageError, part
+from flangeye.files.recording import Archive, Recording
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.streams import mean_pose, turning
+from flangeye.models.loading import load_model
+from flangeye.types import FLANGE, Floats
+from flangeye.units import param
+from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
+from flangeye_plugins.reader.ros2_frames import Frames, Stream, in_order, pose_of
+from flangeye_plugins.reader.ros2_messages import (
+    Raw,
+    bag_files,
+    cloud_of,
+    messages,
+    pixels_of,
+    save_cloud,
+    save_image,
+    scratch,
+    topics_of,
+)
+
+CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+TF = "tf2_msgs/msg/TFMessage"
+BASES = ("base", "base_link", "world")
+FLANGES = ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_link_ee", "link_eef")
+"""Names under which ROS's drivers publish the two frames, the better one first."""
+UR_JOINTS = tuple(
+    f"{name}_joint"
+    for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+)
+OFTEN = 3.0
+"""From so many measurements a second on, their own change tells when something moved."""
+
+
+class BagParams(Params):
+    """What is looked for in the bag; found where it is the only one of its sort."""
+
+    clouds: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
+    images: str | None = Field(None, description="Topic of the images (Image, CompressedImage).")
+    camera_info: str | None = Field(None, description="Topic of the images' CameraInfo.")
+    base: str | None = Field(None, description="Frame of the arm's base, in which its poses are.")
+    flange: str | None = Field(None, description="Frame of the flange, origin in its face.")
+    robot: str | None = Field(
+        None, description="Topic of the arm, in place of tf: PoseStamped, or JointState with model."
+    )
+    model: str | None = Field(
+        None, description="The arm's model, of data/robots or a file, to come from joint angles "
+        "to poses.",
+    )  # fmt: skip
+    joints: tuple[str, ...] = Field(
+        (), description="Names of the joints from base to flange, where JointState mixes them."
+    )
+    target: str | None = Field(
+        None, description="The target as somebody has measured it: a PoseStamped topic, or a frame "
+        "of tf with camera.",
+    )  # fmt: skip
+    camera: str | None = Field(None, description="The camera's frame, for a target in tf.")
+    join: PairingParams = param(PairingParams(), description="How poses and clouds are paired.")
+
+
+@dataclass
+class Bag:
+    """What the first look at a bag gives.
+
+    Attributes:
+        path: The bag.
+        files: Its files.
+        topics: Topic -> type.
+        frames: What tf tells.
+        poses: Topic -> times and poses, of PoseStamped.
+        joints: Topic -> times and, each, name -> angle.
+        stamps: Topic -> times of clouds and images.
+        cameras: Topic -> camera matrix (3, 3) [px] and distortion.
+    """
+
+    path: Path
+    files: list[Path]
+    topics: dict[str, str]
+    frames: Frames = field(default_factory=Frames)
+    poses: dict[str, tuple[list[float], list[Floats]]] = field(default_factory=dict)
+    joints: dict[str, tuple[list[float], list[dict[str, float]]]] = field(default_factory=dict)
+    stamps: dict[str, list[float]] = field(default_factory=dict)
+    cameras: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
+
+    def of_type(self, *types: str) -> list[str]:
+        """Return the topics of some types."""
+        return [topic for topic, kind in self.topics.items() if kind in types]
+
+    def only(self, what: str, given: str | None, *types: str) -> str | None:
+        """Return the topic that was named, or the only one of its types; None where there is none.
+
+        Raises:
+            StageError: It does not exist, or there are several and none was named.
+        """
+        found = self.of_type(*types)
+        if given is not None:
+            if given not in found:
+                known = ", ".join(found) or "none"
+                raise StageError(f"{self.path}: {what}: no topic '{given}'; of this type: {known}")
+            return given
+        if len(found) > 1:
+            raise StageError(f"{self.path}: {what}: name one of {', '.join(sorted(found))}")
+        return found[0] if found else None
+
+
+@part("reader.ros2_bag")
+def ros2_bag(path: Path, params: BagParams) -> Archive:
+    """Read a ROS 2 bag, MCAP or .db3, without ROS: standstills with their clouds or images."""
+    bag = _first_look(path)
+    arm, arm_told, joints = _arm(bag, params)
+    seen, seen_told = _seen(bag, params)
+    try:
+        pairs, paired = pair(arm, seen.times, seen.signals(arm), params.join)
+    except StageError as error:
+        raise StageError(f"{path}: {error}") from None
+    recordings = seen.recordings(pairs, joints)
+    notes = [f"ROS 2 bag: {arm_told}; {seen_told}", *paired]
+    return Archive(f"ROS 2 bag, {path.name}", path, recordings, bag.files, "m", notes)
+
+
+def _first_look(path: Path) -> Bag:
+    """Read all but the clouds and images, and of those the times."""
+    files = bag_files(path)
+    bag = Bag(path, files, topics_of(files))
+    wanted = bag.of_type(CLOUD, POSE, *IMAGES, INFO, JOINTS, TF)
+    for raw in messages(files, wanted):
+        kind = bag.topics[raw.topic]
+        if kind == TF:
+            bag.frames.take(raw.decode(), raw.topic.endswith("tf_static"))
+        elif kind == POSE:
+            _append(bag.poses, raw, _pose_stamped(raw))
+        elif kind == JOINTS:
+            message = raw.decode()
+            _append(bag.joints, raw, dict(zip(message.name, message.position, strict=False)))
+        elif kind == INFO:
+            bag.cameras[raw.topic] = _intrinsics(raw.decode())
+        else:
+            bag.stamps.setdefault(raw.topic, []).append(raw.stamp)
+    return bag
+
+
+def _append(into: dict[str, tuple[list[float], list[Any]]], raw: Raw, value: Any) -> None:
+    times, values = into.setdefault(raw.topic, ([], []))
+    times.append(raw.stamp)
+    values.append(value)
+
+
+def _pose_stamped(raw: Raw) -> Floats:
+    pose = raw.decode().pose
+    return pose_of(raw.topic, pose.position, pose.orientation)
+
+
+def _intrinsics(message: Any) -> tuple[Floats, Floats]:
+    matrix = message.k if hasattr(message, "k") else message.K
+    distortion = message.d if hasattr(message, "d") else message.D
+    return np.array(matrix, dtype=float).reshape(3, 3), np.array(distortion, dtype=float)
+
+
+# --- the arm
+
+
+def _arm(bag: Bag, params: BagParams) -> tuple[Stream, str, Stream | None]:
+    """Return the flange's poses, how they were found, and the joints, if their order is known.
+
+    Raises:
+        StageError: Nothing in the bag tells where the flange is, or several things do.
+    """
+    joints = _joints(bag, params)
+    if params.robot is not None and params.robot not in bag.of_type(JOINTS):
+        topic = bag.only("robot", params.robot, POSE)
+        return in_order(*bag.poses[str(topic)]), f"the flange's poses from {topic}", joints
+    if params.model is not None:
+        if joints is None:
+            raise StageError(f"{bag.path}: model: there are no joint angles whose order is known")
+        poses = Arm(_model(params.model)).flange(joints[1])
+        return (joints[0], poses), f"the flange's poses by the model {params.model}", joints
+    base, flange = _frame(bag, params.base, BASES), _frame(bag, params.flange, FLANGES)
+    if base and flange:
+        told = f"the flange's poses from tf, {base} to {flange}"
+        return bag.frames.between(base, flange), told, joints
+    others = [topic for topic in bag.poses if topic != params.target]
+    if len(others) == 1:
+        return in_order(*bag.poses[others[0]]), f"the flange's poses from {others[0]}", joints
+    frames = ", ".join(bag.frames.names) or "none"
+    raise StageError(
+        f"{bag.path}: nothing tells where the flange is; name base and flange (frames of tf: "
+        f"{frames}), robot (a PoseStamped topic), or model (of the arm, for joint angles)"
+    )
+
+
+def _frame(bag: Bag, given: str | None, usual: Sequence[str]) -> str | None:
+    if given is not None:
+        return given
+    return next((name for name in usual if name in bag.frames.names), None)
+
+
+def _model(name: str) -> Any:
+    try:
+        return load_model("robots", name)
+    except RecipeError as error:
+        raise StageError(f"model: {error}") from None
+
+
+def _joints(bag: Bag, params: BagParams) -> Stream | None:
+    given = params.robot if params.robot in bag.joints else None
+    topics = [given] if given else list(bag.joints)
+    if len(topics) != 1:
+        return None
+    times, values = bag.joints[str(topics[0])]
+    names = params.joints or _usual_order(values[0])
+    usable = [(t, v) for t, v in zip(times, values, strict=True) if set(names) <= set(v)]
+    if not names or not usable:
+        return None
+    angles = [np.array([value[name] for name in names]) for _, value in usable]
+    return in_order([t for t, _ in usable], angles)
+
+
+def _usual_order(names: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the joints from base to flange where their names tell; drivers sort by alphabet."""
+    if set(UR_JOINTS) <= set(names):
+        return UR_JOINTS
+    numbered = sorted(name for name in names if name.rstrip("_joint")[-1:].isdigit())
+    return tuple(numbered) if len(numbered) in (6, 7) else ()
+
+
+# --- what the camera saw
+
+
+@dataclass
+class Target:
+    """The target as somebody measured it: times and poses in the camera."""
+
+    times: Floats
+    poses: Floats
+
+    def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
+        """Both turn as fast, in whatever frame."""
+        enough = len(self.times) > 2 and len(arm[0]) > 2
+        return (turning(*arm), turning(self.times, self.poses)) if enough else None
+
+    def recordings(self, pairs: Sequence[Pair], joints: Stream | None) -> list[Recording]:
+        """Return a recording a pair."""
+        return [
+            Recording(
+                f"{i:03}",
+                {FLANGE: found.pose},
+                joints=_angles(joints, found),
+                time_ns=round(found.time * 1e9),
+                camera_T_target=mean_pose(self.poses[list(found.events)]),
+            )
+            for i, found in enumerate(pairs)
+        ]
+
+
+@dataclass
+class Scans:
+    """Clouds, images, or clouds with the images taken nearest to them."""
+
+    bag: Bag
+    clouds: str | None
+    images: str | None
+    camera: tuple[Floats, Floats] | None
+
+    @property
+    def first(self) -> str:
+        """The topic that is paired with the arm."""
+        return str(self.clouds or self.images)
+
+    @property
+    def times(self) -> Floats:
+        """When its messages were taken [s]."""
+        return np.array(self.bag.stamps[self.first])
+
+    def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
+        """How much each differs from the one before, where they come often enough to tell."""
+        if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / OFTEN:
+            return None
+        looks = [_look(raw.decode()) for raw in messages(self.bag.files, [self.first])]
+        alike = all(look.shape == looks[0].shape for look in looks)
+        changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks)]
+        between = (self.times[1:] + self.times[:-1]) / 2
+        return (turning(*arm), (between, np.array(changes))) if alike else None
+
+    def recordings(self, pairs: Sequence[Pair], joints: Stream | None) -> list[Recording]:
+        """Return a recording a pair, its cloud and image written as files."""
+        chosen = [found.events[len(found.events) // 2] for found in pairs]
+        files = self._files(self.first, chosen)
+        images = files if self.clouds is None else self._beside(chosen)
+        return [
+            Recording(
+                f"{i:03}",
+                {FLANGE: found.pose},
+                cloud=files[event] if self.clouds else None,
+                joints=_angles(joints, found),
+                time_ns=round(found.time * 1e9),
+                image=images.get(event),
+                camera=self.camera,
+            )
+            for i, (found, event) in enumerate(zip(pairs, chosen, strict=True))
+        ]
+
+    def _beside(self, chosen: Sequence[int]) -> dict[int, Path]:
+        """Return the image taken nearest to each chosen cloud."""
+        if self.images is None:
+            return {}
+        taken = np.array(self.bag.stamps[self.images])
+        nearest = {event: int(np.argmin(np.abs(taken - self.times[event]))) for event in chosen}
+        files = self._files(self.images, list(nearest.values()))
+        return {event: files[image] for event, image in nearest.items()}
+
+    def _files(self, topic: str, wanted: Sequence[int]) -> dict[int, Path]:
+        """Write some messages of a topic as files; return them by the message's number."""
+        folder, files = scratch(self.bag.path), {}
+        save = save_cloud if self.bag.topics[topic] == CLOUD else save_image
+        for number, raw in enumerate(messages(self.bag.files, [topic])):
+            if number in wanted:
+                name = f"{topic.strip('/').replace('/', '_')}-{number:05}"
+                files[number] = save(folder / name, raw.decode())
+        return files
+
+
+def _look(message: Any) -> Floats:
+    """Return a coarse look at a cloud's depths or an image's pixels."""
+    if hasattr(message, "fields"):
+        return np.asarray(np.nan_to_num(cloud_of(message)[..., 2].ravel()[::97]), dtype=float)
+    if hasattr(message, "encoding"):
+        return np.asarray(pixels_of(message)[::16, ::16], dtype=float)
+    return np.zeros(1)
+
+
+def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
+    """Return what the camera saw, and how it was found."""
+    if params.target is not None:
+        return _target(bag, params), f"the target from {params.target}"
+    clouds = bag.only("clouds", params.clouds, CLOUD)
+    images = bag.only("images", params.images, *IMAGES)
+    if clouds is None and images is None:
+        raise StageError(
+            f"{bag.path}: holds neither clouds nor images; name the target where somebody has "
+            "measured it (a PoseStamped topic, or a frame of tf)"
+        )
+    info = bag.only("camera_info", params.camera_info, INFO)
+    told = " and ".join(topic for topic in (clouds, images) if topic)
+    return Scans(bag, clouds, images, bag.cameras.get(str(info))), told
+
+
+def _target(bag: Bag, params: BagParams) -> Target:
+    name = str(params.target)
+    if name in bag.poses:
+        return Target(*in_order(*bag.poses[name]))
+    if params.camera is None:
+        raise StageError(f"{bag.path}: target: '{name}' is no PoseStamped topic; as a frame of tf "
+                         "it needs the camera's frame, camera: NAME")  # fmt: skip
+    # Seen from the target the chain is the same, and its times are those of the target's own tf.
+    times, poses = bag.frames.between(name, params.camera)
+    return Target(times, np.array([inverted(pose) for pose in poses]))
+
+
+def _angles(joints: Stream | None, found: Pair) -> Floats | None:
+    if joints is None:
+        return None
+    return np.array([np.interp(found.time, joints[0], each) for each in joints[1].T])

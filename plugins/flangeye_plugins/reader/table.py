@@ -1,0 +1,393 @@
+"""A table of poses in any convention that is stated, with scans beside it or the target in it.
+
+CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
+commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
+the recipe names. YAML or JSON: ``{scan.ply: [numbers], …}``, or a list of ``{scan: scan.ply,
+pose: [numbers]}``. Without names the scans belong to the rows in the order of their names.
+
+What the camera measured may stand in the table in place of scans, as ``target``, and so may a
+second arm's pose, as ``second``; either in the same rows, or in a table of its own that is joined
+by time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flangeye import StageError, part
+from flangeye.files.clouds import LengthUnit
+from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.scans import recording_of, scans_in
+from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.streams import interpolated, mean_pose, turning
+from flangeye.types import FLANGE, FLANGE2, Floats
+from flangeye.units import param
+from flangeye_plugins.reader.columns import Column, TextTable, number_of, read_text_table
+from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
+from flangeye_plugins.reader.written import POINT, WrittenParams
+from flangeye_plugins.reader.yaml_poses import numbers, read_document, value_at
+
+DOCUMENTS = (".yaml", ".yml", ".json")
+PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+class ColumnsParams(WrittenParams):
+    """Which columns hold a pose, and how it is written."""
+
+    columns: tuple[Column, ...] = Field(
+        (), description="Names in the heading, or numbers from 1, in the order of the convention: "
+        "position first; all that nothing else takes if not given.",
+    )  # fmt: skip
+    time: Column | None = Field(None, description="Column of the time.")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+
+
+class OtherParams(ColumnsParams):
+    """Something else that was measured: in the same rows, or in a table of its own."""
+
+    file: str | None = Field(
+        None, description="A table of its own; joined by time, or row by row where neither has a "
+        "time.",
+    )  # fmt: skip
+    columns: tuple[Column, ...] = Field(
+        (), description="As for the arm; must be given where it is in the same table."
+    )
+
+    @model_validator(mode="after")
+    def _found_somewhere(self) -> OtherParams:
+        if not self.columns and self.file is None:
+            raise ValueError("give its columns, as names or numbers from 1, or a file of its own")
+        return self
+
+
+class TargetParams(OtherParams):
+    """The target as the camera saw it; empty cells where it did not."""
+
+    pose: Literal["camera_T_target", "target_T_camera"] = Field(
+        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
+    )
+
+    @classmethod
+    def more(cls) -> tuple[str, ...]:
+        """A point has no rotation."""
+        return (POINT,)
+
+
+class SecondParams(OtherParams):
+    """The second arm."""
+
+    pose: Literal["base2_T_flange2", "flange2_T_base2"] = Field(
+        "base2_T_flange2", description="Whose pose it is."
+    )
+
+
+class TableParams(ColumnsParams):
+    """The convention of the poses; nothing of it is guessed."""
+
+    file: str = Field(
+        "poses.csv", description="The table's name: .yaml, .yml or .json, or text of any ending."
+    )
+    pose: Literal["base_T_flange", "flange_T_base"] = Field(
+        description="Whose pose it is: the flange's in the base, as controllers show, or inverse."
+    )
+    scan: Column | None = Field(
+        None, description="Column of the scans' file names; the first where it holds text."
+    )
+    target: TargetParams | None = Field(
+        None, description="The target as the camera measured it, in place of scans."
+    )
+    second: SecondParams | None = Field(None, description="A second arm's pose.")
+    join: PairingParams = param(
+        PairingParams(), description="How tables of their own are joined by time."
+    )
+    cloud_unit: LengthUnit | None = Field(
+        None, description="Unit of the clouds; found by the scanner's range if not given."
+    )
+
+
+class Row(NamedTuple):
+    """One pose: where it stands in the file, its scan's name or None, and its numbers."""
+
+    where: str
+    scan: str | None
+    numbers: Floats
+
+
+class Readings(NamedTuple):
+    """Poses or points of a table, None where cells are empty; their times [s], if given."""
+
+    file: Path
+    values: list[Floats | None]
+    times: Floats | None
+
+
+@part("reader.table")
+def table(path: Path, params: TableParams) -> Archive:
+    """Read a table of poses in the stated convention, with scans beside it or the target in it."""
+    folder, file = (path.parent, path) if path.is_file() else (path, path / params.file)
+    if not file.is_file():
+        raise NotThisLayout(f"{folder}: holds no {file.name}")
+    if file.suffix in DOCUMENTS:
+        return _of_rows(folder, file, _from_yaml(file), params)
+    text = _with_rows(file)
+    if params.target is None:
+        archive = _of_rows(folder, file, _from_text(text, params), params)
+        return _with_times(archive, text, params)
+    return _measured(folder, text, params)
+
+
+# --- scans beside the table
+
+
+def _of_rows(folder: Path, file: Path, rows: Sequence[Row], params: TableParams) -> Archive:
+    recordings = [
+        recording_of(scans[0].stem, _arm_pose(row.where, row.numbers, params), scans)
+        for row, scans in zip(rows, _scans(folder, file, rows), strict=True)
+    ]
+    return Archive(f"table, {file.name}", folder, recordings, [file], cloud_unit=params.cloud_unit)
+
+
+def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
+    pose = params.value(where, values)
+    return pose if params.pose == "base_T_flange" else inverted(pose)
+
+
+def _with_rows(file: Path) -> TextTable:
+    text = read_text_table(file)
+    if not text.rows:
+        raise StageError(f"{file}: holds no poses")
+    return text
+
+
+def _from_text(text: TextTable, params: TableParams) -> list[Row]:
+    scan = _scan_column(text, params)
+    columns = _columns(text, params, scan)
+    names = [None] * len(text.rows) if scan is None else text.texts(scan)
+    values = text.numbers(columns)
+    return [Row(text.where(i), names[i], values[i]) for i in range(len(values))]
+
+
+def _scan_column(text: TextTable, params: TableParams) -> int | None:
+    if params.scan is not None:
+        return text.index(params.scan)
+    return 0 if number_of(text.rows[0][1][0]) is None and not params.columns else None
+
+
+def _columns(text: TextTable, params: TableParams, scan: int | None) -> list[int]:
+    """Return where the arm's numbers are: where the recipe says, or whatever else is free."""
+    if params.columns:
+        return [text.index(column) for column in params.columns]
+    others = [o for o in (params.target, params.second) if o and o.file is None]
+    taken = {text.index(c) for other in others for c in other.columns}
+    times = [o.time for o in (params, *others) if o.time is not None]
+    taken |= {text.index(time) for time in times} | ({scan} if scan is not None else set())
+    return [i for i in range(len(text.rows[0][1])) if i not in taken]
+
+
+def _with_times(archive: Archive, text: TextTable, params: TableParams) -> Archive:
+    """Return the archive with its times, and the second arm of the same rows."""
+    times = _times(text, params)
+    second = _second(archive.root, text, params)
+    if second is not None and second.file != text.file:
+        raise StageError(f"{second.file}: a second arm beside scans stands in the same table")
+    recordings = [
+        replace(
+            recording,
+            time_ns=0 if times is None else round(times[i] * 1e9),
+            poses=_poses(recording.base_T_flange, None if second is None else second.values[i]),
+        )
+        for i, recording in enumerate(archive.recordings)
+    ]
+    return replace(archive, recordings=recordings)
+
+
+# --- the target in the table
+
+
+def _measured(folder: Path, text: TextTable, params: TableParams) -> Archive:
+    """Return poses with what was measured there, row by row or joined by time."""
+    rows = _from_text(text, params)
+    poses = np.array([_arm_pose(row.where, row.numbers, params) for row in rows])
+    target = _target(folder, text, params)
+    second = _second(folder, text, params)
+    files = list(dict.fromkeys([text.file, target.file, *([second.file] if second else [])]))
+    times = _times(text, params)
+    if times is not None and target.times is not None and target.file != text.file:
+        recordings, notes = _joined((times, poses), target, second, params)
+    else:
+        for other in (target, *([second] if second else [])):
+            _same_rows(text, other)
+        recordings, notes = _row_by_row(times, poses, target, second), []
+    layout = f"table, {', '.join(file.name for file in files)}"
+    return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
+
+
+def _same_rows(text: TextTable, other: Readings) -> None:
+    if len(other.values) != len(text.rows):
+        raise StageError(
+            f"{other.file}: has {len(other.values)} rows, {text.file.name} has {len(text.rows)}; "
+            "give each a time: to join them by it"
+        )
+
+
+def _row_by_row(
+    times: Floats | None, poses: Floats, target: Readings, second: Readings | None
+) -> list[Recording]:
+    return [
+        _recording(
+            f"{i:04}", pose, target.values[i], second.values[i] if second else None,
+            0.0 if times is None else times[i],
+        )
+        for i, pose in enumerate(poses)
+    ]  # fmt: skip
+
+
+def _joined(
+    arm: tuple[Floats, Floats], target: Readings, second: Readings | None, params: TableParams
+) -> tuple[list[Recording], list[str]]:
+    known = np.array([value is not None for value in target.values])
+    values = [value for value in target.values if value is not None]
+    events = np.asarray(target.times)[known]
+    whole = len(values) > 1 and values[0].shape == (4, 4)
+    signals = (turning(*arm), turning(events, np.array(values))) if whole else None
+    try:
+        pairs, notes = pair(arm, events, signals, params.join)
+    except StageError as error:
+        raise StageError(f"{target.file}: {error}") from None
+    recordings = [
+        _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time)
+        for i, p in enumerate(pairs)
+    ]
+    return recordings, notes
+
+
+def _mean(values: Sequence[Floats], found: Pair) -> Floats:
+    seen = np.array([values[i] for i in found.events])
+    return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
+
+
+def _second_at(second: Readings | None, found: Pair) -> Floats | None:
+    if second is None or second.times is None:
+        return None
+    poses = np.array([value for value in second.values if value is not None])
+    return np.asarray(interpolated(second.times, poses, np.array([found.time]))[0])
+
+
+def _recording(
+    name: str, pose: Floats, seen: Floats | None, second: Floats | None, time: float
+) -> Recording:
+    point = seen if seen is not None and seen.shape == (3,) else None
+    whole = seen if seen is not None and seen.shape == (4, 4) else None
+    return Recording(
+        name, _poses(pose, second), centre_in_camera=point, camera_T_target=whole,
+        time_ns=round(time * 1e9),
+    )  # fmt: skip
+
+
+def _poses(pose: Floats, second: Floats | None) -> dict[str, Floats]:
+    return {FLANGE: pose} if second is None else {FLANGE: pose, FLANGE2: second}
+
+
+def _target(folder: Path, text: TextTable, params: TableParams) -> Readings:
+    given = params.target
+    assert given is not None  # noqa: S101  for type checkers: there is one, or nobody asks
+    found = _readings(folder, text, given)
+    if given.pose == "camera_T_target" or given.rotation == POINT:
+        return found
+    return found._replace(values=[None if v is None else inverted(v) for v in found.values])
+
+
+def _second(folder: Path, text: TextTable, params: TableParams) -> Readings | None:
+    if params.second is None:
+        return None
+    found = _readings(folder, text, params.second)
+    if params.second.pose == "base2_T_flange2":
+        return found
+    return found._replace(values=[None if v is None else inverted(v) for v in found.values])
+
+
+def _readings(folder: Path, text: TextTable, given: OtherParams) -> Readings:
+    """Return the values of one thing, from its own table or from the same."""
+    own = text if given.file is None else _with_rows(folder / given.file)
+    time = [] if given.time is None else [own.index(given.time)]
+    free = [i for i in range(len(own.rows[0][1])) if i not in time]
+    columns = [own.index(column) for column in given.columns] or free
+    values = [
+        None if all(_is_empty(cells, c) for c in columns) else _value(own, row, columns, given)
+        for row, (_, cells) in enumerate(own.rows)
+    ]
+    return Readings(own.file, values, _times(own, given))
+
+
+def _is_empty(cells: Sequence[str], column: int) -> bool:
+    return column >= len(cells) or cells[column].lower() in ("", "nan")
+
+
+def _value(own: TextTable, row: int, columns: Sequence[int], given: OtherParams) -> Floats:
+    one = replace(own, rows=(own.rows[row],))
+    return given.value(own.where(row), one.numbers(columns)[0])
+
+
+def _times(text: TextTable, given: ColumnsParams) -> Floats | None:
+    """Return the times [s]; they ascend.
+
+    Raises:
+        StageError: They do not.
+    """
+    if given.time is None:
+        return None
+    times = text.numbers([text.index(given.time)])[:, 0] * PER_SECOND[given.time_unit]
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        raise StageError(f"{text.where(int(back[0]) + 1)}: its time is not after the row before it")
+    return np.asarray(times)
+
+
+# --- YAML, and the scans of rows
+
+
+def _from_yaml(file: Path) -> list[Row]:
+    document = read_document(file)
+    data: Any = document.data
+    if isinstance(data, Mapping):
+        return [
+            Row(f"{file}:{document.line((scan,))}", str(scan), numbers(f"{file}: {scan}", values))
+            for scan, values in data.items()
+        ]
+    if not isinstance(data, list):
+        raise StageError(f"{file}: expected {{scan.ply: [numbers], …}} or a list of poses")
+    rows = []
+    for index, entry in enumerate(data):
+        where = f"{file}:{document.line((index,))}"
+        values = entry if isinstance(entry, list) else value_at(entry, where, "pose")
+        scan = None if isinstance(entry, list) else entry.get("scan")
+        rows.append(Row(where, scan, numbers(where, values)))
+    return rows
+
+
+def _scans(folder: Path, file: Path, rows: Sequence[Row]) -> list[list[Path]]:
+    """Return the scans of each row: the named one, or all of one name in the order of names."""
+    if any(row.scan for row in rows):
+        return [_named(folder, row) for row in rows]
+    stems: dict[str, list[Path]] = {}
+    for scan in scans_in(folder):
+        stems.setdefault(scan.stem, []).append(scan)
+    if len(stems) != len(rows):
+        raise StageError(
+            f"{file}: has {len(rows)} poses, but the folder {len(stems)} scans; name the scan of "
+            "each pose in the first column"
+        )
+    return list(stems.values())
+
+
+def _named(folder: Path, row: Row) -> list[Path]:
+    scan = folder / (row.scan or "")
+    if not row.scan or not scan.is_file():
+        raise StageError(f"{row.where}: its scan '{row.scan or ''}' does not exist")
+    return [scan]

@@ -1,0 +1,1 @@
+"""``refine.*``: change a calibration after solving."""

@@ -1,0 +1,262 @@
+"""``refine.arm``: the arm's own joint zeros and lengths, from scans of its flange alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.handeye.arm_model import (
+    ArmFit,
+    ArmSession,
+    combinations,
+    deviations,
+    fit_arm,
+    identified,
+    most_telling,
+    residuals,
+)
+from flangeye.maths.arm_correction import follow
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.types import (
+    ArmCorrection,
+    CorrectedArm,
+    Floats,
+    HandEye,
+    Mask,
+    Observation,
+    TransformEstimate,
+)
+from flangeye.units import Angle, Length, param
+
+LARGEST_MODEL_ERROR = 5e-3
+"""Further from the controller's poses than this [m], the arm is another one."""
+FOLDS, HELPFUL = 5, 0.95
+"""The arm's error is kept when it brings the error on poses held out to this share or less."""
+CANDIDATES, SPREAD = 300, 0.6
+"""Poses looked at for the next session, and their joints' largest change from the last [rad]."""
+NAMES = ("zero", "a", "d", "alpha")
+UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
+ONE_ORIENTATION = np.radians(10.0)
+
+
+class ArmParams(Params):
+    """Parameters of ``refine.arm``."""
+
+    zeros: Angle = param("5 mrad", gt=0, description="Deviation of a joint's zero to expect.")
+    lengths: Length = param(
+        "0.5 mm", ge=0, description="Of a Denavit-Hartenberg length or offset; 0: zeros alone."
+    )
+    twists: Angle = param("1 mrad", ge=0, description="Of a link's twist; 0: left as they are.")
+    propose: int = Field(
+        6, ge=0, description="How many poses to propose that would tell more of the arm."
+    )
+
+    @property
+    def corrects_arm(self) -> bool:
+        """Whether the arm's own error may be found."""
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One branch of the arm, fitted."""
+
+    session: ArmSession
+    fit: ArmFit
+    used: Mask
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt((self.fit.scatter + self.session.noise.mean()) * 3))
+
+
+@stage("refine.arm")
+def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> HandEye:
+    """Find the arm's joint zeros and lengths together with the camera's pose.
+
+    The pose for the arm as its controller reports it stays; the pose for the arm so corrected is
+    put beside it, if it helps on poses held out. The notes say which parameters the poses identify
+    and which not, and propose poses that would tell more. ``export.robot`` writes the corrected
+    arm as a robot file.
+
+    Raises:
+        StageError: There are too few poses, or the robot's model does not reach them.
+    """
+    before, arm = calibration.as_reported(), Arm(robot)
+    prior = deviations(arm.n, params.zeros, params.lengths, params.twists)
+    found = _best(before, arm, prior)
+    errors = _held_out(before, arm, found, prior)
+    known = identified(found.fit, prior)
+    told = [_told(known, combinations(found.fit, prior), found), *_listed(known, found.fit, prior)]
+    told += _proposed(arm, found, prior, params.propose)
+    compared = f"held-out error {errors[1] * 1e3:.3f} mm with it, {errors[0] * 1e3:.3f} mm without"
+    notes = (*before.notes, *told)
+    if errors[1] > HELPFUL * errors[0]:
+        left = f"the arm's parameters left out, for they do not help ({compared})"
+        return replace(before, notes=(*notes, left))
+    kept = f"the arm's parameters are corrected ({compared})"
+    return replace(before, notes=(*notes, kept), corrected=_corrected(before, found))
+
+
+def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
+    """Fit on every branch the arm may be on, and return the one that fits best."""
+    observations = [pair.observation for pair in calibration.pairs]
+    used = np.array([pair.used for pair in calibration.pairs])
+    found = [
+        _fitted(_session(observations, joints, calibration), used, calibration, arm, prior)
+        for joints in _branches(observations, arm)
+    ]
+    if not found or used.sum() < 6:
+        why = "the robot's model does not reach the poses" if not found else "6 poses are needed"
+        raise StageError(f"refine.arm: {why}; name the arm that was recorded, or take more poses")
+    return min(found, key=lambda each: each.rms)
+
+
+def _fitted(
+    session: ArmSession, used: Mask, calibration: HandEye, arm: Arm, prior: Floats
+) -> _Found:
+    start = calibration.base_T_camera.transform.matrix
+    fit = fit_arm(arm, session.where(used), start, prior, (0.2e-3) ** 2)
+    return _Found(session, fit, used)
+
+
+def _session(
+    observations: Sequence[Observation], joints: Floats, calibration: HandEye
+) -> ArmSession:
+    offset = calibration.correction.tool_offset if calibration.correction else np.zeros(3)
+    return ArmSession(
+        joints,
+        np.array([o.base_T_flange.matrix for o in observations]),
+        np.array([o.circle.centre for o in observations]),
+        np.array([o.centre_in_mount + offset for o in observations]),
+        np.array([np.trace(o.circle.covariance) / 3 for o in observations]),
+    )
+
+
+def _branches(observations: Sequence[Observation], arm: Arm) -> Iterator[Floats]:
+    """Give the (N, n) joint angles [rad], on each branch they may be on."""
+    poses = np.array([o.base_T_flange.matrix for o in observations])
+    given = [o.joints for o in observations if o.joints is not None and len(o.joints) == arm.n]
+    if len(given) == len(observations):
+        joints = np.array(given)
+        apart = np.linalg.norm((arm.flange(joints) - poses)[:, :3, 3], axis=1).max()
+        if apart < LARGEST_MODEL_ERROR:
+            yield joints
+        return
+    for first in arm.inverse(poses[0], starts=96):
+        with suppress(ValueError):  # this branch does not reach all poses
+            yield follow(arm, poses, first)
+
+
+def _held_out(calibration: HandEye, arm: Arm, found: _Found, prior: Floats) -> tuple[float, float]:
+    """Return the rms error on poses held out, without and with the arm's parameters [m]."""
+    session = found.session.where(found.used)
+    order = np.random.default_rng(0).permutation(len(session.joints))
+    squares = np.zeros((2, len(order)))
+    for fold in range(FOLDS):
+        part = np.isin(np.arange(len(order)), order[fold::FOLDS])
+        for row, allowed in enumerate((0 * prior, prior)):
+            start = found.fit.base_T_camera if row else _start(calibration)
+            fit = fit_arm(arm, session.where(~part), start, allowed, found.fit.scatter)
+            squares[row, part] = (residuals(arm, session.where(part), fit) ** 2).sum(axis=1)
+    without, with_it = np.sqrt(squares.mean(axis=1))
+    return float(without), float(with_it)
+
+
+def _start(calibration: HandEye) -> Floats:
+    return calibration.base_T_camera.transform.matrix
+
+
+def _corrected(calibration: HandEye, found: _Found) -> CorrectedArm:
+    fit = found.fit
+    before = calibration.correction or ArmCorrection(np.zeros(3))
+    correction = replace(
+        before,
+        joint_offsets=fit.parameters[:, 0],
+        lengths=fit.parameters[:, 1:],
+        joints=found.session.joints[0],
+    )
+    transform = replace(calibration.base_T_camera.transform, matrix=fit.base_T_camera)
+    camera = TransformEstimate(transform, _symmetric(fit.covariance[:6, :6]), fit.about)
+    return CorrectedArm(camera, correction)
+
+
+def _symmetric(covariance: Floats) -> Floats:
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _told(known: Mask, combined: int, found: _Found) -> str:
+    """Say how much the poses tell of the arm."""
+    turns = found.session.poses[:, :3, :3]
+    cosine = (np.einsum("nij,mij->nm", turns, turns).min() - 1) / 2
+    widest = np.arccos(np.clip(cosine, -1, 1))
+    one = (
+        f" (one orientation: they turn by {np.degrees(widest):.1f} deg at most)"
+        if widest < ONE_ORIENTATION
+        else ""
+    )
+    if known.any():
+        return (
+            f"the poses identify {known.sum()} of {known.size} parameters of the arm singly, and "
+            f"{combined} combinations of them{one}"
+        )
+    return (
+        f"the poses identify none of the arm's {known.size} parameters singly{one}, and {combined} "
+        "combinations of them: the correction predicts at poses like these, and says nothing of "
+        "any one joint"
+    )
+
+
+def _listed(known: Mask, fit: ArmFit, prior: Floats) -> list[str]:
+    """Name what is identified, with value and deviation, and what is not."""
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[6:], 0.0)).reshape(prior.shape)
+    told: list[str] = []
+    not_told: list[str] = []
+    for (joint, which), singly in np.ndenumerate(known):
+        name, (unit, scale) = f"joint {joint + 1} {NAMES[which]}", UNITS[which]
+        value, deviation = fit.parameters[joint, which] * scale, sigma[joint, which] * scale
+        (told if singly else not_told).append(
+            f"{name} {value:+.2f} ± {deviation:.2f} {unit}" if singly else name
+        )
+    lines = [f"identified: {'; '.join(told)}"] if told else []
+    return lines + ([f"not identified singly: {', '.join(not_told)}"] if not_told else [])
+
+
+def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:
+    """Propose poses that would tell more of the arm."""
+    candidates = _candidates(arm, found)
+    if not count or not len(candidates.joints):
+        return []
+    chosen, after = most_telling(arm, candidates, found.fit, prior, count)
+    listed = "; ".join(
+        ", ".join(f"{x:.0f}" for x in np.degrees(candidates.joints[i])) for i in chosen
+    )
+    would = int(identified(after, prior).sum())
+    return [
+        f"poses that would tell more, joints in deg: {listed}; with them {would} of {prior.size} "
+        f"parameters are identified singly, and {combinations(after, prior)} combinations"
+    ]
+
+
+def _candidates(arm: Arm, found: _Found) -> ArmSession:
+    """Return poses about the session's that its camera sees as it saw those: as near, as square."""
+    session, rng = found.session, np.random.default_rng(0)
+    centre = session.joints[rng.integers(len(session.joints), size=CANDIDATES)]
+    joints = centre + rng.uniform(-SPREAD, SPREAD, centre.shape)
+    joints = joints[((joints > arm.lower) & (joints < arm.upper)).all(axis=1)]
+    poses = arm.flange(joints)
+    eye = found.fit.base_T_camera
+    seen = (poses[:, :3, 3] - eye[:3, 3]) @ eye[:3, :3]
+    low, high = session.centres.min(axis=0) - 0.05, session.centres.max(axis=0) + 0.05
+    away = -(poses[:, :3, 2] * (poses[:, :3, 3] - eye[:3, 3])).sum(axis=1)
+    facing = away / np.linalg.norm(seen, axis=1) > np.cos(np.radians(50))
+    kept = ((seen > low) & (seen < high)).all(axis=1) & facing
+    n = int(kept.sum())
+    mounts, noise = np.tile(session.mounts[0], (n, 1)), np.full(n, np.median(session.noise))
+    return ArmSession(joints[kept], poses[kept], seen[kept], mounts, noise)

@@ -1,0 +1,1 @@
+"""``replay.*``: decisions of a step repeated from its log."""

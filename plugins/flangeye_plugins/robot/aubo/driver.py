@@ -1,0 +1,257 @@
+"""``robot.aubo``: arms of AUBO with an ARCS controller, through the maker's library."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import GRACE, DeviceError, Mode, Robot, RobotState
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye_plugins.robot.aubo.client import AuboClient
+from flangeye_plugins.robot.tool_check import (
+    ToolOffset,
+    require_model,
+    require_tool,
+    twist_at_tool,
+    wrench_at_flange,
+)
+
+POSE = CONVENTIONS["rpy"]
+"""The interface's poses: (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
+
+SHOWN = POSE.in_units("mm", "deg")
+
+STALE = 0.1
+"""Reading the arm takes a millisecond; where it takes longer than this, the network is lost [s]."""
+
+BEGUN = 0.3
+"""A move that has not begun after this has ended already [s]."""
+
+STOP = 4.0
+"""Deceleration of a stop [m/s^2, rad/s^2]."""
+
+STANDING = 2e-3
+"""A joint that is slower than this stands [rad/s]."""
+
+SAFETY: dict[str, tuple[Mode, str]] = {
+    "Recovery": ("not ready", "the arm is outside its safety limits: move it back"),
+    "Violation": ("not ready", "safety violation: look at the pendant"),
+    "ProtectiveStop": (
+        "protective stop",
+        "protective stop: look why, then release it at the pendant",
+    ),
+    "SafeguardStop": ("protective stop", "safeguard stop: somebody is in the cell"),
+    "SystemEmergencyStop": ("emergency stop", "emergency stop of the system: release it"),
+    "RobotEmergencyStop": ("emergency stop", "emergency stop: release the button"),
+    "Fault": ("not ready", "safety fault: restart the controller"),
+    "Undefined": ("not ready", "the safety system does not answer"),
+}
+"""SafetyModeType: what it means for motion, and for people."""
+
+
+class AuboParams(Params):
+    """Parameters of ``robot.aubo``."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
+    user: str = Field("aubo", description="Account on the controller.")
+    password: str = Field("123456", description="Of that account; this is the one it comes with.")
+    tool: ToolOffset = Field(
+        default_factory=ToolOffset,
+        description="What the controller's tool is set to; no tool when not given.",
+    )
+
+
+@part("robot.aubo")
+def robot_aubo(model: RobotModel, params: AuboParams) -> Robot:
+    """An arm of AUBO with an ARCS controller, through its JSON-RPC interface.
+
+    On the pendant: power on, brakes released, the payload of what is mounted, no program running.
+    The controller has no watchdog for this interface: a velocity ends by itself after a tenth of a
+    second, but a move that was begun is finished even if this computer dies.
+
+    Args:
+        model: The arm; its kinematics are compared with what the controller says.
+        params: See :class:`AuboParams`.
+
+    Raises:
+        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+    """
+    sdk = load_sdk("pyaubo_sdk", "robot.aubo", "pip install 'flangeye[aubo]'")
+    name = f"{model.model} at {params.host}"
+    client = AuboClient(sdk, name, params.host, params.user, params.password)
+    try:
+        robot = AuboRobot(name, client)
+        require_tool(name, "aubo", robot.offset, params.tool.flange_T_tool(POSE), SHOWN)
+        state = robot.state()
+        require_model(name, state, model)
+        if state.message:
+            raise DeviceError(f"{name}: {state.message}")
+    except DeviceError:
+        client.close()
+        raise
+    return robot
+
+
+class AuboRobot:
+    """An arm of AUBO; see :class:`flangeye.devices.Robot`.
+
+    A state is read in several questions, one after the other. They take a millisecond together:
+    an arm at 0.1 m/s moves 0.1 mm meanwhile; one that stands is read exactly.
+
+    Attributes:
+        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+    """
+
+    def __init__(self, name: str, client: AuboClient) -> None:
+        """Read the tool and the cycle of a connected controller.
+
+        Raises:
+            DeviceError: It does not tell.
+        """
+        self.name, self._client = name, client
+        self.period = float(client.ask("cycle time", client.config.getCycletime))
+        self.offset = POSE.matrix(client.ask("tool", client.state.getActualTcpOffset))
+        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
+        self._tool_T_flange = np.linalg.inv(self.offset)
+        self._begins = self._velocity_until = -np.inf
+        self._in_joints = False
+        self._closed = False
+
+    def state(self) -> RobotState:
+        """Read the arm; once more where this computer was too busy to read it at one time."""
+        state, took = self._read()
+        if took > STALE:
+            state, took = self._read()
+        if took > STALE:
+            raise DeviceError(
+                f"{self.name}: reading it took {took:.2f} s, at most {STALE} s are allowed: the "
+                "network is slow"
+            )
+        return state
+
+    def _read(self) -> tuple[RobotState, float]:
+        """Return the arm's state, and how long it took to read [s]."""
+        began = time.time_ns()
+        tell = self._client.state
+        joints, speeds, pose, force = (
+            np.array(self._ask(what, question))
+            for what, question in (
+                ("joints", tell.getJointPositions),
+                ("joint speeds", tell.getJointSpeeds),
+                ("pose", tell.getTcpPose),
+                ("force", tell.getTcpForce),
+            )
+        )
+        mode, message = self._condition(speeds)
+        ended = time.time_ns()
+        base_T_tool = POSE.matrix(pose)
+        base_T_flange = base_T_tool @ self._tool_T_flange
+        state = RobotState(
+            base_T_flange=Transform(BASE, FLANGE, base_T_flange),
+            joints=joints,
+            joint_speeds=speeds,
+            time_ns=(began + ended) // 2,
+            mode=mode,
+            force=wrench_at_flange(force, base_T_flange, base_T_tool),
+            message=message,
+        )
+        return state, 1e-9 * (ended - began)
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (n,) [rad]; an arm that moves comes to rest first."""
+        target = [float(angle) for angle in joints]
+        self._begin(in_joints=True)
+        move = self._client.motion.moveJoint
+        self._client.command("move", lambda: move(target, acceleration, speed, 0.0, 0.0))
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        target = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
+        self._begin(in_joints=False)
+        move = self._client.motion.moveLine
+        self._client.command("move", lambda: move(target, acceleration, speed, 0.0, 0.0))
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) of the flange; the controller itself ends it after GRACE."""
+        base_T_tool = POSE.matrix(self._ask("pose", self._client.state.getTcpPose))
+        self._require_able()
+        at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
+        go = self._client.motion.speedLine
+        self._in_joints = False
+        self._client.command("velocity", lambda: go(at_tool, acceleration, GRACE))
+        self._velocity_until = time.monotonic() + GRACE
+
+    def wait_cycle(self) -> None:
+        """Wait for as long as a cycle of the controller lasts; it does not tell of its own."""
+        time.sleep(self.period - time.monotonic() % self.period)
+
+    def stop(self) -> None:
+        """Brake, as the motion under way is made."""
+        self._begins = self._velocity_until = -np.inf
+        motion = self._client.motion
+        if self._in_joints:
+            self._client.command("stop", lambda: motion.stopJoint(STOP))
+        else:
+            self._client.command("stop", lambda: motion.stopLine(STOP, STOP))
+
+    def close(self) -> None:
+        """Stop the arm and let go of the connection."""
+        if self._closed:
+            return
+        with contextlib.suppress(DeviceError):
+            self.stop()
+        self._closed = True
+        self._client.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, what: str, question: Any) -> Any:
+        if self._closed:
+            raise DeviceError(f"{self.name} is closed")
+        return self._client.ask(what, question)
+
+    def _begin(self, in_joints: bool) -> None:
+        """Bring an arm that moves to rest, and expect the next move to begin."""
+        self._require_able()
+        self.stop()
+        self._in_joints, self._begins = in_joints, time.monotonic() + BEGUN
+
+    def _require_able(self) -> None:
+        """Do nothing for an arm that can move; raise DeviceError for another."""
+        _, message = self._condition(np.zeros(1))
+        if message:
+            raise DeviceError(f"{self.name}: {message}")
+
+    def _condition(self, speeds: Floats) -> tuple[Mode, str]:
+        """Return the mode, and what to do about it."""
+        tell = self._client.state
+        safety = self._ask("safety mode", tell.getSafetyModeType).name
+        if safety in SAFETY:
+            return SAFETY[safety]
+        power = self._ask("robot mode", tell.getRobotModeType).name
+        if power != "Running":
+            return "not ready", f"the arm is in mode {power}: switch it on at the pendant"
+        moves = self._under_way() or bool(np.abs(speeds).max() > STANDING)
+        return ("moving" if moves else "ready"), ""
+
+    def _under_way(self) -> bool:
+        """Return whether a command is carried out, or has yet to begin."""
+        motion = self._client.motion
+        if self._ask("move", motion.getExecId) != -1:
+            self._begins = -np.inf
+            return True
+        now = time.monotonic()
+        waits = self._ask("queue", motion.getQueueSize) > 0
+        return bool(waits or now < self._begins or now < self._velocity_until)

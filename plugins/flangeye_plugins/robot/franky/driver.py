@@ -1,0 +1,252 @@
+"""``robot.franky``: arms of Franka Robotics through franky and libfranka.
+
+Proven with the library as far as it goes without a controller: it loads, its motions and poses are
+built, a refused and a silent connection are errors in time. Moving, reading and stopping ran
+against a stand-in for the connection alone; see the README of the drivers.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import GRACE, DeviceError, Mode, Robot, RobotState
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye_plugins.robot.franky.connect import cannot_connect, one_line, require_answer
+from flangeye_plugins.robot.tool_check import (
+    ToolOffset,
+    require_model,
+    require_tool,
+    twist_at_tool,
+    wrench_at_flange,
+)
+
+SHOWN = CONVENTIONS["rpy"].in_units("mm", "deg")
+
+SLOWEST = 1e-3
+"""Smallest share of the arm's limits that the library is asked for."""
+
+MODES: dict[str, tuple[Mode, str]] = {
+    "Idle": ("ready", ""),
+    "Move": ("moving", ""),
+    "Guiding": ("not ready", "the arm is being guided by hand: let go of it"),
+    "Reflex": ("protective stop", "a limit or a collision stopped it: look why, recover in Desk"),
+    "UserStopped": ("emergency stop", "the stop button is pressed: release it"),
+    "AutomaticErrorRecovery": ("not ready", "it recovers from an error"),
+    "Other": ("not ready", "joints locked or FCI off: unlock and activate FCI in Desk"),
+}
+"""libfranka's RobotMode: what it means for motion, and for people."""
+
+
+class FrankyParams(Params):
+    """Parameters of ``robot.franky``."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 172.16.0.2.")
+    realtime: bool = Field(
+        True, description="Insist on a real-time kernel; without one, moves may be cut short."
+    )
+    tool: ToolOffset = Field(
+        default_factory=ToolOffset, description="The end effector set in Desk; none when not given."
+    )
+
+
+@part("robot.franky")
+def robot_franky(model: RobotModel, params: FrankyParams) -> Robot:
+    """An arm of Franka Robotics, through franky.
+
+    In Desk: joints unlocked, FCI activated, the end effector and its load; a wired network of its
+    own, and a real-time kernel on this computer.
+
+    Args:
+        model: The arm; its kinematics are compared with what the controller says.
+        params: See :class:`FrankyParams`.
+
+    Raises:
+        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+    """
+    sdk = load_sdk("franky", "robot.franky", "pip install 'flangeye[franka]'")
+    name = f"{model.model} at {params.host}"
+    require_answer(name, params.host, params.realtime)
+    config = sdk.RealtimeConfig.Enforce if params.realtime else sdk.RealtimeConfig.Ignore
+    try:
+        connection = sdk.Robot(params.host, realtime_config=config)
+    except sdk.Exception as error:
+        raise cannot_connect(name, str(error)) from None
+    return opened(FrankyRobot(name, sdk, connection), model, params)
+
+
+def opened(robot: FrankyRobot, model: RobotModel, params: FrankyParams) -> FrankyRobot:
+    """Return a connected robot after a look at it.
+
+    Raises:
+        DeviceError: Tool or arm are not the recipe's, or it is not ready.
+    """
+    expected = params.tool.flange_T_tool(SHOWN)
+    require_tool(robot.name, "franky", robot.offset, expected, SHOWN)
+    state = robot.state()
+    require_model(robot.name, state, model)
+    if state.message:
+        raise DeviceError(f"{robot.name}: {state.message}")
+    return robot
+
+
+class FrankyRobot:
+    """An arm of Franka Robotics; see :class:`flangeye.devices.Robot`.
+
+    Attributes:
+        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+    """
+
+    period = 0.001
+
+    def __init__(self, name: str, sdk: Any, connection: Any) -> None:
+        """Take over a connection.
+
+        Args:
+            name: For people.
+            sdk: The module ``franky``.
+            connection: Its ``Robot``.
+
+        Raises:
+            DeviceError: The connection is lost.
+        """
+        self.name, self._sdk, self._robot = name, sdk, connection
+        self._stopping: Any = None
+        self.offset = np.array(self._ask(lambda: connection.state.F_T_EE).matrix)
+        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
+        self._tool_T_flange = np.linalg.inv(self.offset)
+        self._closed = False
+
+    def state(self) -> RobotState:
+        """Return the newest sample, tool taken off."""
+        sample = self._ask(lambda: self._robot.state)
+        under_way, trouble = self._motion()
+        mode, message = MODES[sample.robot_mode.name]
+        if trouble:
+            mode, message = "protective stop", trouble
+        elif mode == "ready" and under_way:
+            mode = "moving"
+        base_T_tool = np.array(sample.O_T_EE.matrix)
+        base_T_flange = base_T_tool @ self._tool_T_flange
+        # libfranka reports what the arm does to its surroundings.
+        felt = -np.array(sample.O_F_ext_hat_K)
+        return RobotState(
+            base_T_flange=Transform(BASE, FLANGE, base_T_flange),
+            joints=np.array(sample.q),
+            joint_speeds=np.array(sample.dq),
+            time_ns=time.time_ns(),
+            mode=mode,
+            force=wrench_at_flange(felt, base_T_flange, base_T_tool),
+            message=message,
+        )
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (7,) [rad]."""
+        sdk, robot = self._sdk, self._robot
+        factor = self._factor(
+            speed / float(np.max(robot.joint_velocity_limit.get())),
+            acceleration / float(np.max(robot.joint_acceleration_limit.get())),
+        )
+        target = sdk.JointState([float(angle) for angle in joints])
+        motion = sdk.JointMotion(target, relative_dynamics_factor=factor)
+        self._start(motion, sdk.JointStopMotion)
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange."""
+        sdk = self._sdk
+        pose = sdk.RobotPose(sdk.Affine(base_T_flange.matrix @ self.offset))
+        target = sdk.CartesianState(pose)
+        motion = sdk.CartesianMotion(
+            target, relative_dynamics_factor=self._linear_factor(speed, acceleration)
+        )
+        self._start(motion, sdk.CartesianStopMotion)
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) of the flange; the library itself ends it after GRACE."""
+        sdk = self._sdk
+        base_T_tool = np.array(self._ask(lambda: self._robot.state).O_T_EE.matrix)
+        at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
+        velocity = sdk.RobotVelocity(sdk.Twist(at_tool[:3], at_tool[3:]))
+        motion = sdk.CartesianVelocityMotion(
+            velocity,
+            duration=sdk.Duration(round(GRACE * 1e3)),
+            relative_dynamics_factor=self._linear_factor(float("inf"), acceleration),
+        )
+        self._start(motion, sdk.CartesianVelocityStopMotion)
+
+    def wait_cycle(self) -> None:
+        """Wait for as long as a cycle of the controller lasts."""
+        time.sleep(self.period - time.monotonic() % self.period)
+
+    def stop(self) -> None:
+        """Brake as the motion under way is made."""
+        if self._stopping is not None and self._motion()[0]:
+            stopping = self._stopping
+            self._ask(lambda: self._robot.move(stopping(), asynchronous=True))
+
+    def close(self) -> None:
+        """Stop the arm; the library lets go when it is forgotten."""
+        if self._closed:
+            return
+        try:
+            self.stop()
+        finally:
+            self._closed, self._robot = True, None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _start(self, motion: Any, stopping: Any) -> None:
+        state = self.state()
+        if state.message:
+            raise DeviceError(f"{self.name}: {state.message}")
+        # A motion of another kind is refused by the library while one goes on.
+        if self._stopping not in (None, stopping):
+            self.stop()
+            self._ask(lambda: self._robot.join_motion(timeout=1.0))
+        self._stopping = stopping
+        self._ask(lambda: self._robot.move(motion, asynchronous=True))
+
+    def _motion(self) -> tuple[bool, str]:
+        """Return whether a motion goes on, and what ended the last one if it went wrong."""
+        try:
+            return bool(self._robot.poll_motion()), ""
+        except self._sdk.ControlException as error:
+            return False, one_line(str(error))
+        except self._sdk.Exception as error:
+            raise self._lost(error) from None
+
+    def _linear_factor(self, speed: float, acceleration: float) -> Any:
+        robot = self._robot
+        return self._factor(
+            speed / float(robot.translation_velocity_limit.get()),
+            acceleration / float(robot.translation_acceleration_limit.get()),
+        )
+
+    def _factor(self, speed: float, acceleration: float) -> Any:
+        """Return shares of the arm's limits; jerk follows the acceleration."""
+        shares = np.clip([speed, acceleration, acceleration], SLOWEST, 1.0)
+        return self._sdk.RelativeDynamicsFactor(*(float(share) for share in shares))
+
+    def _ask(self, question: Any) -> Any:
+        if self._robot is None:
+            raise DeviceError(f"{self.name} is closed")
+        try:
+            return question()
+        except self._sdk.Exception as error:
+            raise self._lost(error) from None
+
+    def _lost(self, error: Exception) -> DeviceError:
+        return DeviceError(
+            f"{self.name}: {one_line(str(error))}: look at Desk and the network, then open it again"
+        )

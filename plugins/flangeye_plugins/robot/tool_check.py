@@ -1,0 +1,92 @@
+"""What a driver checks in a controller it has opened: its tool and its arm; and their levers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.devices import DeviceError, RobotState
+from flangeye.maths.geometry import hat
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.pose_formats import PoseConvention
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import Params
+from flangeye.types import Floats
+from flangeye.units import Angle, Length, param
+
+SAME_TOOL = (1e-4, 1e-3)
+"""Largest difference of two tool offsets [m, rad]; pendants show 0.01 mm."""
+
+SAME_ARM = (0.01, 0.03)
+"""Largest distance of the controller's flange from where the model puts it [m, rad]. Arms differ
+from their nominal kinematics by a few millimetres; another arm, or base, by more."""
+
+
+class ToolOffset(Params):
+    """The tool the controller is meant to have set, from the flange."""
+
+    position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
+    rotation: tuple[Angle, Angle, Angle] = param(
+        ("0 rad", "0 rad", "0 rad"), description="As the pendant shows it."
+    )
+
+    def flange_T_tool(self, convention: PoseConvention) -> Floats:
+        """Return the offset as a (4, 4) matrix [m]; the rotation is the convention's."""
+        return convention.in_units("m", "rad").matrix([*self.position, *self.rotation])
+
+
+def require_tool(
+    name: str, driver: str, offset: Floats, expected: Floats, shown: PoseConvention
+) -> None:
+    """Do nothing when the controller's tool is the recipe's.
+
+    Args:
+        name: Of the robot.
+        driver: Its driver.
+        offset: (4, 4) the controller's.
+        expected: (4, 4) the recipe's.
+        shown: How the pendant shows it.
+
+    Raises:
+        DeviceError: They differ.
+    """
+    if _differ(offset, expected, SAME_TOOL):
+        raise DeviceError(
+            f"{name}: the controller's tool is set to {shown.text(offset)}, the recipe says "
+            f"{shown.text(expected)}: poses are the flange's, so set the tool at the pendant, or "
+            f"robot.driver.{driver}.tool in the recipe"
+        )
+
+
+def require_model(name: str, state: RobotState, model: RobotModel) -> None:
+    """Do nothing when the flange is where the model's kinematics put it.
+
+    Raises:
+        DeviceError: It is not.
+    """
+    expected = Arm(model).flange(state.joints)
+    if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
+        off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])
+        raise DeviceError(
+            f"{name}: its flange is {off * 1e3:.0f} mm from where a {model.model} has it at these "
+            "joint angles: is robot.model the arm that stands there?"
+        )
+
+
+def twist_at_tool(twist: Floats, base_T_flange: Floats, base_T_tool: Floats) -> list[float]:
+    """Return a (6,) twist of the flange as it is at the tool's tip, both in base."""
+    lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
+    return [*(twist[:3] + hat(twist[3:]) @ lever).tolist(), *(float(turn) for turn in twist[3:])]
+
+
+def wrench_at_flange(wrench: Floats, base_T_flange: Floats, base_T_tool: Floats) -> Floats:
+    """Return a (6,) wrench on the tool's tip as it is at the flange's centre, both in base."""
+    lever = base_T_tool[:3, 3] - base_T_flange[:3, 3]
+    return np.concatenate([wrench[:3], wrench[3:] + hat(lever) @ wrench[:3]])
+
+
+def _differ(pose: Floats, other: Floats, tolerance: tuple[float, float]) -> bool:
+    """Return whether two (4, 4) poses differ; rotations as matrices, whose vectors may jump."""
+    turn = pose[:3, :3].T @ other[:3, :3]
+    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
+    distance = np.linalg.norm(pose[:3, 3] - other[:3, 3])
+    return bool(distance > tolerance[0] or angle > tolerance[1])

@@ -1,0 +1,213 @@
+"""``robot.ur_rtde``: arms of Universal Robots through the client library ur_rtde."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import DeviceError, Robot, RobotState
+from flangeye.files.load import busy
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
+from flangeye_plugins.robot.tool_check import (
+    ToolOffset,
+    require_model,
+    require_tool,
+    twist_at_tool,
+    wrench_at_flange,
+)
+from flangeye_plugins.robot.ur import dashboard
+from flangeye_plugins.robot.ur.link import Link, Sample
+from flangeye_plugins.robot.ur.status import condition_of
+
+SHOWN = CONVENTIONS["ur"]
+POSE = SHOWN.in_units("m", "rad")
+
+OPENING = 2.6
+"""Longest time until the client library is connected, first questions included [s]."""
+
+STALE = 0.1
+"""A sample older than this is no news of the arm [s]."""
+
+
+class UrRtdeParams(Params):
+    """Parameters of ``robot.ur_rtde``."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
+    tool: ToolOffset = Field(
+        default_factory=ToolOffset,
+        description="What the controller's tool is set to; no tool when not given.",
+    )
+
+
+@part("robot.ur_rtde")
+def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
+    """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
+
+    On the pendant: power on, brakes released, Remote Control, the payload of what is mounted in
+    the installation, and no other program that writes RTDE registers (fieldbuses do).
+
+    Args:
+        model: The arm; its kinematics are compared with what the controller says.
+        params: See :class:`UrRtdeParams`.
+
+    Raises:
+        DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
+    """
+    load_sdk("rtde_control", "robot.ur_rtde", "pip install 'flangeye[ur]'")
+    name = f"{model.model} at {params.host}"
+    began = time.monotonic()
+    facts = dashboard.require_ready(name, params.host)
+    link = Link(name, params.host, facts.period, OPENING - (time.monotonic() - began))
+    try:
+        robot = UrRobot(name, params.host, facts.period, link)
+        expected = params.tool.flange_T_tool(SHOWN)
+        require_tool(name, "ur_rtde", robot.offset, expected, SHOWN)
+        require_model(name, robot.state(), model)
+    except DeviceError:
+        link.close()
+        raise
+    return robot
+
+
+class UrRobot:
+    """An arm of Universal Robots; see :class:`flangeye.devices.Robot`.
+
+    Every call ends within three seconds: connecting within two and a half, commands within one
+    and a half, a stop that nobody answers included.
+
+    Attributes:
+        offset: (4, 4) ``flange_T_tool`` as the controller has it.
+    """
+
+    def __init__(self, name: str, host: str, period: float, link: Link) -> None:
+        """Read the tool of a connected controller.
+
+        Raises:
+            DeviceError: It does not tell.
+        """
+        self.name, self.period = name, period
+        self._host, self._link = host, link
+        self._seen = self._commanded = 0
+        self._posed: tuple[int, Floats] = (-1, np.eye(4))
+        self.offset = POSE.matrix(self._link.request("tool"))
+        self._tool_T_flange = np.linalg.inv(self.offset)
+        self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
+
+    def state(self) -> RobotState:
+        """Return the newest sample, tool taken off."""
+        sample = self._fresh()
+        condition = condition_of(sample, sample.number <= self._commanded)
+        base_T_tool = self._base_T_tool(sample)
+        base_T_flange = base_T_tool @ self._tool_T_flange
+        return RobotState(
+            base_T_flange=Transform(BASE, FLANGE, base_T_flange),
+            joints=sample.joints,
+            joint_speeds=sample.joint_speeds,
+            time_ns=sample.time_ns,
+            mode=condition.mode,
+            force=wrench_at_flange(sample.tool_force, base_T_flange, base_T_tool),
+            message=condition.message,
+        )
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (6,) [rad]; an arm that moves comes to rest first."""
+        self._require_able()
+        target = [float(angle) for angle in joints]
+        self._command("move_joints", joints=target, speed=speed, acceleration=acceleration)
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange; an arm that moves comes to rest first."""
+        self._require_able()
+        pose = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
+        self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) of the flange; the controller is told the tool's."""
+        base_T_tool = self._base_T_tool(self._require_able())
+        at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
+        self._command("move_velocity", twist=at_tool, acceleration=acceleration)
+
+    def wait_cycle(self) -> None:
+        """Return when a sample has come that no earlier call waited for."""
+        until = time.monotonic() + STALE
+        late = False
+        while (sample := self._link.sample()) is None or sample.number <= self._seen:
+            if late:
+                raise DeviceError(f"{self.name} sends nothing any more: its cycles have stopped")
+            time.sleep(0.1 * self.period)
+            late = time.monotonic() > until
+        self._seen = sample.number
+
+    def stop(self) -> None:
+        """Brake; where the client does not answer, stop the program through the dashboard."""
+        try:
+            self._command("stop")
+        except DeviceError:
+            with contextlib.suppress(OSError):
+                dashboard.stop(self._host)
+            raise
+
+    def close(self) -> None:
+        """Stop the arm and the controller's program, and end the client's process."""
+        try:
+            self._fresh()
+        except DeviceError:
+            self._link.close(hopeless=True)
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _base_T_tool(self, sample: Sample) -> Floats:
+        """Return the tool's pose (4, 4); a cycle asks twice for that of one sample."""
+        if self._posed[0] != sample.number:
+            self._posed = sample.number, POSE.matrix(sample.tool_pose)
+        return self._posed[1]
+
+    def _fresh(self) -> Sample:
+        """Return the newest sample; wait for one where this computer was too busy to take it."""
+        until = time.monotonic() + STALE
+        while True:
+            # The time comes first: who is not let run for a while after reading has read it fresh.
+            late, now = time.monotonic() > until, time.time_ns()
+            sample = self._link.sample()
+            age = np.inf if sample is None else 1e-9 * (now - sample.time_ns)
+            if sample is not None and age < STALE:
+                return sample
+            if late:
+                raise DeviceError(
+                    f"{self.name}: its last sample is {age:.2f} s old, at most {STALE} s are "
+                    f"allowed: the controller or the network has stopped{busy()}"
+                )
+            time.sleep(self.period)
+
+    def _command(self, what: str, **arguments: Any) -> None:
+        """Give a command; the sample under way now does not know of it yet, nor may the next."""
+        try:
+            self._link.request(what, **arguments)
+        except DeviceError:
+            # What the controller has against it shows a cycle later, if it is still there.
+            self.wait_cycle()
+            self._require_able()
+            raise
+        newest = self._link.sample()
+        self._commanded = newest.number + 1 if newest else 0
+
+    def _require_able(self) -> Sample:
+        """Return the newest sample of an arm that can move; raise DeviceError for another."""
+        sample = self._fresh()
+        condition = condition_of(sample, commanded=False)
+        if condition.message:
+            raise DeviceError(f"{self.name}: {condition.message}")
+        return sample

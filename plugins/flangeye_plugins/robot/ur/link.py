@@ -1,0 +1,206 @@
+"""Our end of the process that holds the client library: it is watched, and killed if it hangs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import signal
+import socket
+import struct
+import subprocess
+import tempfile
+import weakref
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from flangeye.devices import DeviceError
+from flangeye.files.children import python_command
+from flangeye.types import Floats
+from flangeye_plugins.robot.ur import worker
+
+ANSWERING = 0.8
+"""Longest time until a command is answered [s]; the library answers within a few cycles."""
+
+VECTORS = worker.SAMPLE.size - 4 * 6 * 8
+"""Where a sample's vectors begin."""
+
+LEAVING = 0.6
+"""Longest time until the process has ended by itself [s]."""
+
+
+class Sample(NamedTuple):
+    """What the controller sent in one cycle.
+
+    Attributes:
+        number: Samples since the connection was made.
+        time_ns: When the controller took it, on this computer's clock.
+        robot_mode: RTDE ``robot_mode``.
+        safety_mode: RTDE ``safety_mode``.
+        runtime: RTDE ``runtime_state``.
+        remote: 1 for remote control, 0 for local, -1 where that is not known.
+        busy: Whether a command is under way.
+        joints: (6,) [rad].
+        joint_speeds: (6,) [rad/s].
+        tool_pose: (6,) position [m] and rotation vector [rad] of the tool in base.
+        tool_force: (6,) on the tool's tip, in the base's axes [N, N m].
+    """
+
+    number: int
+    time_ns: int
+    robot_mode: int
+    safety_mode: int
+    runtime: int
+    remote: int
+    busy: bool
+    joints: Floats
+    joint_speeds: Floats
+    tool_pose: Floats
+    tool_force: Floats
+
+
+class Link:
+    """A connection of the client library to one controller, in a process of its own."""
+
+    def __init__(self, name: str, host: str, period: float, patience: float) -> None:
+        """Start the process and connect.
+
+        Args:
+            name: Of the robot, for messages.
+            host: Address of the controller.
+            period: Length of its cycle [s].
+            patience: Longest time to wait [s].
+
+        Raises:
+            DeviceError: It cannot connect, or not in time; nothing is left behind.
+        """
+        self._name = name
+        self._gone = ""
+        self._folder = tempfile.TemporaryDirectory(prefix="flangeye-")
+        memory = Path(self._folder.name) / "sample"
+        memory.write_bytes(bytes(worker.SIZE))
+        with memory.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), worker.SIZE)
+        self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        command = python_command(worker.__file__, host, str(period), str(memory))
+        with theirs:
+            self._process = subprocess.Popen(
+                [*command, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                # Ctrl-C is for us alone: we stop the arm, through this process.
+                start_new_session=True,
+            )
+        self._end = weakref.finalize(self, _let_go, self._line, self._process, self._folder)
+        try:
+            self._answer("connect", patience)
+        except DeviceError:
+            self.close()
+            raise
+
+    def sample(self) -> Sample | None:
+        """Return the newest sample; None while there is none.
+
+        Raises:
+            DeviceError: The process is gone, with the connection or without.
+        """
+        if self._process.poll() is not None and not self._gone:
+            self._give_up(self._loss())
+        if self._gone:
+            raise DeviceError(self._gone)
+        for _ in range(100):
+            raw = self._memory[: worker.SIZE]
+            body = raw[: worker.SAMPLE.size]
+            if struct.unpack("<I", raw[worker.SAMPLE.size :])[0] == zlib.crc32(body):
+                return _sample_of(body)
+        return None
+
+    def request(self, what: str, **arguments: Any) -> Any:
+        """Let the library do something, and return what it gives.
+
+        Raises:
+            DeviceError: It did not do it, or did not answer: then its process is ended.
+        """
+        if self._gone:
+            raise DeviceError(self._gone)
+        try:
+            self._line.send(json.dumps({"do": what, **arguments}).encode())
+        except OSError:
+            self._give_up(self._loss())
+        return self._answer(what, ANSWERING)
+
+    def close(self, hopeless: bool = False) -> None:
+        """Let the process stop arm and program, and end it; safe to call twice.
+
+        Args:
+            hopeless: The controller is not heard any more, so there is nothing to wait for.
+        """
+        if not self._gone:
+            self._gone = f"{self._name} is closed"
+        if hopeless:
+            self._process.kill()
+        self._end()
+
+    def _answer(self, what: str, patience: float) -> Any:
+        self._line.settimeout(patience)
+        try:
+            message = self._line.recv(65536)
+        except TimeoutError:
+            self._give_up(f"did not answer '{what}' within {patience:.1f} s")
+        except OSError:
+            message = b""
+        if not message:
+            self._give_up(self._loss())
+        said = json.loads(message)
+        if not said["ok"]:
+            raise DeviceError(f"{self._name}: {what}: {said['error']}")
+        return said["given"]
+
+    def _loss(self) -> str:
+        """Return what became of the process; the library may abort it when a connection breaks."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(LEAVING)
+        code = self._process.returncode
+        if code == worker.LOST:
+            return "is lost: its connection broke"
+        why = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
+        return f"is lost: its client process ended ({why})"
+
+    def _give_up(self, why: str) -> NoReturn:
+        """Kill the process, say why, and stay with it."""
+        self._process.kill()
+        self._gone = (
+            f"{self._name} {why}; its watchdog stops the arm: look at the controller and the "
+            "network, then open it again"
+        )
+        raise DeviceError(self._gone)
+
+
+def _sample_of(body: bytes) -> Sample | None:
+    number, time_ns, *modes = worker.SAMPLE.unpack(body)[:7]
+    if not number:
+        return None
+    joints, speeds, pose, force = np.frombuffer(body, dtype="<f8", offset=VECTORS).reshape(4, 6)
+    robot_mode, safety_mode, runtime, remote, busy = modes
+    return Sample(
+        number, time_ns, robot_mode, safety_mode, runtime, remote, bool(busy),
+        joints, speeds, pose, force,
+    )  # fmt: skip
+
+
+def _let_go(
+    line: socket.socket, process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]
+) -> None:
+    """End what an owner that forgot to close has left; also at the interpreter's exit."""
+    line.close()
+    try:
+        process.wait(LEAVING)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    folder.cleanup()

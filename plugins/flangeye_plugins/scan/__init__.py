@@ -1,0 +1,1 @@
+"""``scan.*``: scans of the workpiece."""

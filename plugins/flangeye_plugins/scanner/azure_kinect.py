@@ -1,0 +1,173 @@
+"""``scanner.azure_kinect``: an Azure Kinect, or one's MKV recording, through pyk4a.
+
+The camera lives in a process of its own: libk4a aborts the process it is in when a device is gone
+at the wrong moment, and a run must not end with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
+from flangeye.files.children import python_command
+from flangeye.files.machine import MachineName, find_named, require_named
+from flangeye.files.machine import settings_file as machine_settings
+from flangeye.files.paths import RecipePath
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params, part
+from flangeye.units import Duration, param
+from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
+from flangeye_plugins.scanner.kinect_view import DepthView
+from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye_plugins.scanner.pipe import Pipe, PipeEndedError
+
+NAME = "scanner.azure_kinect"
+DEFAULT_PYTHON = "kinect"
+HOST = Path(__file__).with_name("kinect_host.py")
+INSTALL = (
+    "pyk4a-bundle needs NumPy 1: make it a Python of its own (python -m venv kinect; "
+    "kinect/bin/pip install pyk4a-bundle 'numpy<2') and name it on this machine: kinect = "
+    '"/whole/path/to/kinect/bin/python" under [programs] in '
+)
+
+STARTING = 20.0
+"""Longest time in which the camera starts: a cold one loads its depth engine [s]."""
+
+PER_METRE = 1000.0
+"""Depths come in the SDK's format DEPTH16, whose unit is the millimetre."""
+
+
+class AzureKinectParams(Params):
+    """Parameters of ``scanner.azure_kinect``."""
+
+    recording: RecipePath | None = Field(
+        None, description="An MKV recording to play instead, one capture an exposure."
+    )
+    device: int = Field(0, ge=0, description="Which camera, if there are several.")
+    depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
+        Field("NFOV_UNBINNED", description="Of the camera; a recording has its own.")
+    )
+    timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
+    python: MachineName = Field(
+        DEFAULT_PYTHON,
+        description="The Python that has pyk4a, where this one cannot have it: a name under "
+        "[programs] of this machine's settings; this Python where they have no 'kinect'.",
+    )
+
+
+@part("scanner.azure_kinect")
+def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) -> Scanner:
+    """Scan with an Azure Kinect, or play its recording: depth, and colour as the depth camera
+    would see it.
+
+    Args:
+        model: What the scanner can see; a scan far out of its range is refused.
+        params: See :class:`AzureKinectParams`.
+
+    Raises:
+        DeviceError: No SDK, no camera, or no recording.
+    """  # noqa: D205
+    if params.recording is not None and not params.recording.is_file():
+        raise DeviceError(f"{NAME}: no recording at {params.recording}")
+    pipe = _host(params)
+    try:
+        facts = _answer(pipe, STARTING)["facts"]
+    except DeviceError:
+        pipe.close()
+        raise
+    return AzureKinect(pipe, facts, model, params)
+
+
+def _host(params: AzureKinectParams) -> Pipe:
+    asked = {
+        "recording": None if params.recording is None else str(params.recording),
+        "device": params.device,
+        "depth_mode": params.depth_mode,
+        "timeout_ms": round(params.timeout * 1e3),
+    }
+    command = _python(params.python)
+    try:
+        return Pipe([*command, str(HOST), json.dumps(asked)])
+    except OSError as error:
+        raise DeviceError(f"{NAME}: {command[0]} cannot be run ({error.strerror})") from None
+
+
+def _python(name: str) -> list[str]:
+    """Return the command of the Python that this machine names; of this one if it names none."""
+    if name == DEFAULT_PYTHON and find_named("programs", name) is None:
+        return python_command()
+    # An older Python knows no -P; isolated, it imports nothing from the current folder either.
+    return [str(require_named("programs", name, NAME)), "-I"]
+
+
+def _answer(pipe: Pipe, patience: float) -> dict[str, Any]:
+    """Return what the host says, in its own words where it is an error."""
+    try:
+        answer: dict[str, Any] = json.loads(pipe.line(patience))
+    except PipeEndedError as error:
+        raise DeviceError(f"{NAME}: the SDK has ended its process ({error})") from None
+    except TimeoutError:
+        raise DeviceError(f"{NAME}: no frame in time; is the camera still connected?") from None
+    if answer.get("dropped"):
+        raise FrameDropped(f"{NAME}: {answer['error']}")
+    if "error" in answer:
+        said = answer["error"].partition("\n")[0].strip()
+        cure = f"; {INSTALL}{machine_settings()}" if "Import" in said or "Module" in said else ""
+        raise DeviceError(f"{NAME}: {said}{cure}")
+    return answer
+
+
+class AzureKinect(OpenScanner):
+    """An open camera or recording."""
+
+    def __init__(
+        self,
+        pipe: Pipe,
+        facts: dict[str, str],
+        model: ScannerModel | None,
+        params: AzureKinectParams,
+    ) -> None:
+        """Take over the process that holds the camera."""
+        what = params.recording.name if params.recording else facts["serial"]
+        super().__init__(f"Azure Kinect {what}", {"unit": "mm", **facts})
+        self._pipe, self._model, self._params = pipe, model, params
+
+    def expose(self) -> Callable[[], Scan]:
+        """Take the next capture; the arm waits until it is here."""
+        started = time.time_ns()
+        with contextlib.suppress(OSError):  # the answer says what became of the process
+            self._pipe.write(b"next\n")
+        answer = _answer(self._pipe, self._params.timeout + 0.5)
+        depth = self._array(answer["depth"], np.uint16)
+        colour = self._array(answer["colour"], np.uint8) if "colour" in answer else None
+        ended = time.time_ns()
+
+        def decode() -> Scan:
+            view = DepthView(**answer["calibration"])
+            xyz = view.points(depth)
+            cloud = cloud_of(xyz, PER_METRE)
+            require_in_range(self.name, cloud, self._model)
+            image = None if colour is None else view.coloured(xyz, colour)
+            return Scan(cloud, started, ended, image)
+
+        return decode
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._pipe.close()
+
+    def _array(self, shape: list[int], kind: Any) -> Any:
+        size = int(np.prod(shape)) * np.dtype(kind).itemsize
+        try:
+            data = self._pipe.read(size, PATIENCE)
+        except (PipeEndedError, TimeoutError) as error:
+            raise DeviceError(f"{self.name}: lost in the middle of a frame ({error})") from None
+        return np.frombuffer(data, dtype=kind).reshape(shape)

@@ -1,0 +1,118 @@
+"""``scanner.mech_eye``: a Mech-Eye industrial 3D camera, through the maker's API."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from pydantic import Field
+
+from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye.units import Duration, param
+from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
+from flangeye_plugins.scanner.opened import OpenScanner
+
+NAME = "scanner.mech_eye"
+INSTALL = "pip install 'flangeye[mech_eye]'"
+
+
+class MechEyeParams(Params):
+    """Parameters of ``scanner.mech_eye``."""
+
+    address: str | None = Field(
+        None, description="IP address of the camera; the only one found if not given."
+    )
+    timeout: Duration = param(
+        "3 s", gt=0, le=PATIENCE, description="Longest wait for a connection, and for a frame."
+    )
+
+
+@part("scanner.mech_eye")
+def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scanner:
+    """Scan with a Mech-Eye camera, with the settings its own viewer left in it.
+
+    Args:
+        model: What the scanner can see; a scan far out of its range is refused.
+        params: See :class:`MechEyeParams`.
+
+    Raises:
+        DeviceError: No SDK, no camera, or it does not connect.
+    """
+    api = load_sdk("mecheye.area_scan_3d_camera", NAME, INSTALL)
+    camera, patience = api.Camera(), round(params.timeout * 1e3)
+    address = params.address or _only_camera(api, patience)
+    _require(camera.connect(address, patience), f"{NAME}: {address}")
+    scanner = MechEye(api, camera, model, params)
+    try:
+        scanner.prepare()
+    except DeviceError:
+        scanner.close()
+        raise
+    return scanner
+
+
+def _only_camera(api: Any, patience: int) -> str:
+    found = [info.ip_address for info in api.Camera.discover_cameras(patience)]
+    if not found:
+        raise DeviceError(f"{NAME}: no camera found; is it on, and in this computer's network?")
+    if len(found) > 1:
+        raise DeviceError(f"{NAME}: several cameras, give address: {', '.join(sorted(found))}")
+    return str(found[0])
+
+
+def _require(status: Any, what: str) -> None:
+    if not status.is_ok():
+        said = " ".join(status.error_description.split())
+        raise DeviceError(f"{what}: {said} (error {status.error_code})")
+
+
+class MechEye(OpenScanner):
+    """A connected camera."""
+
+    def __init__(
+        self, api: Any, camera: Any, model: ScannerModel | None, params: MechEyeParams
+    ) -> None:
+        """Take over a connected camera."""
+        super().__init__(NAME, {"unit": "m", "layout": "organised"})
+        self._api, self._camera, self._model, self._params = api, camera, model, params
+
+    def prepare(self) -> None:
+        """Ask the camera who it is, and for metres.
+
+        Raises:
+            DeviceError: It does not answer, or keeps to another unit.
+        """
+        info, metres = self._api.CameraInfo(), self._api.shared.CoordinateUnit_Meter
+        _require(self._camera.get_camera_info(info), self.name)
+        self.name = f"{info.model} {info.serial_number}"
+        self.facts["firmware"] = info.firmware_version.to_string()
+        _require(self._camera.set_point_cloud_unit(metres), self.name)
+        status, unit = self._camera.get_point_cloud_unit()
+        _require(status, self.name)
+        if unit != metres:
+            raise DeviceError(f"{self.name}: its points stay in unit {unit}, metres are needed")
+
+    def expose(self) -> Callable[[], Scan]:
+        """Capture; the arm waits until the frame is here."""
+        frame, patience = self._api.Frame3D(), round(self._params.timeout * 1e3)
+        started = time.time_ns()
+        _require(self._camera.capture_3d(frame, patience), self.name)
+        ended = time.time_ns()
+
+        def decode() -> Scan:
+            xyz = frame.get_untextured_point_cloud().data()
+            if xyz.ndim != 3:
+                raise DeviceError(f"{self.name}: a frame without points")
+            cloud = cloud_of(xyz, 1.0)
+            require_in_range(self.name, cloud, self._model)
+            return Scan(cloud, started, ended)
+
+        return decode
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._camera.disconnect()

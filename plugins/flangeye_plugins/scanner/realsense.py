@@ -1,0 +1,173 @@
+"""``scanner.realsense``: a RealSense depth camera, or its recording, through pyrealsense2."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner
+from flangeye.files.paths import RecipePath
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye.units import Duration, param
+from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
+from flangeye_plugins.scanner.opened import OpenScanner
+
+NAME = "scanner.realsense"
+INSTALL = "pip install 'flangeye[realsense]'"
+
+STALE = 2
+"""Frames of a running camera that may have been exposed before they were asked for."""
+
+RUN_OUT_MS = 200
+"""A recording that gives no frame for so long has ended [ms]."""
+
+SAME_UNIT = 1e-6
+"""Largest relative difference of two reports of one unit, in single precision."""
+
+
+class RealsenseParams(Params):
+    """Parameters of ``scanner.realsense``."""
+
+    recording: RecipePath | None = Field(
+        None, description="A .db3 or .bag recording to play instead, one frame an exposure."
+    )
+    serial: str | None = Field(None, description="Which camera, if there are several.")
+    timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
+
+
+@part("scanner.realsense")
+def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Scanner:
+    """Scan with a RealSense, or play its recording.
+
+    Args:
+        model: What the scanner can see; a scan far out of its range is refused.
+        params: See :class:`RealsenseParams`.
+
+    Raises:
+        DeviceError: No SDK, no camera, or no recording.
+    """
+    rs = load_sdk("pyrealsense2", NAME, INSTALL)
+    pipeline, config = rs.pipeline(), rs.config()
+    if params.recording is not None:
+        if not params.recording.is_file():
+            raise DeviceError(f"{NAME}: no recording at {params.recording}")
+        config.enable_device_from_file(str(params.recording), False)
+    else:
+        config.enable_device(_serial(rs, params.serial))
+    try:
+        profile = pipeline.start(config)
+    except RuntimeError as error:
+        what = params.recording or "the camera"
+        reason = str(error).rpartition("Reason: ")[2]
+        raise DeviceError(f"{NAME}: {what} cannot be started: {reason}") from None
+    return Realsense(rs, pipeline, profile, model, params)
+
+
+def _serial(rs: Any, wanted: str | None) -> str:
+    """Return the serial number of the camera to open; starting without one waits 15 s for it."""
+    devices = rs.context().query_devices()
+    found = sorted(device.get_info(rs.camera_info.serial_number) for device in devices)
+    if not found:
+        raise DeviceError(
+            f"{NAME}: no camera found; is it plugged in, and may this user use USB devices?"
+        )
+    if wanted is None and len(found) == 1:
+        return str(found[0])
+    if wanted is None or wanted not in found:
+        problem = f"no camera {wanted}; there are" if wanted else "several cameras, give serial"
+        raise DeviceError(f"{NAME}: {problem}: {', '.join(found)}")
+    return str(wanted)
+
+
+class Realsense(OpenScanner):
+    """A running camera or recording."""
+
+    def __init__(
+        self,
+        rs: Any,
+        pipeline: Any,
+        profile: Any,
+        model: ScannerModel | None,
+        params: RealsenseParams,
+    ) -> None:
+        """Take over a started pipeline."""
+        device = profile.get_device()
+        self._rs, self._pipeline, self._model, self._params = rs, pipeline, model, params
+        self._unit = float(device.first_depth_sensor().get_depth_scale())
+        self._points = rs.pointcloud()
+        self._closed = False
+        if params.recording is not None:
+            device.as_playback().set_real_time(False)
+        super().__init__(f"RealSense {_who(rs, device, params.recording)}", self._facts(profile))
+
+    def expose(self) -> Callable[[], Scan]:
+        """Take a new frame; the arm waits until it is here."""
+        started = time.time_ns()
+        for _ in range(0 if self._params.recording else STALE):
+            self._frames()
+        frames = self._frames()
+        ended = time.time_ns()
+
+        def decode() -> Scan:
+            cloud = cloud_of(self._coordinates(frames.get_depth_frame()), 1.0)
+            require_in_range(self.name, cloud, self._model)
+            return Scan(cloud, started, ended)
+
+        return decode
+
+    def close(self) -> None:
+        """Stop the camera."""
+        if not self._closed:
+            self._closed = True
+            if self._params.recording is not None:
+                self._run_out()
+            self._pipeline.stop()
+
+    def _run_out(self) -> None:
+        """Let a recording come to its end: stopped while it is read, the SDK may abort."""
+        limit = time.monotonic() + PATIENCE
+        with contextlib.suppress(RuntimeError):
+            while time.monotonic() < limit:
+                self._pipeline.wait_for_frames(RUN_OUT_MS)
+
+    def _facts(self, profile: Any) -> dict[str, str]:
+        depth = profile.get_stream(self._rs.stream.depth).as_video_stream_profile()
+        layout = f"organised, {depth.width()} x {depth.height()}"
+        return {"unit": f"{self._unit:.6g} m", "layout": layout}
+
+    def _frames(self) -> Any:
+        if self._closed:
+            raise DeviceError(f"{self.name}: is closed")
+        try:
+            return self._pipeline.wait_for_frames(round(self._params.timeout * 1e3))
+        except RuntimeError as error:
+            if self._params.recording is not None:
+                raise DeviceError(f"{self.name}: the recording has ended") from None
+            raise DeviceError(
+                f"{self.name}: {str(error).rstrip('.')}; is the camera still plugged in?"
+            ) from None
+
+    def _coordinates(self, depth: Any) -> Any:
+        """Return (H, W, 3) in metres, zero where nothing was measured."""
+        unit, rows, columns = depth.get_units(), depth.get_height(), depth.get_width()
+        if abs(unit - self._unit) > SAME_UNIT * self._unit:
+            raise DeviceError(
+                f"{self.name}: a frame in units of {unit:.6g} m, but the sensor says "
+                f"{self._unit:.6g} m"
+            )
+        vertices = np.asanyarray(self._points.calculate(depth).get_vertices())
+        return vertices.view(np.float32).reshape(rows, columns, 3)
+
+
+def _who(rs: Any, device: Any, recording: Path | None) -> str:
+    if recording is not None:
+        return recording.name
+    return str(device.get_info(rs.camera_info.serial_number))

@@ -1,0 +1,180 @@
+"""``scanner.watched_folder``: clouds that the scanner's own software exports, as they come."""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import Field
+
+from flangeye.devices import DeviceError, Scan, Scanner
+from flangeye.errors import StageError
+from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
+from flangeye.files.paths import RecipePath
+from flangeye.models.cloud_unit import check_unit, median_distance
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params, part
+from flangeye.types import PointCloud
+from flangeye.units import Duration, param
+from flangeye_plugins.scanner.opened import OpenScanner
+
+NAME = "scanner.watched_folder"
+
+LOOK_AGAIN = 0.1
+"""Between two looks into the folder [s]."""
+
+
+class WatchedFolderParams(Params):
+    """Parameters of ``scanner.watched_folder``."""
+
+    path: RecipePath = Field(description="Folder that the scanner's software exports into.")
+    unit: LengthUnit = Field(description="Unit of the files' coordinates; files do not say.")
+    pattern: str = Field("*", description="Names to look for, for example 'scan_*.ply'.")
+    settle: Duration = param(
+        "500 ms", ge=0, description="A file that did not change for so long may be whole."
+    )
+    timeout: Duration = param("60 s", gt=0, description="Longest wait for the next file.")
+
+
+@part("scanner.watched_folder")
+def scanner_watched_folder(model: ScannerModel | None, params: WatchedFolderParams) -> Scanner:
+    """Take each new cloud that appears in a folder, once it is whole.
+
+    What lies there when the recipe starts is left alone. Trigger the scan in the scanner's own
+    software when the arm stands; files are taken in the order in which they appear.
+
+    Args:
+        model: What the scanner can see; the stated unit is held against it.
+        params: See :class:`WatchedFolderParams`.
+
+    Raises:
+        DeviceError: There is no such folder, or it may not be read.
+    """
+    return WatchedFolder(model, params)
+
+
+class Stamp(NamedTuple):
+    """What changes when a file does; times may be coarse or late on network shares."""
+
+    inode: int
+    size: int
+    changed_ns: int
+
+
+class Arrival(NamedTuple):
+    """A new file: how it looked last, since when it looks so, and when it was not there yet."""
+
+    stamp: Stamp
+    since: float
+    before_ns: int
+
+
+class WatchedFolder(OpenScanner):
+    """A folder that is watched. ``close`` from another thread ends a wait."""
+
+    def __init__(self, model: ScannerModel | None, params: WatchedFolderParams) -> None:
+        """Note what is there already."""
+        super().__init__(f"folder {params.path}", {"unit": params.unit})
+        self._model, self._params = model, params
+        self._looked_ns = time.time_ns()
+        self._known = self._look()
+        self._arrivals: dict[Path, Arrival] = {}
+        self._closed = threading.Event()
+
+    def expose(self) -> Callable[[], Scan]:
+        """Wait for the next file, for as long as ``timeout`` says: a person may have to act.
+
+        The exposure is said to have begun when the folder was last seen without the file, so a
+        file that came while the arm moved cannot pass for one of where it stands. The person is
+        told when to scan.
+        """
+        limit = time.monotonic() + self._params.timeout
+        incomplete = ""
+        self._notice()
+        sys.stderr.write(f"Scan now, and export the cloud into {self._params.path}\n")
+        while time.monotonic() < limit:
+            self._notice()
+            for path in self._settled():
+                try:
+                    cloud = read_cloud(path, self._params.unit)
+                except StageError as error:
+                    incomplete = f": {error}"
+                    break  # files are taken in order: those after it must wait for it
+                return self._take(path, cloud)
+            if self._closed.wait(LOOK_AGAIN):
+                raise DeviceError(f"{self.name}: is closed")
+        raise DeviceError(
+            f"{self.name}: no whole new cloud within {self._params.timeout:g} s{incomplete}; "
+            f"looked for {self._params.pattern} ({', '.join(CLOUD_SUFFIXES)})"
+        )
+
+    def close(self) -> None:
+        """End the wait, if there is one."""
+        self._closed.set()
+
+    def _look(self) -> dict[Path, Stamp]:
+        """Return the clouds in the folder; whole or not."""
+        found = {}
+        try:
+            for path in self._params.path.iterdir():
+                if _is_cloud(path) and path.match(self._params.pattern):
+                    about = path.stat()
+                    found[path] = Stamp(about.st_ino, about.st_size, about.st_mtime_ns)
+        except FileNotFoundError:
+            if self._params.path.is_dir():
+                return self._look()  # a temporary name, renamed while we looked
+            raise DeviceError(f"{NAME}: no folder {self._params.path}") from None
+        except OSError as error:
+            raise DeviceError(
+                f"{NAME}: {self._params.path} cannot be read ({error.strerror})"
+            ) from None
+        return found
+
+    def _notice(self) -> None:
+        """Note which files are new, and since when each looks as it does."""
+        looked_ns, now = time.time_ns(), time.monotonic()
+        there = self._look()
+        self._arrivals = {path: a for path, a in self._arrivals.items() if path in there}
+        new = [path for path, stamp in there.items() if self._known.get(path) != stamp]
+        for path in sorted(new, key=_counted):
+            before = self._arrivals.get(path)
+            if before is None:
+                self._arrivals[path] = Arrival(there[path], now, self._looked_ns)
+            elif before.stamp != there[path]:
+                self._arrivals[path] = before._replace(stamp=there[path], since=now)
+        self._looked_ns = looked_ns
+
+    def _settled(self) -> list[Path]:
+        """Return the files that may be whole, in order, up to the first that still changes."""
+        settled = []
+        for path, arrival in self._arrivals.items():
+            if time.monotonic() - arrival.since < self._params.settle:
+                break
+            settled.append(path)
+        return settled
+
+    def _take(self, path: Path, cloud: PointCloud) -> Callable[[], Scan]:
+        arrival = self._arrivals.pop(path)
+        self._known[path] = arrival.stamp
+        ended = time.time_ns()
+
+        def check() -> Scan:
+            if self._model is not None:
+                check_unit(path, median_distance(cloud), self._params.unit, self._model)
+            return Scan(cloud, arrival.before_ns, ended)
+
+        return check
+
+
+def _is_cloud(path: Path) -> bool:
+    return path.suffix.lower() in CLOUD_SUFFIXES and not path.name.startswith((".", "~"))
+
+
+def _counted(path: Path) -> list[str]:
+    """Return a key that sorts scan_9 before scan_10."""
+    return [part.zfill(20) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

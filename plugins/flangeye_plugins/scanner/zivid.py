@@ -1,0 +1,122 @@
+"""``scanner.zivid``: a Zivid camera, or a file camera, through the maker's SDK."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from flangeye.devices import DeviceError, Scan, Scanner
+from flangeye.files.paths import RecipePath
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.sdk import load_sdk
+from flangeye.plugin.stage import Params, part
+from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
+from flangeye_plugins.scanner.opened import OpenScanner
+
+NAME = "scanner.zivid"
+INSTALL = "install the Zivid SDK, then pip install 'flangeye[zivid]'"
+
+PER_METRE = 1000.0
+"""The SDK's points are millimetres; nothing in it says so at run time."""
+
+
+class ZividParams(Params):
+    """Parameters of ``scanner.zivid``."""
+
+    settings: RecipePath | None = Field(
+        None, description="Settings saved by Zivid Studio (.yml); one default acquisition if none."
+    )
+    serial: str | None = Field(None, description="Which camera, if there are several.")
+    file_camera: RecipePath | None = Field(
+        None, description="A file camera (.zfc) to capture from instead."
+    )
+
+
+@part("scanner.zivid")
+def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
+    """Scan with a Zivid camera.
+
+    Args:
+        model: What the scanner can see; a scan far out of its range is refused.
+        params: See :class:`ZividParams`.
+
+    Raises:
+        DeviceError: No SDK, no camera, or settings that cannot be read.
+    """
+    zivid = load_sdk("zivid", NAME, INSTALL)
+    for path in (params.settings, params.file_camera):
+        if path is not None and not path.is_file():
+            raise DeviceError(f"{NAME}: no file {path}")
+    try:
+        application = zivid.Application()  # must outlive the camera
+        settings = _settings(zivid, params.settings)
+        if params.file_camera is not None:
+            camera = application.create_file_camera(str(params.file_camera))
+        else:
+            camera = application.connect_camera(serial_number=params.serial)
+    except RuntimeError as error:
+        raise DeviceError(f"{NAME}: {_line(error)}") from None
+    return ZividScanner(application, camera, settings, model)
+
+
+def _settings(zivid: Any, path: Path | None) -> Any:
+    if path is not None:
+        return zivid.Settings.load(str(path))
+    return zivid.Settings(acquisitions=[zivid.Settings.Acquisition()])
+
+
+class ZividScanner(OpenScanner):
+    """A connected camera."""
+
+    def __init__(
+        self, application: Any, camera: Any, settings: Any, model: ScannerModel | None
+    ) -> None:
+        """Take over a connected camera."""
+        info = camera.info
+        facts = {"unit": "mm", "firmware": str(info.firmware_version), "layout": "organised"}
+        super().__init__(f"{info.model_name} {info.serial_number}", facts)
+        self._application, self._camera = application, camera
+        self._settings, self._model = settings, model
+
+    def expose(self) -> Callable[[], Scan]:
+        """Capture; the SDK returns when the images are taken, and computes points when asked."""
+        if self._camera is None:
+            raise DeviceError(f"{self.name}: is closed")
+        started = time.time_ns()
+        try:
+            # SDK 2.14 gave 3D its own name; before, capture() told by the settings.
+            capture = getattr(self._camera, "capture_3d", None) or self._camera.capture
+            frame = capture(self._settings)
+        except RuntimeError as error:
+            raise DeviceError(f"{self.name}: {_line(error)}") from None
+        ended = time.time_ns()
+
+        def transfer() -> Scan:
+            try:
+                with frame:
+                    xyz = frame.point_cloud().copy_data("xyz")
+            except RuntimeError as error:
+                raise DeviceError(f"{self.name}: {_line(error)}") from None
+            if xyz.ndim != 3:
+                raise DeviceError(f"{self.name}: points of shape {xyz.shape}, not organised")
+            cloud = cloud_of(xyz, PER_METRE)
+            require_in_range(self.name, cloud, self._model)
+            return Scan(cloud, started, ended)
+
+        return transfer
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        if self._camera is not None:
+            camera, self._camera = self._camera, None
+            camera.disconnect()
+            camera.release()
+            self._application.release()
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,142 @@
+"""Plan a seam from the workpiece's CAD."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import CalibrationRefused, StageError, stage
+from flangeye.maths.geometry import covariance_at
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.models.workpiece import CadSeam, Workpiece, WorkpiecePath, load_workpiece
+from flangeye.types import Box, Floats, Seam, Seed, VerifiedHandEye, WorkpieceScan
+from flangeye.units import Length, param
+from flangeye_plugins.seam.part import CadPart
+from flangeye_plugins.seam.planned import (
+    ArmParams,
+    answer_for,
+    cloud_around,
+    for_the_controller,
+    in_base,
+    refuse_outside,
+    resampled,
+    scanner_covariance,
+)
+from flangeye_plugins.seam.register import STAGE, Registered, RegistrationLimits, register
+
+SEED = 11
+"""Tells this use of the recipe's seed from others."""
+
+
+class CadParams(ArmParams):
+    """Parameters of ``seam.cad``."""
+
+    workpiece: WorkpiecePath = Field(
+        description="One of data/workpieces, or a .yaml file of one's own with CAD and seams."
+    )
+    seam: str | None = Field(None, description="Which of its seams, by name, if it has several.")
+    spacing: Length = param("2 mm", gt=0, description="Between the planned points.")
+    min_seen: float = Field(
+        0.35, gt=0, lt=1, description="Least share of the CAD's surface towards the scanner, seen."
+    )
+    max_refuted: float = Field(
+        0.05, gt=0, lt=1, description="Largest share of it, and at the seam, that is not there."
+    )
+    max_residual: Length = param("0.5 mm", gt=0, description="Of the scan from the CAD, rms.")
+    max_deviation: Length = param(
+        "2 mm", gt=0, description="Largest standard deviation of the registration at the seam."
+    )
+    distinct: float = Field(
+        0.03, gt=0, lt=1, description="How much less the second-best pose must agree."
+    )
+
+
+@stage("seam.cad")
+def seam_cad(  # noqa: PLR0913  what it asks the runner for
+    calibration: VerifiedHandEye,
+    scan: WorkpieceScan,
+    seed: Seed,
+    params: CadParams,
+    workspace: Box | None = None,
+    scanner: ScannerModel | None = None,
+    robot: RobotModel | None = None,
+) -> Seam:
+    """Register the workpiece's CAD to the scan and map its seam into the base.
+
+    Figures: ``seen``, ``refuted`` and ``second`` as in :class:`Registered`; ``residual`` of the
+    scan from the CAD, rms, and ``registration``, the largest standard deviation of a point of
+    the seam before the hand-eye pose comes in [m]; ``points`` and ``blocks`` the fit rests on.
+
+    Raises:
+        StageError: The CAD cannot be read, has no such seam, or is in another unit.
+        CalibrationRefused: The fit is poor or ambiguous, or the seam outside the workspace.
+    """
+    answer = answer_for(STAGE, calibration, params)
+    workpiece = load_workpiece(params.workpiece)
+    seam = _chosen(workpiece, params.seam)
+    points = scan.cloud.points().astype(np.float64)
+    rng = np.random.default_rng([SEED, seed])
+    found = register(points, CadPart(workpiece), seam, _limits(params), rng)
+    turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
+    line = resampled(seam.points, params.spacing) @ turn.T + shift
+    of_fit = found.fit.covariance + scanner_covariance(scanner, float(np.linalg.norm(shift)))
+    covariances = covariance_at(of_fit, found.fit.about, line)
+    deviation = _deviation(covariances, params.max_deviation)
+    mapped, covariance = in_base(line, covariances, answer.base_T_camera)
+    refuse_outside(STAGE, mapped, workspace)
+    opening = answer.base_T_camera.transform.rotation @ turn @ seam.opening
+    planned = Seam(
+        mapped,
+        np.tile(opening, (len(mapped), 1)),
+        covariance,
+        half_angle=seam.half_angle,
+        half_width=seam.half_width,
+        source=f"CAD {workpiece.path.stem} on {scan.source}",
+        figures={**_figures(found), "registration": deviation},
+        cloud=cloud_around(scan, line, answer.base_T_camera),
+    )
+    return for_the_controller(planned, answer, robot, params)
+
+
+def _chosen(workpiece: Workpiece, name: str | None) -> CadSeam:
+    known = ", ".join(workpiece.seams)
+    if name is None and len(workpiece.seams) == 1:
+        return next(iter(workpiece.seams.values()))
+    if name is None:
+        raise StageError(f"{STAGE}: {workpiece.path} has the seams {known}; say which with seam:")
+    if name not in workpiece.seams:
+        raise StageError(f"{STAGE}: {workpiece.path} has no seam '{name}'; it has {known}")
+    return workpiece.seams[name]
+
+
+def _deviation(covariances: Floats, limit: float) -> float:
+    """Return the largest standard deviation along the seam, in any direction [m]."""
+    values, vectors = np.linalg.eigh(covariances)
+    worst = int(np.argmax(values[:, -1]))
+    deviation = float(np.sqrt(values[worst, -1]))
+    if deviation > limit:
+        way = ", ".join(f"{x:.2f}" for x in vectors[worst, :, -1])
+        raise CalibrationRefused(
+            f"{STAGE}: the scan does not tell where the seam lies along ({way}) in camera: "
+            f"standard deviation {deviation * 1e3:.2g} mm, limit {limit * 1e3:g} mm "
+            "(max_deviation); let the scanner see more of the part"
+        )
+    return deviation
+
+
+def _figures(found: Registered) -> dict[str, float]:
+    return {
+        "seen": found.seen,
+        "refuted": found.refuted,
+        "second": found.second,
+        "residual": found.fit.noise,
+        "points": float(found.fit.used),
+        "blocks": float(found.fit.blocks),
+    }
+
+
+def _limits(params: CadParams) -> RegistrationLimits:
+    return RegistrationLimits(
+        params.min_seen, params.max_refuted, params.max_residual, params.distinct
+    )

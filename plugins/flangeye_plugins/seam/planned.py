@@ -1,0 +1,169 @@
+"""From a line in the scan to a planned seam in the base, however the line was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import CalibrationRefused, Params
+from flangeye.maths.arm_correction import reported_flange
+from flangeye.maths.geometry import covariance_at
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import (
+    BASE,
+    Box,
+    Floats,
+    HandEye,
+    PointCloud,
+    Seam,
+    TransformEstimate,
+    WorkpieceScan,
+)
+from flangeye.units import Length, param
+
+CLOUD_POINTS = 20_000
+"""Points of the scan that are kept for people."""
+
+
+class ArmParams(Params):
+    """For which arm a seam is planned."""
+
+    arm: Literal["as-reported", "corrected"] = Field(
+        "as-reported",
+        description="as-reported: with the pose that is best for the arm as its controller has "
+        "it; corrected: with that of the corrected arm, each point where the controller has to be "
+        "told to go so that the tool comes to the seam.",
+    )
+    tool: Length = param(
+        "0 mm", ge=0, description="corrected: from the flange to the tool's tip, along its z."
+    )
+
+
+def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
+    """Return the (6, 6) covariance, about the part, of what a scanner's own distortion does to it.
+
+    A smooth error over the scanner's volume moves and turns a part as a whole; no residual shows
+    it. Its size is the model's, in every direction alike; its slope that of a field which
+    changes its sign over half the distance.
+
+    Args:
+        scanner: The recipe's; zero without one.
+        distance: From the scanner to the part [m].
+    """
+    error = scanner.calibration_error if scanner else 0.0
+    shift, turn = error / np.sqrt(3.0), 2 * error / distance
+    return np.diag([turn**2] * 3 + [shift**2] * 3)
+
+
+def in_base(
+    points: Floats, covariances: Floats, base_T_camera: TransformEstimate
+) -> tuple[Floats, Floats]:
+    """Map (N, 3) points in ``camera`` and their covariances (N, 3, 3) to ``base``.
+
+    The covariance of the hand-eye pose is taken at each point, about the point where it holds,
+    and added: the scan of the workpiece took no part in the calibration.
+    """
+    rotation = base_T_camera.transform.rotation
+    mapped = base_T_camera.transform.apply(points)
+    of_pose = covariance_at(base_T_camera.covariance, base_T_camera.about, mapped)
+    return mapped, rotation @ covariances @ rotation.T + of_pose
+
+
+def answer_for(stage: str, calibration: HandEye, params: ArmParams) -> HandEye:
+    """Return the answer for the arm that shall follow the seam.
+
+    Raises:
+        CalibrationRefused: The corrected arm is asked for, and no error of it was found.
+    """
+    if params.arm == "as-reported":
+        return calibration.as_reported()
+    corrected = calibration.as_corrected()
+    if corrected is None:
+        raise CalibrationRefused(
+            f"{stage}: arm: corrected, and the calibration found no error of the arm that helps; "
+            "write arm: as-reported"
+        )
+    return corrected
+
+
+def for_the_controller(
+    seam: Seam, calibration: HandEye, robot: RobotModel | None, params: ArmParams
+) -> Seam:
+    """Return a seam with each point where the controller has to be told to go to reach it.
+
+    Args:
+        seam: In ``base``, as the corrected arm has it.
+        calibration: The answer it was planned with; see :func:`answer_for`.
+        robot: The arm.
+        params: How long the tool is.
+
+    Raises:
+        CalibrationRefused: The arm cannot reach the seam.
+    """
+    correction = calibration.correction
+    if params.arm == "as-reported" or correction is None:
+        return seam
+    arm, tip = Arm(robot) if robot else None, np.array([0.0, 0.0, params.tool, 1.0])
+    near = np.eye(4) if arm is None or correction.joints is None else arm.flange(correction.joints)
+    poses = _above(seam.points_in_base, seam.openings_in_base, near[:3, 0], params.tool)
+    try:
+        told = [reported_flange(pose, correction, arm) @ tip for pose in poses]
+    except ValueError as error:
+        raise CalibrationRefused(
+            f"the seam cannot be corrected for the arm's error: {error}; move the workpiece to "
+            "where the arm was calibrated, or write arm: as-reported"
+        ) from None
+    note = "points are where the controller has to be told to go: the arm's error is taken off"
+    return replace(seam, points_in_base=np.array(told)[:, :3], notes=(*seam.notes, note))
+
+
+def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
+    """Return (N, 4, 4) flange poses whose tool comes down each opening, its x nearest to (3,)."""
+    z = -openings / np.linalg.norm(openings, axis=1, keepdims=True)
+    along = x - (z @ x)[:, None] * z
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, :3] = np.stack([along, np.cross(z, along), z], axis=-1)
+    poses[:, :3, 3] = points - tool * z
+    return poses
+
+
+def resampled(line: Floats, spacing: float) -> Floats:
+    """Return a polyline (M, 3) at even steps of about ``spacing``, both ends included."""
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
+    return np.stack([np.interp(at, arc, line[:, k]) for k in range(3)], axis=1)
+
+
+def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) -> None:
+    """Refuse a seam that leaves the workspace, where the calibration was not checked.
+
+    Raises:
+        CalibrationRefused: Says how far, and which way.
+    """
+    if workspace is None:
+        return
+    beyond = np.abs(points_in_base - workspace.centre) - np.asarray(workspace.size) / 2
+    worst = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
+    if beyond[worst] > 0:
+        point = ", ".join(f"{1e3 * x:.0f}" for x in points_in_base[worst[0]])
+        raise CalibrationRefused(
+            f"{stage}: the seam leaves the workspace by {1e3 * beyond[worst]:.0f} mm along "
+            f"{'xyz'[worst[1]]}, at ({point}) mm in base; move the workpiece, or widen the "
+            "recipe's workspace and calibrate over it"
+        )
+
+
+def cloud_around(scan: WorkpieceScan, seam: Floats, base_T_camera: TransformEstimate) -> PointCloud:
+    """Return the part of a scan around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
+    points = scan.cloud.points()
+    low, high = seam.min(axis=0), seam.max(axis=0)
+    margin = 0.3 * np.linalg.norm(high - low) + 0.03
+    points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
+    points = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
+    return PointCloud(BASE, base_T_camera.transform.apply(points).astype(np.float32))

@@ -1,0 +1,1 @@
+"""``segment.*``: find the flange or sphere in a scan."""

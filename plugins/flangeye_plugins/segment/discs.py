@@ -1,0 +1,185 @@
+"""Whether a flat part of the scene is the flange, and if not, why not. Arrays only."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.maths.circles import edge_points, vote_centre
+from flangeye.maths.planes import Plane, thinned
+from flangeye.models.targets import Flange
+from flangeye.types import Floats
+from flangeye_plugins.segment.parts import Part
+
+SECTORS = 48
+
+SMALLEST = 0.25
+"""Width of a piece that can belong to the face, in radii of its rim: between holes and recesses
+little of it is left."""
+
+PLATE_SHOWS, PLATE_ENDS = (0.5, 0.65), 0.85
+"""Where a plate's face is sure to be within a wrist circle, and where it is sure to have ended,
+in radii of the circle: of the robots known, wrists are 75 to 90 mm across and plates 63."""
+
+
+class DiscLimits(NamedTuple):
+    """What a disc must fulfil to be taken for the flange.
+
+    Attributes:
+        incidence: Largest angle of the normal to the line of sight [rad].
+        coverage: Smallest share of rim, and of bore, to be seen.
+        crease: Bend of depth between neighbours where a surface ends [m].
+    """
+
+    incidence: float
+    coverage: float
+    crease: float
+
+
+class Disc(NamedTuple):
+    """A flat part compared with the flange.
+
+    Attributes:
+        plane: Its plane, the normal towards the scanner.
+        cell: Row and column of the view in the middle of it.
+        centre: (3,) of the rim, as far as known [m].
+        across: Its largest width [m].
+        seen: Mean share of rim and bore with an edge where there should be one.
+        flaw: Why it is not the flange, or None.
+        rank: How far the comparison got before the flaw showed.
+    """
+
+    plane: Plane
+    cell: tuple[int, int]
+    centre: Floats
+    across: float
+    seen: float
+    flaw: str | None
+    rank: int
+
+
+def of_size(part: Part, cell: tuple[int, int], pitch: float, flange: Flange) -> Disc:
+    """Return a flat part as a disc, its width being its flaw if it cannot be the flange's.
+
+    Args:
+        part: The part.
+        cell: Row and column of the view in the middle of it.
+        pitch: Typical distance of neighbours there [m].
+        flange: What to look for.
+    """
+    # A table has a hundred times the points its width needs.
+    points = thinned(part.points).astype(np.float64)
+    across = width(part.plane.flatten(points))
+    fits = SMALLEST * flange.rim < across < 2 * flange.outer + 4 * pitch
+    flaw = None if fits else f"{across * 1e3:.0f} mm across"
+    return Disc(part.plane, cell, points.mean(axis=0), across, 0.0, flaw, 0)
+
+
+def compare(
+    disc: Disc, around: Floats, nearby: Floats, pitch: float, flange: Flange, limits: DiscLimits
+) -> Disc:
+    """Return a disc of the right size with what else keeps it from being the flange, if anything.
+
+    Args:
+        disc: From :func:`of_size`.
+        around: (N, 3) all points in its plane near it, edges included [m].
+        nearby: (M, 3) all points near it, before and behind its plane too [m].
+        pitch: Typical distance of neighbours there [m].
+        flange: What to look for.
+        limits: What it must fulfil.
+    """
+    start = disc.plane.flatten(disc.centre[None])[0]
+    centre, shares = ring_shares(disc.plane.flatten(around), start, pitch, flange)
+    disc = disc._replace(centre=disc.plane.lift(centre), seen=float(np.mean(shares)))
+    flaws = (
+        _missing_ring(disc, shares, flange, limits),
+        _missing_plate(disc, nearby, flange),
+        _too_steep(disc, limits),
+    )
+    for rank, flaw in enumerate(flaws, 1):
+        if flaw:
+            return disc._replace(flaw=flaw, rank=rank)
+    return disc._replace(rank=len(flaws) + 1)
+
+
+def _missing_ring(
+    disc: Disc, shares: list[float], flange: Flange, limits: DiscLimits
+) -> str | None:
+    for share, (name, radius) in zip(shares, _rings(flange).items(), strict=True):
+        if share < limits.coverage:
+            return (
+                f"a disc {disc.across * 1e3:.0f} mm across has {share:.0%} of a {name} of "
+                f"{2e3 * radius:.1f} mm, at least {limits.coverage:.0%} is needed"
+            )
+    return None
+
+
+def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
+    """Return what is wrong with the plate that must stand before a wrist circle."""
+    if flange.bore is not None:
+        return None
+    around = nearby[np.abs(disc.plane.heights(nearby)) < 2 * flange.details.thickness]
+    radius = np.linalg.norm(disc.plane.flatten(around - disc.centre + disc.plane.point), axis=1)
+    radius /= flange.rim
+    circle = around[(radius > PLATE_ENDS) & (radius < 1.05)]
+    plate = around[(radius > PLATE_SHOWS[0]) & (radius < PLATE_SHOWS[1])]
+    if len(circle) < 10 or len(plate) < 10:
+        return None
+    height = np.median(disc.plane.heights(plate)) - np.median(disc.plane.heights(circle))
+    wanted = flange.details.thickness
+    if abs(height - wanted) < 0.5 * wanted:
+        return None
+    return (
+        f"a disc {disc.across * 1e3:.0f} mm across has no plate {wanted * 1e3:.1f} mm before it, "
+        f"its middle stands {height * 1e3:.1f} mm out"
+    )
+
+
+def _too_steep(disc: Disc, limits: DiscLimits) -> str | None:
+    angle = np.degrees(incidence(disc.centre, disc.plane.normal))
+    limit = np.degrees(limits.incidence)
+    return f"incidence {angle:.0f} deg over the limit of {limit:.0f} deg" if angle > limit else None
+
+
+def _rings(flange: Flange) -> dict[str, float]:
+    return {"rim": flange.rim} | ({} if flange.bore is None else {"bore": flange.bore})
+
+
+def width(flat: Floats) -> float:
+    """Return the largest width of (N, 2) points over all directions, in steps of 10 degrees."""
+    angle = np.arange(18) * np.pi / 18
+    along = flat @ np.stack([np.cos(angle), np.sin(angle)])
+    return float(np.ptp(along, axis=0).max())
+
+
+def incidence(centre: Floats, normal: Floats) -> float:
+    """Return the angle between a disc's normal and the line of sight to the scanner [rad]."""
+    return float(np.arccos(np.clip(-(normal @ centre) / np.linalg.norm(centre), -1, 1)))
+
+
+def ring_shares(
+    flat: Floats, start: Floats, pitch: float, flange: Flange
+) -> tuple[Floats, list[float]]:
+    """Return the centre (2,) of the rim, and how much of rim and bore has its edge there.
+
+    Args:
+        flat: (N, 2) points in the disc's plane [m].
+        start: (2,) a point inside the disc [m].
+        pitch: Typical distance of neighbours [m].
+        flange: Whose rim and bore.
+    """
+    rim = flat[edge_points(flat, start, 2 * SECTORS)]
+    votes = [(rim, flange.rim)]
+    centre = vote_centre(tuple(votes), start, 1.5 * flange.rim)
+    if flange.bore is not None:
+        # Seen from the rim's centre, the innermost points are the bore's.
+        votes.append((flat[edge_points(flat, centre, SECTORS, outer=False)], flange.bore))
+        centre = vote_centre(tuple(votes), centre, 0.5 * flange.bore)
+    tolerance = 1e-3 + pitch
+    shares = []
+    for k, radius in enumerate(_rings(flange).values()):
+        edge = flat[edge_points(flat, centre, SECTORS, outer=k == 0)] - centre
+        off = np.abs(np.hypot(edge[:, 0], edge[:, 1]) - radius)
+        shares.append(float((off < tolerance).sum() / SECTORS))
+    return centre, shares

@@ -1,0 +1,89 @@
+"""Find the flange in a scan of the whole cell."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from flangeye import Params, stage
+from flangeye.models.targets import Flange
+from flangeye.types import Capture, FlangeCloud, PointCloud, Rejected
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.segment.choice import choose
+from flangeye_plugins.segment.crop import crop
+from flangeye_plugins.segment.discs import DiscLimits
+from flangeye_plugins.segment.grid import Grid, coarse_view
+from flangeye_plugins.segment.scale import check_scale
+from flangeye_plugins.segment.search import find_discs
+
+
+class SegmentParams(Params):
+    """Parameters of ``segment.flange``."""
+
+    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
+    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
+    max_incidence: Angle = param(
+        "55 deg", gt=0, description="Largest angle between the flange's normal and the view."
+    )
+    min_coverage: float = param(
+        0.3, gt=0, le=1, description="Smallest share of the rim, and of the bore, to be seen."
+    )
+    crease: Length = param(
+        "0.8 mm",
+        gt=0,
+        description="How much depth bends from one coarse point to the next where a surface ends; "
+        "five times the scan's noise if that is more.",
+    )
+    margin: Length = param(
+        "2 mm", gt=0, description="How far off the face, and outside its circle, points are kept."
+    )
+
+
+@stage("segment.flange")
+def segment_flange(
+    capture: Capture, flange: Flange, params: SegmentParams
+) -> FlangeCloud | Rejected:
+    """Find the flange by its size, flatness, rim, bore and holes, and cut it out.
+
+    The steps of the paper's section 2.1.4, on a coarse view of the scan: pass-through, removal
+    of stray points and clustering (smooth, connected pieces), plane, size, incidence. What is
+    left is compared with the flange's rim and bore, and, where two discs or a blank one are
+    left, with its holes. Only then the full resolution is touched, around the one disc found.
+
+    Raises:
+        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+    """
+    view = coarse_view(capture.cloud.xyz, flange.rim / 15)
+    if view is None:
+        return Rejected("no finite point")
+    check_scale(view.xyz, capture.id)
+    inside = _pass_through(view, params)
+    if inside is None:
+        return Rejected(_nothing_inside(view, params))
+    limits = DiscLimits(params.max_incidence, params.min_coverage, params.crease)
+    discs = find_discs(inside, flange, limits)
+    cut = partial(crop, capture.cloud.xyz, inside, radius=flange.outer, margin=params.margin)
+    found = choose(discs, cut, flange)
+    if isinstance(found, str):
+        return Rejected(found)
+    disc, points = found
+    return FlangeCloud(PointCloud(capture.cloud.frame, points), disc.centre, disc.plane.normal)
+
+
+def _pass_through(view: Grid, params: SegmentParams) -> Grid | None:
+    """Return the view without points too near or too far; None if there are none between."""
+    depth = view.xyz[..., 2]
+    outside = (depth < params.near) | (depth > params.far)
+    if not outside.any():
+        return view
+    xyz = np.where(outside[..., None], np.float32(np.nan), view.xyz)
+    return view._replace(xyz=xyz) if np.isfinite(xyz[..., 2]).any() else None
+
+
+def _nothing_inside(view: Grid, params: SegmentParams) -> str:
+    depth = view.xyz[..., 2]
+    return (
+        f"no point between near {params.near * 1e3:g} mm and far {params.far * 1e3:g} mm: "
+        f"depths from {np.nanmin(depth) * 1e3:.0f} to {np.nanmax(depth) * 1e3:.0f} mm"
+    )

@@ -1,0 +1,166 @@
+"""The flat parts of pieces of surface. Arrays only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.maths.planes import Plane, fit_plane, robust_planes, thinned
+from flangeye.types import Floats, Indices, Singles
+
+FLAT_ENOUGH = 0.7
+"""Share of a piece's points on one plane above which the piece is flat as a whole."""
+
+PATCHES = 60
+"""Patches of a bent piece that are tried: a face fills at least one of the flattest."""
+
+ENOUGH, AROUND = 600, 300
+"""Points that settle the plane of a piece and of what is around a patch; a table has a hundred
+times as many."""
+
+SEARCHED = 1.5e-3
+"""How far off its patch's plane a part's plane may be, besides its scatter [m]."""
+
+
+class Piece(NamedTuple):
+    """A smooth, connected piece of surface.
+
+    Attributes:
+        points: (n, 3) [m].
+        at: (n,) where in the view each point is.
+        patch: (n,) which patch, some ten points wide, each point lies in.
+    """
+
+    points: Singles
+    at: Indices
+    patch: Indices
+
+
+class Part(NamedTuple):
+    """Points of a piece that lie on one plane.
+
+    Attributes:
+        plane: The plane, its normal towards the scanner.
+        points: (m, 3) what lies on it [m].
+        at: (m,) where in the view.
+    """
+
+    plane: Plane
+    points: Singles
+    at: Indices
+
+
+class Patch(NamedTuple):
+    """A patch of a bent piece, which proposes a plane.
+
+    Attributes:
+        piece: Whose patch it is.
+        rough: Its plane.
+        members: Which of the piece's points it holds.
+        rest: Which of them may belong to a part with its plane.
+    """
+
+    piece: Piece
+    rough: Plane
+    members: Indices
+    rest: Indices
+
+    def around(self, reach: float, enough: int | None = None) -> Indices:
+        """Return which of the rest are near; a sample, if so many are ``enough``."""
+        rest = self.rest
+        if enough is not None:
+            # A part of the largest size holds some fifty patches.
+            rest = rest[:: 1 + 50 * len(self.members) // enough]
+        offsets = self.piece.points[rest] - self.rough.point.astype(np.float32)
+        return np.asarray(rest[np.einsum("ij,ij->i", offsets, offsets) < reach**2])
+
+
+def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -> list[Part]:
+    """Return the flat parts of pieces of surface: one of a piece that is flat as a whole.
+
+    Where a scan is too coarse or too noisy to show the crease, a piece holds a face joined to
+    what is around it. The flattest patches of what does not lie on the piece's main plane then
+    propose planes, and each gathers the points around.
+
+    Args:
+        pieces: Of the scene.
+        reach: How far from its patch a part may extend [m].
+        scatter: Largest standard deviation about a plane of what is flat [m].
+        fewest: Points that are worth a search.
+    """
+    parts, bent = _whole(pieces, scatter)
+    searched = [(p, r) for p, r in zip(pieces, bent, strict=True) if len(r) >= fewest]
+    patches = [patch for piece, rest in searched for patch in _flattest(piece, rest)]
+    samples = [patch.piece.points[patch.around(reach, AROUND)] for patch in patches]
+    planes = _planes(samples, [patch.rough for patch in patches], scatter)
+    taken = np.zeros(1 + max((int(p.at.max()) for p in pieces), default=0), dtype=bool)
+    for patch, plane in zip(patches, planes, strict=True):
+        if plane is not None and taken[patch.piece.at[patch.members]].mean() <= 0.5:
+            around = patch.around(reach)
+            members = around[_off(plane, patch.piece.points[around]) <= _thickness(plane)]
+            parts.append(Part(plane, patch.piece.points[members], patch.piece.at[members]))
+            taken[parts[-1].at] = True
+    return parts
+
+
+def _whole(pieces: list[Piece], scatter: float) -> tuple[list[Part], list[Indices]]:
+    """Return the pieces that are flat as a whole, and of every piece what is left to search."""
+    samples = [thinned(piece.points, ENOUGH) for piece in pieces]
+    rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]
+    parts, bent = [], []
+    for piece, plane in zip(pieces, _planes(samples, rough, scatter), strict=True):
+        rest = np.arange(len(piece.points))
+        if plane is not None:
+            off = _off(plane, piece.points)
+            members = np.flatnonzero(off <= _thickness(plane))
+            if len(members) > FLAT_ENOUGH * len(rest):
+                parts.append(Part(plane, piece.points[members], piece.at[members]))
+                rest = np.flatnonzero(off > 3 * scatter + SEARCHED)
+        bent.append(rest)
+    return parts, bent
+
+
+def _planes(samples: list[Singles], rough: list[Plane], scatter: float) -> list[Plane | None]:
+    """Return the planes of what is flat; None where what lies about a rough plane is not.
+
+    A plane is sought in a slab somewhat thicker than the scatter allowed about it.
+    """
+    gates = np.full(len(samples), scatter + SEARCHED)
+    found = robust_planes(samples, rough, gates)
+    return [None if plane is None or plane.sigma > scatter else plane for plane in found]
+
+
+def _thickness(plane: Plane) -> float:
+    return 3 * plane.sigma + 1e-6
+
+
+def _off(plane: Plane, points: Singles) -> Singles:
+    # Single precision resolves a thousandth of the noise, in a third of the time.
+    level = np.float32(plane.normal @ plane.point)
+    return np.asarray(np.abs(points @ plane.normal.astype(np.float32) - level))
+
+
+def _flattest(piece: Piece, rest: Indices) -> Iterator[Patch]:
+    """Yield the flattest patches of ``rest``, flattest first."""
+    order = rest[np.argsort(piece.patch[rest], kind="stable")]
+    starts = np.flatnonzero(np.diff(piece.patch[order], prepend=-1))
+    sizes = np.diff(starts, append=len(order))
+    middle = piece.points[rest].mean(axis=0, dtype=np.float64)
+    means, variances, normals = _principal(piece.points[order] - middle, starts, sizes)
+    full = np.flatnonzero(sizes >= max(np.median(sizes) / 2, 6))
+    for k in full[np.argsort(variances[full], kind="stable")][:PATCHES]:
+        place = means[k] + middle
+        normal = -normals[k] if normals[k] @ place > 0 else normals[k]
+        members = order[starts[k] : starts[k] + sizes[k]]
+        yield Patch(piece, Plane(place, normal, 0.0), members, rest)
+
+
+def _principal(points: Floats, starts: Indices, sizes: Indices) -> tuple[Floats, Floats, Floats]:
+    """Return means (G, 3), variances off the plane (G,) and normals (G, 3) of groups of points."""
+    means = np.add.reduceat(points, starts) / sizes[:, None]
+    offsets = points - np.repeat(means, sizes, axis=0)
+    scatter = np.add.reduceat(offsets[:, :, None] * offsets[:, None], starts) / sizes[:, None, None]
+    variances, axes = np.linalg.eigh(scatter)
+    return means, variances[:, 0], axes[..., 0]

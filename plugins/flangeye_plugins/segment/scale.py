@@ -1,0 +1,37 @@
+"""Whether a cloud can be in metres at all."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import StageError
+
+FARTHEST, NEAREST = 30.0, 0.01
+"""No scanner for such work sees farther than 30 m or nearer than 10 mm."""
+
+SAMPLE = 100_000
+"""Coordinates that settle the median depth."""
+
+
+def check_scale(xyz: NDArray[np.float32], where: str) -> None:
+    """Refuse a cloud whose median depth cannot be metres.
+
+    Args:
+        xyz: (..., 3) points, a missing one NaN [m].
+        where: Whose cloud it is, for the message.
+
+    Raises:
+        StageError: Says which unit it looks like.
+    """
+    depth = float(np.nanmedian(np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // SAMPLE])))
+    if NEAREST <= depth <= FARTHEST:
+        return
+    looks = (
+        "millimetres read as metres: state unit mm where the clouds are read"
+        if depth > FARTHEST
+        else "metres read as millimetres: state unit m where the clouds are read"
+    )
+    raise StageError(
+        f"capture '{where}': half of the points are {depth:.3g} m away; looks like {looks}"
+    )

@@ -1,0 +1,230 @@
+"""Find a calibration sphere of known size in a scan of the whole cell."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye import Params, stage
+from flangeye.models.targets import Sphere
+from flangeye.types import Capture, FlangeCloud, Floats, Indices, PointCloud, Rejected, Singles
+from flangeye.units import Length, param
+from flangeye_plugins.segment.crop import in_box
+from flangeye_plugins.segment.grid import Grid, coarse_view
+from flangeye_plugins.segment.scale import check_scale
+
+ACROSS = 16
+"""Coarse points across the sphere."""
+
+CELL = 0.15
+"""Width of a voting cell, in radii: several times what noise does to a proposed centre."""
+
+CANDIDATES = 6
+"""Places with the most votes that are looked at more closely."""
+
+ROUNDS = 10
+"""Times that a candidate is moved to fit the points near its surface."""
+
+SEEN_TO = np.sin(np.radians(60.0))
+"""Share of the radius within which, across the view, a scanner sees a sphere well."""
+
+
+class SegmentSphereParams(Params):
+    """Parameters of ``segment.sphere``."""
+
+    near: Length = param("100 mm", ge=0, description="Points nearer to the scanner are left out.")
+    far: Length = param("3 m", gt=0, description="Points farther from the scanner are left out.")
+    min_coverage: float = param(
+        0.4, gt=0, le=1, description="Smallest share of the face it turns to be seen."
+    )
+    tolerance: Length = param(
+        "1 mm", gt=0, description="Largest distance of a coarse point from the sphere's surface."
+    )
+    margin: Length = param("2 mm", gt=0, description="How far off the surface points are kept.")
+
+
+class Candidate(NamedTuple):
+    """A place where the sphere may be.
+
+    Attributes:
+        centre: (3,) [m].
+        seen: Share of the face it turns to the scanner that is there.
+    """
+
+    centre: Floats
+    seen: float
+
+
+@stage("segment.sphere")
+def segment_sphere(
+    capture: Capture, sphere: Sphere, params: SegmentSphereParams
+) -> FlangeCloud | Rejected:
+    """Find a calibration sphere by its size, and cut it out.
+
+    Every bit of surface proposes the point one radius behind it: on the sphere they all propose
+    its centre (a Hough transform). The places with the most votes are compared with the sphere,
+    on a coarse view of the scan; only around the one that fits the full resolution is touched.
+
+    Raises:
+        StageError: The cloud is in millimetres, or otherwise a thousand times off.
+    """
+    view = coarse_view(capture.cloud.xyz, 2 * sphere.radius / ACROSS)
+    if view is None:
+        return Rejected("no finite point")
+    check_scale(view.xyz, capture.id)
+    found = find_spheres(_between(view, params.near, params.far), sphere.radius, params.tolerance)
+    fitting = [candidate for candidate in found if candidate.seen >= params.min_coverage]
+    if len(fitting) != 1:
+        return Rejected(_why_not(found, fitting, sphere, params))
+    centre = fitting[0].centre
+    points = _shell(capture.cloud.xyz, centre, sphere.radius, params.margin)
+    towards = -centre / np.linalg.norm(centre)
+    return FlangeCloud(PointCloud(capture.cloud.frame, points), centre, towards)
+
+
+def find_spheres(view: Grid, radius: float, tolerance: float) -> list[Candidate]:
+    """Return places where a sphere of this radius may be, the best first, none overlapping.
+
+    Args:
+        view: The scene; missing points are NaN.
+        radius: [m].
+        tolerance: Largest distance of a point from the surface [m].
+    """
+    points = view.xyz.reshape(-1, 3).astype(np.float64)
+    votes = points - radius * surface_normals(view.xyz).reshape(-1, 3)
+    votes = votes[np.isfinite(votes[:, 0])]
+    if not len(votes):
+        return []
+    starts = most_voted(votes, CELL * radius, 2 * radius)
+    points = points[np.isfinite(points[:, 2])]
+    found = [_settled(start, points, view.angle, radius, tolerance) for start in starts]
+    return _apart(sorted(found, key=lambda c: -c.seen), 2 * radius)
+
+
+def surface_normals(xyz: Singles) -> Floats:
+    """Return the (H, W, 3) unit normals of a grid of points, towards the scanner; NaN if unknown.
+
+    From the differences of the neighbours to both sides.
+    """
+    points = xyz.astype(np.float64)
+    out = np.full(points.shape, np.nan)
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    across = points[1:-1, 2:] - points[1:-1, :-2]
+    normals = np.cross(down, across)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = normals / np.where(length > 0, length, np.nan)
+    away = np.einsum("ijk,ijk->ij", normals, points[1:-1, 1:-1]) > 0
+    out[1:-1, 1:-1] = np.where(away[..., None], -normals, normals)
+    return out
+
+
+def most_voted(votes: Floats, cell: float, apart: float) -> list[Floats]:
+    """Return the means of the (N, 3) votes where they are densest, at most ``CANDIDATES``.
+
+    Args:
+        votes: (N, 3) [m].
+        cell: Edge of the cells they are counted in; a place is three of them wide [m].
+        apart: Least distance of the places returned [m].
+    """
+    index = np.floor(votes / cell).astype(np.intp)
+    low = index.min(axis=0) - 1  # one empty layer to each side, so that neighbours stay neighbours
+    shape = tuple((index.max(axis=0) - low + 2).tolist())
+    keys, which, counts = np.unique(
+        np.ravel_multi_index(tuple((index - low).T), shape),
+        return_inverse=True,
+        return_counts=True,
+    )
+    cells = np.stack(np.unravel_index(keys, shape), axis=1)
+    total = _with_neighbours(keys, counts, shape)
+    middles = (cells + low + 0.5) * cell
+    places: list[Floats] = []
+    while len(places) < CANDIDATES and total.any():
+        near = (np.abs(cells - cells[np.argmax(total)]) <= 1).all(axis=1)
+        places.append(votes[near[which]].mean(axis=0))
+        total[np.linalg.norm(middles - places[-1], axis=1) < apart] = 0
+    return places
+
+
+def _with_neighbours(keys: Indices, counts: Indices, shape: tuple[int, ...]) -> Indices:
+    """Return the votes of each occupied cell and the 26 around it, given those of each alone."""
+    steps = np.array([shape[1] * shape[2], shape[2], 1])
+    around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
+    total = np.zeros_like(counts)
+    for step in around @ steps:
+        at = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
+        total += np.where(keys[at] == keys + step, counts[at], 0)
+    return total
+
+
+def _settled(
+    start: Floats, points: Floats, angle: float, radius: float, tolerance: float
+) -> Candidate:
+    """Move a candidate to where it fits the points near its surface, and say how many do."""
+    centre, near = start, points[np.linalg.norm(points - start, axis=1) < 1.5 * radius]
+    for gate in np.geomspace(max(0.3 * radius, tolerance), tolerance, ROUNDS):
+        offsets = near - centre
+        distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
+        on_surface = np.abs(distance - radius) < gate
+        if on_surface.sum() < 6:
+            return Candidate(start, 0.0)
+        outwards = offsets[on_surface] / distance[on_surface, None]
+        misfit = distance[on_surface] - radius
+        centre = centre + np.linalg.lstsq(outwards, misfit, rcond=None)[0]
+    return Candidate(centre, _share_seen(centre, near, angle, radius, tolerance))
+
+
+def _share_seen(
+    centre: Floats, near: Floats, angle: float, radius: float, tolerance: float
+) -> float:
+    """Return how much of the face turned to the scanner is there, as a share of what is due.
+
+    Points off that face, before it or behind, speak against a sphere as much as points on it
+    speak for one: a plane or a rounder piece of an arm can touch half of it within a millimetre.
+    """
+    offsets = near - centre
+    along = offsets @ (centre / np.linalg.norm(centre))
+    squared = (offsets**2).sum(axis=1)
+    facing = squared - along**2 < (SEEN_TO * radius) ** 2
+    on_face = (np.abs(np.sqrt(squared) - radius) < tolerance) & (along < 0)
+    for_it, against = (facing & on_face).sum(), (facing & ~on_face).sum()
+    due = np.pi * (SEEN_TO * radius) ** 2 / (angle * np.linalg.norm(centre)) ** 2
+    return float(max(0.0, (for_it - against) / due))
+
+
+def _apart(candidates: list[Candidate], apart: float) -> list[Candidate]:
+    kept: list[Candidate] = []
+    for candidate in candidates:
+        if all(np.linalg.norm(candidate.centre - other.centre) > apart for other in kept):
+            kept.append(candidate)
+    return kept
+
+
+def _between(view: Grid, near: float, far: float) -> Grid:
+    depth = view.xyz[..., 2]
+    between = (depth >= near) & (depth <= far)
+    return view._replace(xyz=np.where(between[..., None], view.xyz, np.float32(np.nan)))
+
+
+def _why_not(
+    found: list[Candidate], fitting: list[Candidate], sphere: Sphere, params: SegmentSphereParams
+) -> str:
+    size = f"{2e3 * sphere.radius:g} mm across"
+    if fitting:
+        places = " and ".join(
+            "(" + ", ".join(f"{c * 1e3:.0f}" for c in candidate.centre) + ") mm"
+            for candidate in fitting
+        )
+        return f"{len(fitting)} spheres {size}: at {places}; hide one or narrow near and far"
+    best = found[0].seen if found else 0.0
+    return (
+        f"no sphere {size}: of the best candidate's face {best:.0%} is there, at least "
+        f"{params.min_coverage:.0%} is needed"
+    )
+
+
+def _shell(xyz: Singles, centre: Floats, radius: float, margin: float) -> Singles:
+    """Return the (n, 3) points of a scan within ``margin`` of the sphere's surface."""
+    near = in_box(xyz.reshape(-1, 3), centre, radius + margin)
+    distance = np.linalg.norm(near - centre, axis=1)
+    return np.asarray(near[np.abs(distance - radius) < margin])

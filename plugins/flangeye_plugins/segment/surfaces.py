@@ -1,0 +1,100 @@
+"""Smooth pieces of surface in a grid of points. Arrays only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.types import Indices, Mask, Singles
+from flangeye_plugins.segment.grid import Grid
+
+NOISE_GATE = 5.0
+"""Robust standard deviations of the grid's own bending above which a point is not smooth."""
+
+SAMPLE = 40_000
+"""Second differences that settle what is typical, to one percent."""
+
+STEEPEST = 1.7
+"""Tangent of the steepest incidence at which a surface is still followed, 60 degrees."""
+
+
+def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
+    """Return where the surface is smooth, (H, W), and the standard deviation of depth [m].
+
+    Steps in depth, creases, mixed pixels and stray points are not smooth: depth does not change
+    evenly there from one neighbour to the next. On a plane it does, however tilted.
+
+    Args:
+        grid: Points in the order of the scanner's view.
+        bend: Second difference of depth that is a crease at least [m].
+    """
+    depth = np.ascontiguousarray(grid.xyz[..., 2])
+    # The second difference of independent values has six times their variance.
+    noise = max(_typical(_bending(depth, axis, 1)) for axis in (0, 1)) / np.sqrt(6)
+    if NOISE_GATE * np.sqrt(6) * noise > bend:
+        depth = _averaged(depth)
+    smooth = np.isfinite(depth)
+    for axis in (0, 1):
+        near, wide = _bending(depth, axis, 1), _bending(depth, axis, 2)
+        limit = max(bend, NOISE_GATE * _typical(wide))
+        # A crease of little slope, or one softened by the scanner, shows over two points.
+        smooth &= ~(np.abs(near) > limit) & ~(np.abs(wide) > limit)
+        # Beside a missing point only the step to the other neighbour can be judged.
+        steep = _step(depth, axis) > limit + STEEPEST * grid.angle * depth
+        smooth &= ~(np.isnan(near) & steep)
+    return smooth, noise
+
+
+def _averaged(depth: Singles) -> Singles:
+    """Return the mean of each point and its neighbours that are there; missing stays missing."""
+    import cv2
+
+    there = np.isfinite(depth)
+    total = cv2.blur(np.where(there, depth, np.float32(0)), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(there.astype(np.float32), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    return np.where(there, total / np.maximum(share, np.float32(0.1)), np.float32(np.nan))
+
+
+def _bending(depth: Singles, axis: int, reach: int) -> Singles:
+    """Return the second difference of depth over ``reach`` points, NaN where one is missing."""
+    out = np.full_like(depth, np.nan)
+    view, target = np.moveaxis(depth, axis, 0), np.moveaxis(out, axis, 0)
+    target[reach:-reach] = view[2 * reach :] + view[: -2 * reach] - 2 * view[reach:-reach]
+    return out
+
+
+def _step(depth: Singles, axis: int) -> Singles:
+    """Return the larger step of depth to the neighbours along an axis; missing ones are none."""
+    out = np.zeros_like(depth)
+    target = np.moveaxis(out, axis, 0)
+    step = np.nan_to_num(np.abs(np.diff(np.moveaxis(depth, axis, 0), axis=0)), copy=False)
+    target[:-1] = step
+    target[1:] = np.maximum(target[1:], step)
+    return out
+
+
+def _typical(values: Singles) -> float:
+    """Return the robust standard deviation of second differences."""
+    sample = np.abs(values.ravel()[:: 1 + values.size // SAMPLE])
+    sample = sample[np.isfinite(sample)]
+    return SIGMA_OF_MAD * float(np.median(sample)) if sample.size else 0.0
+
+
+def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
+    """Yield the flat indices of each connected piece of a mask, the largest first.
+
+    Neighbours share a side: a crease that runs diagonally still separates.
+    """
+    import cv2
+
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        mask.astype(np.uint8), connectivity=4
+    )
+    sizes = stats[:, cv2.CC_STAT_AREA]
+    large = [k for k in range(1, count) if sizes[k] >= fewest]
+    for piece in sorted(large, key=lambda k: (-sizes[k], k)):
+        left, top, width, height = stats[piece, : cv2.CC_STAT_AREA]
+        rows, columns = np.nonzero(labels[top : top + height, left : left + width] == piece)
+        yield (rows + top) * mask.shape[1] + columns + left

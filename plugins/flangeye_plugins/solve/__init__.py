@@ -1,0 +1,1 @@
+"""``solve.*``: solvers as stages; the mathematics is in ``flangeye.handeye``."""

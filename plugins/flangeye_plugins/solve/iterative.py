@@ -1,0 +1,200 @@
+"""The paper's Algorithm 1: a small pool of poses, improved one by one until good enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import BoundPart, CalibrationRefused, Choose, Params, stage
+from flangeye.handeye.observability import (
+    FINEST_NOISE,
+    require_poses,
+    robust_sigma,
+    spread_of,
+)
+from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid
+from flangeye.maths.statistics import covariance_inflation
+from flangeye.models.targets import Flange
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    HandEye,
+    Observation,
+    Observations,
+    PoseError,
+    Transform,
+    TransformEstimate,
+    Views,
+)
+from flangeye.units import Length, param
+from flangeye_plugins.solve.observations import (
+    centres_of,
+    estimate_of,
+    hand_eye,
+    residuals_of,
+    tcps_of,
+)
+
+
+class IterativeParams(Params):
+    """Parameters of ``solve.iterative``."""
+
+    pool: int = Field(4, ge=3, description="Poses the answer is computed from.")
+    required: Length = param(
+        "0.3 mm", ge=0, description="Stop acquiring once the cost is this small."
+    )
+    k_max: int = Field(100, ge=0, description="Poses to try at most, after the first pool.")
+    reserve: int = Field(
+        0, ge=0, description="First poses kept from the pool, for error.holdout to measure on."
+    )
+    error: Annotated[BoundPart, Choose("error")] = param(
+        {"icp": {}}, description="How a candidate's error is measured."
+    )
+    cost: Annotated[BoundPart, Choose("cost")] = param(
+        {"translation": {}}, description="What of that error is minimised."
+    )
+
+
+Evaluate = Callable[[Transform], float]
+"""The cost [m] of a candidate ``base_T_camera``; infinite when it cannot be measured."""
+
+
+@dataclass
+class Search:
+    """The state of the search.
+
+    Attributes:
+        pool: The poses of the best answer so far, the oldest first.
+        cost: Its cost [m]; infinite while no answer could be measured.
+        history: The cost after the first pool and after each pose tried.
+        losers: Pose id -> why it is not in the pool.
+    """
+
+    pool: list[Observation]
+    cost: float
+    history: list[float] = field(default_factory=list)
+    losers: dict[str, str] = field(default_factory=dict)
+
+
+@stage("solve.iterative")
+def solve_iterative(
+    observations: Observations, views: Views | None, flange: Flange | None, params: IterativeParams
+) -> HandEye:
+    """Keep a pool of poses; let each new pose replace the one whose loss helps most.
+
+    Algorithm 1, its errata mended: k advances; a pose enters the pool once; while no pool can be
+    measured (cost +infinity) the oldest pose makes way. It stops pulling observations, and so
+    the arm stops, as soon as the cost is as required.
+
+    The pool is chosen for its cost on the verification data, so that cost says little about
+    other places; ``verify.holdout`` does. The covariance is that of the pool's poses, with the
+    noise taken from all poses seen.
+
+    Raises:
+        StageError: Fewer poses than the pool needs, or nothing to measure a candidate on.
+        CalibrationRefused: No pool could be measured.
+    """
+    stream = iter(observations)
+    kept = list(islice(stream, params.reserve))
+    first = list(islice(stream, params.pool))
+    require_poses(len(kept) + len(first), params.reserve + params.pool)
+
+    def measure(base_T_camera: Transform) -> PoseError | None:
+        found: PoseError | None = params.error(base_T_camera, kept, views or Views(), flange)
+        return found
+
+    def evaluate(base_T_camera: Transform) -> float:
+        error = measure(base_T_camera)
+        return float("inf") if error is None else float(params.cost(error))
+
+    search = improve_pool(first, stream, evaluate, params.required, params.k_max)
+    _require_finite(search, len(observations.seen))
+    answer, notes = solve_pool(search.pool), [_stopped(search, params)]
+    losers = {**search.losers, **{o.id: "kept from the pool to measure on" for o in kept}}
+    estimate = _with_covariance(answer, search.pool, observations.seen)
+    return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes)
+
+
+def improve_pool(
+    first: Sequence[Observation],
+    stream: Iterator[Observation],
+    evaluate: Evaluate,
+    required: float,
+    k_max: int,
+) -> Search:
+    """Run Algorithm 1 from a first pool; pulls from ``stream`` only while it is not good enough."""
+    search = Search(list(first), _cost(first, evaluate))
+    search.history.append(search.cost)
+    while search.cost > required and len(search.history) <= k_max:
+        newcomer = next(stream, None)
+        if newcomer is None:
+            break
+        _try(newcomer, search, evaluate)
+        search.history.append(search.cost)
+    return search
+
+
+def _try(newcomer: Observation, search: Search, evaluate: Evaluate) -> None:
+    """Put the newcomer in the place where it helps most, if it helps (lines 6 to 15)."""
+    pools = [[*search.pool[:i], *search.pool[i + 1 :], newcomer] for i in range(len(search.pool))]
+    costs = [_cost(pool, evaluate) for pool in pools]
+    best = int(np.argmin(costs))
+    if costs[best] < search.cost or np.isinf(search.cost):
+        change = f"{_mm(search.cost)} became {_mm(costs[best])}"
+        search.losers[search.pool[best].id] = f"replaced in the pool by {newcomer.id}: {change}"
+        search.pool, search.cost = pools[best], costs[best]
+    else:
+        search.losers[newcomer.id] = (
+            f"did not help the pool: {_mm(costs[best])} at best instead of {_mm(search.cost)}"
+        )
+
+
+def _cost(pool: Sequence[Observation], evaluate: Evaluate) -> float:
+    """Return the cost of a pool's answer; infinite for poses in line, which give none."""
+    in_line = spread_of(tcps_of(pool)).width < 1e-3
+    return float("inf") if in_line else evaluate(solve_pool(pool))
+
+
+def solve_pool(pool: Sequence[Observation]) -> Transform:
+    """Return ``base_T_camera`` from a pool by equations (8) to (10)."""
+    return Transform(BASE, CAMERA, rigid(*kabsch(centres_of(pool), tcps_of(pool))))
+
+
+def _require_finite(search: Search, seen: int) -> None:
+    if not np.isfinite(search.cost):
+        raise CalibrationRefused(
+            f"no pool of {len(search.pool)} out of {seen} poses could be measured: the error was "
+            "infinite each time; check the verification view and the flange's model, "
+            "or measure with error: holdout"
+        )
+
+
+def _stopped(search: Search, params: IterativeParams) -> str:
+    tried = len(search.history) - 1
+    if search.cost <= params.required:
+        why = "as required"
+    elif tried >= params.k_max:
+        why = f"k_max reached before the required {_mm(params.required)}"
+    else:
+        why = f"no more poses before the required {_mm(params.required)}"
+    return f"cost {_mm(search.cost)} after {tried} poses beyond the first pool: {why}"
+
+
+def _with_covariance(
+    answer: Transform, pool: Sequence[Observation], seen: Sequence[Observation]
+) -> TransformEstimate:
+    residuals = residuals_of(seen, answer.rotation, answer.translation)
+    inflation = covariance_inflation(max(3 * len(seen) - 6, 3))
+    sigma = max(robust_sigma(residuals), FINEST_NOISE) * float(np.sqrt(inflation))
+    tcps = tcps_of(pool)
+    covariance = kabsch_covariance(tcps, sigma)
+    return estimate_of(answer.rotation, answer.translation, covariance, tcps.mean(axis=0))
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.3f} mm" if np.isfinite(metres) else "infinity"

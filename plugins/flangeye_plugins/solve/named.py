@@ -1,0 +1,114 @@
+"""One stage for each closed form of the literature."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye import StageError, stage
+from flangeye.handeye.closed.comanipulation import (
+    FEWEST_KRONECKER,
+    kronecker,
+    two_steps,
+)
+from flangeye.handeye.closed.daniilidis import daniilidis
+from flangeye.handeye.closed.robot_world import li, shah
+from flangeye.handeye.closed.separable import (
+    andreff,
+    horaud_dornaika,
+    park_martin,
+    tsai_lenz,
+)
+from flangeye.handeye.measurements import Loop, Measurements
+from flangeye.handeye.starts import start_of
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import EVERY, Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import Stage
+from flangeye.types import Floats, HandEye, Observations
+from flangeye_plugins.solve.closed_forms import (
+    ClosedForm,
+    ClosedFormParams,
+    by_both,
+    by_motions,
+    by_three,
+    solve_closed,
+)
+
+
+def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:
+    def solve(
+        observations: Observations,
+        params: ClosedFormParams,
+        configuration: Configuration | None = None,
+        robot: RobotModel | None = None,
+    ) -> HandEye:
+        arm = Arm(robot) if robot else None
+        try:
+            return solve_closed(name, solver, list(observations), params, (configuration, arm))
+        except StageError as error:
+            raise StageError(f"{name}: {error}") from None
+
+    solve.__doc__ = documentation
+    return stage(name, serves=EVERY)(solve)
+
+
+def _linear(measurements: Measurements, loop: Loop) -> tuple[Floats, Floats, Floats]:
+    if measurements.are_poses:
+        raise StageError("takes circles, and there are whole poses: use solve.park_martin")
+    found = start_of(measurements, loop, np.random.default_rng(0))
+    return found.x, found.y, found.z
+
+
+CLOSED_FORMS = (
+    _named(
+        "solve.tsai_lenz",
+        by_motions(tsai_lenz),
+        "AX = XB by Tsai & Lenz (1989): rotation by the tangent of half its angle.",
+    ),
+    _named(
+        "solve.park_martin",
+        by_motions(park_martin),
+        "AX = XB by Park & Martin (1994): rotation vectors onto each other.",
+    ),
+    _named(
+        "solve.horaud_dornaika",
+        by_motions(horaud_dornaika),
+        "AX = XB by Horaud & Dornaika (1995): the unit quaternion.",
+    ),
+    _named(
+        "solve.andreff",
+        by_motions(andreff),
+        "AX = XB by Andreff, Horaud & Espiau (1999): linear, with Kronecker products.",
+    ),
+    _named(
+        "solve.daniilidis",
+        by_motions(daniilidis),
+        "AX = XB by Daniilidis (1999): rotation and translation at once, by dual quaternions.",
+    ),
+    _named(
+        "solve.shah",
+        by_both(shah),
+        "AX = ZB by Shah (2013): both rotations by singular vectors, then both translations.",
+    ),
+    _named(
+        "solve.li",
+        by_both(li),
+        "AX = ZB by Li, Wang & Wu (2010): one linear system for both transforms.",
+    ),
+    _named(
+        "solve.kronecker",
+        by_three(kronecker, FEWEST_KRONECKER),
+        "AXB = YCZ of two arms, linear in products of the rotations' entries; 12 poses or more.",
+    ),
+    _named(
+        "solve.two_steps",
+        by_three(two_steps, needed=6),
+        "AXB = YCZ of two arms by the paper's (6): one rests while the other moves.",
+    ),
+    _named(
+        "solve.linear",
+        _linear,
+        "Circles in any configuration, by linear least squares: no noise model, no outliers.",
+    ),
+)
+"""The stages."""

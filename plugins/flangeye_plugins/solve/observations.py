@@ -1,0 +1,69 @@
+"""From observations to arrays, and from arrays to a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    Floats,
+    HandEye,
+    Observation,
+    Pair,
+    Transform,
+    TransformEstimate,
+)
+
+
+def centres_of(observations: Sequence[Observation]) -> Floats:
+    """Return the (N, 3) circle centres in ``camera`` [m]."""
+    return np.array([o.circle.centre for o in observations]).reshape(-1, 3)
+
+
+def tcps_of(observations: Sequence[Observation]) -> Floats:
+    """Return the (N, 3) flange centres the controller reports, in ``base`` [m]."""
+    return np.array([o.tcp_in_base for o in observations]).reshape(-1, 3)
+
+
+def residuals_of(observations: Sequence[Observation], rotation: Floats, shift: Floats) -> Floats:
+    """Return the (N, 3) measured centres, mapped to ``base``, minus the TCPs [m]."""
+    return np.asarray(centres_of(observations) @ rotation.T + shift - tcps_of(observations))
+
+
+def estimate_of(
+    rotation: Floats, translation: Floats, covariance: Floats, about: Floats
+) -> TransformEstimate:
+    """Return ``base_T_camera`` with its (6, 6) covariance about a point in ``base``."""
+    transform = Transform(BASE, CAMERA, rigid(rotation, translation))
+    return TransformEstimate(transform, 0.5 * (covariance + covariance.T), about)
+
+
+def hand_eye(
+    observations: Sequence[Observation],
+    estimate: TransformEstimate,
+    method: str,
+    rejected: Mapping[str, str] | None = None,
+    notes: Sequence[str] = (),
+) -> HandEye:
+    """Return the calibration with one pair for each observation, in the order given.
+
+    Args:
+        observations: Everything the solver pulled.
+        estimate: The camera's pose.
+        method: Name of the stage.
+        rejected: Observation id -> why it took no part.
+        notes: For the person.
+    """
+    rejected = rejected or {}
+    residuals = residuals_of(
+        observations, estimate.transform.rotation, estimate.transform.translation
+    )
+    pairs = [
+        Pair(o, residual, o.id not in rejected, rejected.get(o.id))
+        for o, residual in zip(observations, residuals, strict=True)
+    ]
+    return HandEye(estimate, tuple(pairs), method, tuple(notes))

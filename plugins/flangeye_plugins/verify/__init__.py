@@ -1,0 +1,1 @@
+"""``verify.*``: whether a calibration may be used."""

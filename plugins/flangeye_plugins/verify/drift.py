@@ -1,0 +1,54 @@
+"""``verify.drift``: the run's own sightings against an earlier calibration of the same cell."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, stage
+from flangeye.doctor.monitor import stored_calibration
+from flangeye.files.paths import RecipePath
+from flangeye.handeye.drift import DriftTest, information_of, verdict
+from flangeye.types import HandEye, Verification
+from flangeye.units import Length, param
+
+
+class DriftParams(Params):
+    """Parameters of ``verify.drift``."""
+
+    reference: RecipePath = Field(description="The run.mcap of the earlier calibration.")
+    limit: Length = param("0.4 mm", gt=0, description="The work may not be further off than this.")
+    false_alarms: float = Field(
+        2e-4, gt=0, lt=0.1, description="Probability that a cell that did not move is refused."
+    )
+
+
+@stage("verify.drift")
+def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
+    """Say whether the scanner still stands where an earlier calibration found it.
+
+    The poses that this run used are held against the earlier matrix and its covariance. It fails
+    when the cell has moved, so that a robot program with the old matrix is stopped; this run's own
+    matrix is the cure. ``flangeye monitor`` does the same from check to check, and remembers.
+
+    Figures [m, rad]: ``shift`` of the work at its worst corner, ``turn`` of the scanner, and
+    ``statistic``, the likelihood ratio over its threshold.
+
+    Raises:
+        StageError: The reference holds no calibration of a camera beside a robot.
+    """
+    stored = stored_calibration(params.reference)
+    seen = [pair.observation for pair in calibration.pairs if pair.used]
+    sightings = stored.sightings(seen, np.zeros(len(seen), dtype=np.intp))
+    test = DriftTest(false_alarms=params.false_alarms, limit=params.limit)
+    told = information_of(sightings, test.daily)
+    found = verdict(told, stored.estimate.covariance, stored.corners, test)
+    shift = f"{found.shift * 1e3:.2f} mm at the work's worst corner"
+    figures = {
+        "shift": found.shift,
+        "turn": float(np.linalg.norm(found.motion[:3])),
+        "statistic": found.statistic,
+    }
+    if found.state == "OK":
+        return Verification(True, f"the cell stands where {stored.path} found it", figures)
+    return Verification(False, f"the cell has moved since {stored.path}, by {shift}", figures)

@@ -1,0 +1,206 @@
+"""The paper's own check, equation (11): the flange as it was seen against the flange as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.files.clouds import LengthUnit
+from flangeye.files.paths import RecipePath
+from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.geometry import rotation_from_rpy, rotation_log, rpy_from_rotation
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.targets import Flange
+from flangeye.types import (
+    Floats,
+    HandEye,
+    PoseError,
+    Transform,
+    Verification,
+    VerificationView,
+    Views,
+)
+from flangeye.units import Angle, Length, param
+from flangeye_plugins.verify.registration import Registration, register
+from flangeye_plugins.verify.surface import Surface, read_surface, surface_of
+
+
+class CadCloud(Params):
+    """A point cloud of the flange's CAD model."""
+
+    file: RecipePath = Field(
+        description="PCD, PLY, XYZ, CSV or NPY; rows that are not finite are left out."
+    )
+    unit: LengthUnit = Field(description="Unit of the file's coordinates.")
+    offset: tuple[Length, Length, Length] = param(
+        ("0 mm", "0 mm", "0 mm"), description="Origin of the file's frame in the flange's."
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "0 deg"), description="Roll, pitch, yaw of the file's frame."
+    )
+
+
+class IcpSettings(Params):
+    """What every comparison with the flange's shape needs."""
+
+    cad: CadCloud | None = Field(
+        None, description="The flange's shape; by default made from its dimensions."
+    )
+    reach: Length = param("20 mm", gt=0, description="How far off a calibration may be for ICP.")
+    distance: Length = param(
+        "1 mm", gt=0, description="Points further from the surface are not the flange, in the end."
+    )
+
+
+class IcpParams(IcpSettings):
+    """Parameters of ``verify.icp``."""
+
+    max_translation: Length = param(
+        "1 mm", gt=0, description="Largest translation error at the flange that passes."
+    )
+    max_tilt: Angle = param("1 deg", gt=0, description="Largest error of its axis that passes.")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One verification view against the flange's shape.
+
+    Attributes:
+        error: What takes the seen flange onto the predicted one, in ``camera``.
+        registration: The same in ``flange``, with the fit.
+    """
+
+    error: PoseError
+    registration: Registration
+
+
+@stage("verify.icp")
+def verify_icp(
+    calibration: HandEye,
+    views: Views,
+    flange: Flange,
+    params: IcpParams,
+    robot: RobotModel | None = None,
+) -> Verification:
+    """Register the flange seen in each verification view with its shape, point to plane.
+
+    Equation (11) with its subscripts mended: the shape is predicted in ``camera`` as
+    ``inverse(base_T_camera) @ base_T_flange @ shape``, and the motion that takes the measured
+    cloud onto it is the error; it is infinite when ICP fails. The view with the largest
+    translation counts.
+
+    Figures [m, rad], all in ``camera``: ``x, y, z`` at the flange, where the view was taken;
+    ``camera_x, camera_y, camera_z`` at the camera's origin, as the paper prints them: there
+    every rotation error counts times the distance. ``roll, pitch, yaw``; ``tilt`` of the axis and
+    ``clocking`` about it (present when the shape shows it; it speaks of the flange's own turn
+    as much as of the calibration); ``rms`` and ``overlap`` of the fit; ``views``.
+
+    Raises:
+        StageError: There is no verification view.
+    """
+    surface = shape_of(flange, params)
+    transform = calibration.base_T_camera.transform
+    expected = [_corrected(view, calibration, robot) for view in require_views(views)]
+    found = {view.id: compare(transform, view, surface, params) for view in expected}
+    failed = [f"view {view}: {why}" for view, why in found.items() if isinstance(why, str)]
+    if failed:
+        return Verification(False, f"ICP failed, the error is infinite: {'; '.join(failed)}", {})
+    compared = {view: seen for view, seen in found.items() if isinstance(seen, Comparison)}
+    return _judge(compared, params)
+
+
+def require_views(views: Views) -> Views:
+    """Return the views, if there are any.
+
+    Raises:
+        StageError: Says how to get one.
+    """
+    if not views:
+        raise StageError(
+            "no verification view: let the acquire step mark one or more captures as "
+            "verification captures, or use verify.holdout, which needs none"
+        )
+    return views
+
+
+def _corrected(
+    view: VerificationView, calibration: HandEye, robot: RobotModel | None
+) -> VerificationView:
+    """Return the view at the pose the calibration expects: as reported, or corrected."""
+    arm = Arm(robot) if robot else None
+    pose = corrected_flange(
+        view.base_T_flange.matrix, None, calibration.as_reported().correction, arm
+    )
+    return replace(view, base_T_flange=replace(view.base_T_flange, matrix=pose))
+
+
+def shape_of(flange: Flange, settings: IcpSettings) -> Surface:
+    """Return the flange's surface: from its CAD cloud when given, else from its dimensions.
+
+    Raises:
+        StageError: The CAD cloud cannot be read.
+    """
+    return surface_of(flange) if settings.cad is None else _read(settings.cad)
+
+
+@lru_cache(maxsize=4)
+def _read(cad: CadCloud) -> Surface:
+    """Read a CAD cloud once: solvers ask for it for every candidate."""
+    return read_surface(cad.file, cad.unit, rotation_from_rpy(*cad.rpy), np.array(cad.offset))
+
+
+def compare(
+    base_T_camera: Transform, view: VerificationView, surface: Surface, settings: IcpSettings
+) -> Comparison | str:
+    """Register one view with the surface, or say why ICP failed."""
+    camera_T_flange = base_T_camera.inverse() @ view.base_T_flange
+    measured = camera_T_flange.inverse().apply(view.flange.cloud.points())
+    found = register(measured, surface, settings.reach, settings.distance)
+    if isinstance(found, str):
+        return found
+    predicted = camera_T_flange.matrix
+    motion = predicted @ found.motion @ np.linalg.inv(predicted)
+    return Comparison(PoseError(motion, predicted[:3, 3], base_T_camera.rotation), found)
+
+
+def _judge(compared: Mapping[str, Comparison], params: IcpParams) -> Verification:
+    figures = {view: _figures(comparison) for view, comparison in compared.items()}
+    errors = {view: found["translation"] for view, found in figures.items()}
+    worst = max(errors, key=lambda view: errors[view])
+    tilt = max(found["tilt"] for found in figures.values())
+    passed = errors[worst] <= params.max_translation and tilt <= params.max_tilt
+    reason = (
+        f"the flange is {errors[worst] * 1e3:.3f} mm and {np.degrees(tilt):.3f} deg from where it "
+        f"should be, {'within' if passed else 'beyond'} the limits of "
+        f"{params.max_translation * 1e3:g} mm and {np.degrees(params.max_tilt):g} deg"
+    )
+    return Verification(passed, reason, {**figures[worst], "views": float(len(errors))}, errors)
+
+
+def _figures(comparison: Comparison) -> dict[str, float]:
+    error, fit = comparison.error, comparison.registration
+    at_flange = error.motion[:3, :3] @ error.at + error.motion[:3, 3] - error.at
+    turn = rotation_log(fit.motion[:3, :3])  # in the flange's frame: its axis is z
+    figures = {
+        **dict(zip("xyz", at_flange.tolist(), strict=True)),
+        "translation": float(np.linalg.norm(at_flange)),
+        **dict(
+            zip(("camera_x", "camera_y", "camera_z"), error.motion[:3, 3].tolist(), strict=True)
+        ),
+        "camera_translation": float(np.linalg.norm(error.motion[:3, 3])),
+        **_roll_pitch_yaw(error.motion[:3, :3]),
+        "tilt": float(np.linalg.norm(turn[:2])),
+        "rms": fit.rms,
+        "overlap": fit.overlap,
+    }
+    return {**figures, "clocking": float(turn[2])} if fit.roll_seen else figures
+
+
+def _roll_pitch_yaw(rotation: Floats) -> dict[str, float]:
+    return dict(zip(("roll", "pitch", "yaw"), rpy_from_rotation(rotation).tolist(), strict=True))

@@ -1,0 +1,89 @@
+"""``verify.sphere``: distances between places of one target, by the scanner and by the arm."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.types import Floats, HandEye, Verification
+from flangeye.units import Length, param
+
+
+class SphereParams(Params):
+    """Parameters of ``verify.sphere``."""
+
+    max_error: Length = param(
+        "1 mm", gt=0, description="Largest error of a distance that passes, 95 % of the pairs."
+    )
+    shortest: Length = param(
+        "50 mm", gt=0, description="Pairs nearer than this say nothing of scale."
+    )
+    fewest: int = Field(10, ge=3, description="Pairs that are needed.")
+
+
+@stage("verify.sphere")
+def verify_sphere(
+    calibration: HandEye, params: SphereParams, robot: RobotModel | None = None
+) -> Verification:
+    """Compare distances between places of the target on the flange, seen and driven.
+
+    After the manner of the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13, with the arm in
+    place of a calibrated ball bar; it is not that test. The target is a ball on the flange
+    (``fit.sphere``), or the flange's own circle. Distances do not depend on the matrix: it can show
+    a scanner or an arm of the wrong scale and a scanner that is bent, and cannot show a wrong
+    matrix. Which of scanner and arm is wrong it cannot tell.
+
+    Figures [m]: ``pairs``, ``rms``, ``p95`` and ``max`` of the errors of distance, ``mean``, and
+    ``scale``: the seen distances over the driven ones, less one.
+
+    Raises:
+        StageError: Too few pairs are far enough apart.
+    """
+    used = [pair for pair in calibration.pairs if pair.used]
+    seen = np.array([pair.observation.feature.centre for pair in used]).reshape(-1, 3)
+    driven = _driven(calibration, Arm(robot) if robot else None)
+    first, second = np.triu_indices(len(used), 1)
+    lengths = np.linalg.norm(driven[first] - driven[second], axis=1)
+    apart = lengths >= params.shortest
+    if apart.sum() < params.fewest:
+        raise StageError(
+            f"verify.sphere: {int(apart.sum())} pairs of poses are {params.shortest * 1e3:g} mm or "
+            f"more apart, {params.fewest} are needed: take poses that lie further apart"
+        )
+    measured = np.linalg.norm(seen[first] - seen[second], axis=1)[apart]
+    lengths = lengths[apart]
+    figures = _figures(measured - lengths, measured, lengths)
+    passed = figures["p95"] <= params.max_error
+    sign = "within" if passed else "above"
+    reason = (
+        f"95 % of {figures['pairs']:.0f} distances agree to {figures['p95'] * 1e3:.3f} mm, {sign} "
+        f"the limit of {params.max_error * 1e3:g} mm; scale {figures['scale'] * 1e6:+.0f} ppm"
+    )
+    return Verification(passed, reason, figures)
+
+
+def _driven(calibration: HandEye, arm: Arm | None) -> Floats:
+    """Return (N, 3) where the arm had the target, as the calibration corrects it."""
+    out = []
+    for pair in calibration.pairs:
+        if pair.used:
+            o = pair.observation
+            pose = corrected_flange(o.base_T_flange.matrix, o.joints, calibration.correction, arm)
+            out.append(pose[:3, :3] @ o.centre_in_mount + pose[:3, 3])
+    return np.array(out).reshape(-1, 3)
+
+
+def _figures(errors: Floats, measured: Floats, lengths: Floats) -> dict[str, float]:
+    sizes = np.abs(errors)
+    return {
+        "pairs": float(len(errors)),
+        "rms": float(np.sqrt(np.mean(errors**2))),
+        "mean": float(errors.mean()),
+        "p95": float(np.quantile(sizes, 0.95)),
+        "max": float(sizes.max()),
+        "scale": float(measured @ lengths / (lengths @ lengths) - 1),
+    }

@@ -1,0 +1,115 @@
+"""``verify.stitch``: every view of the flange laid over the others, in the flange's own frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.types import Floats, HandEye, Image, Journal, Verification, Views
+from flangeye.units import Length, param
+
+CELLS = 48
+"""Across the flange, in the map and its picture."""
+
+
+class StitchParams(Params):
+    """Parameters of ``verify.stitch``."""
+
+    max_spread: Length = param("0.5 mm", gt=0, description="Largest spread that passes, rms.")
+    fewest: int = Field(5, ge=1, description="Points of a view in a cell for it to count.")
+
+
+@stage("verify.stitch")
+def verify_stitch(
+    calibration: HandEye,
+    views: Views,
+    params: StitchParams,
+    robot: RobotModel | None = None,
+    journal: Journal | None = None,
+) -> Verification:
+    """Lay the clouds of all verification views over each other, and measure how they spread.
+
+    It can show that the views disagree: rotation errors of the matrix, the arm's errors from pose
+    to pose, a bent scanner. It cannot show an error that all views share, such as a shift of the
+    matrix while the flange keeps its orientation, and heights alone do not show a slide in the
+    plane; ``slide`` is that of the clouds' centres.
+
+    Figures [m]: ``spread`` of the heights between views, rms over places that two or more saw;
+    ``p95`` and ``max`` of them; ``slide`` of the clouds' middles in the plane, rms; ``views``.
+    A picture of the spread, blue none and red the limit, is in the log as ``spread``.
+
+    Raises:
+        StageError: There are fewer than two verification views, or no place was seen twice.
+    """
+    if len(views) < 2:
+        raise StageError(
+            f"verify.stitch: {len(views)} verification views, two are needed: let the acquire step "
+            "mark captures as verification captures"
+        )
+    clouds = _in_flange(calibration, views, Arm(robot) if robot else None)
+    spread = _spread(clouds, params.fewest)
+    seen = spread[np.isfinite(spread)]
+    if not len(seen):
+        raise StageError("verify.stitch: no place of the flange was seen in two views")
+    middles = np.array([np.median(cloud[:, :2], axis=0) for cloud in clouds])
+    slides = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
+    figures = {
+        "views": float(len(views)),
+        "spread": float(np.sqrt(np.mean(seen**2))),
+        "p95": float(np.quantile(seen, 0.95)),
+        "max": float(seen.max()),
+        "slide": float(np.sqrt(np.mean(slides**2))),
+    }
+    if journal:
+        journal("spread", _picture(spread, params.max_spread))
+    passed = max(figures["spread"], figures["slide"]) <= params.max_spread
+    sign = "within" if passed else "above"
+    reason = (
+        f"{len(views)} views spread by {figures['spread'] * 1e3:.3f} mm rms in height and "
+        f"{figures['slide'] * 1e3:.3f} mm in the plane, {sign} {params.max_spread * 1e3:g} mm"
+    )
+    errors = {view.id: float(s) for view, s in zip(views, slides, strict=True)}
+    return Verification(passed, reason, figures, errors)
+
+
+def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floats]:
+    """Return each view's points (N, 3) in the flange, as the calibration has it."""
+    camera, out = calibration.base_T_camera.transform.matrix, []
+    for view in views:
+        flange = corrected_flange(view.base_T_flange.matrix, None, calibration.correction, arm)
+        move = np.linalg.inv(flange) @ camera
+        out.append(view.flange.cloud.points() @ move[:3, :3].T + move[:3, 3])
+    return out
+
+
+def _spread(clouds: list[Floats], fewest: int) -> Floats:
+    """Return (CELLS, CELLS) the standard deviation of heights between views, NaN where unseen."""
+    reach = max(float(np.quantile(np.linalg.norm(c[:, :2], axis=1), 0.98)) for c in clouds)
+    heights = np.stack([_heights(cloud, reach, fewest) for cloud in clouds])
+    seen = np.isfinite(heights)
+    count = seen.sum(axis=0)
+    filled = np.where(seen, heights, 0.0)
+    mean = filled.sum(axis=0) / np.maximum(count, 1)
+    squares = np.where(seen, (heights - mean) ** 2, 0.0).sum(axis=0)
+    return np.where(count >= 2, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
+
+
+def _heights(cloud: Floats, reach: float, fewest: int) -> Floats:
+    at = np.clip(((cloud[:, :2] / reach + 1) / 2 * CELLS).astype(np.intp), 0, CELLS - 1)
+    cell = at[:, 1] * CELLS + at[:, 0]
+    count = np.bincount(cell, minlength=CELLS**2)
+    total = np.bincount(cell, weights=cloud[:, 2], minlength=CELLS**2)
+    return np.where(count >= fewest, total / np.maximum(count, 1), np.nan).reshape(CELLS, CELLS)
+
+
+def _picture(spread: Floats, limit: float) -> Image:
+    share = np.clip(np.nan_to_num(spread) / limit, 0, 1)
+    colour = np.stack([share, 0.3 * (1 - share), 1 - share], axis=-1)
+    colour[~np.isfinite(spread)] = 1.0
+    pixels: NDArray[np.uint8] = (255 * colour).astype(np.uint8)
+    return Image(np.kron(pixels, np.ones((6, 6, 1), np.uint8)), np.eye(3))

@@ -1,0 +1,81 @@
+"""``verify.touch``: points that the scanner saw and a tip was jogged to."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, stage
+from flangeye.maths.geometry import covariance_at, rigid, rotation_from_rpy
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.types import Floats, HandEye, Verification
+from flangeye.units import Angle, Length, param
+
+
+class Touch(Params):
+    """One point, seen and touched."""
+
+    seen: tuple[Length, Length, Length] = Field(description="In the camera, from a scan.")
+    position: tuple[Length, Length, Length] = Field(
+        description="Of the flange in the base, as the pendant shows it with the tip on the point."
+    )
+    rpy: tuple[Angle, Angle, Angle] = Field(description="Of the flange: roll, pitch, yaw.")
+
+
+class TouchParams(Params):
+    """Parameters of ``verify.touch``."""
+
+    tip: tuple[Length, Length, Length] = Field(
+        description="Of the tool, in the flange frame: as its own calibration has it."
+    )
+    touches: tuple[Touch, ...] = Field(
+        min_length=1, description="Three or more at different places and heights tell most."
+    )
+    accuracy: Length = param(
+        "0.2 mm", gt=0, description="Standard deviation a coordinate of jogging to a point by eye."
+    )
+    max_error: Length = param("1 mm", gt=0, description="Largest distance that passes.")
+
+
+@stage("verify.touch")
+def verify_touch(calibration: HandEye, params: TouchParams) -> Verification:
+    """Compare where the matrix puts seen points with where a tip touched them.
+
+    It can show that scanner, matrix, arm and tip agree at these places, which is what the work
+    needs. It cannot tell which of them is wrong when they do not, nor anything finer than the eye
+    of who jogged, nor what happens far from the touched points.
+
+    Figures [m]: ``rms``, ``max``, ``x, y, z`` of the mean error in base (a tip that is wrong shows
+    here too), and ``explained``: the share of points within what the covariance and the jogging
+    allow with 95 %.
+    """
+    estimate = calibration.base_T_camera
+    predicted = estimate.transform.apply(np.array([t.seen for t in params.touches]))
+    errors = predicted - np.array([_touched(t, params.tip) for t in params.touches])
+    known = covariance_at(estimate.covariance, estimate.about, predicted)
+    known += params.accuracy**2 * np.eye(3)
+    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(known, errors[..., None])[..., 0])
+    lengths = np.linalg.norm(errors, axis=1)
+    figures = {
+        "points": float(len(errors)),
+        "rms": float(np.sqrt(np.mean(lengths**2))),
+        "max": float(lengths.max()),
+        **dict(zip("xyz", errors.mean(axis=0).tolist(), strict=True)),
+        "explained": float(np.mean(squares <= chi2_quantile(0.95, 3))),
+    }
+    per_point = {f"touch {i + 1}": float(length) for i, length in enumerate(lengths)}
+    passed = figures["max"] <= params.max_error
+    return Verification(passed, _told(figures, params.max_error, passed), figures, per_point)
+
+
+def _touched(touch: Touch, tip: tuple[float, float, float]) -> Floats:
+    flange = rigid(rotation_from_rpy(*touch.rpy), np.array(touch.position))
+    return np.asarray(flange[:3, :3] @ np.array(tip) + flange[:3, 3])
+
+
+def _told(figures: dict[str, float], limit: float, passed: bool) -> str:
+    sign = "within" if passed else "above"
+    return (
+        f"{figures['points']:.0f} touched points are {figures['max'] * 1e3:.2f} mm off at most, "
+        f"{sign} the limit of {limit * 1e3:g} mm"
+    )

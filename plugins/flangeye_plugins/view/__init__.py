@@ -1,0 +1,1 @@
+"""``view.*``: first guesses of the scanner pose, for planning."""

@@ -1,0 +1,100 @@
+"""What is guessed of the scanner's place before the first scan: enough to plan poses in view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.plugin.stage import Params, part
+from flangeye.types import Floats
+from flangeye.units import Angle, Length, param
+
+WIDEST = 0.6
+"""Axes of shown flanges are farther apart than this [rad]: they do not look at one scanner."""
+
+
+class GuessParams(Params):
+    """Parameters of ``view.guess``."""
+
+    position: tuple[Length, Length, Length] = Field(description="Of the scanner, in the base.")
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
+    )
+
+
+@part("view.guess")
+def view_guess(arm: Arm, scanner: ScannerModel, params: GuessParams) -> Floats:
+    """Take the person's guess of where the scanner stands: a tape measure is good enough.
+
+    Returns:
+        (4, 4) base_T_camera.
+    """
+    return rigid(rotation_from_rpy(*params.rpy), np.asarray(params.position))
+
+
+class ShownParams(Params):
+    """Parameters of ``view.shown``."""
+
+    joints: tuple[tuple[Angle, ...], ...] = Field(
+        min_length=3,
+        description="Joint angles of three or more poses at which the flange faces the scanner, "
+        "as the pendant shows them.",
+    )
+
+
+@part("view.shown")
+def view_shown(arm: Arm, scanner: ScannerModel, params: ShownParams) -> Floats:
+    """Find the scanner from poses a person drove to, each with the flange facing the scanner.
+
+    The scanner stands where the flanges' axes come closest to one another; where they are nearly
+    parallel, ahead of the flanges' middle by the distance it works at. Its turn about the view is
+    not known, and not needed: poses are planned within the smaller of its two angles of view.
+
+    Returns:
+        (4, 4) base_T_camera.
+
+    Raises:
+        StageError: The poses do not fit the arm, or do not look at one place.
+    """
+    flanges = _flanges(arm, params.joints)
+    places, axes = flanges[:, :3, 3], flanges[:, :3, 2]
+    mean = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
+    apart = float(np.arccos(np.clip(axes @ mean, -1.0, 1.0)).max())
+    if apart > WIDEST:
+        raise StageError(
+            f"view.shown: one of the flanges looks {np.degrees(apart):.0f} deg away from the "
+            f"others' middle, allowed {np.degrees(WIDEST):.0f} deg; show poses that face the "
+            "scanner"
+        )
+    middle = places.mean(axis=0)
+    distance = float(np.linalg.norm(middle_of_view(scanner, np.eye(4))))
+    eye = _nearest_to_axes(places, axes, middle + distance * mean)
+    view = (middle - eye) / np.linalg.norm(middle - eye)
+    x, y, _ = basis_of_plane(view)
+    return rigid(np.stack([x, y, view], axis=1), eye)
+
+
+def _flanges(arm: Arm, joints: Sequence[Sequence[float]]) -> Floats:
+    lengths = {len(row) for row in joints}
+    if lengths != {arm.n}:
+        raise StageError(
+            f"view.shown: a pose has {' or '.join(map(str, sorted(lengths)))} joint angles, "
+            f"the arm {arm.n} joints"
+        )
+    return arm.flange(np.array(joints))
+
+
+def _nearest_to_axes(places: Floats, axes: Floats, expected: Floats) -> Floats:
+    """Return the point (3,) nearest to lines (N, 3), pulled weakly to where it is expected."""
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    pull = 0.01 * len(places)
+    normal = across.sum(axis=0) + pull * np.eye(3)
+    return np.asarray(
+        np.linalg.solve(normal, (across @ places[:, :, None]).sum(axis=0)[:, 0] + pull * expected)
+    )

@@ -1,0 +1,159 @@
+"""What is checked before anything moves; every refusal says what to change."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.devices import RobotDriver
+from flangeye.errors import StageError
+from flangeye.maths.seam_geometry import tube_radii
+from flangeye.models.finger import Finger
+from flangeye.motion.limits import MotionLimits
+from flangeye.types import Floats, Seam
+from flangeye_plugins.weld.belief import LIMIT, Belief
+from flangeye_plugins.weld.controller import Controller, SimulationOnly
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.reachability import flange_speed
+from flangeye_plugins.weld.settings import Following
+
+LEAN = np.deg2rad(15.0)
+"""The groove's opening may lean from the plane's normal by this much; the tool stays upright."""
+
+SLOPE = np.deg2rad(10.0)
+"""Largest climb of a seam in its plane."""
+
+CROOKED = np.deg2rad(60.0)
+"""Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
+
+
+SEATING = 1.4
+"""The preload holds the tip in the groove by so much more than the deflection pushes it out."""
+
+
+def check_finger(finger: Finger, settings: Following) -> None:
+    """Refuse a deflection that the finger does not stand, or a force beyond the limit.
+
+    Raises:
+        StageError: Which, and what is allowed.
+    """
+    asked = max(settings.deflection, settings.preload)
+    if asked > finger.travel:
+        raise StageError(
+            f"weld.tactile: a deflection of {asked * 1e3:.3g} mm is more than finger "
+            f"{finger.model} stands, {finger.travel * 1e3:.3g} mm"
+        )
+    force = finger.force(np.array([0.0, settings.deflection, settings.preload]))
+    if force is not None and force > settings.force:
+        raise StageError(
+            f"weld.tactile: deflection and preload press with {force:.2g} N, allowed are "
+            f"{settings.force:.2g} N; lower them, or raise 'force'"
+        )
+
+
+def check_controller(controller: Controller, driver: RobotDriver) -> None:
+    """Refuse a controller that must not move a real arm.
+
+    Raises:
+        StageError: The driver does not declare that its arm is simulated.
+    """
+    if isinstance(controller, SimulationOnly) and not driver.simulated:
+        raise StageError(
+            f"weld.tactile: mode {controller.mode} is known to diverge and runs on a simulated arm "
+            f"only, {driver.name} is none; use mode: tactile"
+        )
+
+
+def check_belief(belief: Belief, settings: Following) -> None:
+    """Refuse a tip that would climb its wall, and a torch that is not known well enough.
+
+    Raises:
+        StageError: Which, and what would do.
+    """
+    holding = belief.seating(settings)
+    if holding is not None and holding < SEATING:
+        raise StageError(
+            "weld.tactile: the tip would climb the wall: the preload holds it with "
+            f"{holding:.2f} times what the deflection pushes with, {SEATING} is asked for; lower "
+            f"'deflection' to {settings.deflection * holding / SEATING * 1e3:.2f} mm or raise "
+            f"'preload' to {settings.preload * SEATING / holding * 1e3:.1f} mm"
+        )
+    bound = LIMIT * float(np.sqrt(belief.fixed_variance(settings)))
+    if bound > settings.max_error:
+        raise StageError(
+            f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best ({LIMIT:.0f} sigma "
+            "of torch_sigma in the finger's file, of arm_sigma and of distortion), max_error is "
+            f"{settings.max_error * 1e3:.3g} mm; calibrate the tool, or raise 'max_error'"
+        )
+
+
+def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> None:
+    """Refuse a seam that this tool cannot follow.
+
+    Raises:
+        StageError: Too short, steep, curved, or uncertain.
+    """
+    used = settings.inset + settings.ending
+    used += settings.speed * settings.deflection / settings.release
+    if plan.length <= used:
+        raise StageError(
+            f"weld.tactile: the seam is {plan.length * 1e3:.0f} mm long; inset, ending and release "
+            f"alone take {used * 1e3:.0f} mm"
+        )
+    mean = seam.openings_in_base.mean(axis=0)
+    lean = float(
+        np.arccos(np.clip(seam.openings_in_base @ mean / np.linalg.norm(mean), -1, 1).min())
+    )
+    steep = float(np.arctan(np.abs(np.gradient(plan.points[:, 2], plan.step))).max())
+    if lean > LEAN or steep > SLOPE:
+        raise StageError(
+            f"weld.tactile: the seam leaves its plane: it climbs by {np.degrees(steep):.0f} deg "
+            f"(allowed {np.degrees(SLOPE):.0f}), its opening turns by {np.degrees(lean):.0f} deg "
+            f"(allowed {np.degrees(LEAN):.0f}); the tool is not tilted on the way"
+        )
+    crooked = float(np.abs(tool_angles(plan, finger.torch)).max())
+    if crooked > CROOKED:
+        raise StageError(
+            f"weld.tactile: the seam is too curved for a torch {finger.torch * 1e3:.0f} mm behind "
+            f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
+            f"{np.degrees(CROOKED):.0f}"
+        )
+    fault = float(tube_radii(seam)[0])
+    if fault > settings.reach:
+        raise StageError(
+            f"weld.tactile: the plan's start is uncertain by {fault * 1e3:.1f} mm, and the groove "
+            f"is sought within {settings.reach * 1e3:.1f} mm; plan better, or raise 'reach'"
+        )
+
+
+def tool_angles(plan: Path, distance: float) -> Floats:
+    """Return the tool's angles to the seam at the torch [rad], with tip and torch on the plan."""
+    ahead = np.arange(distance, plan.length + distance, 1e-3)
+    tips, _ = plan.evaluate(ahead)
+    behind = np.array([_chord_end(plan, float(s), distance) for s in ahead])
+    torches, tangents = plan.evaluate(behind)
+    tool = (tips - torches)[:, :2]
+    across = tangents[:, 0] * tool[:, 1] - tangents[:, 1] * tool[:, 0]
+    return np.asarray(np.arctan2(across, np.einsum("ki,ki->k", tangents, tool)))
+
+
+def _chord_end(plan: Path, s: float, distance: float) -> float:
+    """Return where behind ``s`` the plan is first ``distance`` away from its point there."""
+    tip = plan.at(s).point
+    back = np.arange(s, s - 3 * distance, -0.5e-3)
+    away = np.linalg.norm(plan.evaluate(back)[0][:, :2] - tip, axis=1)
+    far = np.flatnonzero(away >= distance)
+    return float(back[far[0]] if len(far) else back[-1])
+
+
+def check_speeds(finger: Finger, settings: Following, limits: MotionLimits) -> None:
+    """Refuse speeds beyond the recipe's limits.
+
+    Raises:
+        StageError: Which, and what is allowed.
+    """
+    fastest = flange_speed(finger, settings)
+    if fastest > limits.speed:
+        raise StageError(
+            f"weld.tactile: speed, lateral_speed and turn_rate together move the flange at "
+            f"{fastest * 1e3:.3g} mm/s, robot.limits.speed allows {limits.speed * 1e3:.3g} mm/s"
+        )

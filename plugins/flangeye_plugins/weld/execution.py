@@ -1,0 +1,145 @@
+"""The control loop: at the controller's rate, in simulated time or in real time."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from flangeye.devices import DeviceError, RobotState
+from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.executor import Executor
+from flangeye_plugins.weld.finger_camera import FingerCameraReader
+from flangeye_plugins.weld.frame import Tool
+from flangeye_plugins.weld.motion import Command, ToolPose, Touch
+from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
+from flangeye_plugins.weld.weld_log import Cycle, WeldLog
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What a weld works with.
+
+    Attributes:
+        drive: The arm.
+        eyes: Read the finger.
+        tool: Translates between flange and plane.
+        bounds: What the tip must keep to.
+    """
+
+    drive: Executor
+    eyes: FingerCameraReader
+    tool: Tool
+    bounds: Bounds
+
+
+def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
+    """Follow the seam; return why it ended early, or nothing when it came to its end.
+
+    Whatever happens the arm is told to stop, and the chronicle holds all up to then.
+    """
+    began: float | None = None
+    cell.drive.lead()
+    try:
+        with _undisturbed():
+            clock = Clock()
+            while controller.phase not in ("done", "stopped"):
+                cell.drive.robot.wait_cycle()
+                clock.start()
+                state = cell.drive.read()
+                seconds = state.time_ns * 1e-9
+                began = seconds if began is None else began
+                if seconds - began > longest:
+                    return f"it did not come to its end within {longest:.0f} s"
+                _turn(cell, controller, weld_log, state, clock)
+    except DeviceError as error:
+        return str(error)
+    finally:
+        cell.drive.stop()
+    return controller.reason
+
+
+class Clock:
+    """How long a cycle takes: by this computer's clock, and by this thread's processor time.
+
+    Attributes:
+        period: Between the starts of the last two cycles [s].
+    """
+
+    def __init__(self) -> None:
+        self.period = 0.0
+        self._started = time.perf_counter()
+        self._began = self._aside = 0.0
+
+    def start(self) -> None:
+        """Begin a cycle."""
+        now = time.perf_counter()
+        self.period, self._started = now - self._started, now
+        self._began, self._aside = time.thread_time(), 0.0
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Leave out what is done meanwhile."""
+        began = time.thread_time()
+        yield
+        self._aside += time.thread_time() - began
+
+    @property
+    def computing(self) -> float:
+        """Processor time of this cycle so far [s]."""
+        return time.thread_time() - self._began - self._aside
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Collect garbage before and after, and not in a cycle: that takes tens of milliseconds."""
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _turn(
+    cell: Cell, controller: Controller, weld_log: WeldLog, state: RobotState, clock: Clock
+) -> None:
+    """One cycle: read, decide, command, log."""
+    with clock.aside():  # in simulated time images are read, and logged, right here
+        numbers = [weld_log.saw(sight) for sight in cell.eyes.seen()]
+    used = tuple(number for number in numbers if number in weld_log.felt)
+    felt = [weld_log.felt[number] for number in used]
+    pose = cell.tool.pose(state.base_T_flange, state.time_ns * 1e-9)
+    cell.bounds.check(pose, controller.tip, felt)
+    command = controller.step(pose, [touch_of(feeling) for feeling in felt])
+    twist = cell.tool.twist(command, state.base_T_flange)
+    cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
+    took = (clock.computing, clock.period)
+    weld_log.turned(cycle_of(pose, used, command, controller, took))
+
+
+def touch_of(feeling: TipDisplacement) -> Touch:
+    """Return what the controller needs of a feeling."""
+    return Touch(feeling.time_ns * 1e-9, feeling.displacement)
+
+
+def cycle_of(
+    pose: ToolPose,
+    used: tuple[int, ...],
+    command: Command,
+    controller: Controller,
+    took: tuple[float, float],
+) -> Cycle:
+    """Return the record of a cycle."""
+    x, y, z = pose.position.tolist()
+    vx, vy, vz = command.velocity.tolist()
+    return Cycle(
+        pose.time, (x, y, z), pose.angle, used, (vx, vy, vz), command.turn, controller.phase,
+        controller.tip, controller.torch, controller.wanted, controller.sigma, controller.bound,
+        controller.band, *took,
+    )  # fmt: skip

@@ -1,0 +1,130 @@
+"""An arm that is driven from this process, and watched in each of its cycles like any other."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+
+from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
+from flangeye.errors import RunStopped
+from flangeye.models.robots import RobotModel
+from flangeye.motion.keyboard import space_pressed
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import Route
+from flangeye.motion.supervision import STANDING, SafetyFault, Watch
+from flangeye.types import Transform
+from flangeye_plugins.weld.finger_camera import LatestState
+
+PATIENT = 10.0
+"""Longest time for an arm to come to rest [s]."""
+
+
+class Executor:
+    """An open arm under watch.
+
+    The watch is that of :mod:`flangeye.motion`. It runs here, in the loop, because the
+    loop commands a velocity in each cycle: where this process hangs or dies, the next velocity is
+    late and the driver brakes (:data:`flangeye.devices.GRACE`).
+
+    Attributes:
+        robot: The arm.
+        latest: Is told each of its states.
+        limits: What it must keep to.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        latest: LatestState,
+        model: RobotModel,
+        limits: MotionLimits,
+        keyboard: int | None = None,
+    ) -> None:
+        """Begin to watch an open arm; the space bar of ``keyboard``, a descriptor, stops it.
+
+        Raises:
+            DeviceError: It is not the model's, has a tool set that nobody knows of, or is moved by
+                a person's hand.
+        """
+        if isinstance(robot, MovedByHand):
+            raise DeviceError(f"{robot.name}: is moved by hand; a weld needs an arm that drives")
+        self.robot, self.latest, self.limits = robot, latest, limits
+        self._watch, self._keyboard = Watch(model, limits), keyboard
+        state = robot.state()
+        latest.tell(state)
+        try:
+            self._watch.judge(state)
+            self._watch.check_model(state)
+        except SafetyFault as fault:
+            raise DeviceError(f"{robot.name}: {fault}") from None
+
+    def tick(self) -> RobotState:
+        """Wait for the controller's next cycle and return the arm's state.
+
+        Raises:
+            DeviceError: The arm must not go on; it was told to stop.
+            RunStopped: The operator stopped it.
+        """
+        self.robot.wait_cycle()
+        return self.read()
+
+    def read(self) -> RobotState:
+        """Return the arm's state in this cycle, judged; raises as :meth:`tick` does."""
+        return self._judged()[0]
+
+    def follow(self, route: Route) -> None:
+        """Drive a checked route and return when the arm has settled at its end.
+
+        Raises:
+            DeviceError: The arm was stopped for a safety fault: the reason.
+        """
+        for leg in route.legs:
+            self._watch.set_off(leg)
+            self.robot.move_joints(leg.joints, leg.speed, leg.acceleration)
+            self.robot.wait_cycle()
+            while not self._judged()[1]:
+                self.robot.wait_cycle()
+        self._watch.halted()
+
+    def lead(self) -> None:
+        """Expect velocities from now on, and watch the limits alone."""
+        self._watch.led()
+
+    def shift(self, base_T_flange: Transform, speed: float) -> RobotState:
+        """Move the flange a little, straight to a pose; return when the arm stands there.
+
+        Raises:
+            DeviceError: The arm was stopped for a safety fault: the reason.
+        """
+        self._watch.led()
+        self.robot.move_linear(
+            base_T_flange, min(speed, self.limits.speed), self.limits.acceleration
+        )
+        began = self.tick().time_ns
+        while (state := self.tick()).mode == "moving" or _moves(state):
+            if state.time_ns - began > PATIENT * 1e9:
+                raise DeviceError(f"{self.robot.name}: does not come to rest")
+        return state
+
+    def stop(self) -> None:
+        """Tell the arm to stop; an arm that is lost cannot be told anything."""
+        with suppress(DeviceError):
+            self.robot.stop()
+
+    def _judged(self) -> tuple[RobotState, bool]:
+        """Return the newest state, and whether the leg under way has ended."""
+        if space_pressed(self._keyboard):
+            self.stop()
+            raise RunStopped("the operator stopped the arm (the space bar)")
+        state = self.robot.state()
+        self.latest.tell(state)
+        try:
+            return state, self._watch.judge(state)
+        except SafetyFault as fault:
+            self.stop()
+            raise DeviceError(f"{self.robot.name}: {fault}") from None
+
+
+def _moves(state: RobotState) -> bool:
+    return bool(np.abs(state.joint_speeds).max() > STANDING)

@@ -1,0 +1,393 @@
+"""Following by touch: one step each cycle, measurements in, velocities out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
+from flangeye_plugins.weld.consistency import Seating
+from flangeye_plugins.weld.contact import LOST, Contact
+from flangeye_plugins.weld.controller import STILL, Phase
+from flangeye_plugins.weld.motion import Command, Felt, ToolPose, Touch, Track, turned
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import Learned, Probing
+from flangeye_plugins.weld.refined import SLOPE, RefinedPath
+from flangeye_plugins.weld.response import Response
+from flangeye_plugins.weld.search import Search
+from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.steering import Steering
+
+BELIEF = 0.3
+"""A sample is believed when contact has not been doubted for so long after it [s]."""
+
+SETTLING = 8e-3
+"""Way in which an error of the torch is taken back at speed [m]."""
+
+LEAD_IN = 3.0
+"""After so many tool lengths the torch has to be on the seam."""
+
+STEADY = 0.03e-3
+"""A finger that scatters less is followed from one measurement to the next [m]."""
+
+PLAYED = 1.0
+"""Share of the finger's play and hysteresis that stays uncertain, one standard deviation."""
+
+LEANING = 0.1e-3
+"""A tip that must be deflected by more, and is not, has lost its wall at the seam's end [m]."""
+
+
+class Follower:
+    """Follows a seam by touch.
+
+    Attributes:
+        mode: Its name, for people.
+        phase: What it is doing.
+        reason: Why it stopped.
+        tip: Arc length of the tip's progress on the plan [m].
+        torch: Arc length of the torch's progress [m].
+        wanted: Deflection asked of the tip at present [m].
+        refined: The seam as felt so far.
+        contact: The state of the tip's contact.
+        learned: What the sweep at the start found of finger, clock and arm.
+        sigma: Standard deviation of the torch's place across the seam [m].
+        bound: What the torch's distance from the seam does not exceed [m].
+        band: The same for 95 % of the seam [m].
+        lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
+    """
+
+    def __init__(self, plan: Path, belief: Belief, settings: Following, touch: bool = True) -> None:
+        """Prepare to follow ``plan``.
+
+        Args:
+            plan: The planned seam.
+            belief: What is known of tool, finger and joint.
+            settings: Gains and limits.
+            touch: Follow by touch; otherwise the plan alone, for comparison.
+        """
+        self.mode = "tactile" if touch else "vision"
+        self.phase: Phase = "seeking" if touch else "following"
+        self.reason = ""
+        self.tip, self.torch = settings.inset, settings.inset - belief.distance
+        self.wanted = 0.0
+        self.refined = RefinedPath(plan, belief.distance + settings.ending)
+        self.contact = Contact()
+        self._plan, self._settings, self._touching = plan, settings, touch
+        gain = max(settings.cross_track_gain, settings.speed / SETTLING)
+        self._steering = Steering(belief.distance, gain, settings.turn_rate)
+        self._belief, self.learned = belief, Learned()
+        self.sigma = self.bound = self.band = 0.0
+        self.lit: float | None = None
+        self.side = 1.0 if settings.side == "left" else -1.0
+        self._track = Track()
+        self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
+        self._time: float | None = None
+        self._seen = self._bridge = 0.0
+        self._loose = False
+        self._place = plan.at(self.tip)
+        self._search = Search(settings, belief)
+        self._probing = Probing(settings, belief, self.side)
+        self._seating = Seating(self.side, belief.half_angle)
+        self._response = Response()
+        self._elapsed = self._began = 0.0
+        self._newest: tuple[ToolPose, Touch] | None = None
+
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        if self._time is None:
+            self._time = self._seen = pose.time
+        self._elapsed, self._time = pose.time - self._time, pose.time
+        self._track.add(pose)
+        for touch in touches:
+            if self._touching and touch.time > self._seen:
+                self._feel(touch)
+        coming = self._response.ahead(pose)
+        self._judge(coming)
+        waiting = self.phase == "seeking" and self._search.resting
+        if self.phase in ("done", "stopped") or self._felt is None or waiting:
+            return STILL
+        command = self._probe(pose) if self.phase == "probing" else self._lead(coming)
+        self._response.told(pose.time, command)
+        return command
+
+    def _lead(self, pose: ToolPose) -> Command:
+        """Return the command that leads the tip along the seam and the torch behind it."""
+        self._ramp(self._elapsed)
+        self._progress(pose)
+        point, normal = self.refined.frame(self.torch)
+        velocity = self._velocity(pose, self._pace(pose, normal))
+        error = float((self._torch_position(pose) - point) @ normal)
+        self._estimate(error, float(pose.direction @ normal))
+        turn = self._steering.turn(velocity[:2], pose.direction, normal, error)
+        return Command(velocity, turn if velocity[:2].any() else 0.0)
+
+    def _probe(self, pose: ToolPose) -> Command:
+        """Return the next piece of the sweep."""
+        speed = self._probing.velocity(self._elapsed)
+        self._probing.note(pose.time, speed, self._lateral(pose))
+        return Command(np.array([*(speed * self._place.normal), 0.0]), 0.0)
+
+    def _estimate(self, error: float, slant: float) -> None:
+        """Estimate how far the torch may be from the seam, and stop where that is too far.
+
+        Args:
+            error: Of the torch from the refined path [m].
+            slant: Sine of the angle between the tool and the path.
+        """
+        if not self._touching:
+            return
+        self.sigma = float(np.sqrt(self._variance(slant)))
+        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
+        if not 0.0 <= self.torch <= self._plan.length:
+            return
+        if self.bound <= self._settings.max_error:
+            self.lit = self.torch if self.lit is None else self.lit
+        elif self.lit is not None or self.torch > LEAD_IN * self._belief.distance:
+            self._stop(self._too_uncertain())
+
+    def _variance(self, slant: float) -> float:
+        """Return the variance of the torch's place across the seam [m^2]."""
+        settings, learned = self._settings, self.learned
+        aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
+        gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
+        arm, wander = settings.arm_sigma**2, settings.wander**2
+        waves = self.refined.waviness(self.torch) * arm / (arm + wander)
+        fixed = self._belief.fixed_variance(settings) + (self._belief.along_sigma * slant) ** 2
+        play = (PLAYED * learned.width) ** 2
+        return fixed + gain**2 + play + waves + self.refined.variance(self.torch)
+
+    # --- what the finger says -------------------------------------------------------------------
+
+    def _feel(self, touch: Touch) -> None:
+        """Take a measurement, with the pose the tool had when its image was taken (13)."""
+        pose = self._track.at(touch.time - self.learned.stamp)
+        if pose is None:
+            return
+        self._seen = touch.time
+        s, felt, deflection = self._located(pose, touch)
+        if self.phase != "seeking" or self._search.found:  # friction on a face is no contact
+            self.contact.update(touch.time, deflection, max(self.wanted, self._settings.probe))
+        if self.phase == "seeking":
+            self._felt = felt
+            compression = float(touch.displacement[2] - self._search.rest[2])
+            self._search.feel(touch.displacement, deflection, compression)
+        elif self.phase == "probing":
+            self._probing.feel(touch.time, -self.side * deflection, felt.height)
+            self._newest = pose, touch
+        else:
+            self._believe(touch.time, s, felt, deflection)
+
+    def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, Felt, float]:
+        """Return where on the plan the tip is, the seam there, and the deflection to the wall."""
+        tip = pose.position + turned(self._corrected(touch.displacement), pose.angle)
+        s = self._plan.foot(tip[:2], self.tip)
+        place = self._plan.at(s)
+        felt = Felt(float((tip[:2] - place.point) @ place.normal), float(tip[2]) - place.height)
+        return s, felt, self.side * float((pose.position - tip)[:2] @ place.normal)
+
+    def _corrected(self, displacement: Floats) -> Floats:
+        """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
+        moved = displacement - self._search.rest
+        play = np.array([0.0, self.side * self.learned.width, 0.0])
+        gain = np.array([1.0 + self.learned.gain, 1.0 + self.learned.gain, 1.0])
+        return np.asarray((moved - play) / gain)
+
+    def _smoothed(self, felt: Felt) -> Felt:
+        """Return a mean over as many measurements as their scatter asks for."""
+        before = self._felt
+        if before is None:
+            return felt
+        share = min(1.0, max((STEADY / self.refined.noise) ** 2, 0.1))
+        return Felt(
+            before.offset + share * (felt.offset - before.offset),
+            before.height + share * (felt.height - before.height),
+        )
+
+    def _believe(self, time: float, s: float, felt: Felt, deflection: float) -> None:
+        """Keep what the tip felt, unless contact is doubtful.
+
+        A finger with play is not believed while it is let go of: the tag is then on the other side.
+        """
+        if self.phase == "ending":
+            self._notice_loss(s, felt, deflection)
+            if self._loose:
+                return
+        released = self.phase == "ending" and abs(self.learned.width) <= STEADY
+        if released or (self.phase == "following" and self.contact.state == "held"):
+            if self.phase == "following" and self.contact.doubted(deflection, self.wanted):
+                return
+            settled = time - self.contact.since > BELIEF
+            if settled and s < self._plan.length - self._settings.ending / 2:
+                self._felt = self._smoothed(felt)
+                self.refined.add(time, s, felt.offset)
+                self._watch(s, felt)
+            self.refined.confirm(time - BELIEF)
+
+    def _watch(self, s: float, felt: Felt) -> None:
+        """Stop where the tip does not sit in the groove any more."""
+        wrong = self._seating.judge(s, felt.offset, felt.height)
+        if wrong is not None and self.phase == "following":
+            self.refined.forget_pending()
+            self._stop(wrong)
+
+    def _notice_loss(self, s: float, felt: Felt, deflection: float) -> None:
+        """Notice that the wall is gone while the tip is let go of: it then goes with the robot.
+
+        What it should be deflected by follows from where the robot is and what was felt before.
+        """
+        if self.refined.empty:
+            return
+        expected = deflection + self.side * (felt.offset - self.refined.offset(s))
+        if expected > LEANING and deflection < LOST * expected:
+            self._loose = True
+            self.refined.forget_pending()
+
+    # --- what follows from it -------------------------------------------------------------------
+
+    def _judge(self, pose: ToolPose) -> None:
+        """Change the phase where what was felt asks for it."""
+        settings, state = self._settings, self.contact.state
+        if self.phase in ("following", "bridging") and self.tip >= self._pressing_ends:
+            self._enter("ending")
+        elif self.phase == "seeking" and state == "held" and self._search.seated:
+            self._enter("probing" if settings.probing else "following")
+        elif self.phase == "probing" and self._probing.over:
+            self._learn()
+        elif self.phase == "following" and state == "lost":
+            self.refined.forget_pending()
+            self._seating.forget()
+            self._bridge = self.tip
+            self._enter("bridging")
+        elif self.phase == "bridging" and state == "held":
+            self._enter("following")
+        if self.torch >= self._plan.length and self.phase != "stopped":
+            self._finish()
+        self._refuse(pose, settings)
+
+    def _finish(self) -> None:
+        """End the weld, if there was one."""
+        if self._touching and self.lit is None:
+            self._stop(self._too_uncertain())
+        else:
+            self._enter("done")
+
+    def _too_uncertain(self) -> str:
+        return (
+            f"the torch is known to {self.bound * 1e3:.2f} mm only, max_error is "
+            f"{self._settings.max_error * 1e3:.3g} mm"
+        )
+
+    def _learn(self) -> None:
+        """Take over what the sweep found of finger, clock and arm."""
+        found = self._probing.learned()
+        if isinstance(found, str):
+            self._stop(found)
+            return
+        self.learned = found
+        self._response.dead_time, self._response.lag = found.dead_time, found.lag
+        self.refined.noise = max(found.noise, float(self._search.sigma[1]))
+        self._began = self._time or 0.0
+        if self._newest is not None:
+            _, self._felt, self.wanted = self._located(*self._newest)
+        self._enter("following")
+
+    def _enter(self, phase: Phase) -> None:
+        self._loose = phase == "ending" and self.phase == "bridging"
+        self.phase = phase
+
+    def _refuse(self, pose: ToolPose, settings: Following) -> None:
+        """Stop where going on would be blind."""
+        if self.phase in ("done", "stopped"):
+            return
+        if self._touching and self.phase != "ending" and pose.time - self._seen > settings.blind:
+            self._stop(f"no tag was seen for {settings.blind * 1e3:.0f} ms")
+        elif self.phase == "bridging" and self.tip - self._bridge > settings.longest_gap:
+            self._stop(f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam")
+        elif self._search.bent:
+            self._stop("the tip is displaced though nothing should touch it")
+        elif self.phase == "seeking" and self._astray(pose):
+            self._stop(f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start")
+
+    def _astray(self, pose: ToolPose) -> bool:
+        below = self._place.height - float(pose.position[2])
+        return self._search.over or below > self._settings.reach
+
+    def _stop(self, reason: str) -> None:
+        self.phase, self.reason = "stopped", reason
+
+    @property
+    def _pressing_ends(self) -> float:
+        """Where the wanted deflection begins to ramp down, so that it is zero at ``ending``."""
+        settings = self._settings
+        release = settings.speed * settings.deflection / settings.release
+        return self._plan.length - settings.ending - release
+
+    def _ramp(self, elapsed: float) -> None:
+        """Move the wanted deflection towards what the phase asks for."""
+        settings = self._settings
+        target = {"bridging": settings.probe, "ending": 0.0}.get(self.phase, settings.deflection)
+        if not self._touching:
+            target = 0.0
+        if self.phase == "seeking" and not self._search.found:
+            target = 0.0
+        rate = settings.release if self.phase == "ending" else settings.ramp
+        step = rate * elapsed
+        self.wanted += float(np.clip(target - self.wanted, -step, step))
+
+    def _progress(self, pose: ToolPose) -> None:
+        reach = self._settings.speed * 0.1
+        self.tip = self._plan.advance(pose.position[:2], self.tip, reach)
+        self._place = self._plan.at(self.tip)
+        self.torch = self._plan.advance(self._torch_position(pose), self.torch, reach)
+
+    def _torch_position(self, pose: ToolPose) -> Floats:
+        """Return P_t (2,), equation (12)."""
+        return pose.position[:2] - self._steering.distance * pose.direction
+
+    def _pace(self, pose: ToolPose, normal: Floats) -> float:
+        """Return the tip's speed along the seam: less where blind or crooked."""
+        if self.phase == "seeking":
+            return 0.0
+        settings = self._settings
+        age = pose.time - self._seen if self._touching and self.phase != "ending" else 0.0
+        sight = float(np.clip((settings.blind - age) / (settings.blind - settings.stale), 0.0, 1.0))
+        return settings.speed * sight * self._steering.slowing(pose.direction, normal)
+
+    def _velocity(self, pose: ToolPose, pace: float) -> Floats:
+        """Return V_r (3,): along the plan; the servo (14) across it and in height."""
+        settings, place, felt = self._settings, self._place, self._seam_at_tip()
+        deflection = self.side * (self._lateral(pose) - felt.offset)
+        height = float(pose.position[2]) - place.height - felt.height
+        most = settings.lateral_speed
+        across = -self.side * settings.servo_gain * (deflection - self.wanted)
+        if self.phase == "seeking" and not self._search.found:
+            across = settings.servo_gain * self._search.step(self._lateral(pose))
+        preload = settings.preload if self._touching else 0.0
+        up = -settings.height_gain * (height + preload)
+        across += pace * self._drifting()
+        planar = pace * place.tangent + np.clip(across, -most, most) * place.normal
+        climb = pace * self._plan.climb(self.tip)
+        return np.array([*planar, climb + np.clip(up, -most, most)])
+
+    def _drifting(self) -> float:
+        """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
+        if self.phase != "following" or self.refined.empty:
+            return 0.0
+        before, here = self.refined.offsets(self.tip - SLOPE * np.array([1.0, 0.0]))
+        return float(np.clip((here - before) / SLOPE, -1.0, 1.0))
+
+    def _lateral(self, pose: ToolPose) -> float:
+        """Return how far the end point is to the left of the plan [m]."""
+        place = self._place
+        return float((pose.position[:2] - place.point) @ place.normal)
+
+    def _seam_at_tip(self) -> Felt:
+        """Return the seam at the tip: as felt, or as predicted while nothing is felt."""
+        felt = self._felt
+        if felt is None:
+            return Felt(0.0, 0.0)
+        if self.phase in ("bridging", "ending") and not self.refined.empty:
+            return Felt(self.refined.offset(self.tip), felt.height)
+        return felt

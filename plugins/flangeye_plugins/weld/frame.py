@@ -1,0 +1,111 @@
+"""The plane of the work: where the controller thinks in two dimensions and a height."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.maths.geometry import rigid
+from flangeye.models.finger import Finger
+from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.weld.motion import Command, ToolPose
+
+UPRIGHT_GAIN = 1.0
+"""How fast the tool is brought back to the plane's normal [1/s]."""
+
+CLOSED = 1e-3
+"""A seam whose ends are nearer to each other goes once around [m]."""
+
+
+class WorkPlane:
+    """A frame on the work: x along the seam as a whole, z out of the work.
+
+    Attributes:
+        base_T_plane: Its pose.
+    """
+
+    def __init__(self, points: Floats, openings: Floats) -> None:
+        """Lay the plane through (N, 3) points of a seam and across its openings (N, 3)."""
+        z = openings.mean(axis=0)
+        z /= np.linalg.norm(z)
+        along = points[-1] - points[0]
+        if np.linalg.norm(along) < CLOSED:
+            along = points[1] - points[0]
+        x = along - (along @ z) * z
+        x /= np.linalg.norm(x)
+        rotation = np.column_stack([x, np.cross(z, x), z])
+        self.base_T_plane = Transform(BASE, "plane", rigid(rotation, points.mean(axis=0)))
+        self._inverse = self.base_T_plane.inverse()
+
+    def points(self, in_base: Floats) -> Floats:
+        """Return points (N, 3) in the plane's frame."""
+        return self._inverse.apply(in_base)
+
+
+class Tool:
+    """Translates between the flange in the base and the tool in the plane."""
+
+    def __init__(self, finger: Finger, plane: WorkPlane) -> None:
+        self._plane = plane.base_T_plane
+        self._tip = np.array(finger.tip)
+        self._flange_R_tool = finger.flange_R_tool
+        self._angle: float | None = None
+
+    def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
+        """Return the tool in the plane; its angle goes on where the last one left off."""
+        plane = self._plane
+        tip = plane.rotation.T @ (base_T_flange.apply(self._tip) - plane.translation)
+        ahead = plane.rotation.T @ base_T_flange.rotation @ self._flange_R_tool[:, 0]
+        angle = float(np.arctan2(ahead[1], ahead[0]))
+        if self._angle is not None:
+            angle += 2 * np.pi * round((self._angle - angle) / (2 * np.pi))
+        self._angle = angle
+        return ToolPose(time, tip, angle)
+
+    @property
+    def normal(self) -> Floats:
+        """(3,) the plane's normal, out of the work, in base."""
+        return self._plane.rotation[:, 2]
+
+    def lowest(self, base_T_flange: Floats, torch: float) -> float:
+        """Return how high the lower one of tip and torch is above the plane [m].
+
+        Args:
+            base_T_flange: (4, 4) pose of the flange.
+            torch: From the torch to the tip [m].
+        """
+        in_flange = np.stack([self._tip, self._tip - torch * self._flange_R_tool[:, 0]])
+        in_base = in_flange @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]
+        return float(((in_base - self._plane.translation) @ self.normal).min())
+
+    def tilt(self, base_T_flange: Transform) -> float:
+        """Return the angle between the tool's z and the plane's [rad]."""
+        up = base_T_flange.rotation @ self._flange_R_tool[:, 2]
+        return float(np.arccos(np.clip(up @ self._plane.rotation[:, 2], -1.0, 1.0)))
+
+    def twist(self, command: Command, base_T_flange: Transform) -> Floats:
+        """Return the flange's twist (6,), along the base's axes, that carries out a command."""
+        normal = self._plane.rotation[:, 2]
+        up = base_T_flange.rotation @ self._flange_R_tool[:, 2]
+        angular = command.turn * normal + UPRIGHT_GAIN * _cross(up, normal)
+        lever = -base_T_flange.rotation @ self._tip
+        linear = self._plane.rotation @ command.velocity + _cross(angular, lever)
+        return np.concatenate([linear, angular])
+
+    def base_T_flange(self, position: Floats, angle: float) -> Transform:
+        """Return where the flange is with the tip at (3,) in the plane, and the tool upright."""
+        c, s = np.cos(angle), np.sin(angle)
+        plane_R_tool = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rotation = self._plane.rotation @ plane_R_tool @ self._flange_R_tool.T
+        tip = self._plane.apply(position)
+        return Transform(BASE, FLANGE, rigid(rotation, tip - rotation @ self._tip))
+
+    def base_R_tool(self, base_T_flange: Transform) -> Floats:
+        """Return the tool's axes (3, 3) in the base's."""
+        return np.asarray(base_T_flange.rotation @ self._flange_R_tool)
+
+
+def _cross(first: Floats, second: Floats) -> Floats:
+    """Return the cross product of two (3,), several times faster than NumPy's for any shape."""
+    a, b, c = first.tolist()
+    x, y, z = second.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

@@ -1,0 +1,106 @@
+"""A seam in the plane of the work, by arc length. Arrays only; lengths [m]."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.types import Floats
+
+STEP = 0.5e-3
+"""Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""
+
+
+class Place(NamedTuple):
+    """One place on a path.
+
+    Attributes:
+        point: (2,) in the plane.
+        tangent: (2,) unit vector, forwards.
+        normal: (2,) unit vector, to the left of the tangent.
+        height: Above the plane.
+    """
+
+    point: Floats
+    tangent: Floats
+    normal: Floats
+    height: float
+
+
+class Path:
+    """A curve that goes on straight beyond both ends; its start has arc length zero.
+
+    Attributes:
+        length: From its first point to its last, in the plane.
+        points: (M, 3) the curve resampled: in the plane, and its height.
+        tangents: (M, 2) unit tangents in the plane.
+        step: Arc length between two of them [m].
+    """
+
+    def __init__(self, points: Floats) -> None:
+        """Resample (N, 3) points: two coordinates in the plane, and the height above it."""
+        along = np.concatenate([[0.0], np.cumsum(_chords(points))])
+        self.length = float(along[-1])
+        ticks = np.linspace(0.0, self.length, max(2, round(self.length / STEP)) + 1)
+        self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
+        self.step = float(ticks[1])
+        slopes = np.gradient(self.points, self.step, axis=0)
+        norms = np.linalg.norm(slopes[:, :2], axis=1, keepdims=True)
+        self.tangents = slopes[:, :2] / norms
+        self._climb = slopes[:, 2]
+        self._rows = np.column_stack([self.points, self.tangents]).tolist()
+
+    def at(self, s: float) -> Place:
+        """Return the place at arc length ``s``, which may lie beyond either end."""
+        # Called several times a cycle: plain floats are ten times faster than arrays of one.
+        inside = min(max(s, 0.0), self.length)
+        index = min(int(inside / self.step), len(self._rows) - 2)
+        share = inside / self.step - index
+        before, after = self._rows[index], self._rows[index + 1]
+        x = before[0] + share * (after[0] - before[0])
+        y = before[1] + share * (after[1] - before[1])
+        z = before[2] + share * (after[2] - before[2])
+        tx = before[3] + share * (after[3] - before[3])
+        ty = before[4] + share * (after[4] - before[4])
+        norm, beyond = math.hypot(tx, ty), s - inside
+        tx, ty = tx / norm, ty / norm
+        point = np.array([x + beyond * tx, y + beyond * ty])
+        return Place(point, np.array([tx, ty]), np.array([-ty, tx]), z)
+
+    def evaluate(self, s: Floats) -> tuple[Floats, Floats]:
+        """Return points (K, 3) and unit tangents (K, 2) at arc lengths (K,)."""
+        inside = np.clip(s, 0.0, self.length)
+        index = np.minimum((inside / self.step).astype(int), len(self.points) - 2)
+        share = (inside / self.step - index)[:, None]
+        tangent = (1 - share) * self.tangents[index] + share * self.tangents[index + 1]
+        tangent /= np.sqrt(np.einsum("ki,ki->k", tangent, tangent))[:, None]
+        point = (1 - share) * self.points[index] + share * self.points[index + 1]
+        point[:, :2] += (s - inside)[:, None] * tangent
+        return point, tangent
+
+    def climb(self, s: float) -> float:
+        """Return the slope of the height along the path, zero beyond its ends."""
+        if not 0.0 <= s <= self.length:
+            return 0.0
+        return float(self._climb[min(round(s / self.step), len(self._climb) - 1)])
+
+    def advance(self, point: Floats, s: float, reach: float) -> float:
+        """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.
+
+        It never goes back, and never jumps to another branch of a path that crosses itself.
+        """
+        place = self.at(s)
+        return s + min(max(float((point - place.point) @ place.tangent), 0.0), reach)
+
+    def foot(self, point: Floats, s: float) -> float:
+        """Return the arc length of the foot of ``point`` (2,) near ``s``, forwards or back."""
+        for _ in range(2):
+            place = self.at(s)
+            s += float((point - place.point) @ place.tangent)
+        return s
+
+
+def _chords(points: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))

@@ -1,0 +1,201 @@
+"""A small sweep of the seated tip before the weld: what finger, clock and arm really do.
+
+The tip is held by the groove's walls, as in a punch mark, while the arm moves across by ``D`` to
+one side and to the other. With the tip at ``y0`` and the end point at ``P`` the true displacement
+is ``u = y0 - P``; the finger says ``m = c + (1 + g) u + w sign(du/dt)``, of an image whose
+timestamp is off by ``tau``. Gain error ``g``, the half width ``w`` of play and hysteresis, and
+``tau`` follow by least squares, ``tau`` and the reversal's length from a grid. A tip that climbs
+its wall is seen by its height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.response import identify
+from flangeye_plugins.weld.settings import Following
+
+MARGIN = 1.1
+"""The sweep presses harder than the weld by this, so that the tip is known to stay seated."""
+
+ENDS = 0.75
+"""The sweep ends with this share of the deflection; the weld then presses on outwards."""
+
+SLOWEST, BEAT = 0.2, 0.8
+"""The sweep's speed swings between this share of it and all of it, with this period [s]."""
+
+USUAL_STAMP, USUAL_WIDTH = 0.05, 0.1e-3
+"""Standard deviations of what is expected of timestamps [s] and of play [m]: priors."""
+
+STAMPS = np.arange(-0.06, 0.121, 0.01)
+"""Errors of the timestamps among which the sweep's is sought [s]."""
+
+REVERSALS = (0.02e-3, 0.1e-3, 0.2e-3, 0.4e-3, 1e-3)
+"""Half widths of play or hysteresis among which the finger's is sought [m]."""
+
+CLIMBED = 0.05e-3
+"""A seated tip rises by less when it is pressed [m]."""
+
+UNEXPLAINED = 0.04e-3
+"""A finger whose displacement the sweep leaves unexplained by more is not understood [m]."""
+
+LARGEST_GAIN = 0.35
+"""A gain that is off by more is no drift but another finger."""
+
+LARGEST_PLAY = 0.1e-3
+"""Within more play, to each side, nothing tells where the tip is [m]."""
+
+FEWEST = 15
+"""Samples of a sweep without which it says nothing."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What the sweep found.
+
+    Attributes:
+        gain: The finger shows displacements larger by this share.
+        gain_sigma: Of it.
+        width: Half width of play and hysteresis [m].
+        stamp: Timestamps are late by this [s].
+        dead_time: Of the arm [s].
+        lag: Of the arm [s].
+        unexplained: rms that the model leaves [m].
+        noise: Standard deviation of one measurement across [m].
+    """
+
+    gain: float = 0.0
+    gain_sigma: float = 0.05
+    width: float = 0.0
+    stamp: float = 0.0
+    dead_time: float = 0.0
+    lag: float = 0.0
+    unexplained: float = 0.0
+    noise: float = 10e-6
+
+
+class Probing:
+    """The sweep: where to go next, what was felt, and what follows from it.
+
+    Attributes:
+        over: Whether the sweep has been made.
+    """
+
+    def __init__(self, settings: Following, belief: Belief, side: float) -> None:
+        self._rate = min(settings.lateral_speed, 4e-3)
+        reach = MARGIN * settings.deflection
+        back = -reach if belief.two_walls else 0.4 * settings.deflection
+        # It ends outwards: play and hysteresis are then where the weld keeps them.
+        self._turns = [reach, back, ENDS * settings.deflection]
+        self._two_walls = belief.two_walls
+        self._side, self._wanted, self._noise = side, settings.deflection, belief.noise
+        self.over, self._time = False, 0.0
+        self._cycles: list[tuple[float, float, float]] = []
+        self._felt: list[tuple[float, float, float]] = []
+
+    def velocity(self, elapsed: float) -> float:
+        """Return the velocity of the sweep in this cycle, to the left [m/s]."""
+        goal, self._time = self._turns[0], self._time + elapsed
+        # At one speed a delay would look like play: both then shift the tag by the same.
+        rate = self._rate * (SLOWEST + (1.0 - SLOWEST) * math.sin(math.pi * self._time / BEAT) ** 2)
+        step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
+        self._wanted += step
+        if abs(goal - self._wanted) < 1e-9:
+            self._turns.pop(0)
+            self.over = not self._turns
+        return self._side * step / elapsed if elapsed else 0.0
+
+    def note(self, time: float, told: float, lateral: float) -> None:
+        """Remember a cycle: what was told [m/s] and where the end point was, to the left [m]."""
+        self._cycles.append((time, told, lateral))
+
+    def feel(self, time: float, across: float, height: float) -> None:
+        """Remember a measurement: displacement to the left, and the tip's height [m]."""
+        self._felt.append((time, across, height))
+
+    def learned(self) -> Learned | str:
+        """Return what was found, or why the weld must not begin."""
+        if len(self._felt) < FEWEST:
+            return "the tag was seen too seldom while the finger was probed"
+        felt, cycles = np.array(self._felt), np.array(self._cycles)
+        found = self._fit(felt, cycles)
+        if abs(found.gain) > LARGEST_GAIN:
+            return f"the finger's gain is off by {found.gain:.0%}; calibrate it again"
+        if found.unexplained > UNEXPLAINED + found.noise:
+            return (
+                "the finger's displacement is not understood: "
+                f"{found.unexplained * 1e3:.2f} mm are left unexplained by gain, play and delay"
+            )
+        if abs(found.width) > LARGEST_PLAY:
+            return (
+                f"the finger has {2 * abs(found.width) * 1e3:.2f} mm of play or hysteresis, at "
+                f"most {2 * LARGEST_PLAY * 1e3:.2f} mm are allowed; fasten it, or its tag"
+            )
+        return self._climb(felt, cycles, found) or found
+
+    def _fit(self, felt: Floats, cycles: Floats) -> Learned:
+        noise = max(_scatter(felt[:, 1]), self._noise[0])
+        tries = ((float(stamp), width) for stamp in STAMPS for width in REVERSALS)
+        rms, solution, sigma, stamp = min(
+            (_explained(felt, cycles, stamp, width) for stamp, width in tries),
+            key=lambda found: (
+                len(felt) * (found[0] / noise) ** 2
+                + (found[3] / USUAL_STAMP) ** 2
+                + (float(found[1][2]) / USUAL_WIDTH) ** 2
+            ),
+        )
+        dead, lag = identify(cycles)
+        sigma *= max(rms, noise)
+        return Learned(
+            float(solution[1]) - 1.0, sigma, -float(solution[2]), stamp, dead, lag, rms, noise
+        )
+
+    def _climb(self, felt: Floats, cycles: Floats, found: Learned) -> str | None:
+        """Say that the tip rises where it is pressed hard."""
+        at = np.interp(felt[:, 0] - found.stamp, cycles[:, 0], cycles[:, 2])
+        from_wall = self._side * at
+        middle = from_wall.min() if not self._two_walls else (at.max() + at.min()) / 2 * self._side
+        pressed = np.abs(from_wall - middle) / max(float(np.abs(from_wall - middle).max()), 1e-9)
+        hard, soft = felt[pressed > 0.85, 2], felt[pressed < 0.5, 2]
+        if min(len(hard), len(soft)) < 3:
+            return None
+        rise = float(hard.mean() - soft.mean())
+        scatter = max(_scatter(felt[:, 2]), self._noise[1])
+        sigma = scatter * float(np.sqrt(1 / len(hard) + 1 / len(soft)))
+        if rise < CLIMBED + 3 * sigma:
+            return None
+        return (
+            f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
+            "'deflection' or raise 'preload'"
+        )
+
+
+def _scatter(values: Floats) -> float:
+    """Return the standard deviation of one of a row of measurements, by second differences."""
+    return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
+
+
+def _explained(
+    felt: Floats, cycles: Floats, stamp: float, width: float
+) -> tuple[float, Floats, float, float]:
+    """Return rms, (3,) offset, gain and play, the gain's sigma for unit noise, and the stamp."""
+    at = np.interp(felt[:, 0] - stamp, cycles[:, 0], cycles[:, 2])
+    rows = np.column_stack([np.ones(len(at)), -at, (_dragged(at, width) - at) / width])
+    solution, *_ = np.linalg.lstsq(rows, felt[:, 1], rcond=None)
+    rms = float(np.sqrt(np.mean((felt[:, 1] - rows @ solution) ** 2)))
+    middle = at - at.mean()
+    return rms, np.asarray(solution), float(1.0 / np.sqrt(middle @ middle + 1e-12)), stamp
+
+
+def _dragged(at: Floats, half: float) -> Floats:
+    """Return what is dragged along by a motion with a dead band of ``half`` to both sides."""
+    behind, out = float(at[0]), []
+    for value in at.tolist():
+        behind = min(max(behind, value - half), value + half)
+        out.append(behind)
+    return np.array(out)

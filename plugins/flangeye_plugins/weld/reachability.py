@@ -1,0 +1,236 @@
+"""The arm's way to the seam and along it, in joint angles: checked before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.kinematics import Arm
+from flangeye.models.finger import Finger
+from flangeye.models.robots import RobotModel
+from flangeye.motion.clearance import ArmVolume
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import STEP, TABLE, Barred, Route, Router
+from flangeye.types import Floats, Transform
+from flangeye_plugins.weld.frame import Tool
+from flangeye_plugins.weld.path import Path, Place
+from flangeye_plugins.weld.settings import Following, WeldTactileParams
+
+SPACING = 10e-3
+"""Poses along the seam are checked at this distance [m]."""
+
+HIGHER = 0.05
+"""The way from joint to joint ends this far above the clearance [m]."""
+
+ROOM = np.radians(2.0)
+"""The joints keep this far away from their limits along the seam [rad]."""
+
+JUMP = np.radians(30.0)
+"""A joint that turns farther from one pose to the next takes another posture [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is to be driven.
+
+    Attributes:
+        model: The arm.
+        limits: What it must keep to.
+        finger: What it carries.
+        tool: Translates between flange and plane.
+        plan: The seam.
+        params: Speeds and clearances.
+    """
+
+    model: RobotModel
+    limits: MotionLimits
+    finger: Finger
+    tool: Tool
+    plan: Path
+    params: WeldTactileParams
+
+
+class Station(NamedTuple):
+    """A pose on the way, and what to call it."""
+
+    name: str
+    pose: Transform
+
+
+class Bar(NamedTuple):
+    """Why the arm must not be in a posture, and how near it came to being allowed."""
+
+    rank: int
+    reason: str
+
+
+class SeamReach:
+    """Postures of the arm from above the seam's start to beyond its end."""
+
+    def __init__(self, task: Task) -> None:
+        """Find every posture in which the whole seam can be driven.
+
+        Raises:
+            StageError: There is none: where, and why.
+        """
+        self._task = task
+        self._arm, self._volume = Arm(task.model), ArmVolume(task.model)
+        stations = _stations(task)
+        for station in stations:
+            self._require_inside(station)
+        postures = [self._arm.inverse(station.pose.matrix) for station in stations]
+        for station, found in zip(stations, postures, strict=True):
+            if not len(found):
+                raise StageError(
+                    f"weld.tactile: {station.name}, the {task.model.model} cannot reach the seam"
+                )
+        self._chains = self._drivable(stations, postures)
+
+    def to_start(self, here: Floats) -> Route:
+        """Return a checked way from joint angles (n,) to above the seam's start.
+
+        Raises:
+            StageError: There is none: what bars it.
+        """
+        reasons = []
+        chains = [self._turned_to(here, chain) for chain in self._chains]
+        for high, low, *_ in sorted(chains, key=lambda chain: float(np.abs(chain[0] - here).max())):
+            way = self._way(here, high, low)
+            if isinstance(way, Route):
+                return way
+            reasons.append(way.reason)
+        raise StageError(
+            f"weld.tactile: no free way from where the arm stands to the seam: {reasons[0]}; bring "
+            "the arm above the work by hand"
+        )
+
+    def _way(self, here: Floats, high: Floats, low: Floats) -> Route | Barred:
+        task = self._task
+        slow = min(task.params.approach_joint_speed, task.limits.joint_speed)
+        speed = min(task.params.approach_speed, task.limits.speed)
+        limits = replace(task.limits, speed=speed, joint_speed=slow)
+        router = Router(task.model, limits, here)
+        over, down = router.route(here, high), router.route(high, low)
+        if isinstance(over, Barred) or isinstance(down, Barred):
+            return over if isinstance(over, Barred) else down
+        return self._touches(here, high) or Route((*over.legs, *down.legs))
+
+    def _touches(self, start: Floats, goal: Floats) -> Barred | None:
+        """Say where finger or torch would come too near to the work's face."""
+        count = 2 + int(np.abs(goal - start).max() / STEP)
+        postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
+        task = self._task
+        allowed = float(task.plan.points[:, 2].max()) + 0.9 * task.params.clearance
+        lowest = min(
+            task.tool.lowest(matrix, task.finger.torch) for matrix in self._arm.flange(postures)
+        )
+        if lowest >= allowed:
+            return None
+        return Barred(
+            f"finger or torch would come to {lowest * 1e3:.0f} mm above the work, "
+            f"{allowed * 1e3:.0f} mm are asked for"
+        )
+
+    def _require_inside(self, station: Station) -> None:
+        why = self._task.limits.outside(station.pose.translation)
+        if why is not None:
+            raise StageError(
+                f"weld.tactile: {station.name}, the flange is {why} (robot.limits.box)"
+            )
+
+    def _drivable(self, stations: list[Station], postures: list[Floats]) -> list[Floats]:
+        """Return the chains of postures (M, n), one for each station, that can be driven."""
+        found: list[Floats] = []
+        refusals: list[tuple[int, Bar]] = []
+        for first in postures[0]:
+            chain = [first]
+            for i in range(len(stations)):
+                joints = _nearest(chain[-1], postures[i])
+                bar = self._bars(chain[-1], joints)
+                if bar is not None:
+                    refusals.append((i, bar))
+                    break
+                chain.append(joints)
+            else:
+                found.append(np.array(chain[1:]))
+        if not found:
+            farthest, bar = max(refusals)
+            raise StageError(f"weld.tactile: {stations[farthest].name}, {bar.reason}")
+        return found
+
+    def _turned_to(self, here: Floats, chain: Floats) -> Floats:
+        """Return a chain with its joints turned by whole turns towards where they stand."""
+        turns = 2 * np.pi * np.round((here - chain[0]) / (2 * np.pi))
+        low, high = self._task.limits.lower + ROOM, self._task.limits.upper - ROOM
+        allowed = ((chain + turns >= low) & (chain + turns <= high)).all(axis=0)
+        return np.asarray(chain + np.where(allowed, turns, 0.0))
+
+    def _bars(self, before: Floats, joints: Floats) -> Bar | None:
+        """Say why a posture must not be taken after another."""
+        # The order matters: of all that was tried, what came farthest in it is told.
+        axes = self._volume.axes(self._arm.frames(joints))
+        if not self._volume.above(axes, TABLE):
+            return Bar(0, "the arm touches the table")
+        if not self._volume.apart(axes):
+            return Bar(1, "the arm touches itself")
+        if why := self._task.limits.beyond(joints, ROOM):
+            return Bar(2, why)
+        if np.abs(joints - before).max() > JUMP:
+            return Bar(3, "the arm would have to change its posture")
+        fastest, allowed = self._fastest(joints), self._task.limits.joint_speed
+        if fastest > allowed:
+            return Bar(
+                4,
+                f"a joint may have to turn at {np.degrees(fastest):.0f} deg/s, "
+                f"robot.limits.joint_speed allows {np.degrees(allowed):.0f} deg/s",
+            )
+        return None
+
+    def _fastest(self, joints: Floats) -> float:
+        """Return what a joint turns at most while the seam is followed [rad/s]."""
+        task = self._task
+        inverse = np.linalg.pinv(self._arm.jacobian(joints))
+        turning = np.abs(inverse[:, :3] @ task.tool.normal) * task.params.turn_rate
+        going = np.linalg.norm(inverse[:, 3:], axis=1) * flange_speed(task.finger, task.params)
+        return float((turning + going).max())
+
+
+def flange_speed(finger: Finger, settings: Following) -> float:
+    """Return the largest speed of the flange along a seam [m/s]."""
+    lever = float(np.hypot(*finger.tip[:2]))
+    going = np.linalg.norm([settings.speed, settings.lateral_speed, settings.lateral_speed])
+    return float(going) + settings.turn_rate * lever
+
+
+def _stations(task: Task) -> list[Station]:
+    """Return the poses to check: twice above the start, turning there, then along the seam.
+
+    The tip goes on beyond the seam's end by the torch's distance.
+    """
+    plan, params, tool = task.plan, task.params, task.tool
+    start = plan.at(params.inset)
+    above = np.array([*start.point, start.height + params.clearance])
+    count = 1 + int(np.ceil(abs(params.start_angle) / (JUMP / 2)))
+    angles = _angle(start) + np.linspace(params.start_angle, 0.0, count)
+    poses = [tool.base_T_flange(above + [0.0, 0.0, HIGHER], float(angles[0]))]
+    poses += [tool.base_T_flange(above, float(angle)) for angle in angles]
+    stations = [Station("above the seam's start", pose) for pose in poses]
+    for s in np.arange(0.0, plan.length + task.finger.torch, SPACING):
+        place = plan.at(float(s))
+        pose = tool.base_T_flange(np.array([*place.point, place.height]), _angle(place))
+        name = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"
+        stations.append(Station(name, pose))
+    return stations
+
+
+def _angle(place: Place) -> float:
+    return float(np.arctan2(place.tangent[1], place.tangent[0]))
+
+
+def _nearest(before: Floats, postures: Floats) -> Floats:
+    """Return the one of (K, n) postures that is nearest to the last, joints by whole turns."""
+    near = postures + 2 * np.pi * np.round((before - postures) / (2 * np.pi))
+    return np.asarray(near[int(np.argmin(np.abs(near - before).max(axis=1)))])

@@ -1,0 +1,143 @@
+"""What a weld amounts to, from what was logged of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.models.finger import Finger
+from flangeye.types import Floats, Seam, WeldReport
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.motion import turned
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.weld_log import WeldLog, columns
+
+SAMPLES = 2000
+"""At most so many of the cycles go into the report."""
+
+
+def report_of(  # noqa: PLR0913  all that a weld had
+    seam: Seam,
+    plane: WorkPlane,
+    plan: Path,
+    finger: Finger,
+    controller: Controller,
+    weld_log: WeldLog,
+    reason: str,
+    truth: tuple[Floats, Floats] | None = None,
+) -> WeldReport:
+    """Return the report of a weld; ``truth`` is of a simulation: times, and the true torch."""
+    every = columns(weld_log.cycles)
+    kept = np.unique(np.linspace(0, len(weld_log.cycles) - 1, SAMPLES).round().astype(int))
+    kept = kept[kept >= 0]
+    cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
+    robot = np.array(every["position"]).reshape(-1, 3)[kept]
+    ahead = np.stack([np.cos(cycle["angle"]), np.sin(cycle["angle"]), 0 * cycle["angle"]], axis=1)
+    tip, deflection = _felt(weld_log, plan, kept)
+    to_base = plane.base_T_plane.apply
+    velocity = cycle["velocity"].reshape(-1, 3)
+    return WeldReport(
+        mode=controller.mode,
+        completed=not reason,
+        reason=reason,
+        planned=seam.points_in_base,
+        refined=to_base(_refined(controller, plan)),
+        opening=plane.base_T_plane.rotation[:, 2],
+        time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
+        tip=to_base(tip),
+        torch=to_base(robot - finger.torch * ahead),
+        robot=to_base(robot),
+        deflection=controller.side * deflection,
+        wanted=np.array(every["wanted"])[kept],
+        speed=np.linalg.norm(velocity[:, :2], axis=1),
+        turn=cycle["turn"],
+        along=np.array(every["torch"])[kept],
+        phases=tuple(every["phase"][i] for i in kept),
+        figures={**_figures(weld_log), **learned_figures(controller)},
+        sigma=np.array(every["sigma"])[kept],
+        bound=np.array(every["bound"])[kept],
+        band=np.array(every["band"])[kept],
+        true_torch=np.zeros((0, 3)) if truth is None else _at(cycle["time"], *truth),
+        loop=_loop(weld_log),
+    )
+
+
+def _at(times: Floats, known: Floats, points: Floats) -> Floats:
+    """Return points (N, 3) at times (K,), between those (N,) at which they are known."""
+    return np.stack([np.interp(times, known, axis) for axis in points.T], axis=1)
+
+
+def learned_figures(controller: Controller) -> Mapping[str, float]:
+    """Return what the sweep at the start found."""
+    if not isinstance(controller, Follower):
+        return {}
+    found = controller.learned
+    return {
+        "finger_gain_error": found.gain,
+        "finger_play": 2.0 * abs(found.width),
+        "timestamps_late": found.stamp,
+        "arm_dead_time": found.dead_time,
+        "arm_lag": found.lag,
+        "lit_from": -1.0 if controller.lit is None else controller.lit,
+    }
+
+
+def _felt(weld_log: WeldLog, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).
+
+    Each image meets the pose of its own time; until the next one the tip stays there.
+    """
+    every = columns(weld_log.cycles)
+    robot = np.array(every["position"]).reshape(-1, 3)
+    felt = [weld_log.felt[number] for touches in every["touches"] for number in touches]
+    used = np.cumsum([len(touches) for touches in every["touches"]], dtype=int)[kept]
+    if not felt:
+        return robot[kept], np.zeros(len(kept))
+    times = np.array([feeling.time_ns for feeling in felt]) * 1e-9
+    then = np.stack([np.interp(times, every["time"], axis) for axis in robot.T], axis=1)
+    angle = np.interp(times, every["time"], every["angle"])
+    moved = np.array([turned(f.displacement, a) for f, a in zip(felt, angle, strict=True)])
+    _, tangents = plan.evaluate(np.interp(times, every["time"], every["tip"]))
+    across = tangents[:, 1] * moved[:, 0] - tangents[:, 0] * moved[:, 1]
+    newest = np.maximum(used - 1, 0)
+    tip = np.where((used > 0)[:, None], (then + moved)[newest], robot[kept])
+    return tip, np.where(used > 0, across[newest], 0.0)
+
+
+def _refined(controller: Controller, plan: Path) -> Floats:
+    """Return the seam as it was felt, (M, 3) in the plane."""
+    if not isinstance(controller, Follower) or controller.refined.empty:
+        return np.zeros((0, 3))
+    s = np.arange(0.0, plan.length, 1e-3)
+    points, tangents = plan.evaluate(s)
+    offsets = np.concatenate([controller.refined.offsets(s[i : i + 1]) for i in range(len(s))])
+    points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    return points
+
+
+def _figures(weld_log: WeldLog) -> Mapping[str, float]:
+    felt = list(weld_log.felt.values())
+    return {
+        "images": float(weld_log.sights),
+        "images_with_tag": float(len(felt)),
+        "turn_max": max((abs(c.turn) for c in weld_log.cycles), default=0.0),
+    }
+
+
+def _loop(weld_log: WeldLog) -> Mapping[str, float]:
+    """Return how the loop kept time; not the same in two equal runs."""
+    if not weld_log.cycles:
+        return {}
+    computing = np.array([c.computing for c in weld_log.cycles])
+    period = np.array([c.period for c in weld_log.cycles[1:]] or [0.0])
+    return {
+        "cycles": float(len(computing)),
+        "computing_median": float(np.median(computing)),
+        "computing_p99": float(np.quantile(computing, 0.99)),
+        "period_median": float(np.median(period)),
+        "period_p99": float(np.quantile(period, 0.99)),
+    }

@@ -1,0 +1,89 @@
+"""How an arm follows velocities: identified from a sweep, and where it will come to.
+
+After a dead time D it follows with a time constant tau. The commands it has been given but not yet
+carried out take it on by the integral over the last D seconds plus tau times its speed; a servo
+that steers by where the arm *will* be needs no smaller gain for the delay (a Smith predictor).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.motion import Command, ToolPose
+
+DEAD_TIMES = np.arange(0.0, 0.161, 0.02)
+LAGS = np.array([1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3])
+"""Among which the arm's response is sought [s]."""
+
+
+class Response:
+    """Where an arm that is late will come to.
+
+    Attributes:
+        dead_time: [s].
+        lag: [s].
+    """
+
+    def __init__(self) -> None:
+        self.dead_time = self.lag = 0.0
+        self._commands: deque[tuple[float, Floats]] = deque()
+        self._speed = np.zeros(4)
+
+    @property
+    def delay(self) -> float:
+        """Both together [s]."""
+        return self.dead_time + self.lag
+
+    def told(self, time: float, command: Command) -> None:
+        """Remember a command given at ``time`` [s]."""
+        if not self.delay:
+            return
+        self._commands.append((time, np.array([*command.velocity, command.turn])))
+
+    def ahead(self, pose: ToolPose) -> ToolPose:
+        """Return where the tool will be when all it was told is carried out."""
+        if not self._commands:
+            return pose
+        motion = np.zeros(4)
+        while len(self._commands) > 1 and pose.time - self._commands[0][0] >= self.dead_time:
+            began, command = self._commands.popleft()
+            lasted = self._commands[0][0] - began
+            self._speed += (1 - math.exp(-lasted / max(self.lag, 1e-3))) * (command - self._speed)
+        times = [time for time, _ in self._commands]
+        for (time, command), end in zip(self._commands, [*times[1:], pose.time], strict=True):
+            motion += (end - max(time, pose.time - self.dead_time)) * command
+        motion += self.lag * self._speed
+        return ToolPose(pose.time, pose.position + motion[:3], pose.angle + float(motion[3]))
+
+
+def identify(cycles: Floats) -> tuple[float, float]:
+    """Return dead time and lag [s] that explain best how an arm moved along one axis.
+
+    Args:
+        cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].
+    """
+    clock = cycles[:, 0]
+    grid = np.arange(clock[0], clock[-1], 5e-3)
+    command, where = (np.interp(grid, clock, column) for column in cycles.T[1:])
+    best, found = math.inf, (0.0, 0.0)
+    for lag in LAGS:
+        followed = _lagged(command, 5e-3, float(lag))
+        for dead in DEAD_TIMES:
+            moved = np.cumsum(np.interp(grid - dead, grid, followed)) * 5e-3
+            off = where - moved
+            spread = float(np.var(off))
+            if spread < best:
+                best, found = spread, (float(dead), float(lag) if lag > 1e-3 else 0.0)
+    return found
+
+
+def _lagged(command: Floats, period: float, lag: float) -> Floats:
+    share, speed, followed = 1.0 - math.exp(-period / lag), 0.0, []
+    for told in command.tolist():
+        speed += share * (told - speed)
+        followed.append(speed)
+    return np.array(followed)

@@ -1,0 +1,106 @@
+"""Finding the groove at the start: down until something is touched, then across, both ways.
+
+Every decision is taken on the mean of several measurements, as many as their scatter asks for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.settings import Following
+
+NEAR = 0.2e-3
+"""A turning point of the sweep is reached when it is this close [m]."""
+
+SEATED = 0.3
+"""The tip bears on the groove when its preload is right to this share."""
+
+SURE = 4.0
+"""A mean is compared with a threshold this many standard deviations away."""
+
+FEWEST, MOST = 3, 15
+"""Measurements to a mean."""
+
+RESTING = 10
+"""Measurements of the tip in the air, before it descends."""
+
+FREE = 0.5e-3
+"""A tip that touches nothing is displaced by less [m]."""
+
+STEEPER = 1.1
+"""What friction gives at most is exceeded by this where there is a wall."""
+
+
+class Search:
+    """A sweep of the tip across the planned start.
+
+    Attributes:
+        resting: Whether the tip still hangs where it began, to be measured.
+        bent: Whether it was deformed there, though nothing should touch it.
+        down: Whether the tip has touched something.
+        found: Whether it then felt a wall.
+        seated: Whether it now bears on the groove with its preload.
+        over: Whether both sides were swept without one.
+        rest: (3,) mean displacement while nothing was touched [m].
+        sigma: (3,) standard deviations of one measurement then [m].
+    """
+
+    def __init__(self, settings: Following, belief: Belief) -> None:
+        """Sweep ``reach`` to the left of the plan, then as far to the right."""
+        self.resting, self.bent = True, False
+        self.down = self.found = self.seated = self.over = False
+        self.rest = np.zeros(3)
+        self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
+        self._settings = settings
+        self._wall = max(STEEPER * belief.sliding(settings), settings.probe / 2)
+        self._turns = [settings.reach, -settings.reach]
+        self._free: list[Floats] = []
+        self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
+
+    def feel(self, displacement: Floats, deflection: float, compression: float) -> None:
+        """Take a measurement of the tip.
+
+        Args:
+            displacement: (3,) along the tool's axes, as measured [m].
+            deflection: Across the plan [m].
+            compression: Upwards [m].
+        """
+        if self.resting:
+            self._rest(displacement)
+            return
+        self._newest.append((deflection, compression))
+        preload = self._settings.preload
+        if not self.down:
+            self.down = self._mean(1, preload / 2) > preload / 2
+            return
+        self.seated = abs(self._mean(1, SEATED * preload) - preload) < SEATED * preload
+        self.found = self.found or abs(self._mean(0, self._wall / 2)) > self._wall
+
+    def _rest(self, displacement: Floats) -> None:
+        self._free.append(displacement)
+        if len(self._free) < RESTING:
+            return
+        free = np.array(self._free)
+        self.resting, self.rest = False, np.median(free, axis=0)
+        self.sigma = np.maximum(self.sigma, free.std(axis=0))
+        self.bent = bool(np.linalg.norm(self.rest[:2]) > FREE + self.sigma[0])
+
+    def _mean(self, axis: int, threshold: float) -> float:
+        """Return the mean of as many measurements as make it sure at a threshold [m]."""
+        sigma = float(self.sigma[1 + axis])
+        count = int(np.clip(np.ceil((SURE * sigma / threshold) ** 2), FEWEST, MOST))
+        newest = [sample[axis] for sample in self._newest][-count:]
+        return sum(newest) / len(newest) if len(newest) == count else 0.0
+
+    def step(self, lateral: float) -> float:
+        """Return how far to go across [m], from where the end point is, left of the plan."""
+        if not self.down:
+            return 0.0
+        if self._turns and abs(self._turns[0] - lateral) < NEAR:
+            self._turns.pop(0)
+        self.over = not self._turns
+        return self._turns[0] - lateral if self._turns else 0.0

@@ -1,0 +1,121 @@
+"""How to follow, with units: part of the parameters of ``weld.tactile``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.models.finger import FingerPath
+from flangeye.plugin.stage import BoundPart, Choose, Params
+from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
+
+Mode = Literal["tactile", "as_printed", "vision"]
+
+
+class Following(Params):
+    """The controller's parameters; names in brackets are the paper's."""
+
+    speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Of the tip along the seam.")
+    side: Literal["left", "right"] = Field(
+        "left", description="Which wall of the groove to press, seen along the seam."
+    )
+    deflection: Length = param(
+        "2 mm", gt=0, le=0.01, description="Of the tip against the wall (delta_d)."
+    )
+    preload: Length = param("1.5 mm", gt=0, le=0.01, description="Of the tip into the groove.")
+    servo_gain: float = Field(3.0, gt=0, le=20, description="k_p of the deflection servo [1/s].")
+    height_gain: float = Field(3.0, ge=0, le=20, description="Of the preload [1/s].")
+    cross_track_gain: float = Field(
+        1.0, ge=0, le=5, description="How fast an error of the torch is taken back [1/s]."
+    )
+    lateral_speed: Speed = param(
+        "5 mm/s", gt=0, le=0.05, description="Largest speed across the seam, and in height."
+    )
+    turn_rate: AngularSpeed = param(
+        "20 deg/s", gt=0, le=2.0, description="Largest angular velocity of the tool."
+    )
+    inset: Length = param(
+        "5 mm", ge=0, description="How far inside the planned start the tip is set down."
+    )
+    ending: Length = param(
+        "8 mm", ge=0, description="How far before the planned end the tip stops pressing."
+    )
+    probe: Length = param(
+        "0.5 mm", gt=0, description="Deflection with which lost contact is felt for."
+    )
+    reach: Length = param(
+        "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
+    )
+    longest_gap: Length = param(
+        "40 mm", gt=0, description="Without contact for longer, the weld is stopped."
+    )
+    astray: Length = param(
+        "20 mm", gt=0, description="Farther from the plan the tip stops the weld."
+    )
+    ramp: Speed = param("2 mm/s", gt=0, description="At which the wanted deflection changes.")
+    release: Speed = param(
+        "0.8 mm/s", gt=0, description="At which the wanted deflection ends before the seam does."
+    )
+    force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
+    stale: Duration = param(
+        "150 ms", gt=0, description="Older images slow the weld down until a new one comes."
+    )
+    friction: float = Field(
+        0.3, ge=0, le=1, description="Largest coefficient of the tip on the work to reckon with."
+    )
+    max_error: Length = param(
+        "1 mm", gt=0, description="The weld is refused or stopped where the torch's stated bound "
+        "(4 sigma and its control error) exceeds this.",
+    )  # fmt: skip
+    arm_sigma: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of what the arm is off by between the "
+        "tip's and the torch's passing one place.",
+    )  # fmt: skip
+    distortion: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of how far heat moves the seam between "
+        "the tip's and the torch's passing one place.",
+    )  # fmt: skip
+    gain_drift: float = Field(
+        0.05, ge=0, le=1, description="Standard deviation of the finger's gain after a minute."
+    )
+    wander: Length = param(
+        "0.3 mm", gt=0, description="Standard deviation of the seam about the plan's shape."
+    )
+    probing: bool = Field(
+        True, description="Sweep the seated tip at the start: finger, clock and arm are measured."
+    )
+    joint: Literal["groove", "butt", "fillet", "lap", "corner"] = Field(
+        "groove", description="A groove or butt joint has two walls that hold the tip."
+    )
+    blind: Duration = param(
+        "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
+    )
+
+
+class WeldTactileParams(Following):
+    """Parameters of ``weld.tactile``."""
+
+    finger: FingerPath = param(
+        "srm", description="One of data/fingers, or a .yaml file of one's own."
+    )
+    sensor: Annotated[BoundPart, Choose("sensor")] = Field(
+        description="What gives the finger's images, for example {opencv: {device: 0}}."
+    )
+    mode: Mode = Field(
+        "tactile",
+        description="tactile, or for comparison: as_printed (the paper's Algorithm 2), or vision "
+        "(the plan alone, nothing is touched).",
+    )
+    log_images: bool = Field(
+        True, description="Log what was read of every image, 17 kB each; replaying needs it."
+    )
+    clearance: Length = param(
+        "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
+    )
+    approach_speed: Speed = param("50 mm/s", gt=0, description="Of the flange on its way there.")
+    approach_joint_speed: AngularSpeed = param("20 deg/s", gt=0, description="Of the joints.")
+    start_angle: Angle = param(
+        "0 deg", ge=-np.pi, le=np.pi, description="Of the tool to the seam, at the start."
+    )

@@ -1,0 +1,62 @@
+"""How fast the tool must turn so that the torch behind it stays on the seam (README, eq. A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.types import Floats
+
+
+@dataclass(frozen=True)
+class Steering:
+    """How the tool is turned.
+
+    Attributes:
+        distance: Tip to torch, ||d|| of the paper [m].
+        gain: k_c, how fast an error of the torch is taken back [1/s].
+        rate: Largest angular velocity [rad/s].
+        regular: |n_d . n_t| above which equation (16) alone decides; zero half way below.
+        share: Largest part of the tip's speed that taking back an error may use.
+    """
+
+    distance: float
+    gain: float
+    rate: float
+    regular: float = 0.5
+    share: float = 0.7
+
+    def turn(self, velocity: Floats, tool: Floats, normal: Floats, error: float) -> float:
+        """Return the angular velocity [rad/s], never beyond :attr:`rate`.
+
+        Args:
+            velocity: (2,) of the robot's end point [m/s].
+            tool: (2,) unit vector from the torch to the tip, t_d.
+            normal: (2,) unit normal of the refined path at the torch, n_t.
+            error: How far the torch is off the refined path, along ``normal`` [m].
+        """
+        cosine, sine = _cos_sin(tool, normal)
+        most = self.share * float(np.hypot(*velocity))
+        back = min(max(self.gain * error, -most), most)
+        trusted = self.trust(cosine)
+        # Near n_d perpendicular to n_t equation (16) divides by zero and below it the torch would
+        # be pushed, not pulled: there the tool is turned into the path's direction instead.
+        aligning = -float(np.copysign(self.rate, sine))
+        solved = (float(velocity @ normal) + back) / (self.distance * cosine) if trusted else 0.0
+        wanted = trusted * solved + (1.0 - trusted) * aligning
+        return float(min(max(wanted, -self.rate), self.rate))
+
+    def trust(self, cosine: float) -> float:
+        """Return 1 where equation (16) decides, 0 where the tool is turned back, and between."""
+        return min(max(2.0 * cosine / self.regular - 1.0, 0.0), 1.0)
+
+    def slowing(self, tool: Floats, normal: Floats) -> float:
+        """Return the share of its speed that the tip may keep, 0.1 to 1."""
+        cosine, _ = _cos_sin(tool, normal)
+        return min(max(cosine / self.regular, 0.1), 1.0)
+
+
+def _cos_sin(tool: Floats, normal: Floats) -> tuple[float, float]:
+    """Return n_d . n_t, and t_d . n_t: cosine and sine of the angle from the path to the tool."""
+    return float(tool[0] * normal[1] - tool[1] * normal[0]), float(tool @ normal)

@@ -1,0 +1,128 @@
+"""``weld.tactile``: the torch in the seam, by touch."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, nullcontext
+from dataclasses import asdict
+from typing import Any
+
+from flangeye.devices import KnowsTorch, MotionAllowed, Robot, RobotDriver, TactileSensor
+from flangeye.errors import NothingMoved
+from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
+from flangeye.models.robots import RobotModel
+from flangeye.motion.keyboard import keys
+from flangeye.motion.limits import limits_of
+from flangeye.plugin.stage import stage
+from flangeye.recipe.header import LimitsSection
+from flangeye.types import Floats, Journal, Seam, Seed, VerifiedHandEye, WeldReport
+from flangeye_plugins.weld import checks
+from flangeye_plugins.weld.approach import approach
+from flangeye_plugins.weld.as_printed import AsPrinted
+from flangeye_plugins.weld.belief import Belief, belief_of
+from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.execution import Cell, follow
+from flangeye_plugins.weld.executor import Executor
+from flangeye_plugins.weld.finger_camera import (
+    FingerCameraReader,
+    LatestState,
+    Reader,
+    SteppedReader,
+    ThreadedReader,
+)
+from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.reachability import SeamReach, Task
+from flangeye_plugins.weld.report import report_of
+from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+from flangeye_plugins.weld.weld_log import WeldLog
+
+
+@stage("weld.tactile")
+def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
+    hand_eye: VerifiedHandEye,
+    seam: Seam,
+    model: RobotModel,
+    driver: RobotDriver,
+    limits: LimitsSection,
+    motion: MotionAllowed,
+    seed: Seed,
+    journal: Journal,
+    params: WeldTactileParams,
+) -> WeldReport:
+    """Follow the planned seam by touch: the tip feels it, the torch follows behind.
+
+    Raises:
+        StageError: The seam, the finger or the limits do not allow it; nothing has moved.
+        NothingMoved: Motion was not asked for; the message is the plan.
+        DeviceError: Arm or finger cannot be opened, or are lost on the way to the seam.
+        RunStopped: The operator stopped the arm.
+    """
+    finger: Finger = read_model(params.finger, Finger)
+    plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
+    points = plane.points(seam.points_in_base)
+    plan = Path(points)
+    tool = Tool(finger, plane)
+    reader = Reader(finger)
+    allowed = limits_of(limits, model)
+    checks.check_finger(finger, params)
+    checks.check_seam(seam, plan, finger, params)
+    checks.check_speeds(finger, params, allowed)
+    passage = SeamReach(Task(model, allowed, finger, tool, plan, params))
+    simulated = driver.simulated
+    belief = belief_of(finger, seam.half_angle, params)
+    checks.check_belief(belief, params)
+    controller = controller_of(plan, belief, params, params.mode)
+    checks.check_controller(controller, driver)
+    if not (motion.allowed or simulated):
+        raise NothingMoved(_plan_text(plan, params))
+    with ExitStack() as opened:
+        robot: Robot = opened.enter_context(driver.open())
+        latest = LatestState(robot.state())
+        sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
+        eyes = opened.enter_context(_eyes(sensor, reader, simulated))
+        weld_log = opened.enter_context(WeldLog(journal, not simulated, params.log_images))
+        weld_log.note("start", start_of(points, plane, finger, belief, params))
+        keyboard = opened.enter_context(nullcontext() if simulated else keys())
+        drive = Executor(robot, latest, model, allowed, keyboard)
+        cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
+        approach(cell, passage, weld_log, params.mode)
+        longest = 60.0 + 3.0 * (plan.length + finger.torch) / params.speed
+        reason = follow(cell, controller, weld_log, longest)
+        truth = sensor.true_torch() if isinstance(sensor, KnowsTorch) else None
+    return report_of(seam, plane, plan, finger, controller, weld_log, reason, truth)
+
+
+def controller_of(plan: Path, belief: Belief, settings: Following, mode: Mode) -> Controller:
+    """Return the controller of the mode that was asked for."""
+    if mode == "as_printed":
+        return AsPrinted(plan, belief.distance, settings)
+    return Follower(plan, belief, settings, touch=mode == "tactile")
+
+
+def _eyes(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:
+    return SteppedReader(sensor, reader) if simulated else ThreadedReader(sensor, reader)
+
+
+def _plan_text(plan: Path, params: WeldTactileParams) -> str:
+    seconds = (plan.length + 2 * params.inset) / params.speed
+    return (
+        f"weld.tactile: would weld {plan.length * 1e3:.0f} mm at {params.speed * 1e3:.3g} mm/s, "
+        f"in about {seconds:.0f} s; nothing moved: add --move"
+    )
+
+
+def start_of(
+    points: Floats, plane: WorkPlane, finger: Finger, belief: Belief, params: WeldTactileParams
+) -> dict[str, Any]:
+    """Return all that the decisions of a weld follow from, besides what was measured."""
+    return {
+        "points": points.tolist(),
+        "base_T_plane": plane.base_T_plane.matrix.tolist(),
+        "finger": finger.model_dump(mode="json"),
+        "belief": asdict(belief),
+        "mode": params.mode,
+        "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
+    }

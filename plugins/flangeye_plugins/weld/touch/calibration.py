@@ -1,0 +1,119 @@
+"""What a finger's rest pose, gain, noise and stiffness are, from readings. Arrays only.
+
+The tip is held in a punch mark while the robot moves a little: then it is displaced, seen from the
+tool, by exactly what the robot moved, the other way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.models.finger import Calibration
+from flangeye.types import Floats
+from flangeye.units import SI
+from flangeye_plugins.weld.touch.tag_observation import TagReading
+from flangeye_plugins.weld.touch.tip_displacement import nearest_rotation
+
+FEWEST = 10
+"""Readings at rest, and again with the tip held, without which nothing is estimated."""
+
+CLEAR = 0.2e-3
+"""Largest rms of the tip's displacement that the gain leaves unexplained [m]."""
+
+FORCE_FROM = 0.5
+"""A force that never exceeds this says nothing of stiffness [N]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """One reading with the tip held in its mark.
+
+    Attributes:
+        reading: The tag.
+        displacement: (3,) of the tip from where it would rest, in the tool's axes [m].
+        force: (3,) on the finger, in the tool's axes [N], if it is measured.
+    """
+
+    reading: TagReading
+    displacement: Floats
+    force: Floats | None = None
+
+
+def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> Calibration:
+    """Return the calibration that explains the readings best (least squares).
+
+    Args:
+        rest: Readings of the undeformed finger.
+        held: Readings with the tip held, displaced along all three axes.
+        source: For people: when and how.
+
+    Raises:
+        StageError: Too few readings, an axis that was not moved along, or a tip that slid.
+    """
+    if min(len(rest), len(held)) < FEWEST:
+        raise StageError(
+            f"calibration: the tag was seen {len(rest)} times at rest and {len(held)} times held; "
+            f"at least {FEWEST} each are needed"
+        )
+    place = np.mean([r.translation for r in rest], axis=0)
+    tag = np.array([h.reading.translation for h in held]) - place
+    tip = np.array([h.displacement for h in held])
+    gain = _gain(tag, tip)
+    left = tip - tag @ gain.T
+    unexplained = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    if unexplained > CLEAR:
+        raise StageError(
+            f"calibration: the tag's motion leaves {unexplained * 1e3:.2f} mm of the tip's "
+            f"unexplained, at most {CLEAR * 1e3:.2f} mm are allowed; did the tip slide in its mark?"
+        )
+    noise = np.std([gain @ (r.translation - place) for r in rest], axis=0)
+    lateral, axial = _stiffness(held)
+    return Calibration.model_validate(
+        {
+            "rest": _si(place),
+            "rotation": _si(_mean_rotation([r.rotation for r in rest])),
+            "gain": gain.tolist(),
+            "noise": _si(noise),
+            "lateral": lateral,
+            "axial": axial,
+            "source": source,
+        }
+    )
+
+
+def _gain(tag: Floats, tip: Floats) -> Floats:
+    moved = np.linalg.svd(tip, compute_uv=False)
+    if moved[-1] < 0.1 * moved[0]:
+        raise StageError("calibration: the robot did not move the finger along all three axes")
+    solution, *_ = np.linalg.lstsq(tag, tip, rcond=None)
+    return np.asarray(solution.T)
+
+
+def _mean_rotation(vectors: Sequence[Floats]) -> Floats:
+    matrices = np.array([rotation_exp(v) for v in vectors])
+    return rotation_log(nearest_rotation(matrices.mean(axis=0)))
+
+
+def _stiffness(held: Sequence[Held]) -> tuple[SI | None, SI | None]:
+    """Return the stiffness across and along the finger, where the force was measured."""
+    known = [h for h in held if h.force is not None]
+    if not known:
+        return None, None
+    # What the robot holds against the spring: force on the finger is opposite to its displacement.
+    force = np.array([h.force for h in known])
+    tip = np.array([h.displacement for h in known])
+    if np.abs(force).max() < FORCE_FROM:
+        return None, None
+    slopes = -np.sum((force - force.mean(0)) * (tip - tip.mean(0)), 0) / np.sum(
+        (tip - tip.mean(0)) ** 2, 0
+    )
+    return SI(abs(float(slopes[:2].mean()))), SI(abs(float(slopes[2])))
+
+
+def _si(values: Floats) -> tuple[SI, ...]:
+    return tuple(SI(float(v)) for v in values)

@@ -1,0 +1,78 @@
+"""From the tag's pose to the tip's displacement, in the tool's axes and in the base's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.models.finger import Finger
+from flangeye.types import Array, Floats
+from flangeye_plugins.weld.touch.tag_observation import TagReading
+
+
+@dataclass(frozen=True, eq=False)
+class TipDisplacement:
+    """How the finger is deformed in one image, in the tool's axes.
+
+    Attributes:
+        time_ns: Middle of the exposure, on the robot's clock.
+        displacement: (3,) of the tip from where it rests [m].
+        rotation: (3,) rotation vector of the tag, from how it rests [rad].
+        covariance: (3, 3) of the displacement [m^2].
+        confidence: Of the tag's detection, 0 to 1.
+    """
+
+    time_ns: int
+    displacement: Array
+    rotation: Array
+    covariance: Array
+    confidence: float
+
+    def turned_by(self, base_R_tool: Floats) -> TipDisplacement:
+        """Return the same in the base's axes."""
+        return TipDisplacement(
+            self.time_ns,
+            base_R_tool @ self.displacement,
+            base_R_tool @ self.rotation,
+            base_R_tool @ self.covariance @ base_R_tool.T,
+            self.confidence,
+        )
+
+
+class Interpreter:
+    """Knows how the tag moves when the tip does."""
+
+    def __init__(self, finger: Finger) -> None:
+        """Take the finger's calibration.
+
+        Raises:
+            StageError: The finger has none yet.
+        """
+        if finger.calibration is None:
+            raise StageError(
+                f"finger {finger.model} is not calibrated: run 'flangeye tactile calibrate' first"
+            )
+        self._rest = np.array(finger.calibration.rest)
+        self._gain = np.array(finger.calibration.gain)
+        self._upright = rotation_exp(np.array(finger.calibration.rotation))
+        self._tool_R_camera = nearest_rotation(self._gain)
+
+    def feel(self, reading: TagReading, time_ns: int) -> TipDisplacement:
+        """Return the tip's displacement that the tag's pose speaks of."""
+        turn = rotation_log(rotation_exp(reading.rotation) @ self._upright.T)
+        return TipDisplacement(
+            time_ns,
+            self._gain @ (reading.translation - self._rest),
+            self._tool_R_camera @ turn,
+            self._gain @ reading.covariance @ self._gain.T,
+            reading.confidence,
+        )
+
+
+def nearest_rotation(matrix: Floats) -> Floats:
+    """Return the rotation (3, 3) nearest to a matrix, by its polar decomposition."""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)

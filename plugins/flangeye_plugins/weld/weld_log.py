@@ -1,0 +1,142 @@
+"""What a weld leaves in the log while it runs: images, feelings, and every cycle's decision.
+
+Cycles go to the journal in blocks, column by column. In real time a thread of its own writes, so
+that the loop never waits for the disk.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+from flangeye.types import Journal
+from flangeye_plugins.weld.finger_camera import TagObservation
+from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
+
+BLOCK = 25
+"""Cycles to a block."""
+
+
+class Cycle(NamedTuple):
+    """One turn of the control loop, in the frame of the work's plane; SI units.
+
+    Attributes:
+        time: On the robot's clock [s].
+        position: (3,) of the robot's end point P_r.
+        angle: Of the tool.
+        touches: Numbers of the sights that were used first in this cycle.
+        velocity: (3,) commanded.
+        turn: Angular velocity commanded.
+        phase: Of the controller, after this cycle.
+        tip: Arc length of the tip's progress.
+        torch: Arc length of the torch's progress.
+        wanted: Deflection asked of the tip.
+        sigma: Standard deviation of the torch's place across the seam.
+        bound: What its distance from the seam does not exceed.
+        band: The same for 95 % of the seam.
+        computing: Processor time that the cycle took, besides reading images [s].
+        period: Since the last cycle began, on this computer's clock [s].
+    """
+
+    time: float
+    position: tuple[float, float, float]
+    angle: float
+    touches: tuple[int, ...]
+    velocity: tuple[float, float, float]
+    turn: float
+    phase: str
+    tip: float
+    torch: float
+    wanted: float
+    sigma: float
+    bound: float
+    band: float
+    computing: float
+    period: float
+
+
+class WeldLog:
+    """Collects a weld, and writes it into the step's journal.
+
+    Attributes:
+        cycles: All so far.
+        sights: How many images were read.
+        felt: Number of an image -> what was felt in it.
+    """
+
+    def __init__(self, journal: Journal, beside: bool, images: bool = True) -> None:
+        """Write into ``journal``: at once, or in a thread ``beside`` the loop; images if asked."""
+        self._images = images
+        self.cycles: list[Cycle] = []
+        self.sights = 0
+        self.felt: dict[int, TipDisplacement] = {}
+        self._journal = journal
+        self._block: list[Cycle] = []
+        self._queue: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="journal") if beside else None
+
+    def __enter__(self) -> Self:
+        if self._thread:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write what is left."""
+        self._put_block()
+        if self._thread:
+            self._queue.put(None)
+            self._thread.join()
+
+    def note(self, name: str, value: Any) -> None:
+        """Write one value under a name."""
+        if self._thread:
+            self._queue.put((name, value))
+        else:
+            self._put(name, value)
+
+    def saw(self, sight: TagObservation) -> int:
+        """Write an image and what was felt in it; return its number."""
+        number, self.sights = self.sights, self.sights + 1
+        felt = sight.feeling
+        self._note_sight(number, sight)
+        if felt is not None:
+            self.felt[number] = felt
+            self.note("feeling", felt)
+        return number
+
+    def before(self, sight: TagObservation) -> None:
+        """Write an image that was looked at before anything moved; it has no number."""
+        self._note_sight(-1, sight)
+
+    def _note_sight(self, number: int, sight: TagObservation) -> None:
+        piece = sight.piece
+        if self._images:
+            self.note("image", piece.image)
+        told = {"number": number, "time_ns": sight.time_ns, "corner": piece.corner}
+        self.note("sight", {**told, "tag": sight.feeling is not None})
+
+    def turned(self, cycle: Cycle) -> None:
+        """Take in a cycle."""
+        self.cycles.append(cycle)
+        self._block.append(cycle)
+        if len(self._block) >= BLOCK:
+            self._put_block()
+
+    def _put_block(self) -> None:
+        if self._block:
+            self.note("cycles", self._block)
+            self._block = []
+
+    def _write(self) -> None:
+        while (item := self._queue.get()) is not None:
+            self._put(*item)
+
+    def _put(self, name: str, value: Any) -> None:
+        self._journal(name, columns(value) if name == "cycles" else value)
+
+
+def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:
+    """Return cycles column by column."""
+    return {name: [getattr(c, name) for c in cycles] for name in Cycle._fields}

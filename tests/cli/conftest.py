@@ -1,0 +1,30 @@
+"""The command line, called as a person calls it."""
+
+import sys
+
+import pytest
+
+from flangeye import cli
+from flangeye.plugin import registry
+
+
+@pytest.fixture
+def flangeye(monkeypatch, toy_registry, tmp_path, capsys):
+    """Call the command line in an empty folder with the toy stages; return code, out, err."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "load_registry", lambda: toy_registry)
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as exit_:
+            code = exit_.code
+        for plugin in list(toy_registry.hooks.get_plugins()):
+            if toy_registry.hooks.get_name(plugin) != "toy":
+                toy_registry.hooks.unregister(plugin)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call

@@ -1,0 +1,301 @@
+"""The command line as a person meets it: output, exit codes, and what stays on disk."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from flangeye import __version__
+from flangeye.errors import NothingMoved
+from flangeye.types import Rejection
+from tests import toy
+from tests.conftest import replaced
+
+
+def test_a_run_leaves_its_folder_and_says_the_result(flangeye, toy_recipe, tmp_path):
+    code, out, err = flangeye("run", toy_recipe, "--out", "here")
+    assert code == 0, err
+    assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [
+        "calibration.yaml", "recipe.resolved.yaml", "report.html", "result.json", "run.mcap",
+    ]  # fmt: skip
+    assert "verified: 6 of 6 captures used" in out
+    assert "true error" in out
+    result = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert result["status"] == "verified"
+    calibration = yaml.safe_load((tmp_path / "here" / "calibration.yaml").read_text())
+    assert calibration["base_T_camera"]["matrix"] == result["transforms"]["base_T_camera"]["matrix"]
+
+
+def test_by_default_the_folder_is_named_by_time_and_recipe(flangeye, toy_recipe, tmp_path):
+    assert flangeye("run", toy_recipe)[0] == 0
+    assert flangeye("run", toy_recipe)[0] == 0
+    folders = [p.name for p in (tmp_path / "runs").iterdir()]
+    assert len(folders) == 2
+    assert all("_toy" in name for name in folders)
+
+
+def test_the_resolved_recipe_runs_to_the_same_result(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--out", "a")
+    flangeye("run", tmp_path / "a" / "recipe.resolved.yaml", "--out", "b")
+    first, second = (json.loads((tmp_path / x / "result.json").read_text()) for x in "ab")
+    assert first["transforms"] == second["transforms"]
+    assert first["provenance"]["recipe_hash"] == second["provenance"]["recipe_hash"]
+
+
+def test_refused_is_exit_code_one_with_the_reason(flangeye, toy_recipe, tmp_path):
+    code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
+    assert code == 1
+    assert "refused: verify.toy: " in out
+    assert (tmp_path / "x" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["run", "nothing"], "error: no recipe 'nothing'; 'flangeye recipes' lists them"),
+        (["run", "toy.yaml", "--at", "solve.toy"],
+         "error: --from and --at go together: --from run.mcap --at solve.svd"),
+        (["run", "toy.yaml", "--from", "no.mcap", "--at", "solve.toy"],
+         "error: no.mcap: cannot be read: No such file or directory"),
+        (["run", "toy.yaml", "--set", "steps.2.inlier=3"],
+         "error: --set steps.2.fit.toy.inlier: '3' has no unit: a length needs one (mm, m, um, "
+         "for example '31.5 mm')"),
+        (["run", "toy.yaml", "--set", "steps.0.count=2"],
+         "error: solve.toy: 3 poses needed, 2 given"),
+        (["run", "toy.yaml", "--out", "."],
+         "error: .: already holds files; name a new or empty folder"),
+        (["run", "toy.yaml", "--out", "toy.yaml/x"],
+         "error: toy.yaml/x: cannot be made: Not a directory"),
+        (["show", "toy.yaml"], "error: toy.yaml: is not an MCAP file"),
+        (["report", "none.mcap"], "error: none.mcap: cannot be read: No such file or directory"),
+        (["stages", "solve.toi"], "error: no stage 'solve.toi'; did you mean solve.toy?"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_code_two(flangeye, toy_recipe, tmp_path, words, line):
+    before = sorted(p.name for p in tmp_path.iterdir())
+    code, out, err = flangeye(*words)
+    assert code == 2
+    assert err.splitlines()[-1] == line
+    assert "Traceback" not in out + err
+    kept = [n for n in sorted(p.name for p in tmp_path.iterdir()) if n != "runs"]
+    assert kept == before
+
+
+def test_from_a_log_without_the_scans(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--out", "a")
+    code, _, err = flangeye(
+        "run", toy_recipe, "--from", "a/run.mcap", "--at", "solve.toy", "--out", "b"
+    )
+    assert code == 0, err
+    first, second = (json.loads((tmp_path / x / "result.json").read_text()) for x in "ab")
+    assert first["transforms"] == second["transforms"]
+
+
+def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--set", "steps.0.bad=1", "--out", "a")
+    code, out, _ = flangeye("show", "a/run.mcap")
+    assert code == 0
+    assert "a/run.mcap: complete" in out
+    assert "set aside 000: segment.toy: no finite point" in out
+    assert "2.fit.toy" in out
+    (tmp_path / "a" / "report.html").unlink()
+    assert flangeye("report", "a/run.mcap")[0] == 0
+    assert (tmp_path / "a" / "report.html").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["schema", "--out", "nowhere/schema.json"],
+        ["report", "done/run.mcap", "--out", "nowhere/report.html"],
+        ["new-plugin", "mine", "--kind", "fit", "--into", "nowhere/file"],
+    ],
+)
+def test_a_place_that_cannot_be_written_is_one_line(flangeye, toy_recipe, tmp_path, words):
+    assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
+    (tmp_path / "nowhere").write_text("a file where a folder should be")
+    code, _, err = flangeye(*words)
+    assert code == 2
+    assert err.startswith("error: nowhere/")
+    assert " cannot be " in err and err.endswith(": Not a directory\n")
+
+
+def test_version(flangeye):
+    assert flangeye("--version") == (0, f"flangeye {__version__}\n", "")
+
+
+def test_check_stages_plugins_schema(flangeye, toy_recipe, tmp_path):
+    assert flangeye("check", toy_recipe)[1] == (
+        f"{toy_recipe}: ok, 5 steps\n"
+        "eye-on-base: [base_T_camera] · camera_T_target = base_T_flange · flange_T_target; "
+        "to be found: base_T_camera\n"
+    )
+    out = flangeye("stages")[1]
+    assert "fit: the circle's centre or the marker's pose, with covariance\n  fit.toy" in out
+    out = flangeye("stages", "fit.toy")[1]
+    assert "  inlier: length = 0.3 mm  (> 0 in SI)\n" in out
+    assert "      Largest distance of a rim point from the circle.\n" in out
+    out = flangeye("stages", "solve.toy")[1]
+    assert "  cost: a cost = toy\n" in out
+    assert flangeye("plugins")[0] == 0
+    code, out, err = flangeye("schema")
+    assert json.loads(out)["title"] == "flangeye recipe"
+    assert err == (
+        "first line of your recipe: # yaml-language-server: $schema=recipe.schema.json\n"
+    )
+    assert json.loads(flangeye("schema", "--result")[1])["title"] == "Result"
+
+
+def test_a_folder_is_kept_once_something_was_gathered(flangeye, toy_recipe, tmp_path):
+    code, _, err = flangeye("run", toy_recipe, "--set", "steps.0.count=2", "--out", "kept")
+    assert code == 2
+    assert err.splitlines()[1] == "what was gathered is in kept/run.mcap"
+    assert flangeye("show", "kept/run.mcap")[0] == 0
+
+
+def test_help_and_stages_answer_at_once():
+    """Ratios against imports in the same run, so that a slow machine does not fail it."""
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}
+
+    def best(*command):
+        times = []
+        for _ in range(3):
+            start = time.perf_counter()
+            subprocess.run([sys.executable, *command], capture_output=True, env=environment)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    heavy = best("-c", "import scipy.optimize, cv2, open3d")
+    assert best("-m", "flangeye.cli", "--help") < 0.5 * heavy
+    assert best("-m", "flangeye.cli", "stages") < 0.5 * heavy
+
+
+def test_light_commands_import_nothing_heavy():
+    code = (
+        "import sys; from flangeye import cli; from flangeye.plugin.registry import load_registry; "
+        "load_registry(); print([m for m in ('open3d', 'scipy', 'cv2', 'plotly') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "[]\n"
+
+
+def test_ctrl_c_keeps_what_was_gathered(flangeye, toy_recipe, monkeypatch):
+    plain = toy.segment.function
+
+    def stopped_at_the_fourth(capture):
+        if capture.id == "003":
+            raise KeyboardInterrupt
+        return plain(capture)
+
+    with replaced(toy.segment, stopped_at_the_fourth):
+        code, _, err = flangeye("run", toy_recipe, "--out", "a")
+    assert code == 130
+    assert err.splitlines()[-3:] == [
+        "what was gathered is in a/run.mcap",
+        "with other parameters: flangeye run toy --from a/run.mcap --at fit.toy --set PATH=VALUE "
+        "(to do segment.toy again, record with --set log.clouds=full)",
+        "error: stopped by Ctrl-C",
+    ]
+    assert "3 went through" in flangeye("show", "a/run.mcap")[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((), "error: name a recipe, or --resume RUN, which brings its own"),
+        (("toy.yaml", "--resume", "done"),
+         "error: name a recipe, or --resume RUN, which brings its own"),
+        (("--resume", "done", "--set", "seed=4"),
+         "error: --set and --resume: a run goes on with the recipe it began with"),
+        (("--resume", "nowhere"), "error: nowhere: cannot be read: No such file or directory"),
+        (("--resume", "done"),
+         "error: done/run.mcap: this run came to its end; there is nothing to go on with"),
+        (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_gone_on_with_is_said(flangeye, toy_recipe, tmp_path, words, line):
+    assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
+    log = (tmp_path / "done" / "run.mcap").read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(log[: len(log) // 2])
+    assert flangeye("run", *words)[::2] == (2, f"{line}\n")
+
+
+def test_a_plan_that_was_not_allowed_to_move_is_no_mistake(flangeye, toy_recipe, tmp_path):
+    def acquire(seed, params):
+        raise NothingMoved("stop 1: here\nnothing moved")
+
+    with replaced(toy.acquire, acquire):
+        code, out, err = flangeye("run", toy_recipe, "--out", "here")
+    assert (code, out, err) == (0, "stop 1: here\nnothing moved\n", "")
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_source_may_reject_its_own_captures(flangeye, toy_recipe, tmp_path):
+    plain = toy.acquire.function
+    made = []
+
+    def acquire(seed, params):
+        captures = plain(seed, params)
+        made.append(captures)
+        items = captures._items
+        captures._items = (
+            Rejection(c.id, "acquire.toy", "the arm moved") if c.id == "001" else c for c in items
+        )
+        return captures
+
+    with replaced(toy.acquire, acquire):
+        assert flangeye("run", toy_recipe, "--out", "here")[0] == 0
+    result = json.loads((tmp_path / "here" / "result.json").read_text())
+    aside = [o for o in result["observations"] if not o["used"]]
+    assert [(o["id"], o["reason"]) for o in aside] == [("001", "acquire.toy: the arm moved")]
+    outcomes = made[0].outcomes
+    assert outcomes["001"] is None
+    assert outcomes["000"].id == "000"
+
+
+def test_a_refusal_says_what_to_do(flangeye, toy_recipe, tmp_path):
+    code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
+    assert code == 1
+    assert "what to do: flangeye doctor x/run.mcap" in out
+
+
+def test_solvers_are_compared_by_exchanging_a_step(flangeye, toy_recipe):
+    code, _, err = flangeye("check", toy_recipe, "--set", "steps.3=solve.toi")
+    assert (code, err) == (
+        2,
+        "error: --set steps.3: no stage 'solve.toi'; did you mean solve.toy?\n",
+    )
+    assert flangeye("check", toy_recipe, "--set", "verify.toy.max_rms=1 mm")[0] == 0
+
+
+def test_notes_of_the_solver_stand_under_the_verdict(flangeye, toy_recipe, tmp_path):
+    text = toy_recipe.read_text().replace("  - solve.toy", "  - solve.toy\n  - refine.toy")
+    toy_recipe.write_text(text)
+    _, out, _ = flangeye("run", toy_recipe, "--out", "here")
+    lines = out.splitlines()
+    assert lines[lines.index("verified: 6 of 6 captures used") + 1] == "note: refined"
+    assert "note: refined" in flangeye("show", "here")[1]
+    page = (tmp_path / "here" / "report.html").read_text()
+    assert page.index("<li>refined</li>") < page.index('class="headlines"')
+
+
+def test_a_runs_folder_is_as_good_as_its_log(flangeye, toy_recipe, tmp_path):
+    flangeye("run", toy_recipe, "--out", "here")
+    assert flangeye("show", "here")[1] == flangeye("show", "here/run.mcap")[1]
+    (tmp_path / "here" / "report.html").unlink()
+    assert flangeye("report", "here") == (0, "here/report.html\n", "")
+    assert (tmp_path / "here" / "report.html").exists()
+    assert flangeye("replay", "here") == flangeye("replay", "here/run.mcap")
+    assert flangeye("doctor", "here") == flangeye("doctor", "here/run.mcap")
+
+
+def test_a_refused_run_writes_no_calibration(flangeye, toy_recipe, tmp_path):
+    toy_recipe.write_text(toy_recipe.read_text().replace("2 mm", "0.001 mm"))
+    code, out, _ = flangeye("run", toy_recipe, "--out", "here")
+    assert code == 1
+    assert not (tmp_path / "here" / "calibration.yaml").exists()
+    assert "here/: report.html  result.json  run.mcap\n" in out

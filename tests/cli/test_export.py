@@ -1,0 +1,117 @@
+"""``flangeye export`` and export steps: what is written where, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from flangeye_plugins.export.kuka import export_kuka
+from flangeye_plugins.export.matrix import export_matrix
+from flangeye_plugins.export.zivid import export_zivid
+from tests.conftest import TOY_RECIPE
+
+REFUSED = TOY_RECIPE.replace("max_rms: 2 mm", "max_rms: 0.001 mm")
+
+
+@pytest.fixture
+def exporting(flangeye, toy_registry, tmp_path):
+    """Run a recipe into ``here`` with exports on offer; return the command line."""
+    for stage in (export_kuka, export_matrix, export_zivid):
+        toy_registry.stages[stage.name] = stage
+
+    def ran(text):
+        (tmp_path / "toy.yaml").write_text(text)
+        return flangeye("run", "toy.yaml", "--out", "here")
+
+    flangeye.ran = ran
+    return flangeye
+
+
+def test_an_export_is_written_into_the_runs_folder(exporting, tmp_path):
+    assert exporting.ran(TOY_RECIPE)[0] == 0
+    code, out, err = exporting("export", "here", "--to", "matrix", "--set", "length=mm")
+    assert (code, out, err) == (0, "here/exports/camera.txt: numpy.loadtxt reads it\n", "")
+    result = json.loads((tmp_path / "here" / "result.json").read_text())
+    wanted = np.array(result["transforms"]["base_T_camera"]["matrix"])
+    found = np.loadtxt(tmp_path / "here" / "exports" / "camera.txt")
+    assert np.allclose(found[:3, :3], wanted[:3, :3], atol=1e-8)
+    assert np.allclose(found[:3, 3], 1e3 * wanted[:3, 3], atol=1e-8)
+
+
+def test_an_export_is_printed_or_written_elsewhere(exporting, tmp_path):
+    exporting.ran(TOY_RECIPE)
+    log = "here/run.mcap"
+    code, out, _ = exporting("export", log, "--to", "kuka", "--set", "number=7", "--out", "-")
+    assert code == 0
+    assert out.startswith("; flangeye: base_T_camera, maps camera to base; verified\n; recipe toy,")
+    assert "BASE_DATA[7]={X " in out
+    assert exporting("export", log, "--to", "kuka", "--out", "else/b.dat")[0] == 0
+    assert "BASE_DATA[1]={X " in (tmp_path / "else" / "b.dat").read_text()
+
+
+def test_a_refused_calibration_is_not_exported(exporting, tmp_path):
+    assert exporting.ran(REFUSED + "  - export.zivid\n")[0] == 1
+    assert not (tmp_path / "here" / "exports").exists()
+    code, out, err = exporting("export", "here", "--to", "zivid")
+    assert (code, out) == (1, "")
+    assert err.startswith("error: the calibration was refused, so nothing is exported: verify.toy:")
+    assert err.endswith("; --anyway writes it all the same, and says so in the file\n")
+    assert not (tmp_path / "here" / "exports").exists()
+
+
+def test_a_refused_calibration_says_so_in_the_file(exporting, tmp_path):
+    exporting.ran(REFUSED)
+    assert exporting("export", "here", "--to", "zivid", "--anyway")[0] == 0
+    text = (tmp_path / "here" / "exports" / "camera.zivid.yaml").read_text()
+    assert "# REFUSED, DO NOT USE: verify.toy: " in text
+
+
+def test_a_calibration_nobody_judged_says_so_in_the_file(exporting, tmp_path):
+    exporting.ran(TOY_RECIPE.replace("  - verify.toy: {max_rms: 2 mm}\n", "  - export.matrix\n"))
+    text = (tmp_path / "here" / "exports" / "camera.txt").read_text()
+    assert "# NOT VERIFIED: nothing has judged this calibration\n" in text
+
+
+def test_a_recipe_exports_wherever_the_step_stands(exporting, tmp_path):
+    steps = "  - export.kuka: {name: eye}\n  - export.matrix\n"
+    before = TOY_RECIPE.replace("  - verify.toy", steps + "  - verify.toy")
+    assert exporting.ran(before)[0] == 0
+    files = {p.name: p.read_text() for p in (tmp_path / "here" / "exports").iterdir()}
+    assert sorted(files) == ["camera.txt", "eye.kuka.dat"]
+    assert all("; verified\n" in text for text in files.values())
+    assert json.loads((tmp_path / "here" / "result.json").read_text())["exports"] == files
+
+
+@pytest.mark.parametrize(
+    ("text", "told", "message"),
+    [
+        (
+            TOY_RECIPE + "  - export.matrix\n  - export.matrix: {length: mm}\n",
+            (),
+            "6.export.matrix: an earlier step writes camera.txt already; give this one another name",
+        ),
+        (TOY_RECIPE, ("--to", "kukka"), "no stage 'export.kukka'; did you mean export.kuka?"),
+        (
+            TOY_RECIPE,
+            ("--to", "kuka", "--set", "number=x"),
+            "--set number: must be a valid integer, unable to parse string as an integer, not 'x'",
+        ),
+        (
+            TOY_RECIPE,
+            ("--to", "kuka", "--set", "nam=eye"),
+            "--set nam: unknown key 'nam'; did you mean 'name'? (allowed: name, number)",
+        ),
+        (
+            TOY_RECIPE,
+            ("--to", "matrix", "--set", "name=../../x"),
+            "--set name: string should match pattern '^[A-Za-z][A-Za-z0-9_]{0,31}$', not '../../x'",
+        ),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(exporting, text, told, message):
+    code, _, err = exporting.ran(text)
+    if told:
+        code, _, err = exporting("export", "here", *told)
+    assert code == 2
+    assert f"error: {message}" in err
+    assert "Traceback" not in err

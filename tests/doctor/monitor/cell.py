@@ -1,0 +1,56 @@
+"""A stored calibration, and later runs of the same cell with something moved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.log.record import Recorder
+from flangeye.maths.geometry import rigid, rotation_exp
+from tests.report.conftest import TRUTH, WORKSPACE, Script, _pose, scripted
+
+STATIONS = [_pose(np.random.default_rng(k)) for k in (11, 12, 13)]
+
+
+def calibrate(folder: Path) -> Path:
+    """Record a calibration and return its folder."""
+    folder.mkdir()
+    scripted(Script(points=50, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
+    return folder
+
+
+def check(folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5) -> Path:
+    """Record a check: three scans, the scanner shifted by ``shift`` in base [m]."""
+    folder.mkdir()
+    rng = np.random.default_rng(seed)
+    recorder = Recorder(folder / "run.mcap", {"recipe.resolved.yaml": "title: x"}, False)
+    recorder.flangeye_run_started(source=t.Source("sha256:0"), total=3)
+    camera = t.Transform(t.BASE, t.CAMERA, rigid(np.eye(3), np.array(shift)) @ TRUTH.matrix)
+    for i, pose in enumerate(STATIONS):
+        name = f"scan-{i}"
+        cloud = t.PointCloud(t.CAMERA, np.zeros((1, 3), np.float32))
+        capture = t.Capture(
+            name, cloud, t.by_frame(pose), time_ns=10**18 + seed * 8 * 3600 * 10**9 + i
+        )
+        recorder.flangeye_captured(step="0.acquire.live", capture=capture, seconds=0.1)
+        recorder.flangeye_stage_finished(
+            step="2.fit.rim", value=_circle(camera.inverse() @ pose, rng, noise),
+            capture=name, seconds=0.0,
+        )  # fmt: skip
+        recorder.flangeye_capture_finished(capture=name)
+    recorder.close()
+    return folder
+
+
+def _circle(seen: t.Transform, rng: np.random.Generator, noise: float) -> t.CircleFeature:
+    normal = rotation_exp(rng.normal(0, 3e-4, 3)) @ seen.rotation[:, 2]
+    across = np.eye(3) - np.outer(normal, normal)
+    return t.CircleFeature(
+        seen.translation + rng.normal(0, noise, 3), normal, {}, noise**2 * np.eye(3),
+        9e-8 * across, 0.9,
+    )  # fmt: skip
+
+
+__all__ = ["STATIONS", "TRUTH", "WORKSPACE", "calibrate", "check"]

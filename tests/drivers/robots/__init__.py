@@ -1,5 +1,0 @@
-"""Drivers of arms, through their makers' client libraries."""
-
-import pytest
-
-pytest.register_assert_rewrite("tests.drivers.robots.behaviour")

@@ -1,0 +1,11 @@
+"""A controller in simulated time for every test that wants one."""
+
+import pytest
+
+from tests.emulators.controllers.desk import Desk
+
+
+@pytest.fixture
+def desk():
+    """A UR5e that waits for commands."""
+    return Desk()

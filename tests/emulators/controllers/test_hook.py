@@ -1,0 +1,60 @@
+"""``flangeye emulator`` finds controllers that plugins offer, whoever wrote them."""
+
+import sys
+import types
+
+import pytest
+
+from flangeye import cli
+from flangeye.errors import StageError
+from flangeye.models.emulator import Emulator, EmulatorOptions, find_emulator
+from flangeye.models.loading import load_model
+from flangeye.plugin import registry
+from flangeye.plugin.registry import load_registry
+from tests import toy
+
+
+def test_the_built_in_controllers_come_through_the_hook():
+    offered = [one for some in load_registry().hooks.hook.flangeye_emulators() for one in some]
+    for model in ("ur3e", "ur5", "ur5e", "ur10e"):
+        assert find_emulator(offered, load_model("robots", model)).name == "ur"
+
+
+def test_without_plugins_there_are_none():
+    with pytest.raises(StageError) as error:
+        find_emulator([], load_model("robots", "ur5e"))
+    assert str(error.value) == (
+        "no controller on loopback for a ur5e of Universal Robots; there is one for arms of: none"
+    )
+
+
+def test_a_vendors_controller_is_found(monkeypatch, toy_registry):
+    served = []
+    vendor = types.ModuleType("vendor")
+    vendor.flangeye_emulators = toy.hookimpl(
+        lambda: [Emulator("fr", "Franka Emika", served.append)]
+    )
+    toy_registry.register("vendor", vendor)
+    monkeypatch.setattr(registry, "load_registry", lambda: toy_registry)
+    arguments = [
+        "--host",
+        "127.0.0.9",
+        "--joints",
+        "0 10 deg",
+        "--fault",
+        "a",
+        "--fault",
+        "b@moving",
+    ]
+    monkeypatch.setattr(sys, "argv", ["flangeye", "loopback", "franka-panda", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    assert served == [
+        EmulatorOptions(
+            robot=load_model("robots", "franka-panda"),
+            host="127.0.0.9",
+            joints=(0.0, pytest.approx(0.17453292519943295)),
+            faults=("a", "b@moving"),
+        )
+    ]

@@ -1,0 +1,133 @@
+"""What a weld stays within, what it refuses, and that nothing of the truth leads to a controller."""
+
+from types import MethodType
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye_emulators.weld_world import trial as trials
+from flangeye_emulators.weld_world.bench import try_condition
+from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
+from flangeye_emulators.weld_world.worlds import drawn, judged
+from tools.weld_worlds import summary
+
+SHORT = 0.07
+
+
+def rms(trial):
+    return float(np.sqrt(np.mean(trial.errors**2)))
+
+
+@pytest.mark.parametrize(
+    "name", ["finger gain +20 %", "finger gain -20 %", "tag's rest off 0.2 mm"]
+)
+def test_a_finger_that_is_not_as_calibrated_is_measured_before_the_weld(name):
+    found = try_condition(CONDITIONS[name], 0, SHORT, 16e-3)
+    assert found.done
+    assert rms(found) < 0.1e-3
+
+
+def test_delays_of_arm_and_images_are_measured_and_made_up_for():
+    name = "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms"
+    found = try_condition(CONDITIONS[name], 0)
+    assert found.controller.learned.dead_time == pytest.approx(0.06, abs=0.021)
+    assert found.controller.learned.lag == pytest.approx(0.1, abs=0.051)
+    assert rms(found) < 0.15e-3
+    assert found.errors.max() < 0.4e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("groove half angle 60 deg, planned 40 deg", "not understood|climbs"),
+        ("finger half as stiff axially", "not understood|climbs"),
+        ("finger play 0.3 mm", "of play"),
+        ("tag hidden 0.6 s", "no tag was seen"),
+    ],
+)
+def test_what_cannot_be_welded_is_stopped_with_its_reason(name, reason):
+    found = try_condition(CONDITIONS[name], 0, period=16e-3)
+    assert found.phases[-1] == "stopped"
+    assert any(word in found.controller.reason for word in reason.split("|"))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("groove half angle 60 deg, known", "climb the wall.*lower 'deflection' to 1.24 mm"),
+        ("torch 0.5 mm aside", "torch is known to 1.24 mm at best"),
+        ("arm wavy 0.3 mm", "of arm_sigma and of distortion"),
+    ],
+)
+def test_what_is_known_beforehand_is_refused_beforehand(name, message):
+    with pytest.raises(StageError, match=message):
+        try_condition(CONDITIONS[name], 0)
+
+
+def test_noise_of_a_tenth_of_a_millimetre_is_no_silent_failure():
+    found = try_condition(CONDITIONS["tip noise 0.1 mm"], 0, period=16e-3)
+    stated = found.column("bound")[found.beside]
+    assert not found.done or (found.errors <= stated).all()
+
+
+def test_heat_stays_within_the_stated_bound():
+    hot = CONDITIONS["heat: 1 mm around the torch"]
+    found = try_condition(hot, 0, SHORT, 16e-3)
+    assert (found.errors <= found.column("bound")[found.beside]).all()
+
+
+def _reachable(value):
+    seen, left = {}, [value]
+    while left:
+        each = left.pop()
+        if id(each) in seen:
+            continue
+        seen[id(each)] = each
+        yield each
+        if isinstance(each, dict):
+            left.extend([*each.keys(), *each.values()])
+        elif isinstance(each, list | tuple | set | frozenset):
+            left.extend(each)
+        elif isinstance(each, MethodType):
+            left.append(each.__self__)
+        elif type(each).__module__.startswith("flangeye") or hasattr(each, "popleft"):
+            left.extend(getattr(each, "__dict__", {}).values())
+            left.extend(each if hasattr(each, "popleft") else [])
+
+
+def test_nothing_of_the_world_is_reachable_from_the_controller(monkeypatch):
+    given = []
+
+    def spy(controller, nominal, truth, start, seed):
+        step = controller.step
+
+        def watched(pose, touches):
+            given.append((pose, touches))
+            return step(pose, touches)
+
+        controller.step = watched
+        try:
+            return trials_run(controller, nominal, truth, start, seed)
+        finally:
+            del controller.step
+
+    trials_run = trials.run_trial
+    monkeypatch.setattr("flangeye_emulators.weld_world.bench.run_trial", spy)
+    found = try_condition(Condition(), 0, SHORT, 16e-3)
+    ours = [*_reachable(found.controller), *_reachable(given[-200:])]
+    modules = {type(each).__module__ for each in ours}
+    assert "flangeye_plugins.weld.refined" in modules  # the walk goes somewhere
+    assert not [name for name in modules if name.startswith("flangeye_emulators")]
+
+
+def test_worlds_are_drawn_again_as_they_were():
+    assert drawn(3) == drawn(3) != drawn(4)
+
+
+@pytest.mark.slow
+def test_no_weld_is_reported_done_beyond_its_bound():
+    verdicts = [judged(seed) for seed in range(2000, 2040)]
+    assert sum(v.done for v in verdicts) >= 8
+    assert not [v for v in verdicts if v.silent]
+    assert f"{len(verdicts)} worlds" in summary(verdicts)[0]

@@ -1,0 +1,1 @@
+"""Malformed input of every sort: one line and an exit code, never a traceback."""

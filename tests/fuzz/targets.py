@@ -1,0 +1,298 @@
+"""What is fuzzed: for each sort of input sound seeds, and the reader that must refuse or read."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import FlangeyeError
+from tests.crafted import rewritten
+
+Seeds = Callable[[Path], list[bytes]]
+SEEDS = Path(__file__).with_name("seeds")
+"""Inputs that once broke something, by target: ``seeds/<target>/<anything>``."""
+
+
+class Target(NamedTuple):
+    """A sort of input.
+
+    Attributes:
+        suffix: Of its file.
+        seeds: Sound examples, made in a folder.
+        read: Reads the file at a path; whatever but FlangeyeError it raises is a find.
+    """
+
+    suffix: str
+    seeds: Seeds
+    read: Callable[[Path], object]
+
+
+def survives(target: Target, path: Path) -> bool:
+    """Return whether a file was read (True) or refused in one message (False).
+
+    Raises:
+        Exception: Anything else: a find.
+    """
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            target.read(path)
+    except FlangeyeError as error:
+        assert str(error)
+        return False
+    return True
+
+
+@cache
+def _registry():
+    from flangeye.plugin.registry import load_registry
+
+    return load_registry()
+
+
+@cache
+def _toys():
+    from tests.conftest import toy_plugins
+
+    return toy_plugins()
+
+
+@cache
+def sound_log(folder: Path) -> Path:
+    """Return a whole log of the toy stages."""
+    from flangeye.recipe.load import load_recipe
+    from flangeye.run.folder import RunFolder
+    from flangeye.run.session import Start, record_run
+    from tests.conftest import TOY_RECIPE
+
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "toy.yaml").write_text(TOY_RECIPE)
+    made = RunFolder.create("toy", folder / "run")
+    recipe = load_recipe(folder / "toy.yaml", _toys())
+    record_run(recipe, _toys(), made, Start(), report=False)
+    return made.log
+
+
+def _recipes(folder):
+    from flangeye.recipe.load import recipe_names
+
+    names = ("ur5_phoxi-m_simulated", "ur5e_phoxi-m_loopback", "aubo-i5_phoxi-s_archive")
+    return [recipe_names()[name].read_bytes() for name in names]
+
+
+def _check_recipe(path):
+    from flangeye.recipe.load import load_recipe
+
+    load_recipe(path, _registry())
+
+
+def _overrides(folder):
+    return [
+        b"steps.2.inlier=0.2 mm", b"robot.limits.box.size=[1 m, 1 m, 1 m]", b"seed=3", b"title=x",
+        b"robot.limits.box.centre=[0 m, 0 m, 0 m]", b"steps.0.view={guess: {position: [1 m, 0 m, 1 m]}}",
+    ]  # fmt: skip
+
+
+def _check_override(path):
+    from flangeye.recipe.load import find_recipe, load_recipe
+
+    text = path.read_bytes().decode("utf-8", "replace")
+    load_recipe(find_recipe("ur5e_phoxi-m_loopback"), _registry(), [text])
+
+
+def _models(folder):
+    from flangeye.files.bundled import bundled
+
+    return [(bundled("data") / "robots" / f"{name}.yaml").read_bytes() for name in ("ur5", "ur5e")]
+
+
+def _read_model(path):
+    from flangeye.models.model import read_model
+    from flangeye.models.robots import RobotModel
+
+    read_model(path, RobotModel)
+
+
+def _pcd(folder):
+    from flangeye.files.clouds import write_cloud
+    from flangeye.types import CAMERA, PointCloud
+
+    xyz = np.random.default_rng(0).normal(size=(6, 8, 3)).astype(np.float32)
+    write_cloud(folder / "a.pcd", PointCloud(CAMERA, xyz))
+    raw = (folder / "a.pcd").read_bytes()
+    head, _, _ = raw.partition(b"DATA")
+    rows = "\n".join(" ".join(map(str, row)) for row in xyz.reshape(-1, 3))
+    return [raw, head + b"DATA ascii\n" + rows.encode() + b"\n"]
+
+
+PLY = (
+    "ply\nformat {} 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+)
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
+
+
+def _ply(folder):
+    faces = b"".join(b"\x03" + np.array(f, "<i4").tobytes() for f in ([0, 1, 2], [0, 2, 3]))
+    rows = "\n".join(" ".join(map(str, row)) for row in CORNERS)
+    return [
+        PLY.format("binary_little_endian").encode() + CORNERS.tobytes() + faces,
+        f"{PLY.format('ascii')}{rows}\n3 0 1 2\n3 0 2 3\n".encode(),
+    ]
+
+
+def _stl(folder):
+    facet = np.zeros(1, dtype=[("n", "<3f4"), ("v", "<9f4"), ("a", "<u2")])
+    facet["v"] = CORNERS[:3].reshape(-1)
+    return [b"solid".ljust(80) + (1).to_bytes(4, "little") + facet.tobytes(),
+            b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+            b"endloop\nendfacet\nendsolid a\n"]  # fmt: skip
+
+
+def _npy(folder):
+    out = io.BytesIO()
+    np.save(out, CORNERS)
+    return [out.getvalue()]
+
+
+def _npz(folder):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("arr_0.npy", _npy(folder)[0])
+    return [out.getvalue()]
+
+
+def _poses(folder):
+    return [
+        b"cloud,x_m,y_m,z_m,qx,qy,qz,qw\n00.pcd,0.1,0.2,0.3,0,0,0,1\n01.pcd,0.2,0,0.3,0,0,0,1\n"
+    ]
+
+
+def _images(folder):
+    import cv2
+
+    pixels = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    return [cv2.imencode(kind, pixels)[1].tobytes() for kind in (".png", ".bmp", ".jpg", ".tif")]
+
+
+def _logs(folder):
+    raw = sound_log(folder / "sound").read_bytes()
+    return [raw, raw[:5000]]
+
+
+def _rewritten(folder):
+    """Texts that say which topic gets which content: the log's checksums are made anew."""
+    topics = ["/source", "/capture", "/capture/cloud", "/step/1.segment.toy", "/step/2.fit.toy",
+              "/step/3.solve.toy", "/step/4.verify.toy", "/capture/finished", "/log", "/rejection",
+              "result.json", "recipe.yaml", "recipe.resolved.yaml"]  # fmt: skip
+    held = {}
+    rewritten(sound_log(folder / "sound"), folder / "copy.mcap",
+              lambda name, data: (name, held.setdefault(name, data)))  # fmt: skip
+    return [t.encode() + b"\n" + held[t] for t in topics if t in held]
+
+
+def _read_log(path):
+    from rich.console import Console
+
+    from flangeye.cli.terminal import print_log
+    from flangeye.log.read import read_notes, read_run
+
+    log = read_run(path)
+    print_log(Console(file=io.StringIO()), log)
+    log.observations(), log.views(), list(log.readings())
+    for message in log.notes:
+        assert str(path) in message
+    list(read_notes(path))
+
+
+def _read_rewritten(path):
+    topic, _, content = path.read_bytes().partition(b"\n")
+    name = topic.decode("utf-8", "replace")
+    source = sound_log(path.parent / "sound")
+    changed = rewritten(source, path.with_suffix(".mcap"),
+                        lambda n, data: (n, content if n == name else data))  # fmt: skip
+    _read_log(changed)
+    _follow(changed)
+
+
+def _follow(path):
+    from flangeye.errors import StageError
+    from flangeye.log.watch.tail import follow
+    from flangeye.log.watch.view import View
+
+    def wait():
+        raise StageError("no more")
+
+    view = View("run")
+    for message in follow(path, wait, view.note):
+        view.take(message)
+    view.rendered()
+
+
+def _read_cloud(path):
+    from flangeye.files.clouds import read_cloud
+
+    read_cloud(path)
+
+
+def _read_mesh(path):
+    from flangeye.models.workpiece import read_mesh
+
+    read_mesh(path)
+
+
+def _read_npz(path):
+    from flangeye.files.arrays import read_arrays
+
+    read_arrays(path)
+
+
+def _read_image(path):
+    from flangeye_plugins.acquire.camera import read_image
+
+    read_image(path)
+
+
+def _read_poses(path):
+    folder = path.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    (folder / "poses.csv").write_bytes(path.read_bytes())
+    for name in ("00.pcd", "01.pcd"):
+        (folder / name).touch()
+    _registry().part("reader.folder").bind()(folder)
+
+
+def _read_json(path):
+    from flangeye.errors import StageError
+    from flangeye.log.read import decode_json
+
+    try:
+        decode_json(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise StageError(str(error) or type(error).__name__) from None
+
+
+TARGETS = {
+    "recipe": Target(".yaml", _recipes, _check_recipe),
+    "set": Target(".txt", _overrides, _check_override),
+    "model": Target(".yaml", _models, _read_model),
+    "pcd": Target(".pcd", _pcd, _read_cloud),
+    "ply": Target(".ply", _ply, _read_cloud),
+    "npy": Target(".npy", _npy, _read_cloud),
+    "npz": Target(".npz", _npz, _read_npz),
+    "xyz": Target(".xyz", lambda folder: [b"0 0 1\n1 0 1\n", b"x,y,z\n1,2,3\n"], _read_cloud),
+    "mesh-ply": Target(".ply", _ply, _read_mesh),
+    "mesh-stl": Target(".stl", _stl, _read_mesh),
+    "image": Target(".png", _images, _read_image),
+    "poses": Target(".csv", _poses, _read_poses),
+    "log": Target(".mcap", _logs, _read_log),
+    "log-rewritten": Target(".txt", _rewritten, _read_rewritten),
+    "json": Target(".json", lambda f: [json.dumps({"a": [1.5, "x"]}).encode()], _read_json),
+}

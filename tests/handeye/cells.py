@@ -1,0 +1,165 @@
+"""Observations of known truth for every configuration, drawn in a moment."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.maths.geometry import (
+    hat,
+    invert,
+    rigid,
+    rotation_exp,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rotation_log,
+)
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import Configuration, carriers_of
+from flangeye.models.loading import load_model
+from flangeye.types import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    CircleFeature,
+    Observation,
+    Observations,
+    PoseFeature,
+    Source,
+    Transform,
+    by_frame,
+)
+
+ROBOT = load_model("robots", "ur5", None)
+KNOWN = rigid(rotation_from_rpy(0.1, -0.2, 0.3), np.array([0.02, -0.01, 0.05]))
+
+CONFIGURATIONS = {
+    "eye-on-base, flange": Configuration(place=np.eye(4)),
+    "eye-on-base, marker": Configuration(),
+    "eye-in-hand, marker": Configuration("eye-in-hand", FLANGE, BASE),
+    "eye-in-hand, base circle": Configuration("eye-in-hand", FLANGE, BASE, KNOWN),
+    "eye-on-arm 1, marker": Configuration("eye-on-arm", "link3", FLANGE),
+    "eye-on-arm 1, flange": Configuration("eye-on-arm", "link3", FLANGE, np.eye(4)),
+    "eye-on-arm 2, marker": Configuration("eye-on-arm", "link3", BASE),
+    "eye-on-arm 2, base circle": Configuration("eye-on-arm", "link3", BASE, KNOWN),
+    "two arms, marker": Configuration("two-arms", FLANGE, FLANGE2),
+    "two arms, flange": Configuration("two-arms", FLANGE, FLANGE2, np.eye(4)),
+}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations; the issue's by default."""
+
+    turn: float = np.radians(0.05)
+    shift: float = 1e-4
+    arm_turn: float = 2e-4
+    arm_shift: float = 5e-5
+
+    def scaled(self, k: float) -> "Noise":
+        return Noise(k * self.turn, k * self.shift, k * self.arm_turn, k * self.arm_shift)
+
+
+@dataclass(frozen=True)
+class Session:
+    configuration: Configuration
+    observations: list
+    truth: dict
+
+    def stream(self):
+        return Observations(self.observations, Source("cells"), len(self.observations))
+
+
+def rotation(rng):
+    return rotation_from_quaternion(rng.standard_normal(4))
+
+
+def moves(rng, n, tilt, reach=0.15):
+    """Return (n, 4, 4) small motions: roll, pitch, yaw within the tilt, shifts within the reach."""
+    turns = [rotation_from_rpy(*rng.uniform(-tilt, tilt, 3)) for _ in range(n)]
+    return np.array([rigid(r, rng.uniform(-reach, reach, 3)) for r in turns])
+
+
+TILT = np.radians(17)
+ISSUE = Noise()
+
+
+def session(configuration, rng, n=15, tilt=TILT, noise=ISSUE, feature="pose", poses=None):
+    """Draw a session whose target is some 0.6 m before the camera.
+
+    ``poses`` gives (n, 4, 4) motions of every arm in place of those drawn.
+    """
+    homes = [rigid(rotation(rng), np.array([0.4, 0.1, 0.4])) for _ in range(2)]
+    drawn = [moves(rng, n, tilt) if poses is None else poses for _ in range(2)]
+    first, second = homes[0] @ drawn[0], homes[1] @ drawn[1]
+    joints = None
+    if configuration.name == "eye-on-arm":
+        joints = np.array([0.2, -1.4, 1.3, -1.2, -1.4, 0.3]) + rng.uniform(-tilt, tilt, (n, 6))
+        first = Arm(ROBOT).flange(joints)
+    x = rigid(rotation(rng), rng.normal(0, 0.05, 3))
+    z = configuration.place
+    seen = rigid(rotation_from_rpy(np.pi, 0, 0), np.array([0.0, 0.0, 0.6]))
+    # Carriers as reported; the place left over closes the loop at the first pose.
+    bare = [_observation(i, None, first, joints, second, configuration) for i in range(n)]
+    carriers = carriers_of(configuration, bare, Arm(ROBOT))
+    a, b, y = carriers.camera, carriers.target, np.eye(4)
+    if configuration.other_base:
+        z = rigid(rotation(rng), rng.normal(0, 0.05, 3)) if z is None else z
+        y = a[0] @ x @ seen @ invert(b[0] @ z)
+    elif z is None:
+        z = invert(b[0]) @ a[0] @ x @ seen
+    else:
+        x = invert(a[0]) @ b[0] @ z @ invert(seen)
+    a, b = (
+        m if frame == BASE else m @ _jitter(rng, n, noise.arm_turn, noise.arm_shift)
+        for frame, m in ((configuration.camera, a), (configuration.target, b))
+    )
+    true = invert(a @ x) @ (y @ b @ z)
+    observations = [
+        replace(o, feature=_feature(m, noise, feature, rng))
+        for o, m in zip(bare, true, strict=True)
+    ]
+    values = [x, *([y] if configuration.other_base else []), z]
+    return Session(
+        configuration, observations, dict(zip(configuration.unknowns, values, strict=False))
+    )
+
+
+def _observation(i, feature, first, joints, second, configuration):
+    return Observation(
+        f"{i:03d}",
+        feature,
+        by_frame(
+            Transform(BASE, FLANGE, first[i]),
+            Transform(BASE2, FLANGE2, second[i]) if configuration.other_base else None,
+        ),
+        None if joints is None else joints[i],
+    )
+
+
+def _jitter(rng, n, turn, shift):
+    out = np.tile(np.eye(4), (n, 1, 1))
+    out[:, :3, :3] = rotation_exp(turn * rng.standard_normal((n, 3)))
+    out[:, :3, 3] = shift * rng.standard_normal((n, 3))
+    return out
+
+
+def _feature(true, noise, kind, rng):
+    turned = rotation_exp(noise.turn * rng.standard_normal(3)) @ true[:3, :3]
+    centre = true[:3, 3] + noise.shift * rng.standard_normal(3)
+    turn, shift = max(noise.turn, 1e-7) ** 2, max(noise.shift, 1e-7) ** 2
+    if kind == "pose":
+        covariance = np.diag([turn] * 3 + [shift] * 3)
+        return PoseFeature(Transform(CAMERA, TARGET, rigid(turned, centre)), covariance)
+    normal = turned[:, 2] if kind == "normal" else None
+    of_normal = None if normal is None else -turn * hat(normal) @ hat(normal)
+    return CircleFeature(centre, normal, {"rim": 0.0315}, shift * np.eye(3), of_normal, 1.0)
+
+
+def errors(found, truth):
+    """Return (6,) rotation and translation error, as the covariance of an estimate takes it."""
+    error = found.transform.matrix @ np.linalg.inv(truth)
+    shift = error[:3, :3] @ found.about + error[:3, 3] - found.about
+    return np.concatenate([rotation_log(error[:3, :3]), shift])

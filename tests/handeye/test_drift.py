@@ -1,0 +1,69 @@
+"""The sequential test: what it finds, when, and how often it cries wolf."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flangeye.handeye.drift import DriftTest, Information, allowance, information_of, verdict
+from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
+from tools import drift_year
+
+
+def test_the_days_motion_is_marginalised_as_an_unknown_would_be() -> None:
+    watched = watch(Year(checks=2), Happening(), np.random.default_rng(0))
+    seen, daily = watched.sightings, 3e-5
+    told = information_of(seen, daily)
+    own = seen.of(1, 2)
+    stacked = own.effects.reshape(-1, 6)
+    noise = stacked @ allowance(daily) @ stacked.T
+    for i, each in enumerate(own.covariances):
+        noise[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] += each
+    weighted = np.linalg.solve(noise, stacked)
+    np.testing.assert_allclose(told.matrix[1], stacked.T @ weighted, rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(told.vector[1], -weighted.T @ own.residuals.ravel(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", drift_year.STEPS)
+def test_a_step_is_found_within_three_checks(name: str) -> None:
+    part, size = drift_year.STEPS[name]
+    found, _, by_check = drift_year.steps(part, size, 20)
+    assert by_check[2] >= 0.95 and found >= 19
+
+
+def test_a_cell_that_only_warms_and_cools_is_ok() -> None:
+    watched = watch(Year(checks=90), Happening(), np.random.default_rng(5))
+    told = information_of(watched.sightings, DriftTest().daily)
+    for n in range(1, 91):
+        seen = Information(told.matrix[:n], told.vector[:n])
+        assert verdict(seen, watched.prior, CORNERS, DriftTest()).state == "OK"
+
+
+def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
+    part, _ = drift_year.STEPS["scanner 0.2 mm"]
+    _, right, by_check = drift_year.steps(part, lambda v: np.concatenate([2e-3 * v, 2e-3 * v]), 8)
+    assert by_check[0] == 1.0 and right == 1.0
+
+
+def test_a_joint_re_mastered_is_named() -> None:
+    from flangeye.handeye.drift import blame, suspects
+    from flangeye_emulators.world.year import ABOUT, step_at
+
+    wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))
+    watched = watch(Year(checks=46), Happening(joints=wrong), np.random.default_rng(3))
+    told = information_of(watched.sightings, DriftTest().daily)
+    found = verdict(told, watched.prior, CORNERS, DriftTest())
+    assert found.state == "MOVED" and found.since is not None
+    before = Information.of_covariance(watched.prior).plus(told.summed(10, 40))
+    parts = blame(before, watched.sightings.of(40, 46), ABOUT, watched.scanner, 3e-5)
+    assert suspects(parts)[0][0] == "arm"
+    assert max(parts, key=lambda part: parts[part]) == "joint 3 re-mastered"
+
+
+@pytest.mark.slow
+def test_a_year_as_the_page_says() -> None:
+    for part, size in drift_year.STEPS.values():
+        assert drift_year.steps(part, size, 200)[2][2] >= 0.95
+    alarms, checks = drift_year.false_alarms(3)
+    assert alarms <= checks / 1000
+    assert max(drift_year.slow(20)) < 0.3

@@ -1,0 +1,160 @@
+"""Several cameras, arms, rails and targets at once."""
+
+import numpy as np
+import pytest
+
+from flangeye import CalibrationRefused, StageError
+from flangeye.handeye.graph import Frame, Sighting, chain, solve_graph
+from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+
+UR5 = Arm(load_model("robots", "ur5"))
+HOME = np.radians([0, -90, 90, -90, -90, 0])
+TURN, SHIFT = 0.5e-3, 0.1e-3
+COVARIANCE = np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
+
+
+def pose(*numbers):
+    return rigid(
+        rotation_exp(np.array(numbers[:3], dtype=float)), np.array(numbers[3:], dtype=float)
+    )
+
+
+def arm_poses(count, seed):
+    joints = HOME + np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 6))
+    return UR5.flange(joints)
+
+
+def rail_poses(count, seed):
+    places = np.tile(np.eye(4), (count, 1, 1))
+    places[:, 0, 3] = np.random.default_rng(seed).uniform(-1, 1, count)
+    return places
+
+
+N = 14
+CELLS = {
+    # name: (frames as they are, those to be found, who sees whom)
+    "two fixed scanners and one arm": (
+        {
+            "flange": Frame("base", arm_poses(N, 1)),
+            "left": Frame("base", pose(3, 0.1, 0, 0.4, 0.6, 1.1)),
+            "right": Frame("base", pose(3, -0.2, 0.3, 0.4, -0.7, 1.2)),
+            "marker": Frame("flange", pose(0, 0.1, 0.2, 0.01, 0.02, 0.05)),
+        },
+        ["left", "right", "marker"],
+        [("left", "marker"), ("right", "marker")],
+    ),
+    "two arms with a scanner each and one between": (
+        {
+            "flange": Frame("base", arm_poses(N, 2)),
+            "base2": Frame("base", pose(0, 0, 3, 1.2, 0.1, 0)),
+            "flange2": Frame("base2", arm_poses(N, 3)),
+            "hand": Frame("flange", pose(0, 0, 1.5, 0.06, 0, 0.04)),
+            "hand2": Frame("flange2", pose(0.1, 0, -1.5, 0.05, 0.01, 0.04)),
+            "between": Frame("base", pose(2.5, 0.4, 0, 0.6, 0.1, 1.3)),
+            "plate": Frame("flange", pose(0, 0, 0.3, 0, 0.05, 0.01)),
+            "plate2": Frame("flange2", pose(0, 0.1, 0.3, 0.02, 0.05, 0.01)),
+        },
+        ["base2", "hand", "hand2", "between", "plate", "plate2"],
+        [("hand", "plate2"), ("hand2", "plate"), ("between", "plate"), ("between", "plate2")],
+    ),
+    "an arm on a rail": (
+        {
+            "carriage": Frame("world", rail_poses(N, 4)),
+            "base": Frame("carriage", pose(0, 0, 0.8, 0.1, 0, 0.3)),
+            "flange": Frame("base", arm_poses(N, 5)),
+            "camera": Frame("world", pose(2.8, 0.2, 0, 0.2, 1.5, 1.4)),
+            "marker": Frame("flange", pose(0.2, 0.1, 0.2, 0.01, 0.02, 0.05)),
+        },
+        ["camera", "marker"],
+        [("camera", "marker")],
+    ),
+    "a scanner in the hand and one on the wall that never see the same thing": (
+        {
+            "flange": Frame("base", arm_poses(N, 6)),
+            "hand": Frame("flange", pose(0, 0, 1.5, 0.06, 0, 0.04)),
+            "wall": Frame("base", pose(2.0, 1.2, 0, 0.3, -1.2, 0.9)),
+            "table": Frame("base", pose(0, 0, 0.4, 0.5, 0.2, 0)),
+            "marker": Frame("flange", pose(0, 0.4, 0.2, 0.05, 0.02, 0.05)),
+        },
+        ["hand", "wall", "table", "marker"],
+        [("hand", "table"), ("wall", "marker")],
+    ),
+}
+
+
+def composed(frames, name, t):
+    out = np.eye(4)
+    for each in chain(frames, name):
+        place = frames[each].place
+        out = out @ (place[t] if place.ndim == 3 else place)
+    return out
+
+
+def seen(frames, pairs, rng, scale=1.0):
+    sightings = []
+    for t in range(N):
+        for camera, target in pairs:
+            true = invert(composed(frames, camera, t)) @ composed(frames, target, t)
+            noise = scale * rng.standard_normal(6) * np.repeat([TURN, SHIFT], 3)
+            measured = rigid(rotation_exp(noise[:3]) @ true[:3, :3], true[:3, 3] + noise[3:])
+            sightings.append(Sighting(t, camera, target, measured, COVARIANCE))
+    return sightings
+
+
+def solved(name, seed=0, scale=1.0):
+    frames, unknown, pairs = CELLS[name]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    return solve_graph(given, seen(frames, pairs, np.random.default_rng(seed), scale))
+
+
+def error(found, true):
+    turn = rotation_log(found[:3, :3] @ true[:3, :3].T)
+    return np.concatenate([turn, found[:3, 3] - true[:3, 3]])
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_every_unknown_of_a_cell_is_found_with_its_covariance(name):
+    frames, unknown, _ = CELLS[name]
+    found = solved(name)
+    assert list(found.places) == unknown
+    for each in unknown:
+        off = error(found.places[each], frames[each].place)
+        distance = off @ np.linalg.solve(found.covariances[each], off)
+        assert distance < 22.5  # 99.9 % of chi-squared with six degrees of freedom
+        assert np.linalg.norm(off[3:]) < 2e-3
+    assert np.sqrt((found.residuals[:, 3:] ** 2).mean()) == pytest.approx(SHIFT, rel=0.35)
+
+
+def test_without_noise_it_is_exact():
+    name = "two fixed scanners and one arm"
+    found = solved(name, scale=0.0)
+    for each in CELLS[name][1]:
+        assert np.abs(error(found.places[each], CELLS[name][0][each].place)).max() < 1e-7
+
+
+def test_what_nothing_ties_is_named():
+    frames, _, _ = CELLS["two fixed scanners and one arm"]
+    given = {**frames, "left": Frame("base"), "other": Frame("base"), "marker": Frame("flange")}
+    sightings = seen(frames, [("left", "marker")], np.random.default_rng(0))
+    with pytest.raises(CalibrationRefused, match="do not tell where other is"):
+        solve_graph(given, sightings)
+
+
+def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands():
+    """A shift of arm and camera together changes nothing that either sees: the rail only slides."""
+    frames, _, pairs = CELLS["an arm on a rail"]
+    given = {
+        **frames,
+        **{name: Frame(frames[name].parent) for name in ("base", "camera", "marker")},
+    }
+    with pytest.raises(CalibrationRefused, match="where base and camera are: a common shift chang"):
+        solve_graph(given, seen(frames, pairs, np.random.default_rng(0)))
+
+
+def test_frames_that_lead_to_two_roots_are_refused():
+    with pytest.raises(StageError, match="stand on base and floor, which nothing ties"):
+        solve_graph({"a": Frame("base"), "b": Frame("floor")}, [])
+    with pytest.raises(StageError, match="stands on itself"):
+        solve_graph({"a": Frame("b"), "b": Frame("a")}, [])

@@ -1,0 +1,70 @@
+"""What other viewers are given: circles as points, the flanges in base, and a layout."""
+
+import json
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from flangeye import types as t
+from flangeye.log.foxglove import points_of
+from flangeye.log.layouts import CLOUDS
+from flangeye.log.record import Recorder
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.runner import Runner
+from tests import toy
+from tests.conftest import TOY_RECIPE
+
+
+@pytest.fixture
+def messages(toy_registry, tmp_path):
+    """The decoded messages of a toy run, by topic."""
+    recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
+    toy_registry.hooks.register(recorder)
+    Runner(parse_recipe(TOY_RECIPE, "toy", toy_registry), toy_registry, t.ArchivePath()).run()
+    toy_registry.hooks.unregister(recorder)
+    found = {}
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, raw, message in reader.iter_decoded_messages(topics=list(CLOUDS)):
+            found.setdefault(channel.topic, []).append(message)
+            assert raw.log_time > 0
+    return found
+
+
+def test_circles_are_points_too(messages):
+    assert len(messages["/circle"]) == 6
+    points = points_of(messages["/circle"][0])
+    assert messages["/circle"][0].frame_id == "camera"
+    # A ring of 10 mm, as toy.fit says, and the normal behind it.
+    centre = points[:360].mean(axis=0)
+    assert np.allclose(np.linalg.norm(points[:361] - centre, axis=1), 0.01, atol=1e-5)
+
+
+def test_the_flanges_are_in_base_once_solved(messages):
+    assert len(messages["/base/flanges"]) == 6
+    seen = messages["/base/flanges"][0]
+    assert seen.frame_id == "base"
+    first = points_of(messages["/capture/cloud"][0])
+    assert np.allclose(points_of(seen), toy.BASE_T_CAMERA.apply(first), atol=1e-3)
+
+
+def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in, tmp_path):
+    assert flangeye_in("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
+    layout = json.loads((tmp_path / "l.json").read_text())
+    shown = layout["configById"]["3D!cell"]["topics"]
+    assert set(CLOUDS) <= set(shown)
+    named = json.dumps(layout["layout"])
+    assert all(panel in named for panel in layout["configById"])
+
+
+def test_a_rerun_blueprint_is_written(flangeye_in, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    assert flangeye_in("layout", "rerun", "--out", tmp_path / "l.rbl")[0] == 0
+    assert (tmp_path / "l.rbl").read_bytes()[:4] == b"RRF2"
+
+
+def test_another_viewer_is_not_known(flangeye_in):
+    code, _, err = flangeye_in("layout", "rviz")
+    assert (code, err) == (2, "error: no layout for 'rviz'; known: foxglove, rerun\n")

@@ -1,0 +1,216 @@
+"""The log survives: a killed run, a damaged file, a full disk."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder, adapter
+
+CIRCLE = t.CircleFeature(
+    np.array([0.1, 0.2, 0.7]), np.array([0, 0, -1.0]), {"rim": 0.03}, np.eye(3), np.eye(3), 0.9
+)
+CAPTURE = t.Capture(
+    "a",
+    t.PointCloud(t.CAMERA, np.arange(12, dtype=np.float32).reshape(4, 3)),
+    t.by_frame(t.Transform(t.BASE, t.FLANGE, np.eye(4))),
+    np.array([0.1, 0.2]),
+)
+
+
+def recorded(path, full=True):
+    recorder = Recorder(path, {"recipe.yaml": "title: T"}, full)
+    recorder.flangeye_run_started(t.Source("hash", ("a note",)), 2)
+    recorder.flangeye_captured("0.acquire.toy", CAPTURE, 0.1)
+    recorder.flangeye_stage_finished("2.fit.toy", "a", CIRCLE, 0.2)
+    recorder.flangeye_capture_finished("a")
+    recorder.flangeye_capture_rejected(t.Rejection("b", "fit.toy", "too dark"))
+    return recorder
+
+
+def test_what_is_written_is_read(tmp_path):
+    recorder = recorded(tmp_path / "r.mcap")
+    recorder.flangeye_run_finished({"status": "verified"})
+    log = read_run(tmp_path / "r.mcap")
+    assert log.complete
+    assert log.result == {"status": "verified"}
+    assert log.attachments["recipe.yaml"] == b"title: T"
+    assert (log.source.fingerprint, log.source.notes, log.total) == ("hash", ["a note"], 2)
+    assert log.messages == ["a note", "b set aside by fit.toy: too dark"]
+    assert [(r.id, r.stage, r.reason) for r in log.rejections] == [("b", "fit.toy", "too dark")]
+    (capture,) = log.captures()
+    assert np.array_equal(capture.cloud.xyz, CAPTURE.cloud.xyz)
+    assert np.array_equal(capture.joints, CAPTURE.joints)
+    (entry,) = log.entries
+    assert (entry.step, entry.stage, entry.kind, entry.capture) == (
+        "2.fit.toy", "fit.toy", "fit", "a",
+    )  # fmt: skip
+    assert np.array_equal(entry.value.centre, CIRCLE.centre)
+
+
+@pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])
+def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(tmp_path, shape):
+    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    matrix = np.array([[500.0, 0, 20], [0, 501, 15], [0, 0, 1]])
+    image = t.Image(pixels, matrix, np.array([-0.1, 0.01]))
+    nothing = t.PointCloud(t.CAMERA, np.zeros((0, 3), np.float32))
+    second = t.Transform(t.BASE2, t.FLANGE2, np.eye(4))
+    seen = replace(
+        CAPTURE, image=image, cloud=nothing, poses=t.by_frame(CAPTURE.base_T_flange, second)
+    )
+    recorder = Recorder(tmp_path / "r.mcap", {}, full_clouds=False)
+    recorder.flangeye_run_started(t.Source("hash"), 2)
+    recorder.flangeye_captured("0.acquire.toy", seen, 0.1)
+    recorder.flangeye_captured("0.acquire.toy", replace(CAPTURE, id="b"), 0.1)
+    recorder.close()
+    log = read_run(tmp_path / "r.mcap")
+    assert set(log.poses["a"]["image"]) == {"camera_matrix", "distortion"}
+    assert log.poses["a"]["full"]  # an image without a cloud is whole
+    first, other = log.captures()
+    assert np.array_equal(first.image.pixels, pixels)
+    assert np.array_equal(first.image.camera_matrix, matrix)
+    assert np.array_equal(first.image.distortion, image.distortion)
+    assert first.poses["flange2"].name == "base2_T_flange2"
+    assert other.image is None
+
+
+def test_viewers_find_foxglove_schemas_and_frames(tmp_path):
+    from mcap.reader import make_reader
+
+    recorder = recorded(tmp_path / "r.mcap")
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    schemas = {(s.name, s.encoding) for s in summary.schemas.values()}
+    assert {
+        ("foxglove.PointCloud", "protobuf"), ("foxglove.PoseInFrame", "protobuf"),
+        ("foxglove.FrameTransform", "protobuf"), ("foxglove.SceneUpdate", "protobuf"),
+        ("foxglove.Log", "protobuf"), ("flangeye.CircleFeature", "jsonschema"),
+    } <= schemas  # fmt: skip
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.5, 0.8, 0.99])
+def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path, keep):
+    path = tmp_path / "r.mcap"
+    recorded(path).flangeye_run_finished({})
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep)])
+    log = read_run(path)
+    assert not log.complete
+
+
+@given(st.integers(0, 2_000), st.binary(min_size=1, max_size=40))
+def test_a_damaged_file_never_raises_anything_else(tmp_path_factory, at, junk):
+    path = tmp_path_factory.mktemp("d") / "r.mcap"
+    recorded(path).flangeye_run_finished({})
+    data = bytearray(path.read_bytes())
+    data[at : at + len(junk)] = junk
+    path.write_bytes(data)
+    try:
+        read_run(path)
+    except StageError as error:
+        assert str(path) in str(error)
+
+
+def test_what_is_no_log_is_said(tmp_path):
+    with pytest.raises(StageError, match="none.mcap: cannot be read: No such file"):
+        read_run(tmp_path / "none.mcap")
+    (tmp_path / "text.mcap").write_text("hello, this is no log at all")
+    with pytest.raises(StageError, match=r"text.mcap: is not an MCAP file"):
+        read_run(tmp_path / "text.mcap")
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    assert not read_run(tmp_path / "empty.mcap").gathered
+
+
+@given(arrays(np.float64, (3, 3), elements=st.floats(-1e9, 1e9)), st.floats(0, 1))
+def test_values_are_lossless(covariance, coverage):
+    circle = t.CircleFeature(
+        covariance[0], np.array([0, 0, -1.0]), {"rim": coverage}, covariance, np.eye(3), coverage
+    )
+    again = adapter(t.CircleFeature).validate_json(adapter(t.CircleFeature).dump_json(circle))
+    assert np.array_equal(again.covariance, circle.covariance)
+    assert again.radii == circle.radii
+
+
+def test_kill_minus_nine_loses_nothing_that_was_finished(tmp_path, toy_recipe):
+    script = f"""
+import sys, time
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from pathlib import Path
+from tests.conftest import _registry_with
+from tests import toy
+from flangeye import types as t
+from flangeye.recipe.load import load_recipe
+from flangeye.log.record import Recorder
+from flangeye.run.runner import Runner
+plain = toy.segment.function
+def slow(capture):
+    time.sleep(0.3 if capture.id >= "003" else 0)
+    return plain(capture)
+object.__setattr__(toy.segment, "function", slow)
+registry = _registry_with(("toy", toy))
+recipe = load_recipe(Path({str(toy_recipe)!r}), registry)
+registry.hooks.register(Recorder(Path({str(tmp_path / "run.mcap")!r}), {{}}, True))
+Runner(recipe, registry, t.ArchivePath()).run()
+"""
+    process = subprocess.Popen([sys.executable, "-c", script])
+    log = None
+    for _ in range(400):
+        time.sleep(0.05)
+        if (tmp_path / "run.mcap").exists() and (tmp_path / "run.mcap").stat().st_size:
+            log = read_run(tmp_path / "run.mcap")
+            if len(log.finished) >= 3:
+                break
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    log = read_run(tmp_path / "run.mcap")
+    assert not log.complete
+    assert log.finished[:3] == ["000", "001", "002"]
+    assert [e.capture for e in log.of_kind("fit")][:3] == ["000", "001", "002"]
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    script = f"""
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from tests.log.test_record import recorded
+from flangeye.log.record import LogWriteError
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+try:
+    recorded(Path({str(tmp_path / "r.mcap")!r}))
+except LogWriteError as error:
+    print(error)
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert told.stdout == (
+        f"{tmp_path / 'r.mcap'}: cannot be written: File too large; what was written so far can be "
+        "read with 'flangeye show'\n"
+    )
+
+
+def test_the_clouds_of_a_step_keep_their_rows_and_columns(tmp_path):
+    grid = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+    scan = t.WorkpieceScan(t.PointCloud(t.CAMERA, grid), "a scan")
+    recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "title: T"}, full_clouds=False)
+    recorder.flangeye_stage_finished("5.scan.simulated", None, scan, 0.0)
+    recorder.close()
+    back = read_run(tmp_path / "r.mcap").last(t.WorkpieceScan)
+    assert back.cloud.organised
+    np.testing.assert_array_equal(back.cloud.xyz, grid)

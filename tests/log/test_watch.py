@@ -1,0 +1,146 @@
+"""A run as it goes, read from a log that is still being written."""
+
+import socket
+import threading
+import time
+
+import pytest
+from rich.console import Console
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
+from flangeye.log.watch import watch_run
+from flangeye.log.watch.tail import follow
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.runner import Runner
+from tests.conftest import TOY_RECIPE
+
+
+@pytest.fixture
+def log(toy_registry, tmp_path):
+    """Return what runs the toy recipe into a log, slowly enough to be watched."""
+    path = tmp_path / "2026_toy" / "run.mcap"
+    path.parent.mkdir()
+
+    def run(pause=0.0):
+        recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)
+        recorder = Recorder(path, {"recipe.yaml": TOY_RECIPE}, False)
+        toy_registry.hooks.register(recorder)
+        try:
+            time.sleep(pause)
+            Runner(recipe, toy_registry, t.ArchivePath()).run()
+        finally:
+            toy_registry.hooks.unregister(recorder)
+            recorder.close()
+
+    return path, run
+
+
+def plain():
+    return Console(record=True, width=120, force_terminal=False)
+
+
+def test_a_run_is_followed_while_it_is_written(log):
+    path, run = log
+    runner = threading.Thread(target=run, args=(0.5,))
+    runner.start()
+    while not path.exists():
+        time.sleep(0.01)
+    view = watch_run(path.parent, None, plain(), patience=30)
+    runner.join()
+    assert view.ended
+    assert (view.captures, view.fitted, view.total) == (6, 6, 6)
+    rows = dict(view.rows())
+    assert rows["run"] == "2026_toy, ended"
+    assert rows["captures"] == "6 of at most 6, 6 fitted"
+    assert rows["arm"].endswith("mm in the base, at the last capture")
+    assert view.events[-2] == "3.solve.toy done"
+    assert view.events[-1].startswith("4.verify.toy done: verify.toy: 0.")
+
+
+def test_a_killed_run_is_given_up_on(log, tmp_path):
+    path, run = log
+    run()
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(StageError, match=r"nothing new for 0 s; the run is over$"):
+        watch_run(torn, None, plain(), patience=0.3)
+
+
+def test_what_is_no_log_is_one_line(tmp_path):
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"x" * 100)
+    with pytest.raises(StageError, match=r"bad.mcap: is not an MCAP file"):
+        list(follow(bad, lambda: None))
+
+
+def test_no_run_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StageError) as error:
+        watch_run(None, None, plain(), patience=0.2)
+    assert str(error.value) == "./runs: no run came to be watched within 0.2 s"
+    with pytest.raises(StageError) as error:
+        watch_run(tmp_path / "nowhere.mcap", None, plain(), patience=0.2)
+    assert str(error.value).endswith("nowhere.mcap: no run came to be watched within 0.2 s")
+
+
+def test_a_run_that_is_still_to_come_is_waited_for(log):
+    path, run = log
+    late = threading.Timer(0.5, run)
+    late.start()
+    view = watch_run(path.parent, None, plain(), patience=30)
+    late.join()
+    assert view.ended
+
+
+def test_a_run_that_failed_is_not_waited_for(tmp_path):
+    recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
+    recorder.ended("step 3 failed")
+    recorder.close()
+    began = time.monotonic()
+    watch_run(tmp_path, None, plain(), patience=60)
+    assert time.monotonic() - began < 5
+    assert read_run(tmp_path).messages == ["step 3 failed"]
+
+
+def test_a_journal_and_a_solvers_progress_are_shown(log):
+    path, _ = log
+    recorder = Recorder(path, {}, False)
+    recorder.flangeye_noted("3.solve.robust", "progress", t.Progress(7, 0.4e-3, 0.35e-3))
+    recorder.flangeye_run_finished({})
+    rows = dict(watch_run(path, None, plain(), patience=5).rows())
+    assert rows["error so far"] == "95 % below 0.400 mm after 7 poses, 0.350 mm required"
+
+
+def test_foxglove_is_served_the_same_messages(log):
+    websockets = pytest.importorskip("websockets.sync.client")
+    path, run = log
+    run()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    from flangeye.log.watch.server import foxglove_server
+
+    with foxglove_server(port) as send:
+        for message in follow(path, lambda: None):
+            send(message)
+        with websockets.connect(
+            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]
+        ) as viewer:
+            told = [viewer.recv(timeout=10) for _ in range(2)]
+    advertised = next(text for text in told if "advertise" in str(text))
+    for topic in ("/capture/cloud", "/tf", "/step/2.fit.toy", "foxglove.PointCloud"):
+        assert topic in str(advertised)
+
+
+def test_a_port_that_is_taken_is_one_line(log):
+    pytest.importorskip("foxglove")
+    path, run = log
+    run()
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(StageError, match="cannot serve there"):
+            watch_run(path, taken.getsockname()[1], plain(), patience=5)

@@ -1,0 +1,62 @@
+"""A field of displacements: smooth, without a rigid part, and its covariance that of its weights."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.geometry import hat, kabsch, rigid
+from flangeye.maths.smooth_field import (
+    displacement,
+    displacement_covariance,
+    effects,
+    field_over,
+)
+from flangeye.types import ArmCorrection
+
+RNG = np.random.default_rng(0)
+PLACES = np.array([0.4, -0.5, 0.2]) + RNG.uniform(-0.15, 0.15, (40, 3))
+
+
+def weighted(seed: int):
+    bare = field_over(PLACES)
+    rng = np.random.default_rng(seed)
+    spread = 1e-4 * rng.standard_normal((len(bare.weights), len(bare.weights)))
+    weights = 1e-3 * rng.standard_normal(len(bare.weights))
+    return replace(bare, weights=weights, covariance=spread @ spread.T, size=1e-3)
+
+
+def test_a_field_moves_no_camera():
+    """Over the calibration's poses it has no rigid part, so the best camera stays the same."""
+    moved = PLACES + displacement(weighted(0), PLACES)
+    rotation, translation = kabsch(PLACES, moved)
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(PLACES @ rotation.T + translation, PLACES, atol=3e-6)
+
+
+def test_a_quadratic_error_is_followed():
+    """What joints that are off do to a workspace of 0.3 m is a polynomial of low order."""
+    field, u = field_over(PLACES), PLACES - PLACES.mean(axis=0)
+    wanted = np.stack([4e-2 * u[:, 0] * u[:, 1], 3e-2 * u[:, 2] ** 2, -5e-2 * u[:, 0] ** 2], axis=1)
+    rows = np.concatenate([effects(field, PLACES), -hat(u), np.tile(np.eye(3), (40, 1, 1))], axis=2)
+    rows, wanted = rows.reshape(120, -1), wanted.ravel()
+    left = wanted - rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    assert np.abs(left).max() < 0.15 * np.abs(wanted).max()
+
+
+def test_covariances_are_those_of_the_weights():
+    field, place = weighted(1), PLACES[:1] + 0.05
+    rng = np.random.default_rng(2)
+    drawn = rng.multivariate_normal(field.weights, field.covariance, 20000)
+    found = np.cov((drawn @ effects(field, place)[0].T).T)
+    known = displacement_covariance(field, place, corrected=True)[0]
+    np.testing.assert_allclose(found, known, atol=0.05 * np.abs(known).max())
+    wide = displacement_covariance(field, place, corrected=False)[0]
+    np.testing.assert_allclose(wide, 1e-6 * effects(field, place)[0] @ effects(field, place)[0].T)
+
+
+def test_a_correction_moves_the_reported_flange_by_the_field():
+    field, pose = weighted(3), rigid(np.eye(3), PLACES[3])
+    moved = corrected_flange(pose, None, ArmCorrection(np.zeros(3), field=field), None)
+    np.testing.assert_allclose(moved[:3, 3] - pose[:3, 3], displacement(field, PLACES[3]))
+    np.testing.assert_allclose(moved[:3, :3], np.eye(3))

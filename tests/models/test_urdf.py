@@ -1,0 +1,186 @@
+"""An arm from its URDF: the chain, the frames, the volumes, and what is said when one is wrong."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flangeye.errors import RecipeError, StageError
+from flangeye.maths.capsules import fit_capsule
+from flangeye.maths.geometry import rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.urdf import robot_from_urdf
+from flangeye.motion.clearance import ArmVolume
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+
+ORIGINS = [  # of a KUKA KR 6 R900 sixx: its maker's table
+    ("0 0 0.400", "0 0 -1", 170), ("0.025 0 0", "0 1 0", 120), ("0.455 0 0", "0 1 0", 156),
+    ("0 0 0.035", "-1 0 0", 185), ("0.420 0 0", "0 1 0", 120), ("0.080 0 0", "-1 0 0", 350),
+]  # fmt: skip
+
+
+def link(i):
+    return (
+        f'<link name="link_{i}"><collision><geometry><mesh filename="package://kuka/m/{i}.stl" '
+        'scale="0.001 0.001 0.001"/></geometry></collision></link>'
+    )
+
+
+def joint(i, xyz, axis, limit, kind="revolute"):
+    limit = np.radians(limit)
+    return (
+        f'<joint name="joint_{i}" type="{kind}"><parent link="link_{i - 1}"/>'
+        f'<child link="link_{i}"/><origin xyz="{xyz}"/><axis xyz="{axis}"/>'
+        f'<limit lower="{-limit}" upper="{limit}" effort="0" velocity="1"/></joint>'
+    )
+
+
+TOOL = (
+    '<link name="flange"/><joint name="f" type="fixed"><parent link="link_6"/>'
+    '<child link="flange"/></joint><link name="tool0"/><joint name="t" type="fixed">'
+    f'<parent link="flange"/><child link="tool0"/><origin rpy="0 {np.pi / 2} 0"/></joint>'
+)
+WORLD = (
+    '<link name="world"/><joint name="w" type="fixed"><parent link="world"/>'
+    '<child link="link_0"/><origin xyz="1 2 3"/></joint><link name="base"/>'
+    '<joint name="b" type="fixed"><parent link="link_0"/><child link="base"/></joint>'
+)
+
+
+@pytest.fixture
+def kuka(tmp_path):
+    """A URDF as xacro writes it, and its meshes in a package beside it."""
+    meshes = tmp_path / "kuka" / "m"
+    meshes.mkdir(parents=True)
+    for i in range(7):
+        trimesh.creation.box(extents=(120 + 10 * i, 80, 60)).export(meshes / f"{i}.stl")
+    joints = "".join(joint(i, *each) for i, each in enumerate(ORIGINS, 1))
+    links = "".join(map(link, range(7)))
+    path = tmp_path / "kuka" / "urdf" / "kr6.urdf"
+    path.parent.mkdir()
+    path.write_text(f'<robot name="kr6_r900">{links}{joints}{TOOL}{WORLD}</robot>')
+    return path
+
+
+def test_the_chain_is_the_makers(kuka):
+    """Straight ahead at zero, as KUKA's drawing has it: 25 + 455 + 420 + 80 mm, at 435 mm."""
+    robot = robot_from_urdf(kuka)
+    assert robot.model == "kr6_r900"
+    arm = Arm(robot)
+    zero = arm.flange(np.zeros(6))
+    assert zero[:3, 3] == pytest.approx([0.98, 0, 0.435])
+    assert zero[:3, 2] == pytest.approx([1, 0, 0])
+    assert np.degrees(arm.upper) == pytest.approx([170, 120, 156, 185, 120, 350])
+    bent = arm.flange(np.radians([90, -90, 0, 0, 0, 0]))  # A1 turns against z
+    assert bent[:3, 3] == pytest.approx([0, 0.01, 1.355])
+    solutions = arm.inverse(arm.flange(np.array([0.3, -1.0, 1.2, 0.4, 0.9, 0.2])))
+    assert np.abs(solutions - [0.3, -1.0, 1.2, 0.4, 0.9, 0.2]).max(axis=1).min() < 1e-6
+
+
+def test_each_link_has_a_capsule_about_its_mesh(kuka):
+    robot = robot_from_urdf(kuka)
+    assert [volume.link for volume in robot.volumes] == list(range(7))
+    half = np.array([0.06, 0.04, 0.03])
+    assert robot.volumes[0].radius == pytest.approx(np.hypot(*half[1:]), rel=2e-3)
+    assert ArmVolume(robot).axes(Arm(robot).frames(np.zeros(6))).shape == (7, 2, 3)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 60))
+@settings(max_examples=30, deadline=None)
+def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(seed, count):
+    rng = np.random.default_rng(seed)
+    points = (
+        rng.normal(size=(count, 3))
+        * rng.uniform(0.01, 1, 3)
+        @ rotation_from_rpy(*rng.normal(size=3)).T
+    )
+    capsule = fit_capsule(points)
+    assert capsule.distance(points).max() < 1e-9
+    ball = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    assert capsule.volume < 4 / 3 * np.pi * (1.5 * ball) ** 3
+
+
+@pytest.mark.parametrize("name", ["stl", "obj", "dae"])
+def test_meshes_as_they_are_published(kuka, name):
+    for file in (kuka.parents[1] / "m").glob("*.stl"):
+        trimesh.load_mesh(file).export(file.with_suffix(f".{name}"))
+    kuka.write_text(kuka.read_text().replace(".stl", f".{name}"))
+    radius = robot_from_urdf(kuka).volumes[0].radius
+    assert radius == pytest.approx(0.05, rel=2e-3)
+
+
+def test_missing_meshes_matter_where_a_plan_needs_them(kuka, tmp_path):
+    moved = tmp_path / "alone.urdf"
+    moved.write_text(kuka.read_text().replace("package://kuka", "package://kuka_support"))
+    robot = robot_from_urdf(moved)
+    assert Arm(robot).n == 6
+    with pytest.raises(StageError) as error:
+        ArmVolume(robot)
+    assert "write robot: {packages: {kuka_support: FOLDER}}, where FOLDER holds m/" in str(
+        error.value
+    )
+    named = robot_from_urdf(moved, packages={"kuka_support": tmp_path / "kuka"})
+    assert len(named.volumes) == 7
+
+
+def test_a_rail_and_a_base_of_ones_own(kuka):
+    text = kuka.read_text().replace(
+        'name="joint_1" type="revolute"', 'name="joint_1" type="prismatic"'
+    )
+    kuka.write_text(text)
+    arm = Arm(robot_from_urdf(kuka, base="world", flange="flange"))
+    assert arm.slides.tolist() == [True] + 5 * [False]
+    assert arm.flange(np.array([0.1, 0, 0, 0, 0, 0]))[:3, 3] == pytest.approx([1.98, 2, 3.335])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t[:-5], "not valid XML"),
+        (lambda t: t.replace("robot", "sdf"), "is no URDF: its outermost element is <sdf>"),
+        (lambda t: t.replace(">", ' xmlns:xacro="http://wiki.ros.org/xacro"><xacro:macro/>', 1), "expand it: xacro"),
+        (lambda t: t.replace("tool0", "a").replace("flange", "b").replace("</robot>",
+         '<link name="c"/><joint name="c" type="fixed"><parent link="link_6"/><child link="c"/>'
+         "</joint></robot>"), "which link is the flange, .* write flange: a or c"),
+        (lambda t: t.replace("revolute", "fixed"), "no joint moves between base and flange"),
+        (lambda t: t.replace("0 0 0.400", "0 0 x"), "is not three numbers"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_urdf_is_one_line(kuka, change, words):
+    kuka.write_text(change(kuka.read_text()))
+    with pytest.raises(RecipeError, match=words) as error:
+        robot_from_urdf(kuka)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka, tmp_path):
+    recipe = tmp_path / "cell.yaml"
+    recipe.write_text(
+        "title: My cell\nrobot: {urdf: kuka/urdf/kr6.urdf}\nfeature: {standard: ISO 9409-1-40-4-M6}\n"
+        "scanner: {name: ACME 3000, range: [300 mm, 900 mm]}\n"
+        "steps: [acquire.archive, segment.flange, fit.rim, solve.robust]\n"
+    )
+    load_recipe(recipe, load_registry())
+    recipe.write_text(
+        recipe.read_text().replace("kr6.urdf}", "kr6.urdf, flange: ISO 9409-1-40-4-M6}")
+    )
+    with pytest.raises(RecipeError, match="the plate goes to feature: {standard: …}"):
+        load_recipe(recipe, load_registry())
+
+
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [
+        ("{urdf: a.urdf, factory: calibration.conf}", "a urdf brings its own calibration"),
+        ("{urdf: a.urdf, model: ur5}", "either a model or a urdf, not both"),
+        ("{model: ur5, base: base_link}", "say where things are in a urdf; name it"),
+        ("{urdf: a.urdf}", "robot.urdf: .*a.urdf: cannot be read"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(robot, words, tmp_path):
+    recipe = tmp_path / "cell.yaml"
+    recipe.write_text(f"title: T\nrobot: {robot}\nsteps: [acquire.samples, solve.shah]\n")
+    with pytest.raises(RecipeError, match=words):
+        load_recipe(recipe, load_registry())

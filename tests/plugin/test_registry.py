@@ -1,0 +1,166 @@
+import importlib
+import subprocess
+import sys
+import types as python_types
+from typing import Protocol
+
+import pytest
+
+from flangeye import stage
+from flangeye import types as t
+from flangeye.plugin.registry import DuplicatePluginError, PluginNotFoundError, load_registry
+from flangeye.plugin.stage import PARTS, part
+from tests import toy
+
+
+def module_offering(*stages):
+    module = python_types.ModuleType("vendor")
+    module.flangeye_stages = toy.hookimpl(lambda: stages)
+    return module
+
+
+def test_two_plugins_with_one_name_are_an_error(toy_registry):
+    with pytest.raises(DuplicatePluginError) as error:
+        toy_registry.register("acme", module_offering(toy.solve))
+    assert str(error.value) == (
+        "plugins 'toy' and 'acme' both offer 'solve.toy'; uninstall one of them"
+    )
+
+
+def test_a_broken_plugin_is_named_only_when_something_is_missing(toy_registry):
+    toy_registry.broken["acme"] = ModuleNotFoundError("No module named 'acme_sdk'")
+    assert toy_registry.stage("solve.toy") is toy.solve
+    with pytest.raises(PluginNotFoundError) as error:
+        toy_registry.stage("solve.acme")
+    assert str(error.value) == (
+        "no stage 'solve.acme'; did you mean solve.toy?; plugin 'acme' could not be loaded "
+        "(ModuleNotFoundError: No module named 'acme_sdk')"
+    )
+
+
+def test_a_misspelt_hook_is_a_broken_plugin(monkeypatch, toy_registry):
+    module = python_types.ModuleType("vendor")
+    module.flangeye_stagez = toy.hookimpl(lambda: ())
+    with pytest.raises(Exception, match="unknown hook 'flangeye_stagez'"):
+        toy_registry.register("acme", module)
+
+
+def test_the_built_ins_come_through_the_same_door():
+    registry = load_registry()
+    assert registry.broken == {}
+    assert set(registry.owners.values()) >= {"builtin"}
+
+
+def test_a_signature_is_checked_when_it_is_declared():
+    def no_docstring(capture: t.Capture) -> t.FlangeCloud: ...
+
+    def wrong_result(capture: t.Capture) -> t.HandEye:
+        """Give the wrong thing."""
+
+    def wrong_input(cloud: t.FlangeCloud) -> t.FlangeCloud:
+        """Take the wrong thing."""
+
+    for name, function, message in [
+        ("segment.a", no_docstring, "'segment.a' has no docstring; its first line is what people "
+         "read"),
+        ("segment.b", wrong_result, "stage 'segment.b' returns HandEye, but a 'segment' stage "
+         "returns FlangeCloud or Rejected"),
+        ("segment.c", wrong_input, "stage 'segment.c': a 'segment' stage takes a Capture"),
+        ("paint.d", wrong_result, "stage 'paint.d': no kind 'paint'; kinds: acquire, segment, fit, "
+         "solve, refine, verify, export, scan, seam, weld"),
+    ]:  # fmt: skip
+        with pytest.raises(TypeError) as error:
+            stage(name)(function)
+        assert str(error.value) == message
+    with pytest.raises(TypeError, match="part 'colour.red': no kind 'colour'; kinds: "):
+        part("colour.red")(wrong_result)
+
+
+@pytest.mark.parametrize(
+    ("name", "declare", "message"),
+    [
+        ("cost.x", "def x(value: float) -> float: 'X.'",
+         "part 'cost.x': a 'cost' part is called with error, and has value"),
+        ("cost.x", "def x(error: float) -> float: 'X.'",
+         "part 'cost.x': its error is a PoseError, not a float"),
+        ("cost.x", "def x(error: PoseError) -> str: 'X.'",
+         "part 'cost.x' returns str, but a 'cost' part returns float"),
+        ("reader.x", "def x() -> float: 'X.'",
+         "part 'reader.x': a 'reader' part is called with path, and has no arguments"),
+    ],
+)  # fmt: skip
+def test_a_part_keeps_the_contract_of_its_kind(name, declare, message):
+    given = {"PoseError": t.PoseError}
+    exec(declare, given)
+    with pytest.raises(TypeError) as caught:
+        part(name)(given["x"])
+    assert str(caught.value) == message
+
+
+def test_every_kind_of_part_has_a_protocol_in_the_engine():
+    for kind, declared in PARTS.items():
+        module, _, protocol = declared.contract.partition(":")
+        contract = getattr(importlib.import_module(module), protocol)
+        assert issubclass(contract, Protocol), kind
+        assert contract.__call__.__doc__
+
+
+def test_a_stage_says_which_configurations_it_serves():
+    with pytest.raises(TypeError) as caught:
+        stage("solve.x", serves=["eye-on-wall"])
+    assert str(caught.value) == (
+        "stage 'solve.x' serves 'eye-on-wall', which is no configuration; known: eye-on-base, "
+        "eye-in-hand, eye-on-arm, two-arms"
+    )
+
+
+def test_a_former_name_still_works_and_is_said():
+    registry = load_registry()
+    assert registry.part("robot.loopback") is registry.part("robot.emulator")
+    assert registry.notes() == [
+        "robot.loopback is now called robot.emulator; the old name works in this version only"
+    ]
+
+
+def offering(**places):
+    module = python_types.ModuleType("acme")
+    module.flangeye_stages = toy.hookimpl(lambda: {f"solve.{n}": at for n, at in places.items()})
+    return module
+
+
+def test_a_stage_named_by_its_place_is_imported_when_it_is_asked_for(toy_registry):
+    toy_registry.register("acme", offering(away="acme_away:solve", toy2="tests.toy:solve"))
+    assert "solve.away" in toy_registry.stages
+    with pytest.raises(
+        PluginNotFoundError, match=r"'solve.away' cannot be imported from acme_away"
+    ):
+        toy_registry.stage("solve.away")
+    with pytest.raises(PluginNotFoundError, match=r"tests.toy:solve is no stage 'solve.toy2'"):
+        toy_registry.stage("solve.toy2")
+    assert "solve.toy" in toy_registry.everything()
+    assert isinstance(toy_registry.broken["acme"], PluginNotFoundError)
+
+
+def test_every_name_of_ours_is_where_it_is_said_to_be():
+    registry = load_registry()
+    offered = registry.everything()
+    assert registry.broken == {}
+    assert set(offered) == set(registry.stages) | set(registry.parts)
+    assert all(plugin.name == name for name, plugin in offered.items())
+    former = {old: name for name, plugin in offered.items() for old in plugin.formerly}
+    assert former == registry.renamed
+
+
+def test_finding_plugins_imports_none_of_their_modules():
+    code = (
+        "import sys; from flangeye.plugin.registry import load_registry; load_registry(); "
+        "print([m for m in sys.modules if m.startswith('flangeye_plugins.')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_waits_for_no_arrays():
+    code = "import sys; import flangeye.cli; print({'numpy', 'pydantic'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

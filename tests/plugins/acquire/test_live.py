@@ -1,0 +1,37 @@
+"""What a live session makes of its devices; the devices themselves are tested with the loopback."""
+
+import numpy as np
+import pytest
+
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.motion.supervision import Sample
+from flangeye_plugins.acquire.live import movement, within
+
+
+def samples(*times, move=0.0, turn=0.0):
+    """Return samples of an arm that moves and turns by so much from each to the next."""
+    return [
+        Sample(time, rigid(rotation_exp([0.0, 0.0, turn * i]), [move * i, 0.0, 0.0]), np.zeros(6))
+        for i, time in enumerate(times)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "expected"),
+    [(10, 30, [10, 20, 30]), (12, 18, [10, 20]), (11, 21, [10, 20, 30]), (0, 40, [0, 10, 20, 30, 40])],
+)  # fmt: skip
+def test_an_exposure_is_framed_by_samples(start, end, expected):
+    found = within(samples(0, 10, 20, 30, 40), start, end)
+    assert [sample.time_ns for sample in found] == expected
+
+
+@pytest.mark.parametrize(("start", "end"), [(-1, 20), (20, 41), (50, 60)])
+def test_an_exposure_that_is_not_covered_has_no_pose(start, end):
+    assert within(samples(0, 10, 20, 30, 40), start, end) == []
+    assert within([], start, end) == []
+
+
+def test_movement_counts_shifts_and_turns():
+    assert movement(samples(0, 1, 2)) == 0.0
+    assert movement(samples(0, 1, 2, move=1e-4)) == pytest.approx(2e-4)
+    assert movement(samples(0, 1, 2, turn=1e-3)) == pytest.approx(2e-4, rel=1e-3)

@@ -1,0 +1,377 @@
+"""Each written file, read back by a reader that is not ours, is the pose that was written.
+
+Where PyPI has the maker's library it reads; else the maker's definition is spelt out here in
+elementary rotations, not with the code that wrote the file.
+"""
+
+import re
+import sys
+import types
+import warnings
+from math import cos, pi, sin
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.testing import ExportConformance
+from flangeye.types import BASE, CAMERA, FLANGE, CalibratedPose, Transform
+from flangeye_plugins.export import EXPORTS
+from flangeye_plugins.export.urdf import UrdfParams
+
+with warnings.catch_warnings():  # robodk warns of its own __init__
+    warnings.simplefilter("ignore", PendingDeprecationWarning)
+    from robodk import robomath
+
+REMARKS = ("flangeye: written by a test", "REFUSED, DO NOT USE: not -- ever")
+BY_NAME = {stage.name.partition(".")[2]: stage for stage in EXPORTS}
+
+
+# --- elementary rotations, degrees ---------------------------------------------------------------
+
+
+def rx(deg):
+    c, s = cos(deg * pi / 180), sin(deg * pi / 180)
+    return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
+
+
+def ry(deg):
+    c, s = cos(deg * pi / 180), sin(deg * pi / 180)
+    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
+
+
+def rz(deg):
+    c, s = cos(deg * pi / 180), sin(deg * pi / 180)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def at(xyz, rotation, unit=1.0):
+    moved = np.array(rotation, dtype=float)
+    moved[:3, 3] = np.array(xyz, dtype=float) * unit
+    return moved
+
+
+def of_robodk(mat):
+    return at(mat.Pos(), [[mat[i, j] for j in range(4)] for i in range(4)], 1e-3)
+
+
+# --- the readers -----------------------------------------------------------------------------------
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+NUMBER = r"-?\d+\.\d+"
+
+
+def ros_message(values):
+    """A geometry_msgs/Transform through ROS's own wire format and back."""
+    msg = STORE.types["geometry_msgs/msg/Transform"](
+        translation=STORE.types["geometry_msgs/msg/Vector3"](*values[:3]),
+        rotation=STORE.types["geometry_msgs/msg/Quaternion"](*values[3:]),
+    )
+    again = STORE.deserialize_cdr(STORE.serialize_cdr(msg, msg.__msgtype__), msg.__msgtype__)
+    move, turn = again.translation, again.rotation
+    mat = robomath.quaternion_2_pose([turn.w, turn.x, turn.y, turn.z])
+    return at((move.x, move.y, move.z), of_robodk(mat))
+
+
+def of_flags(words):
+    told = dict(zip(words[::2], words[1::2], strict=True))
+    assert told.pop("--frame-id") in ("base", "flange")
+    assert told.pop("--child-frame-id") == "camera"
+    return ros_message(
+        [float(told[f"--{name}"]) for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]]
+    )
+
+
+def read_command(text):
+    command = next(line for line in text.splitlines() if not line.startswith("#"))
+    words = command.split()
+    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    return of_flags(words[4:])
+
+
+def read_launch(text):
+    """Run the launch file with stand-ins for ROS's two packages."""
+    nodes = []
+    launch, launch_ros = types.ModuleType("launch"), types.ModuleType("launch_ros.actions")
+    launch.LaunchDescription = list
+    launch_ros.Node = lambda **told: nodes.append(told) or told
+    names = {"launch": launch, "launch_ros": launch, "launch_ros.actions": launch_ros}
+    before = {name: sys.modules.get(name) for name in names}
+    sys.modules.update(names)
+    try:
+        space = {}
+        exec(compile(text, "launch", "exec"), space)
+        assert len(space["generate_launch_description"]()) == 1
+    finally:
+        for name, module in before.items():
+            sys.modules.pop(name) if module is None else sys.modules.update({name: module})
+    assert nodes[0]["executable"] == "static_transform_publisher"
+    return of_flags(nodes[0]["arguments"])
+
+
+def joints_of(text):
+    found = {}
+    for joint in ElementTree.fromstring(text).findall("joint"):
+        origin = joint.find("origin")
+        roll, pitch, yaw = (float(x) * 180 / pi for x in origin.get("rpy").split())
+        move = [float(x) for x in origin.get("xyz").split()]
+        child = joint.find("child").get("link")
+        found[child] = at(move, rz(yaw) @ ry(pitch) @ rx(roll))
+    return found
+
+
+def read_urdf(text):
+    return joints_of(text)["camera_optical_frame"]
+
+
+def read_calib(text):
+    told = yaml.safe_load(text)["transform"]
+    move, turn = told["translation"], told["rotation"]
+    return ros_message([move[a] for a in "xyz"] + [turn[a] for a in "xyzw"])
+
+
+def read_opencv(text):
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    (name,) = storage.root().keys()
+    assert name in ("base_T_camera", "flange_T_camera")
+    return storage.getNode(name).mat()
+
+
+def numbers_after(pattern, text):
+    return [float(x) for x in re.findall(NUMBER, re.search(pattern, text)[0])]
+
+
+def read_ur(text):
+    mat = robomath.UR_2_Pose(numbers_after(r"(?m)^camera = p\[.*\]$", text))
+    return at(mat.Pos(), of_robodk(mat))
+
+
+def read_kuka(text):
+    numbers = numbers_after(r"(?m)^(BASE|TOOL)_DATA\[1\]=\{X .*,Y .*,Z .*,A .*,B .*,C .*\}$", text)
+    return of_robodk(robomath.KUKA_2_Pose(numbers))
+
+
+def read_abb(text):
+    """The RAPID value, whose brackets are Python's; q1 is the real part."""
+    line = re.search(r"PERS wobjdata camera:=(.*);", text)[1]
+    held, programmed, unit, user, obj = eval(line, {"TRUE": True, "FALSE": False})
+    assert (programmed, unit, obj) == (True, "", [[0, 0, 0], [1, 0, 0, 0]])
+    assert held in (True, False)
+    mat = robomath.quaternion_2_pose(user[1])
+    mat.setPos(user[0])
+    return of_robodk(mat)
+
+
+def labelled(text, labels):
+    return [float(re.search(rf"(?m)^{label}: ({NUMBER})$", text)[1]) for label in labels]
+
+
+def read_fanuc(text):
+    return of_robodk(robomath.Fanuc_2_Pose(labelled(text, "XYZWPR")))
+
+
+def read_yaskawa(text):
+    return of_robodk(robomath.Motoman_2_Pose(labelled(text, ["X", "Y", "Z", "RX", "RY", "RZ"])))
+
+
+def read_staubli(text):
+    return of_robodk(robomath.Staubli_2_Pose(numbers_after(r"camera\.trsf=\{.*\}", text)))
+
+
+def read_doosan(text):
+    x, y, z, a, b, c = numbers_after(r"camera = posx\(.*\)", text)
+    return at((x, y, z), rz(a) @ ry(b) @ rz(c), 1e-3)
+
+
+def read_zivid(text):
+    told = yaml.safe_load(text)
+    assert told["__version__"] == {"serializer": 1, "data": 1}
+    matrix = np.array(told["FloatMatrix"]["Data"])
+    return at(matrix[:3, 3], matrix, 1e-3)
+
+
+def read_mech_mind(text):
+    numbers = labelled(text, ["X", "Y", "Z", "QW", "QX", "QY", "QZ"])
+    return at(numbers[:3], of_robodk(robomath.quaternion_2_pose(numbers[3:])))
+
+
+def read_halcon(text):
+    told = {
+        line[0]: line[1:].split() for line in text.splitlines() if line[:2] in ("f ", "r ", "t ")
+    }
+    assert told["f"] == ["0"]
+    alpha, beta, gamma = map(float, told["r"])
+    return at([float(x) for x in told["t"]], rx(alpha) @ ry(beta) @ rz(gamma))
+
+
+def read_robodk(text):
+    space = {"__name__": "not run"}
+    exec(compile(text, "script", "exec"), space)
+    return of_robodk(space["POSE"])
+
+
+def read_matrix(text):
+    return np.loadtxt(text.splitlines())
+
+
+READERS = {
+    "ros2_command": read_command,
+    "ros2_launch": read_launch,
+    "moveit": read_launch,
+    "urdf": read_urdf,
+    "easy_handeye2": read_calib,
+    "opencv": read_opencv,
+    "ur": read_ur,
+    "kuka": read_kuka,
+    "abb": read_abb,
+    "fanuc": read_fanuc,
+    "yaskawa": read_yaskawa,
+    "staubli": read_staubli,
+    "doosan": read_doosan,
+    "zivid": read_zivid,
+    "mech_mind": read_mech_mind,
+    "halcon": read_halcon,
+    "robodk": read_robodk,
+    "matrix": read_matrix,
+}
+
+
+# --- the poses -------------------------------------------------------------------------------------
+
+near = st.sampled_from([0.0, 1e-9, -1e-9, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3])
+quarter = st.sampled_from([-180.0, -90.0, 0.0, 90.0, 180.0])
+
+
+@st.composite
+def rotations(draw):
+    """Any, or within a thousandth of a degree of where some maker's angles are singular."""
+    if draw(st.booleans()):
+        vector = np.array(draw(st.tuples(*[st.floats(-3.2, 3.2)] * 3)))
+        return rotation_exp(vector)
+    a, b, c = (draw(quarter) + draw(near) for _ in range(3))
+    free = draw(st.floats(-180, 180))
+    return (rz(a + free) @ ry(b) @ rx(c))[:3, :3]
+
+
+@st.composite
+def poses(draw):
+    move = np.array(draw(st.tuples(*[st.floats(-3, 3)] * 3)))
+    parent = draw(st.sampled_from([BASE, FLANGE]))
+    return CalibratedPose(Transform(parent, CAMERA, rigid(draw(rotations()), move)), REMARKS)
+
+
+def written(name, pose, **params):
+    stage = BY_NAME[name]
+    return stage(pose=pose, params=stage.params(**params))
+
+
+def require_same(found, pose):
+    wanted = pose.transform.matrix
+    assert np.linalg.norm(found[:3, 3] - wanted[:3, 3]) < 1e-6
+    turned = found[:3, :3].T @ wanted[:3, :3]
+    axis = np.array(
+        [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+    )
+    assert np.trace(turned) > 2.9
+    assert np.linalg.norm(axis) / 2 < 1e-6
+
+
+def test_every_format_has_its_reader():
+    assert set(READERS) == set(BY_NAME)
+
+
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=40, deadline=None)
+@given(pose=poses())
+def test_what_is_written_is_read_back(name, pose):
+    require_same(READERS[name](written(name, pose).text), pose)
+
+
+@pytest.mark.parametrize("name", ["zivid", "opencv", "matrix"])
+def test_the_unit_is_the_one_asked_for(name):
+    pose = CalibratedPose(Transform(BASE, CAMERA, rigid(np.eye(3), [0.1, 0.2, 0.3])))
+    by_default = 1e-3 if name == "zivid" else 1.0
+    for length, metres in (("m", 1.0), ("mm", 1e-3)):
+        text = written(name, pose, length=length).text
+        found = READERS[name](text)[:3, 3] * metres / by_default
+        assert np.allclose(found, [0.1, 0.2, 0.3], atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(pose=poses())
+def test_a_urdf_hangs_the_camera_by_its_mount(tmp_path_factory, pose):
+    """base_T_mount mount_T_optical is what was found, the mount given or from the camera's URDF."""
+    roll, pitch, yaw = 10.0, -20.0, 170.0
+    told = {
+        "position": ["10 mm", "-20 mm", "5 mm"],
+        "rpy": [f"{a} deg" for a in (roll, pitch, yaw)],
+    }
+    mount_T_optical = at((0.010, -0.020, 0.005), rz(yaw) @ ry(pitch) @ rx(roll))
+    joints = joints_of(written("urdf", pose, mount_T_optical=told).text)
+    assert np.allclose(joints["camera_optical_frame"], mount_T_optical, atol=1e-9)
+    require_same(joints["camera_link"] @ joints["camera_optical_frame"], pose)
+
+    file = tmp_path_factory.mktemp("urdf") / "camera.urdf"
+    file.write_text(CAMERA_URDF)
+    params = UrdfParams.model_validate({"camera_urdf": file})
+    joints = joints_of(BY_NAME["urdf"](pose=pose, params=params).text)
+    assert set(joints) == {"camera_link"}
+    own = joints_of(CAMERA_URDF)
+    chain = own["camera_depth_frame"] @ own["camera_optical_frame"]
+    require_same(joints["camera_link"] @ chain, pose)
+    del mount_T_optical
+
+
+CAMERA_URDF = """<robot name="eye">
+<link name="camera_link"/><link name="camera_depth_frame"/><link name="camera_optical_frame"/>
+<joint name="a" type="fixed"><parent link="camera_link"/><child link="camera_depth_frame"/>
+  <origin xyz="0.01 0.0175 0.0125" rpy="0 0 0.02"/></joint>
+<joint name="b" type="fixed"><parent link="camera_depth_frame"/><child link="camera_optical_frame"/>
+  <origin xyz="0 0 0" rpy="-1.5707963267948966 0 -1.5707963267948966"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("no xml", "{}: cannot be read: syntax error: line 1, column 0"),
+        (
+            "<robot/>",
+            "{}: no fixed joints lead from 'camera_link' to 'camera_optical_frame'; links with a "
+            "fixed joint: none; run xacro first if the file holds macros",
+        ),
+        (
+            CAMERA_URDF.replace("0 0 0.02", "${x} 0 0"),
+            "{}: joint 'a': could not convert string to float: '${{x}}'; run xacro first",
+        ),
+    ],
+)
+def test_a_camera_s_urdf_that_does_not_tell(tmp_path, text, message):
+    file = tmp_path / "camera.urdf"
+    file.write_text(text)
+    pose = CalibratedPose(Transform(BASE, CAMERA, np.eye(4)))
+    params = UrdfParams.model_validate({"camera_urdf": file})
+    with pytest.raises(Exception) as error:
+        BY_NAME["urdf"](pose=pose, params=params)
+    assert str(error.value) == message.format(file)
+
+
+def test_every_format_keeps_to_the_kit():
+    """What is asked of a vendor's export, asked of each of ours."""
+    checks = [name for name in dir(ExportConformance) if name.startswith("test_")]
+    for stage in EXPORTS:
+        kit = type("Kit", (ExportConformance,), {"stage": stage})()
+        for check in checks:
+            getattr(kit, check)()
+
+
+def test_each_format_is_explained_in_the_docs():
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "exports.md").read_text()
+    assert [name for name in BY_NAME if f"`{name}`" not in page] == []

@@ -1,0 +1,234 @@
+"""Printed targets in rendered images: perspective, lens, blur and noise, with known truth."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
+from flangeye.models.boards import Board, print_of
+from flangeye.types import CAMERA, Capture, Image, PointCloud, Rejected, Transform, by_frame
+from flangeye.units import SI
+from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board, scan_board
+from flangeye_plugins.fit.boards import (
+    CharucoParams,
+    CheckerboardParams,
+    MarkerParams,
+    fit_aruco,
+    fit_charuco,
+    fit_checkerboard,
+)
+
+CAMERA_MATRIX = np.array([[1000.0, 0, 400], [0, 1000, 300], [0, 0, 1]])
+LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
+SMALL = BoardCamera(CAMERA_MATRIX, (800, 600))
+BENT = BoardCamera(CAMERA_MATRIX, (800, 600), LENS)
+POSE = Transform("base", "flange", np.eye(4))
+
+CHARUCO = Board("charuco", 7, 5, 0.03, 0.022)
+CHECKER = Board("checkerboard", 8, 5, 0.025)
+MARKER = Board("marker", 1, 1, 0.08, 0.0, "APRILTAG_36h11", 3)
+OF_CHARUCO = CharucoParams(columns=7, rows=5, square=SI(0.03), marker=SI(0.022))
+OF_CHECKER = CheckerboardParams(columns=8, rows=5, square=SI(0.025))
+OF_MARKER = MarkerParams(size=SI(0.08), dictionary="APRILTAG_36h11", id=3)
+FITS = {
+    "charuco": (CHARUCO, fit_charuco, OF_CHARUCO),
+    "checkerboard": (CHECKER, fit_checkerboard, OF_CHECKER),
+    "marker": (MARKER, fit_aruco, OF_MARKER),
+}
+
+
+def looking(tilt=0.4, about=(0.8, 0.6, 0.0), yaw=0.2, distance=0.5):
+    """Return ``camera_T_target`` of a board that faces the camera, then tilted."""
+    facing = np.diag([1.0, -1.0, -1.0]) @ rotation_exp(np.array([0, 0, yaw]))
+    turned = facing @ rotation_exp(tilt * np.array(about))
+    return rigid(turned, np.array([0.01, -0.006, distance]))
+
+
+def capture(board, pose, camera=SMALL, depth=False, seed=0):
+    rng = np.random.default_rng(seed)
+    cloud = scan_board(board, pose, camera, rng) if depth else PointCloud(CAMERA, np.zeros((0, 3)))
+    return Capture("0", cloud, by_frame(POSE), image=render_board(board, pose, camera, rng))
+
+
+def error(feature, pose):
+    found = feature.camera_T_target.matrix
+    turn = rotation_log(found[:3, :3] @ pose[:3, :3].T)
+    return np.concatenate([turn, found[:3, 3] - pose[:3, 3]])
+
+
+@pytest.mark.parametrize("depth", [False, True])
+@pytest.mark.parametrize("camera", [SMALL, BENT])
+@pytest.mark.parametrize("kind", FITS)
+def test_a_tilted_target_is_found_where_it_is(kind, camera, depth):
+    board, fit, params = FITS[kind]
+    pose = looking()
+    feature = fit(capture(board, pose, camera, depth), params)
+    off = error(feature, pose)
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.15
+    assert np.linalg.norm(off[3:]) < 0.25e-3
+    assert off @ np.linalg.solve(feature.covariance, off) < 22.5  # chi-square, 6, 99.9 %
+
+
+@pytest.mark.parametrize("yaw", np.arange(0, 360, 72.0))
+@pytest.mark.parametrize("kind", FITS)
+def test_no_target_is_taken_for_itself_upside_down(kind, yaw):
+    board, fit, params = FITS[kind]
+    pose = looking(yaw=np.radians(yaw))
+    feature = fit(capture(board, pose), params)
+    assert np.degrees(np.linalg.norm(error(feature, pose)[:3])) < 0.3
+
+
+def test_the_axes_are_right_up_and_towards_the_camera():
+    feature = fit_charuco(capture(CHARUCO, looking(tilt=0.0, yaw=0.0)), OF_CHARUCO)
+    assert np.allclose(feature.camera_T_target.rotation, np.diag([1, -1, -1]), atol=5e-3)
+
+
+def test_a_markers_sides_are_not_taken_for_straight_where_the_lens_bends_them():
+    camera = BoardCamera(CAMERA_MATRIX, (800, 600), np.array([-0.2, 0.0, 0.0, 0.0]), noise=0.5)
+    pose = looking(0.5)
+    pose[:3, 3] = [0.1, 0.07, 0.5]  # a side is bent by half a pixel out there
+    off = error(fit_aruco(capture(MARKER, pose, camera), OF_MARKER), pose)
+    assert np.linalg.norm(off[3:]) < 0.08e-3
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.1
+
+
+def test_a_checkerboard_is_not_taken_one_square_beside_itself():
+    """Where a side is covered, the sheet about the board can stand in for its outer squares."""
+    matrix = np.array([[1400.0, 0, 639.5], [0, 1400, 511.5], [0, 0, 1]])
+    lens = np.array([-0.12, 0.08, 0.0005, -0.0003, 0.0])
+    camera = BoardCamera(matrix, (1280, 1024), lens, shade=0.4)
+    turn = np.array(
+        [[0.978590, 0.194829, -0.066359], [0.195266, -0.980750, 0.000093],
+         [-0.065063, -0.013048, -0.997796]]
+    )  # fmt: skip
+    pose = rigid(turn, np.array([-0.06487, -0.097677, 0.674374]))
+    cover = Cover(1.67357, 0.026487)
+    for seed in range(3):
+        image = render_board(CHECKER, pose, camera, np.random.default_rng(seed), cover)
+        nothing = PointCloud(CAMERA, np.zeros((0, 3)))
+        found = fit_checkerboard(Capture("0", nothing, by_frame(POSE), image=image), OF_CHECKER)
+        assert isinstance(found, Rejected)
+
+
+def test_the_corners_come_with_what_the_pose_misses():
+    feature = fit_charuco(capture(CHARUCO, looking()), OF_CHARUCO)
+    assert feature.corners.shape == (24, 4)
+    assert np.sqrt((feature.corners[:, 2:] ** 2).mean()) == feature.figures["reprojection_px"]
+    assert feature.figures["reprojection_px"] < 0.1
+
+
+def test_a_small_marker_seen_frontally_has_two_poses_and_is_set_aside():
+    small = Board("marker", 1, 1, 0.02, 0.0, "APRILTAG_36h11", 3)
+    params = OF_MARKER.model_copy(update={"size": 0.02})
+    rejected = [
+        fit_aruco(capture(small, looking(tilt=0.12, distance=0.6), seed=seed), params)
+        for seed in range(4)
+    ]
+    assert all(isinstance(each, Rejected) for each in rejected)
+    assert "fit the corners alike" in rejected[0].reason
+    assert "tilt it by 15 deg and more" in rejected[0].reason
+
+
+def test_depth_decides_between_the_two_poses():
+    small = Board("marker", 1, 1, 0.02, 0.0, "APRILTAG_36h11", 3)
+    params = OF_MARKER.model_copy(update={"size": 0.02})
+    pose = looking(tilt=0.12, distance=0.6)
+    feature = fit_aruco(capture(small, pose, depth=True), params)
+    assert np.degrees(np.linalg.norm(error(feature, pose)[:3])) < 1.0
+
+
+def test_the_better_of_image_and_depth_is_taken():
+    """A marker's tilt is known well from depth only; of a good board the image is as good."""
+    assert fit_aruco(capture(MARKER, looking(0.05), depth=True), OF_MARKER).figures["by_depth"] == 1
+    coarse = BoardCamera(CAMERA_MATRIX, (800, 600), depth_noise=3e-3)
+    by_image = fit_charuco(capture(CHARUCO, looking(), coarse, depth=True), OF_CHARUCO)
+    assert by_image.figures["by_depth"] == 0
+
+
+@pytest.mark.parametrize("kind", FITS)
+def test_a_print_in_another_size_is_named_by_depth(kind):
+    board, fit, params = FITS[kind]
+    field = "size" if kind == "marker" else "square"
+    said = params.model_copy(update={field: getattr(params, field) / 1.03})
+    rejected = fit(capture(board, looking(), depth=True), said)
+    assert isinstance(rejected, Rejected)
+    assert "times as large as the recipe says" in rejected.reason
+    assert float(rejected.reason.split("target is ")[1].split()[0]) == pytest.approx(1.03, abs=5e-3)
+
+
+def blank():
+    image = Image(np.full((600, 800), 90, np.uint8), CAMERA_MATRIX)
+    return Capture("0", PointCloud(CAMERA, np.zeros((0, 3))), by_frame(POSE), image=image)
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("charuco", "0 corners of the ChArUco board found, at least 6 are needed (0 of its "
+         "markers were)"),
+        ("checkerboard", "no checkerboard of 8 x 5 squares found"),
+        ("marker", "marker 3 found 0 times, once is needed (found: none)"),
+    ],
+)  # fmt: skip
+def test_nothing_to_be_seen_is_said(kind, reason):
+    _, fit, params = FITS[kind]
+    assert fit(blank(), params).reason == reason
+
+
+def test_a_capture_without_an_image_is_set_aside():
+    nothing = Capture("0", PointCloud(CAMERA, np.zeros((0, 3))), by_frame(POSE))
+    assert fit_charuco(nothing, OF_CHARUCO).reason.startswith("there is no image")
+
+
+def test_depth_only_needs_depth():
+    params = OF_CHARUCO.model_copy(update={"depth": "only"})
+    reason = fit_charuco(capture(CHARUCO, looking()), params).reason
+    assert reason == "the cloud has no depth at the corners; it must be organised as the image"
+
+
+def test_a_wrong_camera_matrix_is_told_by_the_corners():
+    seen = capture(CHARUCO, looking(0.7, distance=0.35))
+    wrong = CAMERA_MATRIX * [[1.5, 1, 1], [1, 0.7, 1], [1, 1, 1]]
+    rejected = fit_charuco(
+        Capture("0", seen.cloud, by_frame(POSE), image=Image(seen.image.pixels, wrong)), OF_CHARUCO
+    )
+    assert "is the camera's matrix right" in rejected.reason
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "message"),
+    [
+        (CheckerboardParams, {"columns": 8, "rows": 6, "square": SI(0.02)},
+         "a board of 8 x 6 squares looks the same after half a turn; use one with an odd and an "
+         "even number of squares, or a ChArUco board"),
+        (CharucoParams, {"columns": 7, "rows": 5, "square": SI(0.02), "marker": SI(0.03)},
+         "the markers of a ChArUco board are smaller than its squares"),
+        (MarkerParams, {"size": SI(0.02), "dictionary": "4X4_51"}, "no dictionary '4X4_51'; known:"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_with_the_recipe(model, values, message):
+    with pytest.raises(ValidationError) as error:
+        model.model_validate(values)
+    assert message in str(error.value)
+
+
+def test_the_first_square_of_a_checkerboard_is_black():
+    printed = print_of(CHECKER, 10)
+    assert printed.shape == (50, 80)
+    assert (printed[:10, :10] == 0).all()
+    assert (printed[:10, 10:20] == 255).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FITS)
+def test_the_stated_covariance_holds_its_share(kind):
+    board, fit, params = FITS[kind]
+    rng = np.random.default_rng(7)
+    inside = []
+    for seed in range(30):
+        angle = rng.uniform(0, 2 * np.pi)
+        pose = looking(rng.uniform(0.3, 0.7), (np.cos(angle), np.sin(angle), 0), rng.uniform(-3, 3))
+        feature = fit(capture(board, pose, seed=seed), params)
+        off = error(feature, pose)
+        inside.append(off @ np.linalg.solve(feature.covariance, off) < 12.6)  # 95 %
+    assert np.mean(inside) > 0.8

@@ -1,0 +1,198 @@
+"""A ROS 2 bag, read without ROS, gives what was recorded."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flangeye import StageError
+from flangeye.files.clouds import read_cloud
+from flangeye.files.recording import NotThisLayout
+from flangeye.maths.geometry import rigid
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.runner import Runner
+from flangeye.types import ArchivePath
+from flangeye_plugins.reader.folder import FolderParams, folder
+from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
+from tests.plugins.reader.bags import (
+    FIXED,
+    START,
+    camera_info,
+    image,
+    joint_state,
+    point_cloud,
+    pose_stamped,
+    stops,
+    tf,
+    write_bag,
+)
+from tests.testing.test_builtins import SAMPLE
+
+RNG = np.random.default_rng(8)
+POSES = np.array(
+    [
+        rigid(Rotation.random(random_state=RNG).as_matrix(), RNG.uniform(-0.5, 0.5, 3))
+        for _ in "12345"
+    ]
+)
+CLOUDS = RNG.normal(0, 0.1, (5, 6, 7, 3)).astype(np.float32) + np.float32([0, 0, 1])
+
+
+def read(path, **params):
+    return ros2_bag(path, BagParams.model_validate(params))
+
+
+def robot_in_tf(poses):
+    """The flange by way of a link that moves and one that does not, in UR's two bases."""
+    times, moving, middles = stops(poses)
+    link_T_flange = rigid(Rotation.from_euler("x", 20, degrees=True).as_matrix(), [0, 0.05, 0.1])
+    told = [("/tf_static", START, tf(START, ("base_link", "base", FIXED),
+                                     ("wrist_3_link", "flange", link_T_flange)))]  # fmt: skip
+    for t, pose in zip(times, moving, strict=True):
+        link = FIXED @ pose @ np.linalg.inv(link_T_flange)
+        told.append(("/tf", t, tf(t, ("base_link", "wrist_3_link", link))))
+    return told, middles
+
+
+@pytest.fixture(params=["mcap", "db3"])
+def bag(request, tmp_path):
+    def write(told):
+        return write_bag(tmp_path / "bag", request.param, told)
+
+    return write
+
+
+def test_clouds_are_paired_with_the_standstills(bag):
+    told, middles = robot_in_tf(POSES)
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+    found = read(bag(told))
+    assert np.allclose([r.base_T_flange for r in found.recordings], POSES, atol=1e-9)
+    clouds = [read_cloud(r.cloud).xyz for r in found.recordings]
+    assert np.array_equal(clouds, CLOUDS)
+    assert "the flange's poses from tf, base to flange; /scan" in found.notes[0]
+    assert "stood still 5 times" in found.notes[1]
+    assert [
+        abs(r.time_ns * 1e-9 - m) < 0.05 for r, m in zip(found.recordings, middles, strict=True)
+    ]
+
+
+def test_a_cameras_clock_that_is_off_is_moved_into_the_standstills(bag):
+    told, middles = robot_in_tf(POSES)
+    late = middles + 0.7
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(late, CLOUDS, strict=True)]
+    found = read(bag(told))
+    assert np.allclose([r.base_T_flange for r in found.recordings], POSES, atol=1e-9)
+    assert np.array_equal([read_cloud(r.cloud).xyz for r in found.recordings], CLOUDS)
+
+
+def test_an_offset_is_estimated_by_how_images_change(bag):
+    """Images at 20 Hz of something that moves with the arm, their clock 0.35 s behind."""
+    told, _ = robot_in_tf(POSES)
+    times, moving, _ = stops(POSES)
+    columns = np.arange(128)
+    for t, pose in list(zip(times, moving, strict=True))[::2]:
+        shift = 300 * np.linalg.norm(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
+        row = 127 + 120 * np.sin((columns + shift) / 15)
+        told.append(("/image", t - 0.35, image(t - 0.35, np.tile(row, (96, 1)).astype(np.uint8))))
+    told.append(("/camera_info", START, camera_info(START, np.diag([900.0, 901, 1]), (96, 128))))
+    found = read(bag(told))
+    offset = float(found.notes[1].split("clock offset ")[1].split(" ms")[0])
+    assert offset == pytest.approx(350, abs=30)
+    assert len(found.recordings) == 5
+    assert found.recordings[0].image.is_file()
+    assert found.recordings[0].camera[0][1, 1] == 901
+
+
+def test_joint_angles_give_poses_by_the_arms_model(bag):
+    model = load_model("robots", "ur5e")
+    angles = RNG.uniform(-1, 1, (5, 6))
+    poses = Arm(model).flange(angles)
+    times, _, middles = stops(poses)
+    held = np.clip(((times - START) // 1.8).astype(int), 0, 4)
+    told = [("/joint_states", t, joint_state(t, angles[i]))
+            for t, i in zip(times, held, strict=True)]  # fmt: skip
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+    found = read(bag(told), model="ur5e")
+    assert np.allclose([r.base_T_flange for r in found.recordings], poses, atol=1e-9)
+    assert np.allclose([r.joints for r in found.recordings], angles, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", ["topic", "frame"])
+def test_a_target_that_somebody_has_measured(bag, way):
+    told, _ = robot_in_tf(POSES)
+    times, moving, _ = stops(POSES)
+    base_T_camera, flange_T_target = POSES[2], POSES[3]
+    seen = np.linalg.inv(base_T_camera) @ moving @ flange_T_target
+    for t, pose in list(zip(times, seen, strict=True))[::2]:
+        told.append(("/tf", t, tf(t, ("eye", "marker", pose))) if way == "frame"
+                    else ("/marker", t, pose_stamped(t, pose)))  # fmt: skip
+    params = {"target": "marker", "camera": "eye"} if way == "frame" else {"target": "/marker"}
+    found = read(bag(told), **params)
+    wanted = np.linalg.inv(base_T_camera) @ POSES @ flange_T_target
+    assert np.allclose([r.camera_T_target for r in found.recordings], wanted, atol=1e-3)
+    assert np.allclose([r.base_T_flange for r in found.recordings], POSES, atol=1e-3)
+
+
+RECIPE = """\
+title: A bag
+robot: {model: ur5}
+scanner: {model: phoxi-m}
+steps:
+  - acquire.archive
+  - segment.flange
+  - fit.rim
+  - solve.svd
+"""
+
+
+def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag):
+    """The recipe on the sample's folder and on a bag made of it, reader and all found out."""
+    recorded = folder(SAMPLE, FolderParams()).recordings
+    told, middles = robot_in_tf(np.array([r.base_T_flange for r in recorded]))
+    for t, recording in zip(middles, recorded, strict=True):
+        told.append(("/phoxi/cloud", t, point_cloud(t, read_cloud(recording.cloud).xyz)))
+    registry = load_registry()
+    recipe = parse_recipe(RECIPE, "bag", registry)
+    results = [Runner(recipe, registry, ArchivePath(path)).run() for path in (SAMPLE, bag(told))]
+    matrices = [result.transforms["base_T_camera"].matrix for result in results]
+    assert np.allclose(*matrices, rtol=0, atol=1e-9)
+    assert "reader: ros2_bag, chosen by" in results[1].provenance.notes[1]
+
+
+@pytest.mark.parametrize(
+    ("topics", "params", "message"),
+    [
+        ("tf", {}, "holds neither clouds nor images; name the target where somebody has measured it "
+         "(a PoseStamped topic, or a frame of tf)"),
+        ("tf two", {}, "clouds: name one of /a, /b"),
+        ("tf two", {"clouds": "/c"}, "clouds: no topic '/c'; of this type: /a, /b"),
+        ("two", {"clouds": "/a"}, "nothing tells where the flange is; name base and flange (frames "
+         "of tf: none), robot (a PoseStamped topic), or model (of the arm, for joint angles)"),
+        ("tf two", {"clouds": "/a", "model": "ur5e"},
+         "model: there are no joint angles whose order is known"),
+        ("tf two", {"target": "marker"}, "target: 'marker' is no PoseStamped topic; as a frame of "
+         "tf it needs the camera's frame, camera: NAME"),
+        ("tf late", {}, "the arm's poses are from 1700000000.000 to 1700000008.200 s, the "
+         "measurements from 1700001000.000 to 1700001000.000 s: they have no time in common; set "
+         "clock_offset"),
+    ],
+)  # fmt: skip
+def test_what_a_bag_does_not_tell_is_one_line(tmp_path, topics, params, message):
+    told = robot_in_tf(POSES)[0] if "tf" in topics else []
+    told += [(f"/{name}", START, point_cloud(START, CLOUDS[0])) for name in "ab" if "two" in topics]
+    late = START + 1000
+    told += [("/a", late, point_cloud(late, CLOUDS[0]))] if "late" in topics else []
+    path = write_bag(tmp_path / "bag", "mcap", told)
+    with pytest.raises(StageError) as error:
+        read(path, **params)
+    assert str(error.value) == f"{path}: {message}"
+
+
+def test_what_is_no_bag_is_said(tmp_path):
+    with pytest.raises(NotThisLayout, match="holds no ROS 2 bag"):
+        read(tmp_path)
+    (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\0" * 40)
+    with pytest.raises(StageError, match=r"x\.mcap: cannot be read as a ROS 2 bag"):
+        read(tmp_path)

@@ -1,0 +1,5 @@
+"""Drivers of arms, through their makers' client libraries."""
+
+import pytest
+
+pytest.register_assert_rewrite("tests.plugins.robot.behaviour")

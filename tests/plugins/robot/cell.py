@@ -1,0 +1,52 @@
+"""What tests of drivers share: controllers on loopback, poses to go to, and a clock on every call."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+
+import numpy as np
+
+from flangeye.devices import PATIENCE
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.models.loading import load_model
+from flangeye.types import Transform
+from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
+
+UR5E = load_model("robots", "ur5e")
+
+
+def open_ur(host, **params):
+    return robot_ur_rtde(UR5E, UrRtdeParams(host=host, **params))
+
+
+def moved(pose, x=0.0, y=0.0, z=0.0, turn=(0.0, 0.0, 0.0)):
+    rotation = rotation_exp(np.array(turn)) @ pose.rotation
+    return Transform("base", "flange", rigid(rotation, pose.translation + [x, y, z]))
+
+
+@contextmanager
+def in_time(limit=PATIENCE):
+    """Fail when what is inside takes longer than a driver may."""
+    began = time.monotonic()
+    yield
+    lasted = time.monotonic() - began
+    assert lasted < limit, f"a call took {lasted:.1f} s"
+
+
+def until(condition, patience=PATIENCE):
+    """Wait until a condition holds; return what it gave."""
+    end = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+    return found
+
+
+def arrived(robot, patience=20.0):
+    """Watch a move to its end; return the last state."""
+    end = time.monotonic() + patience
+    while (state := robot.state()).mode == "moving":
+        assert time.monotonic() < end, "the arm does not arrive"
+        robot.wait_cycle()
+    return state

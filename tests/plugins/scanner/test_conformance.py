@@ -1,0 +1,56 @@
+"""The scanners' drivers go through the kit, each with its counterpart."""
+
+from pathlib import Path
+
+import pytest
+
+from flangeye.testing import ScannerConformance
+from flangeye_emulators.scanner.loopback import LoopbackParams, scanner_loopback
+from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
+from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
+from tests.emulators.controllers.process import Process
+from tests.plugins.scanner.test_loopback import shown
+from tests.plugins.scanner.test_realsense import recording  # noqa: F401  a fixture
+
+
+@pytest.fixture(scope="class")
+def viky(request):
+    genicam = pytest.importorskip("genicam", reason="pip install 'flangeye[genicam]'")
+    pytest.importorskip("harvesters", reason="pip install 'flangeye[genicam]'")
+    request.cls.params = {"producer": "viky", "serial": "0"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FLANGEYE_LIBRARY_VIKY", str(Path(genicam.__file__).parent / "viky.cti"))
+        yield
+
+
+@pytest.mark.usefixtures("viky")
+class TestGenicam(ScannerConformance):
+    part = scanner_genicam
+    unreachable = GenicamParams(producer="none")
+
+
+@pytest.fixture
+def recorded(request, recording):  # noqa: F811
+    request.cls.params = {"recording": str(recording), "timeout": "1 s"}
+
+
+@pytest.mark.usefixtures("recorded")
+class TestRealsense(ScannerConformance):
+    part = scanner_realsense
+    unreachable = RealsenseParams(serial="none")
+
+
+@pytest.fixture(scope="class")
+def controller(request):
+    with Process() as process:
+        process.control.put(shown())
+        request.cls.params = {
+            "host": process.host, "resolution": 0.05, "exposure": "20 ms", "latency": "0 ms"
+        }  # fmt: skip
+        yield
+
+
+@pytest.mark.usefixtures("controller")
+class TestLoopback(ScannerConformance):
+    part = scanner_loopback
+    unreachable = LoopbackParams(host="127.0.0.254")

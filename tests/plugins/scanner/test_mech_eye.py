@@ -1,0 +1,131 @@
+"""The Mech-Eye driver: its real library without a camera, and a stand-in for the camera alone."""
+
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError, Scanner
+from flangeye.units import SI
+from flangeye_plugins.scanner.mech_eye import MechEyeParams, scanner_mech_eye
+
+api = pytest.importorskip("mecheye.area_scan_3d_camera", reason="pip install 'flangeye[mech_eye]'")
+
+
+def refused(params):
+    with pytest.raises(DeviceError) as error:
+        scanner_mech_eye(None, params)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_no_camera_is_found_by_the_real_library():
+    began = time.monotonic()
+    assert refused(MechEyeParams(timeout=SI(0.3))) == (
+        "scanner.mech_eye: no camera found; is it on, and in this computer's network?"
+    )
+    assert time.monotonic() - began < 10
+
+
+def test_what_the_real_library_says_of_an_address_is_said():
+    assert refused(MechEyeParams(address="not an address")) == (
+        "scanner.mech_eye: not an address: Failed to connect to the Mech-Eye Industrial 3D Camera. "
+        "IP Address is invalid. (error -7)"
+    )
+    assert refused(MechEyeParams(address="127.0.0.9", timeout=SI(0.3))).startswith(
+        "scanner.mech_eye: 127.0.0.9: Failed to connect to the Mech-Eye Industrial 3D Camera. "
+    )
+
+
+def test_a_missing_sdk_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mecheye.area_scan_3d_camera", None)
+    assert refused(MechEyeParams()).endswith("; pip install 'flangeye[mech_eye]'")
+
+
+class Status:
+    """An answer of the library; the real one cannot be made by hand."""
+
+    def __init__(self, description="", code=0):
+        self.error_description, self.error_code = description, code
+
+    def is_ok(self):
+        return self.error_code == 0
+
+
+@pytest.fixture
+def camera(monkeypatch):
+    """A camera in the real library's place; frames, clouds and infos are the real library's."""
+
+    class Camera:
+        unit, closed, lost = api.shared.CoordinateUnit_Millimeter, 0, False
+        addresses = ("10.0.0.7",)
+
+        def discover_cameras(self):
+            found = []
+            for address in Camera.addresses:
+                info = api.CameraInfo()
+                info.ip_address = address
+                found.append(info)
+            return found
+
+        def connect(self, address, patience):
+            assert address == "10.0.0.7"
+            return Status()
+
+        def get_camera_info(self, info):
+            info.model, info.serial_number = "Mech-Eye PRO M", "NEM1"
+            return Status()
+
+        def set_point_cloud_unit(self, unit):
+            Camera.unit = unit if Camera.unit is not None else None
+            return Status()
+
+        def get_point_cloud_unit(self):
+            return Status(), Camera.unit
+
+        def capture_3d(self, frame, patience):
+            if Camera.lost:
+                return Status("Device is offline.", -2)
+            cloud = api.UntexturedPointCloud()
+            cloud.resize(4, 3)
+            frame.get_untextured_point_cloud = lambda: cloud
+            return Status()
+
+        def disconnect(self):
+            Camera.closed += 1
+
+    class Frame:
+        pass
+
+    monkeypatch.setattr(api, "Camera", Camera)
+    monkeypatch.setattr(api, "Frame3D", Frame)
+    return Camera
+
+
+def test_a_frame_of_the_real_library_becomes_an_organised_cloud(camera):
+    with scanner_mech_eye(None, MechEyeParams()) as scanner:
+        assert isinstance(scanner, Scanner)
+        assert scanner.name == "Mech-Eye PRO M NEM1"
+        assert camera.unit == api.shared.CoordinateUnit_Meter
+        scan = scanner.expose()()
+    assert scan.cloud.xyz.shape == (3, 4, 3)
+    assert scan.cloud.xyz.dtype == np.float32
+    assert camera.closed == 1
+
+
+def test_what_a_camera_does_not_do_is_said(camera):
+    camera.addresses = ("10.0.0.7", "10.0.0.5")
+    assert refused(MechEyeParams()) == (
+        "scanner.mech_eye: several cameras, give address: 10.0.0.5, 10.0.0.7"
+    )
+    scanner = scanner_mech_eye(None, MechEyeParams(address="10.0.0.7"))
+    camera.lost = True
+    with pytest.raises(DeviceError) as error:
+        scanner.expose()
+    assert str(error.value) == "Mech-Eye PRO M NEM1: Device is offline. (error -2)"
+    camera.unit = None
+    assert refused(MechEyeParams(address="10.0.0.7")) == (
+        "Mech-Eye PRO M NEM1: its points stay in unit None, metres are needed"
+    )
+    assert camera.closed == 1

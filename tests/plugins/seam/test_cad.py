@@ -1,0 +1,247 @@
+"""seam.cad: accuracy against the truth, robustness, refusals."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from flangeye import CalibrationRefused, StageError
+from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
+from flangeye.maths.seam_geometry import errors_from, tube_radii
+from flangeye.models.loading import load_model
+from flangeye.models.workpiece import load_workpiece
+from flangeye.types import CAMERA, Box, PointCloud, Seed, WorkpieceScan
+from flangeye_emulators.scan.simulated import SimulatedScanParams
+from flangeye_emulators.world.workpiece import PLATES, _description
+from flangeye_plugins.seam.cad import CadParams, seam_cad
+from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
+
+MM = 1e-3
+PHOXI = load_model("scanners", "phoxi-m")
+
+
+@lru_cache
+def plain(workpiece="v-straight"):
+    """Return the planned seam of the plain scene, made once."""
+    return planned(scanned(workpiece)[0], workpiece)
+
+
+def planned(scan, workpiece="v-straight", workspace=None, hand=None, **given):
+    params = CadParams.model_validate({"workpiece": str(workpiece), **given})
+    return seam_cad(hand or hand_eye(), scan, Seed(0), params, workspace, PHOXI)
+
+
+@pytest.mark.parametrize(
+    ("workpiece", "given"),
+    [
+        ("v-curved", {"clutter": 15, "seed": 3}),
+        ("v-straight", {"covered": 0.4, "clutter": 10}),
+        ("v-straight", {"rpy": ("15 deg", "-20 deg", "140 deg"), "seed": 2}),
+    ],
+)
+def test_the_seam_is_where_it_is(workpiece, given):
+    scan, truth = scanned(workpiece, **given)
+    check_planned(planned(scan, workpiece), truth)
+
+
+def test_the_plain_seam_is_where_it_is():
+    check_planned(plain(), scanned("v-straight")[1])
+
+
+def check_planned(seam, truth):
+    errors = errors_from(seam, truth)
+    assert errors.max() < 0.15 * MM
+    assert (errors <= tube_radii(seam)).all()
+    assert tube_radii(seam).max() < 0.3 * MM
+    ends = np.linalg.norm(seam.points_in_base[[0, -1]] - truth[[0, -1]], axis=1)
+    assert ends.max() < 0.3 * MM
+    assert seam.arc_length[-1] == pytest.approx(0.2, abs=0.005)
+    assert seam.half_angle == pytest.approx(np.radians(40))
+    assert seam.cloud.frame == "base"
+
+
+def test_the_opening_points_at_the_torch():
+    assert (plain().openings_in_base[:, 2] > 0.999).all()
+
+
+def test_a_plate_that_can_slide_is_held_by_its_outline(tmp_path):
+    path = write_plate(tmp_path, -0.015)
+    scan, truth = scanned(path)
+    seam = planned(scan, path)
+    ends = np.linalg.norm(seam.points_in_base[[0, -1]] - truth[[0, -1]], axis=1)
+    assert ends.max() < 0.5 * MM
+    assert 0.2 * MM < seam.figures["registration"] < 2 * MM  # along the seam, and it says so
+    assert tube_radii(seam).max() < 0.5 * MM  # across it
+
+
+def test_the_seam_moves_with_the_scene():
+    """Another camera frame of the same scan gives the same seam in the base."""
+    scan, _ = scanned("v-straight")
+    motion = rigid(rotation_from_rpy(0.02, -0.03, 0.04), np.array([0.01, 0.02, -0.03]))
+    seam = plain()
+    moved = planned(scan, hand=hand_eye(error=motion))
+    assert np.allclose(
+        moved.points_in_base, seam.points_in_base @ motion[:3, :3].T + motion[:3, 3], atol=1e-9
+    )
+
+
+def test_the_hand_eye_covariance_widens_the_tube_away_from_where_it_holds():
+    scan, _ = scanned("v-straight")
+    seam = planned(scan, hand=hand_eye(sigma=(5e-3, 1e-7)))
+    arm = np.linalg.norm(seam.points_in_base - [0.6, 0.0, 0.25], axis=1)
+    wide = tube_radii(seam)
+    assert wide[np.argmax(arm)] == pytest.approx(2.448 * 5e-3 * arm.max(), rel=0.2)
+    assert wide[np.argmax(arm)] > 2 * wide[np.argmin(arm)] > tube_radii(plain()).min()
+
+
+def refused(scan, workpiece="v-straight", error=CalibrationRefused, **given):
+    with pytest.raises(error) as caught:
+        planned(scan, workpiece, **given)
+    return str(caught.value)
+
+
+def test_a_cad_in_another_unit_is_named(tmp_path):
+    scan, _ = scanned("v-straight")
+    path = write_plate(tmp_path, -0.015, unit="m")
+    told = refused(scan, path, StageError)
+    assert told.startswith(f"{path}: with unit: m the part is 239.7 m across, ")
+    assert told.endswith("it would be 0.2397 m: set unit: mm")
+    tiny = WorkpieceScan(PointCloud(CAMERA, 1e3 * scan.cloud.points()), "in mm")
+    assert "too small for the scan, whose points are about" in refused(tiny, error=StageError)
+
+
+def test_another_part_is_refused():
+    scan, _ = scanned("v-straight")
+    told = refused(scan, "v-curved")
+    assert "seam.cad: poor fit: where the scanner looked at" in told
+    assert told.endswith("is it 'Plate with a curved V-groove' (v-curved.yaml), and in view?")
+
+
+def test_a_part_that_is_not_there_is_refused():
+    rng = np.random.default_rng(1)
+    floor = np.column_stack([rng.uniform(-0.3, 0.3, (40_000, 2)), rng.normal(0.75, 1e-4, 40_000)])
+    told = refused(WorkpieceScan(PointCloud(CAMERA, floor.astype(np.float32)), "floor"))
+    assert told.startswith("seam.cad: ")
+    assert "poor fit" in told or "nowhere in the scan" in told
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_part_that_could_lie_either_way_is_refused(tmp_path, seed):
+    path = write_plate(tmp_path, 0.0)
+    told = refused(scanned(path, seed=seed)[0], path)
+    assert told.startswith("seam.cad: ambiguous: the part turned by 180 deg about the CAD's z")
+    assert "its seam would be up to 200 mm away" in told
+
+
+def test_a_seam_outside_the_workspace_is_refused():
+    scan, _ = scanned("v-straight")
+    told = refused(scan, workspace=Box([0.6, 0.0, 0.3], [0.15, 0.3, 0.2]))
+    assert told.startswith("seam.cad: the seam leaves the workspace by ")
+    assert " mm along x, at (" in told
+
+
+def test_limits_are_held():
+    scan, _ = scanned("v-straight")
+    assert "is needed (min_seen)" in refused(scan, min_seen=0.999)
+    assert "limit 0.01 mm (max_deviation)" in refused(scan, max_deviation="0.01 mm")
+
+
+def test_too_small_a_scan_is_refused():
+    scan = WorkpieceScan(PointCloud(CAMERA, np.ones((5, 3), np.float32)), "few")
+    assert refused(scan, error=StageError) == "seam.cad: the scan has 5 points; 300 are needed"
+
+
+def test_the_seam_is_chosen_by_name(tmp_path):
+    path = write_plate(tmp_path, -0.015)
+    scan, _ = scanned("v-straight")
+    told = refused(scan, path, StageError, seam="weld")
+    assert told == f"seam.cad: {path} has no seam 'weld'; it has groove"
+    text = path.read_text()
+    seam = text[text.index("- name: groove") : text.index("source:")]
+    path.write_text(text.replace("source:", seam.replace("groove", "second") + "source:"))
+    told = refused(scan, path, StageError)
+    assert told == f"seam.cad: {path} has the seams groove, second; say which with seam:"
+
+
+@pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
+def test_the_shipped_workpieces_are_those_the_project_makes(plate):
+    from flangeye.files.bundled import bundled
+
+    path = bundled("data") / "workpieces" / f"{plate.name}.yaml"
+    assert path.read_text() == _description(plate)
+    read = load_workpiece(path)
+    corners = plate.mesh().vertices[plate.mesh().triangles]
+    assert np.allclose(read.vertices[read.triangles], corners, atol=1e-8)
+
+
+@pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
+def test_the_sample_workpieces_are_closed_and_face_outwards(plate):
+    mesh = plate.mesh()
+    edges = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+    there = {tuple(edge) for edge in edges.tolist()}
+    assert len(there) == len(edges)
+    assert all((b, a) in there for a, b in there)
+    corners = mesh.vertices[mesh.triangles]
+    volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    assert 0.0006 < volume < 0.0007
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("plate.stl", "plate.step"), "plate.step: '.step' is no CAD; known: .stl, .ply"),
+        (("plate.stl", "none.stl"), "none.stl: cannot be read: No such file"),
+        (
+            ("-15.0, 14.0]\n", "-15.0, 140.0]\n"),
+            "mm outside its CAD; both must be in one frame and one",
+        ),
+        (("[0, 0, 1]", "[0, 0, 0]"), "has an opening without a direction"),
+    ],
+)
+def test_a_wrong_workpiece_file_is_refused(tmp_path, change, message):
+    path = write_plate(tmp_path, -0.015)
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(StageError, match=message.replace("(", r"\(")):
+        load_workpiece(path)
+
+
+def test_a_file_without_triangles_is_no_cad(tmp_path):
+    path = write_plate(tmp_path, -0.015)
+    (tmp_path / "plate.stl").write_bytes(b"solid nothing\nendsolid nothing\n")
+    with pytest.raises(
+        StageError, match=r"plate.stl: holds no triangles; is it a mesh, and whole\?"
+    ):
+        load_workpiece(path)
+
+
+@pytest.mark.slow
+def test_the_registration_is_as_uncertain_as_it_says():
+    """Errors of the fit against its own covariance, over scans without the scanner's distortion.
+
+    The mean squared Mahalanobis distance of six parameters is six; 8 scans vary it by a quarter.
+    """
+    squares = []
+    for seed in range(8):
+        scan, _ = scanned("v-curved", seed=seed, resolution=0.3, distortion=0.0)
+        squares.append(squared_error(scan, seed))
+    assert 1.0 < np.mean(squares) < 12.0
+
+
+def squared_error(scan, seed):
+    """Return the squared Mahalanobis distance of a fit from the truth."""
+    from flangeye_plugins.seam.cad import _limits
+    from flangeye_plugins.seam.part import CadPart
+    from flangeye_plugins.seam.register import register
+
+    workpiece = load_workpiece(CadParams(workpiece="v-curved").workpiece)
+    seam = workpiece.seams["groove"]
+    points = scan.cloud.points().astype(np.float64)
+    params = CadParams(workpiece="v-curved")
+    fit = register(
+        points, CadPart(workpiece), seam, _limits(params), np.random.default_rng(seed)
+    ).fit
+    true = BASE_T_CAMERA.inverse().matrix @ SimulatedScanParams().base_T_part
+    motion = fit.pose @ np.linalg.inv(true)
+    shift = motion[:3, :3] @ fit.about + motion[:3, 3] - fit.about
+    error = np.concatenate([rotation_log(motion[:3, :3]), shift])
+    return float(error @ np.linalg.solve(fit.covariance, error))

@@ -1,0 +1,80 @@
+"""Where a scan of a workpiece comes from."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from flangeye import StageError
+from flangeye.devices import Scan, ScannerDriver
+from flangeye.files.clouds import write_cloud
+from flangeye.types import CAMERA, PointCloud, Seed
+from flangeye_emulators.scan.simulated import SimulatedScanParams, scan_simulated
+from flangeye_plugins.scan.scans import FileScanParams, scan_file, scan_live
+from tests.plugins.seam.scenes import BASE_T_CAMERA, scanned
+
+CLOUD = PointCloud(CAMERA, np.arange(12, dtype=np.float32).reshape(4, 3))
+
+
+def test_the_simulated_scan_shows_the_true_seam():
+    scan, truth = scanned("v-straight")
+    points = BASE_T_CAMERA.apply(scan.cloud.points())
+    middle = truth.mean(axis=0)
+    near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 5e-3
+    assert np.quantile(points[near, 2], 0.02) == pytest.approx(middle[2], abs=1e-3)
+    assert scan.notes == (
+        "workpiece: Plate with a straight V-groove, simulated, with 6 things about it",
+    )
+
+
+def test_without_a_simulated_cell_nothing_is_simulated():
+    with pytest.raises(StageError) as error:
+        scan_simulated(None, Seed(0), SimulatedScanParams())
+    assert str(error.value) == (
+        "scan.simulated: looks with the scanner of a simulated cell, and the acquire step "
+        "simulates none; use acquire.simulated, or scan.file"
+    )
+
+
+def test_an_unknown_workpiece_is_named():
+    with pytest.raises(ValidationError, match="no workpiece 'v-strait'; known: v-straight, "):
+        SimulatedScanParams(workpiece="v-strait")
+
+
+def test_a_file_and_a_folder_of_clouds_are_read(tmp_path):
+    write_cloud(tmp_path / "a.pcd", CLOUD, "mm")
+    one = scan_file(FileScanParams(path=tmp_path / "a.pcd", unit="mm"))
+    assert np.allclose(one.cloud.xyz, CLOUD.xyz)
+    write_cloud(tmp_path / "b.pcd", CLOUD, "mm")
+    both = scan_file(FileScanParams(path=tmp_path, unit="mm"))
+    assert both.cloud.xyz.shape == (8, 3)
+    assert both.notes == (f"workpiece scan: {tmp_path}, 2 files, 8 points",)
+
+
+def test_a_scan_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(StageError, match="none.pcd: does not exist"):
+        scan_file(FileScanParams(path=tmp_path / "none.pcd", unit="m"))
+    with pytest.raises(StageError, match="holds no cloud; known: .csv, .npy, .pcd"):
+        scan_file(FileScanParams(path=tmp_path, unit="m"))
+
+
+class Still:
+    """A scanner with one scan."""
+
+    name, facts = "still scanner", {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.closed = True
+
+    def expose(self):
+        return lambda: Scan(CLOUD, 0, 1)
+
+
+def test_a_live_scan_is_one_exposure_and_lets_go_of_the_scanner():
+    device = Still()
+    scan = scan_live(ScannerDriver("scanner.still", lambda: device))
+    assert np.array_equal(scan.cloud.xyz, CLOUD.xyz)
+    assert scan.source == "still scanner"
+    assert device.closed

@@ -1,0 +1,224 @@
+"""verify.holdout: folds, figures, outliers, and the prediction over the workspace."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from flangeye import StageError
+from flangeye.maths.geometry import rotation_exp
+from flangeye.types import (
+    BASE,
+    FLANGE,
+    Box,
+    CircleFeature,
+    HandEye,
+    Observation,
+    Observations,
+    Pair,
+    Seed,
+    Source,
+    Transform,
+    by_frame,
+)
+from flangeye_plugins.solve.svd import SvdParams, solve_svd
+from flangeye_plugins.verify.holdout import HoldoutParams, deal, verify_holdout
+
+TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])
+MM = 1e-3
+
+
+def simulate(
+    n: int, sigma: float = 0.3 * MM, tilt: float = 0.0, seed: int = 0
+) -> list[Observation]:
+    """Observations with isotropic noise; every normal is off by ``tilt`` in a random direction."""
+    rng = np.random.default_rng(seed)
+    observations = []
+    for i in range(n):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_exp(rng.uniform(-0.3, 0.3, 3))
+        pose[:3, 3] = np.array([0.4, -0.5, 0.2]) + rng.uniform(-1, 1, 3) * [0.15, 0.15, 0.1]
+        centre = TRUTH[0].T @ (pose[:3, 3] - TRUTH[1]) + sigma * rng.standard_normal(3)
+        across = np.cross(pose[:3, 2], rng.standard_normal(3))
+        axis = across / np.linalg.norm(across)
+        normal = TRUTH[0].T @ rotation_exp(tilt * axis) @ pose[:3, 2]
+        circle = CircleFeature(
+            centre, normal, {}, np.eye(3) * sigma**2, np.diag([1e-6, 1e-6, 0]), 1.0
+        )
+        observations.append(
+            Observation(f"{i:02d}", circle, by_frame(Transform(BASE, FLANGE, pose)))
+        )
+    return observations
+
+
+def svd(observations: Sequence[Observation]) -> HandEye:
+    return solve_svd(Observations(observations, Source("test")), SvdParams())
+
+
+def displaced(observation: Observation, by: Sequence[float]) -> Observation:
+    circle = observation.circle
+    moved = CircleFeature(
+        circle.centre + by, circle.normal, {}, circle.covariance, circle.normal_covariance, 1.0
+    )
+    return Observation(observation.id, moved, by_frame(observation.base_T_flange))
+
+
+def test_folds_hold_out_every_pose_once_and_do_not_depend_on_global_state() -> None:
+    np.random.seed(1)
+    first = deal(13, 5, 0)
+    np.random.seed(2)
+    second = deal(13, 5, 0)
+    assert sorted(np.concatenate(first)) == list(range(13))
+    assert [f.tolist() for f in first] == [f.tolist() for f in second]
+    assert [len(f) for f in first] == [3, 3, 3, 2, 2]
+    assert len(deal(4, 5, 0)) == 4
+
+
+def test_errors_are_those_of_solutions_without_the_pose() -> None:
+    observations = simulate(8)
+    result = verify_holdout(svd(observations), svd, HoldoutParams(folds=8))
+    for i, observation in enumerate(observations):
+        without = svd(observations[:i] + observations[i + 1 :]).base_T_camera.transform
+        error = np.linalg.norm(without.apply(observation.circle.centre) - observation.tcp_in_base)
+        assert result.errors[observation.id] == pytest.approx(error)
+    assert result.figures["rms"] == pytest.approx(
+        np.sqrt(np.mean(np.square(list(result.errors.values()))))
+    )
+    assert result.figures["folds"] == 8
+
+
+def test_the_figures_of_isotropic_noise() -> None:
+    result = verify_holdout(svd(simulate(60)), svd, HoldoutParams())
+    figures = result.figures
+    assert result.passed
+    assert figures["rms"] == pytest.approx(0.3 * MM * np.sqrt(3), rel=0.15)
+    assert 0 < figures["median"] < figures["p95"] < figures["max"]
+    assert figures["outliers"] == 0
+    assert figures["rms_inliers"] == figures["rms"]
+    assert result.reason == (
+        f"held-out error {figures['rms'] * 1e3:.3f} mm rms, within the limit of 1 mm"
+    )
+
+
+def test_tilt_is_the_angle_between_mapped_and_reported_normals() -> None:
+    result = verify_holdout(svd(simulate(30, 1e-6, tilt=2e-3)), svd, HoldoutParams())
+    assert result.figures["tilt_rms"] == pytest.approx(2e-3, rel=0.01)
+
+
+def test_a_calibration_above_the_limit_does_not_pass() -> None:
+    result = verify_holdout(
+        svd(simulate(20)), svd, HoldoutParams.model_validate({"max_rms": "0.1 mm"})
+    )
+    assert not result.passed
+    assert result.reason == (
+        f"held-out error {result.figures['rms'] * 1e3:.3f} mm rms, above the limit of 0.1 mm"
+    )
+
+
+def test_a_solver_that_sets_nothing_aside_answers_for_every_pose() -> None:
+    observations = simulate(20)
+    observations[7] = displaced(observations[7], [0.02, 0, 0])
+    result = verify_holdout(svd(observations), svd, HoldoutParams())
+    assert not result.passed
+    assert result.figures["outliers"] == 0
+    assert result.figures["rms"] == result.figures["rms_inliers"] > 3 * MM
+
+
+def without_07(observations: Sequence[Observation]) -> HandEye:
+    """A solver that sets pose 07 aside."""
+    solved = svd([o for o in observations if o.id != "07"])
+    transform = solved.base_T_camera.transform
+    pairs = [
+        Pair(o, transform.apply(o.circle.centre) - o.tcp_in_base, o.id != "07", None)
+        for o in observations
+    ]
+    return HandEye(solved.base_T_camera, tuple(pairs), "test")
+
+
+def test_an_outlier_the_solver_set_aside_is_counted_and_reported() -> None:
+    observations = simulate(20)
+    observations[7] = displaced(observations[7], [0.02, 0, 0])
+    result = verify_holdout(without_07(observations), without_07, HoldoutParams())
+    assert result.passed
+    assert result.figures["outliers"] == 1
+    assert result.figures["rms_inliers"] < 0.8 * MM < result.figures["rms"]
+    assert result.errors["07"] == pytest.approx(0.02, rel=0.05)
+    assert "mm rms over all 20 poses, " in result.reason
+    assert "mm without 1 set aside, within the limit of 1 mm" in result.reason
+
+
+def test_a_good_pose_the_solver_set_aside_still_counts() -> None:
+    result = verify_holdout(without_07(simulate(20)), without_07, HoldoutParams())
+    assert result.figures["outliers"] == 0
+    assert result.figures["poses"] == 20
+
+
+def test_too_many_outliers_do_not_pass() -> None:
+    observations = simulate(20)
+    observations[7] = displaced(observations[7], [0.02, 0, 0])
+    params = HoldoutParams(max_outliers=0.01)
+    result = verify_holdout(without_07(observations), without_07, params)
+    assert not result.passed
+    assert result.reason == (
+        "1 of 20 poses are outliers, limit 1%: look at the scans the solver set aside"
+    )
+
+
+def test_three_poses_cannot_be_held_out() -> None:
+    result = verify_holdout(svd(simulate(3)), svd, HoldoutParams())
+    assert not result.passed
+    assert result.reason == (
+        "without one fold of 3 there is no answer: 3 poses needed, 2 given: "
+        "add poses, or see why captures were set aside"
+    )
+
+
+def test_another_seed_deals_other_folds() -> None:
+    observations = simulate(20)
+    first = verify_holdout(svd(observations), svd, HoldoutParams())
+    again = verify_holdout(svd(observations), svd, HoldoutParams())
+    other = verify_holdout(svd(observations), svd, HoldoutParams(), seed=Seed(1))
+    assert first.figures == again.figures
+    assert first.figures["rms"] != other.figures["rms"]
+
+
+def test_errors_of_other_kinds_are_not_hidden() -> None:
+    def broken(_observations: Sequence[Observation]) -> HandEye:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        verify_holdout(svd(simulate(10)), broken, HoldoutParams())
+
+
+def test_an_unsolvable_fold_is_said_and_not_raised() -> None:
+    def refusing(_observations: Sequence[Observation]) -> HandEye:
+        raise StageError("no")
+
+    result = verify_holdout(svd(simulate(10)), refusing, HoldoutParams())
+    assert (result.passed, result.reason) == (False, "without one fold of 5 there is no answer: no")
+
+
+@pytest.mark.parametrize("n", [8, 20])
+def test_the_predicted_error_over_the_workspace_holds(n: int) -> None:
+    runs = 80
+    inside = sum(_holds(n, seed) for seed in range(runs)) / runs
+    assert inside >= 0.95 - 0.075  # three standard deviations of 80 runs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [8, 20, 40])
+def test_the_predicted_error_holds_in_93_to_97_percent(n: int) -> None:
+    inside = sum(_holds(n, seed) for seed in range(1000)) / 1000
+    assert 0.93 <= inside <= 0.97
+
+
+def _holds(n: int, seed: int) -> bool:
+    """Whether the true error in every corner of the workspace is below the prediction."""
+    box = Box([0.4, -0.5, 0.2], [0.4, 0.4, 0.3])
+    calibration = svd(simulate(n, seed=1000 * n + seed))
+    predicted = verify_holdout(calibration, svd, HoldoutParams(folds=2), box).figures[
+        "predicted_worst_p95"
+    ]
+    corners = box.grid(2)
+    wrong = calibration.base_T_camera.transform.apply((corners - TRUTH[1]) @ TRUTH[0]) - corners
+    return bool(np.linalg.norm(wrong, axis=1).max() <= predicted)

@@ -1,0 +1,114 @@
+"""``verify.touch``, ``verify.stitch``, ``verify.sphere``: what each shows, and what it cannot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rpy_from_rotation
+from flangeye_plugins.verify.sphere import SphereParams, verify_sphere
+from flangeye_plugins.verify.stitch import StitchParams, verify_stitch
+from flangeye_plugins.verify.touch import Touch, TouchParams, verify_touch
+
+TRUTH = rigid(rotation_from_rpy(np.pi - 0.2, 0.1, 0.5), np.array([0.5, -0.1, 1.1]))
+CENTRE = np.array([0.45, 0.0, 0.4])
+TIP = np.array([0.01, -0.02, 0.15])
+
+
+def poses(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [
+        rigid(rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)), CENTRE + rng.uniform(-0.15, 0.15, 3))
+        for _ in range(count)
+    ]
+
+
+def calibration(turn=(0, 0, 0), shift=(0, 0, 0), scale: float = 1.0) -> t.HandEye:
+    """A calibration that is off by a motion about the work; a scanner of another scale."""
+    turned = rotation_exp(np.array(turn, float))
+    move = rigid(turned, CENTRE - turned @ CENTRE + np.array(shift, float))
+    camera = t.Transform(t.BASE, t.CAMERA, move @ TRUTH)
+    estimate = t.TransformEstimate(camera, 1e-10 * np.eye(6), CENTRE)
+    pairs = []
+    for i, pose in enumerate(poses(12)):
+        seen = scale * (np.linalg.inv(TRUTH) @ pose)[:3, 3]
+        circle = t.CircleFeature(seen, None, {}, 1e-9 * np.eye(3), None, 1.0)
+        flange = t.by_frame(t.Transform(t.BASE, t.FLANGE, pose))
+        pairs.append(t.Pair(t.Observation(f"{i}", circle, flange), np.zeros(3)))
+    return t.HandEye(estimate, tuple(pairs), "test")
+
+
+def touches(count: int = 4) -> TouchParams:
+    """Points on the work, touched exactly."""
+    made = []
+    for pose in poses(count):
+        point = pose[:3, :3] @ TIP + pose[:3, 3]
+        seen = np.linalg.inv(TRUTH) @ np.append(point, 1.0)
+        rpy = [f"{a} rad" for a in rpy_from_rotation(pose[:3, :3])]
+        made.append(Touch(seen=_m(seen[:3]), position=_m(pose[:3, 3]), rpy=tuple(rpy)))
+    return TouchParams(tip=_m(TIP), touches=tuple(made))
+
+
+def _m(values) -> tuple[str, ...]:
+    return tuple(f"{v:.12f} m" for v in values)
+
+
+def views(count: int = 4) -> t.Views:
+    rng, out = np.random.default_rng(1), t.Views()
+    for i, pose in enumerate(poses(count)):
+        radius, angle = 0.03 * np.sqrt(rng.uniform(0, 1, 20000)), rng.uniform(0, 2 * np.pi, 20000)
+        disc = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(20000)])
+        move = np.linalg.inv(TRUTH) @ pose
+        cloud = t.PointCloud(t.CAMERA, (disc @ move[:3, :3].T + move[:3, 3]).astype(np.float32))
+        flange = t.FlangeCloud(cloud, move[:3, 3], move[:3, 2])
+        out.append(t.VerificationView(f"{i}", flange, t.Transform(t.BASE, t.FLANGE, pose)))
+    return out
+
+
+def test_touch_finds_a_shift_of_the_matrix() -> None:
+    right, wrong = (
+        verify_touch(calibration(shift=s), touches()) for s in [(0, 0, 0), (2e-3, 0, 0)]
+    )
+    assert right.passed and right.figures["max"] < 1e-8 and right.figures["explained"] == 1.0
+    assert not wrong.passed
+    assert wrong.figures["x"] == pytest.approx(2e-3, abs=1e-8)
+    assert wrong.figures["explained"] == 0.0
+    assert "4 touched points are 2.00 mm off at most, above the limit of 1 mm" in wrong.reason
+
+
+def test_stitch_finds_a_turn_of_the_matrix_and_draws_it() -> None:
+    pictures = {}
+    right, wrong = (
+        verify_stitch(calibration(turn=a), views(), StitchParams(), journal=pictures.__setitem__)
+        for a in [(0, 0, 0), (0.05, 0, 0)]
+    )
+    assert right.passed and right.figures["spread"] < 1e-6
+    assert not wrong.passed and wrong.figures["slide"] > 5e-4
+    assert pictures["spread"].pixels.shape == (288, 288, 3)
+
+
+def test_stitch_cannot_see_what_all_views_share() -> None:
+    still = t.Views(replace(v, base_T_flange=v.base_T_flange) for v in views(1) * 3)
+    found = verify_stitch(calibration(shift=(5e-3, 0, 0)), still, StitchParams())
+    assert found.passed  # three views of one pose: the shift is common to them
+
+
+def test_sphere_finds_a_scale_and_cannot_see_the_matrix() -> None:
+    shifted = verify_sphere(calibration(shift=(5e-3, 0, 0)), SphereParams())
+    assert shifted.passed and shifted.figures["max"] < 1e-9
+    stretched = verify_sphere(calibration(scale=1.01), SphereParams())
+    assert not stretched.passed
+    assert stretched.figures["scale"] == pytest.approx(0.01, rel=1e-6)
+
+
+def test_what_cannot_be_checked_is_one_line() -> None:
+    with pytest.raises(StageError, match="1 verification views, two are needed"):
+        verify_stitch(calibration(), views(1), StitchParams())
+    with pytest.raises(
+        StageError, match="0 pairs of poses are 900 mm or more apart, 10 are needed"
+    ):
+        verify_sphere(calibration(), SphereParams(shortest="900 mm"))

@@ -1,0 +1,130 @@
+"""The torch stays in the seam; the controller alone, against the simulated groove."""
+
+import numpy as np
+import pytest
+
+from flangeye_emulators.weld_world.groove import Gap
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import curved, misplaced, planning_error, straight, weld
+
+LIMIT = Following().turn_rate
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("seam", [straight, curved])
+def test_the_torch_follows_the_true_seam_and_not_the_plan(seam):
+    true = seam()
+    done = weld(true, planning_error(true, seed=2))
+    assert done.controller.phase == "done"
+    assert rms(done.deviation()) < 0.15e-3
+    assert abs(done.deviation()).max() < 0.4e-3
+    assert abs(done.turn).max() <= LIMIT
+
+
+def test_vision_alone_keeps_the_planning_error():
+    true = straight()
+    plan = misplaced(true, (0.0, 2e-3, 0.0))
+    assert rms(weld(true, plan, "vision").deviation()) == pytest.approx(2e-3, rel=0.05)
+
+
+def test_algorithm_2_as_printed_diverges():
+    true = curved()
+    done = weld(true, planning_error(true, seed=0), "as_printed", longest=40.0)
+    assert rms(done.deviation(-0.03)) > 5e-3
+
+
+def test_a_plan_too_high_and_tilted_is_followed_too():
+    true = straight(0.08)
+    plan = misplaced(true, (1e-3, 1e-3, 2e-3), tilt=np.deg2rad(1.0))
+    done = weld(true, plan, above=14e-3)
+    assert abs(done.deviation()).max() < 0.4e-3
+
+
+@pytest.mark.parametrize("degrees", [90, -90])
+def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees):
+    true = curved()
+    done = weld(true, planning_error(true, seed=0), angle=np.deg2rad(degrees))
+    assert abs(done.turn).max() <= LIMIT
+    off = np.flatnonzero(abs(done.torch) > 0.4e-3)[-1]
+    assert done.advance[off] - done.advance[0] < 4 * 40e-3
+    assert done.controller.phase == "done"
+
+
+@pytest.mark.parametrize("seam", [straight, curved])
+def test_a_gap_in_the_wall_is_bridged(seam):
+    true = seam()
+    done = weld(true, planning_error(true, seed=0), gaps=(Gap(0.055, 0.075, 1),))
+    phases = list(dict.fromkeys(done.phase))
+    assert phases == ["seeking", "probing", "following", "bridging", "ending", "done"]
+    regained = done.phase.index("bridging")
+    assert "following" in done.phase[regained:]
+    assert abs(done.deviation(0.055, 0.075)).max() < 0.5e-3
+    assert abs(done.tip).max() < 5e-3
+
+
+def test_the_end_of_the_seam_makes_no_step():
+    true = straight(0.08)
+    done = weld(true, planning_error(true, seed=0))
+    leaving = done.tip_s > true[-1, 0] - 20e-3
+    assert done.tip_s.max() > true[-1, 0] + 20e-3
+    for path in (done.torch, done.tip, done.robot):
+        lateral = path[leaving]  # within 0.1 s, during which the tip goes 0.5 mm
+        assert abs(lateral[12:] - lateral[:-12]).max() < 0.1e-3
+
+
+@pytest.mark.parametrize("start", [0.085, 0.095, 0.1, 0.105])
+def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start):
+    true = curved()
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    blind = Following(max_error="2 mm")  # what is not felt is known less
+    done = weld(true, planning_error(true, seed=0), settings=blind, gaps=(Gap(start, length, 1),))
+    assert done.controller.phase == "done"
+    assert abs(done.deviation()).max() < 0.4e-3
+
+
+def test_a_plan_that_starts_away_from_the_groove_is_refused():
+    true = straight(0.06)
+    done = weld(true, misplaced(true, (0.0, 15e-3, 0.0)))
+    assert done.controller.phase == "stopped"
+    assert done.controller.reason == "no groove within 8 mm of the plan's start"
+    assert done.advance.max() == done.advance[0]
+
+
+def test_a_groove_that_ends_early_stops_the_weld():
+    true = straight()
+    settings = Following(longest_gap="15 mm")
+    done = weld(true, true, settings=settings, gaps=(Gap(0.04, 0.08, 1),))
+    assert done.controller.reason == "no contact for 15 mm of the seam"
+
+
+def test_a_short_blindness_slows_down_and_a_long_one_stops():
+    true = straight(0.06)
+    short = weld(true, true, hidden=(8.0, 8.35))
+    assert short.controller.phase == "done"
+    assert abs(short.deviation()).max() < 0.4e-3
+    long = weld(true, true, hidden=(8.0, 20.0))
+    assert long.controller.reason == "no tag was seen for 500 ms"
+    assert long.time[-1] == pytest.approx(8.5, abs=0.1)
+
+
+def test_another_side_of_the_groove_does_as_well():
+    true = curved(0.08)
+    done = weld(true, planning_error(true, seed=1), settings=Following(side="right"))
+    assert abs(done.deviation()).max() < 0.4e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seam", [straight, curved])
+def test_a_hundred_planning_errors_without_one_run_away(seam):
+    true = seam(0.1)
+    settings = Following()
+    for seed in range(50):
+        done = weld(true, planning_error(true, seed), settings=settings, seed=seed, period=16e-3)
+        assert done.controller.phase == "done", seed
+        assert rms(done.deviation()) < 0.15e-3, seed
+        assert abs(done.deviation()).max() < 0.4e-3, seed
+        # The tip never goes farther than the sweep that seeks the groove.
+        assert abs(done.tip).max() < settings.reach + 5e-3, seed

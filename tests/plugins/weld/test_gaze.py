@@ -1,0 +1,84 @@
+"""Only the part of an image that holds the tag is read, with the same result."""
+
+import numpy as np
+import pytest
+
+from flangeye.devices import SensorFrame
+from flangeye.types import Image
+from flangeye_plugins.weld.finger_camera import Reader
+from flangeye_plugins.weld.touch.region_of_interest import MARGIN, Piece, RegionOfInterest, cut
+from tests.plugins.weld.test_touch import FINGER, Eye, displacements
+
+CORNERS = np.array([[100.0, 60.5], [180.0, 60.0], [180.2, 140.0], [100.0, 140.0]])
+
+
+def blank(height=240, width=320):
+    return Image(np.zeros((height, width), np.uint8), FINGER.camera.matrix)
+
+
+def test_the_first_look_is_at_the_whole_image():
+    whole = blank()
+    (piece,) = RegionOfInterest().pieces(whole)
+    assert piece.corner == (0, 0)
+    assert piece.image is whole
+
+
+def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone():
+    gaze = RegionOfInterest()
+    gaze.follow(Piece(blank(), (0, 0)), CORNERS)
+    near, whole = gaze.pieces(blank())
+    assert near.corner == (100 - MARGIN, 60 - MARGIN)
+    assert near.image.pixels.shape == (140 + MARGIN - near.corner[1], 181 + MARGIN - near.corner[0])
+    assert whole.corner == (0, 0)
+    gaze.follow(near, CORNERS - near.corner + [5.0, 0.0])
+    moved, _ = gaze.pieces(blank())
+    assert moved.corner == (105 - MARGIN, 60 - MARGIN)
+    gaze.follow(moved, None)
+    assert len(list(gaze.pieces(blank()))) == 1
+
+
+def test_a_tag_at_the_edge_is_cut_there():
+    gaze = RegionOfInterest()
+    gaze.follow(Piece(blank(), (0, 0)), CORNERS - [95.0, 55.0])
+    near, _ = gaze.pieces(blank())
+    assert near.corner == (0, 0)
+    gaze.follow(Piece(blank(), (0, 0)), CORNERS + [130.0, 90.0])
+    near, _ = gaze.pieces(blank())
+    assert near.image.pixels.shape[1] == 320 - near.corner[0]
+    assert near.image.pixels.shape[0] == 240 - near.corner[1]
+
+
+def test_a_piece_keeps_its_place_in_the_camera():
+    piece = cut(blank(), (30, 20), (130, 100))
+    assert piece.image.pixels.shape == (80, 100)
+    np.testing.assert_allclose(
+        piece.image.camera_matrix[:2, 2], FINGER.camera.matrix[:2, 2] - [30, 20]
+    )
+
+
+def test_what_is_felt_is_the_same_from_the_piece_as_from_the_whole():
+    eye, reader = Eye(), Reader(FINGER)
+    for i, place in enumerate(np.linspace([0, -1e-3, 0], [5e-4, 2e-3, 1e-3], 10)):
+        image = eye.image(place)
+        part, whole = reader.read(SensorFrame(image, i)), Reader(FINGER).read(SensorFrame(image, i))
+        assert (part.piece.image.pixels.size < 0.6 * image.pixels.size) == (i > 0)
+        np.testing.assert_allclose(part.feeling.displacement, whole.feeling.displacement, atol=1e-6)
+
+
+def test_a_tag_that_jumped_is_found_in_the_same_image():
+    eye, reader = Eye(), Reader(FINGER)
+    reader.read(SensorFrame(eye.image([0, -1.5e-3, 0]), 0))
+    sight = reader.read(SensorFrame(eye.image([0, 2.5e-3, 0]), 1))
+    assert sight.feeling.displacement[1] == pytest.approx(2.5e-3, abs=0.05e-3)
+    assert sight.piece.corner == (0, 0)
+
+
+def test_a_piece_is_read_again_as_it_was_read():
+    eye, reader, again = Eye(), Reader(FINGER), Reader(FINGER)
+    for i, place in enumerate([*displacements(5, 1e-3), [1.0, 0, 0], [0, 0, 0]]):
+        sight = reader.read(SensorFrame(eye.image(place), i))
+        redone = again.reread(sight.piece, sight.time_ns)
+        if sight.feeling is None:
+            assert redone.feeling is None
+        else:
+            np.testing.assert_array_equal(redone.feeling.displacement, sight.feeling.displacement)

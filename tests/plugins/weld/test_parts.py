@@ -1,0 +1,229 @@
+"""The controller's parts, one by one."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flangeye.files.bundled import bundled
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.seam_geometry import torch_deviation
+from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
+from flangeye.types import Transform
+from flangeye_emulators.weld_world.groove import Contact as Tip3D
+from flangeye_emulators.weld_world.groove import Groove, Section, Tip
+from flangeye_plugins.weld.contact import Contact
+from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.motion import Command, ToolPose, Track, turned
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.refined import RefinedPath
+from tests.plugins.weld.bench import curved, misplaced, straight
+
+FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
+RADIUS = 0.06
+
+
+def circle(turns=0.5):
+    angle = np.linspace(0.0, 2 * np.pi * turns, 400)
+    return RADIUS * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
+
+
+# --- path -----------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.0, np.pi * RADIUS))
+def test_a_path_knows_points_tangents_and_normals(s):
+    place, angle = PATH.at(s), s / RADIUS
+    np.testing.assert_allclose(
+        place.point, RADIUS * np.array([np.sin(angle), 1 - np.cos(angle)]), atol=2e-6
+    )
+    np.testing.assert_allclose(place.tangent, [np.cos(angle), np.sin(angle)], atol=5e-3)
+    np.testing.assert_allclose(place.normal, [-place.tangent[1], place.tangent[0]])
+    points, tangents = PATH.evaluate(np.array([s]))
+    np.testing.assert_allclose(points[0, :2], place.point, atol=1e-12)
+    np.testing.assert_allclose(tangents[0], place.tangent, atol=1e-12)
+
+
+PATH = Path(circle())
+
+
+def test_a_path_goes_on_straight_beyond_its_ends():
+    end = PATH.at(PATH.length)
+    np.testing.assert_allclose(PATH.at(PATH.length + 0.04).point, end.point + 0.04 * end.tangent)
+    assert PATH.climb(-0.01) == 0.0
+
+
+def test_progress_neither_goes_back_nor_jumps_to_another_branch():
+    eight = Path(
+        np.column_stack([np.sin(t := np.linspace(0, 2 * np.pi, 800)), np.sin(2 * t) / 2, 0 * t])
+        * 0.1
+    )
+    s, crossings = 0.0, []
+    for ahead in np.arange(0.0, eight.length, 1e-3):
+        at = eight.at(float(ahead)).point
+        before, s = s, eight.advance(at, s, 5e-3)
+        assert before <= s <= before + 5e-3
+        crossings.append(abs(s - ahead))
+    assert max(crossings) < 1e-3
+    assert eight.advance(eight.at(0.0).point, s, 5e-3) >= s
+
+
+# --- the refined path -----------------------------------------------------------------------------
+
+
+def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was():
+    true, plan = Path(curved()), Path(misplaced(curved(), (1e-3, 2e-3, 0.0), np.deg2rad(1.0)))
+    refined = RefinedPath(plan, 0.05)
+    for i, s in enumerate(
+        np.concatenate([np.arange(0.03, 0.05, 2e-4), np.arange(0.07, 0.09, 2e-4)])
+    ):
+        place = plan.at(float(s))
+        foot = true.foot(place.point, float(s))
+        for _ in range(3):  # the true seam across the plan
+            at = true.at(foot)
+            foot -= float((at.point - place.point) @ place.tangent) / float(
+                at.tangent @ place.tangent
+            )
+        offset = float((true.at(foot).point - place.point) @ place.normal)
+        refined.add(i * 0.01, float(s), offset)
+    refined.confirm(100.0)
+    for s in (0.02, 0.04, 0.06, 0.08, 0.1):
+        point, normal = refined.frame(s)
+        foot = true.foot(point, s)
+        assert np.linalg.norm(true.at(foot).point - point) < 0.05e-3
+        assert normal @ true.at(foot).normal > np.cos(np.deg2rad(0.5))
+
+
+def test_what_is_not_confirmed_is_not_believed():
+    refined = RefinedPath(Path(straight()), 0.05)
+    refined.add(1.0, 0.01, 1e-3)
+    assert refined.empty
+    refined.confirm(0.5)
+    assert refined.empty
+    refined.forget_pending()
+    refined.confirm(2.0)
+    assert refined.empty
+    np.testing.assert_array_equal(refined.offsets(np.array([0.01])), [0.0])
+
+
+def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one():
+    refined = RefinedPath(Path(straight(5.0)), 0.05)
+    for s in np.arange(0.0, 4.0, 4e-4):
+        refined.add(0.0, float(s), 1e-3)
+    refined.confirm(1.0)
+    assert len(refined._near(0.01)) <= len(refined._near(2.0)) <= 2 * 60e-3 / 0.5e-3 + 2
+    assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
+    assert refined.offset(4.5) == pytest.approx(1e-3, abs=1e-5)  # half a metre beyond
+
+
+# --- contact --------------------------------------------------------------------------------------
+
+
+def fed(contact, values, start=0.0, wanted=2e-3):
+    states = []
+    for i, value in enumerate(values):
+        contact.update(start + i * 0.03, value, wanted)
+        states.append(contact.state)
+    return states
+
+
+def test_contact_has_hysteresis_in_size_and_in_time():
+    contact = Contact()
+    assert fed(contact, [1e-3] * 20)[-1] == "seeking"
+    assert fed(contact, [2e-3] * 20, 1.0)[-1] == "held"
+    assert fed(contact, [1e-3] * 20, 2.0)[-1] == "held"
+    assert fed(contact, [0.0] * 2 + [2e-3] * 10, 3.0)[-1] == "held"
+    assert fed(contact, [0.0] * 20, 4.0)[-1] == "lost"
+    assert fed(contact, [1e-3] * 20, 5.0)[-1] == "lost"
+    assert fed(contact, [2e-3] * 20, 6.0)[-1] == "held"
+    assert contact.doubted(0.5e-3, 2e-3)
+    assert not contact.doubted(1e-3, 2e-3)
+
+
+# --- where the tool was ---------------------------------------------------------------------------
+
+
+def test_an_image_meets_the_pose_of_its_own_time():
+    track = Track()
+    for i in range(200):
+        track.add(ToolPose(i * 0.01, np.array([i * 1e-3, 0.0, 0.0]), i * 0.1))
+    assert track.at(1.505).position[0] == pytest.approx(0.1505)
+    assert track.at(1.505).angle == pytest.approx(15.05)
+    assert track.at(9.0).position[0] == pytest.approx(0.199)
+    assert track.at(0.5) is None
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.3, 0.3))
+def test_the_flange_moves_as_the_tip_is_told(angle, yaw, turn):
+    base_T_plane = rigid(rotation_exp(np.array([0.1, -0.2, yaw])), np.array([0.5, 0.1, 0.2]))
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0]]) @ base_T_plane[:3, :3].T + base_T_plane[:3, 3]
+    plane = WorkPlane(points, np.tile(base_T_plane[:3, 2], (2, 1)))
+    finger = FINGER.model_copy(update={"tip": (0.03, -0.01, 0.18), "direction": 0.7})
+    tool = Tool(finger, plane)
+    flange = tool.base_T_flange(np.array([0.01, 0.02, 0.03]), angle)
+    assert tool.tilt(flange) < 1e-6
+    before = tool.pose(flange, 0.0)
+    np.testing.assert_allclose(before.position, [0.01, 0.02, 0.03], atol=1e-12)
+    step = 1e-5
+    twist = tool.twist(Command(np.array([5e-3, -2e-3, 1e-3]), turn), flange)
+    moved = rigid(
+        rotation_exp(twist[3:] * step) @ flange.rotation, flange.translation + twist[:3] * step
+    )
+    after = tool.pose(Transform("base", "flange", moved), step)
+    np.testing.assert_allclose(
+        (after.position - before.position) / step, [5e-3, -2e-3, 1e-3], atol=1e-5
+    )
+    assert (after.angle - before.angle) / step == pytest.approx(turn, abs=1e-5)
+
+
+def test_turning_is_about_the_normal():
+    np.testing.assert_allclose(turned(np.array([1.0, 0.0, 2.0]), np.pi / 2), [0, 1, 2], atol=1e-12)
+
+
+# --- the simulated tip ----------------------------------------------------------------------------
+
+SECTION = Section(np.pi / 6, 8e-3)
+SEAT = 1.5e-3 / np.sin(np.pi / 6)
+
+
+def energy(tip, position, rest):
+    off = position - rest
+    return tip.lateral * off[1] ** 2 + tip.axial * off[2] ** 2
+
+
+@given(st.floats(-3e-3, 3e-3), st.floats(-3e-3, 4e-3))
+def test_the_tip_takes_the_place_of_least_energy_between_the_walls(across, up):
+    tip = Tip(friction=0.0)
+    contact = Tip3D(Groove(Path(straight()), SECTION), tip)
+    rest = np.array([0.06, across, SEAT + up])
+    found = contact.settle(rest)
+    y = np.linspace(-5e-3, 5e-3, 2001)
+    floor = SEAT + np.abs(y) / np.tan(SECTION.half_angle)
+    height = np.maximum(floor, rest[2])
+    least = (tip.lateral * (y - rest[1]) ** 2 + tip.axial * (height - rest[2]) ** 2).min()
+    assert found[2] >= SEAT + abs(found[1]) / np.tan(SECTION.half_angle) - 1e-9
+    assert energy(tip, found, rest) <= least + 1e-9
+
+
+def test_the_tip_lags_by_friction_and_no_more():
+    tip = Tip(friction=0.1)
+    contact = Tip3D(Groove(Path(straight()), SECTION), tip)
+    for x in np.arange(0.02, 0.03, 1e-4):
+        found = contact.settle(np.array([x, 1e-3, SEAT - 1e-3]))
+    normal = np.hypot(tip.lateral * 1e-3, tip.axial * 1e-3)
+    assert x - found[0] == pytest.approx(0.1 * normal / tip.lateral, rel=1e-6)
+
+
+def test_outside_the_workpiece_and_on_its_face_the_tip_is_free():
+    contact = Tip3D(Groove(Path(straight()), SECTION), Tip())
+    np.testing.assert_array_equal(contact.settle(np.array([-0.01, 0, 0.0])), [-0.01, 0, 0])
+    on_top = contact.settle(np.array([0.05, 8e-3, 5e-3]))
+    np.testing.assert_allclose(on_top[1:], [8e-3, 8e-3 + 1.5e-3], atol=1e-9)
+
+
+def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam():
+    line = np.array([[0.0, 0, 0], [0.1, 0, 0]])
+    points = np.array([[-0.01, 0, 0], [0.05, 2e-3, 7e-3], [0.2, 0, 0]])
+    found = torch_deviation(points, line, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(found, [2e-3])

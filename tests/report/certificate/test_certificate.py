@@ -1,0 +1,151 @@
+"""The certificate states what result.json says, and its budget is that of another library."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flangeye.cli import app
+from flangeye.errors import StageError
+from flangeye.maths.geometry import covariance_at
+from flangeye.models.loading import load_model
+from flangeye.report.certificate import (
+    Conditions,
+    budget_of,
+    print_pdf,
+    use_budget_of,
+    write_certificate,
+)
+from flangeye.report.certificate.budget import shares_of
+from flangeye.report.units import millimetres
+from flangeye.result import Result
+from tests.report.conftest import WORKSPACE, Script, scripted
+
+SCANNER = load_model("scanners", "phoxi-m")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    scripted(Script(points=200), folder / "run.mcap")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(run: Path) -> Result:
+    from flangeye.log.read import read_run
+
+    return Result.model_validate(read_run(run / "run.mcap").result)
+
+
+def test_every_number_is_that_of_result_json(run: Path, result: Result, tmp_path: Path) -> None:
+    page = write_certificate(run, tmp_path / "c.html", Conditions(21.0, 8.0, "Hall 3", "A & B"))
+    text = re.sub(r"<[^>]+>", " ", page.read_text())
+    assert result.workspace and result.holdout
+    for value in (
+        result.workspace.predicted_rms,
+        result.workspace.predicted_p95,
+        result.holdout.rms,
+        result.holdout.median,
+        result.holdout.p95,
+    ):
+        assert f"{millimetres(value)} mm" in text
+    for number in np.ravel(result.transforms["base_T_camera"].matrix):
+        assert f"{number:z.9f}" in text
+    for said in (result.provenance.recipe_hash, "A &amp; B", "21 °C, 8 K", result.title):
+        assert said in text
+    assert "script" not in page.read_text()
+
+
+def test_the_combined_uncertainty_is_the_covariance_of_the_mapped_point(result: Result) -> None:
+    estimate, budget = result.transforms["base_T_camera"], budget_of(result)
+    covariance, about = np.array(estimate.covariance), np.array(estimate.about)
+    expected = covariance_at(covariance, about, budget.point[None])[0]
+    np.testing.assert_allclose(budget.covariance, expected, rtol=1e-12)
+    grid = covariance_at(covariance, about, WORKSPACE.grid())
+    assert result.workspace
+    rms = np.sqrt(np.trace(grid, axis1=1, axis2=2).mean())
+    assert result.workspace.predicted_rms == pytest.approx(rms, rel=1e-12)
+    assert np.trace(budget.covariance) == pytest.approx(
+        max(np.trace(grid, axis1=1, axis2=2)), rel=1e-9
+    )
+
+
+def test_the_calibrations_budget_agrees_with_gtc(result: Result) -> None:
+    gtc = pytest.importorskip("GTC", reason="GTC is not installed")
+    estimate, budget = result.transforms["base_T_camera"], budget_of(result)
+    phi, tau = _quantities(gtc, np.array(estimate.covariance))
+    lever = budget.point - np.array(estimate.about)
+    moved = [
+        phi[1] * lever[2] - phi[2] * lever[1] + tau[0],
+        phi[2] * lever[0] - phi[0] * lever[2] + tau[1],
+        phi[0] * lever[1] - phi[1] * lever[0] + tau[2],
+    ]
+    np.testing.assert_allclose(budget.standard, [gtc.uncertainty(x) for x in moved], rtol=1e-9)
+    expanded = [gtc.reporting.k_factor(gtc.dof(x)) * gtc.uncertainty(x) for x in moved]
+    np.testing.assert_allclose(budget.expanded, expanded, rtol=1e-6)
+
+
+def _quantities(gtc: Any, covariance: np.ndarray) -> tuple[list[Any], list[Any]]:
+    sigma = np.sqrt(np.diag(covariance))
+    found = [gtc.ureal(0.0, float(u), independent=False) for u in sigma]
+    for i in range(6):
+        for j in range(i):
+            gtc.set_correlation(float(covariance[i, j] / sigma[i] / sigma[j]), found[i], found[j])
+    return found[:3], found[3:]
+
+
+def test_the_budget_of_use_agrees_with_gtc(result: Result) -> None:
+    gtc = pytest.importorskip("GTC", reason="GTC is not installed")
+    budget = use_budget_of(result, SCANNER, Conditions(spread=8.0))
+    for axis in range(3):
+        parts = [
+            gtc.ureal(0.0, float(c.standard), float(c.freedom))
+            for c in budget.contributions
+            if c.sensitivity[axis]
+        ]
+        assert len(parts) == 4
+        total = sum(parts[1:], parts[0])
+        assert budget.standard[axis] == pytest.approx(gtc.uncertainty(total), rel=1e-9)
+        assert budget.freedom[axis] == pytest.approx(gtc.dof(total), rel=1e-6)
+        factor = gtc.reporting.k_factor(gtc.dof(total))
+        assert budget.coverage[axis] == pytest.approx(factor, rel=1e-6)
+
+
+def test_the_causes_add_up_to_the_calibrations_uncertainty(result: Result) -> None:
+    shares = {s.cause: s.standard for s in shares_of(result)}
+    total = float(np.sum(budget_of(result).standard ** 2))
+    assert sum(u**2 for u in shares.values()) == pytest.approx(total, rel=1e-9)
+    # 0.1 mm from the fits (their covariance says so) and 0.11 mm more in the residuals
+    assert shares["scans, fit by fit"] > 0 and shares["arm, pose by pose"] > 0
+
+
+def test_correlated_quantities_are_named(result: Result) -> None:
+    covariance = np.array(result.transforms["base_T_camera"].covariance)
+    covariance[0, 1] = covariance[1, 0] = 0.8 * np.sqrt(covariance[0, 0] * covariance[1, 1])
+    changed = result.model_copy(deep=True)
+    changed.transforms["base_T_camera"].covariance = covariance.tolist()
+    (first, second, r), *_ = budget_of(changed).correlated
+    assert (first, second) == ("Rotation about x", "Rotation about y")
+    assert r == pytest.approx(0.8)
+
+
+def test_the_command_writes_the_page_and_prints_it(run: Path, tmp_path: Path) -> None:
+    page = tmp_path / "c.html"
+    done = CliRunner().invoke(app, ["certificate", str(run), "--out", str(page), "--no-pdf"])
+    assert done.exit_code == 0 and page.exists()
+    printed = print_pdf(page)
+    if printed is None:
+        pytest.skip("no chromium on this machine: apt-get install chromium")
+    assert len(re.findall(rb"/Type\s*/Page[^s]", printed.read_bytes())) <= 2
+
+
+def test_without_a_calibration_there_is_nothing_to_certify(tmp_path: Path) -> None:
+    scripted(Script(solved=False, verified=None, points=50), tmp_path / "run.mcap")
+    with pytest.raises(StageError, match="gave no calibration, so there is nothing to certify"):
+        write_certificate(tmp_path, None, Conditions())

@@ -1,0 +1,92 @@
+"""Captures that are there already are worked on ahead: in order, bounded, with equal results."""
+
+import json
+import threading
+import time
+
+import pytest
+
+from flangeye import types as t
+from flangeye.recipe.load import parse_recipe
+from flangeye.run import runner
+from flangeye.run.ahead import Done, cores, worked_ahead
+from flangeye.run.runner import Runner
+from tests import toy
+from tests.conftest import TOY_RECIPE
+
+
+def test_results_come_in_order_whatever_finishes_first():
+    def work(k):
+        time.sleep(0.002 * (k % 3))
+        return k * k
+
+    assert [(k, done()) for k, done in worked_ahead(iter(range(20)), work, 3)] == [
+        (k, k * k) for k in range(20)
+    ]
+
+
+def test_no_more_is_pulled_than_workers_and_two():
+    pulled = []
+
+    def items():
+        for k in range(100):
+            pulled.append(k)
+            yield k
+
+    ahead = worked_ahead(items(), lambda k: k, 2)
+    for k in range(5):
+        next(ahead)
+        assert len(pulled) <= k + 1 + 2
+    ahead.close()
+    assert len(pulled) <= 5 + 2 and threading.active_count() < 10
+
+
+def test_what_was_raised_is_raised_when_it_is_asked_for():
+    def fail():
+        raise ValueError("no")
+
+    done = Done.of(fail)
+    with pytest.raises(ValueError, match="no"):
+        done.result()
+
+
+def test_what_ends_the_items_is_raised_after_what_they_were():
+    def items():
+        yield from (1, 2)
+        raise ValueError("torn")
+
+    seen = []
+    with pytest.raises(ValueError, match="torn"):
+        for item, done in worked_ahead(items(), lambda k: k, 4):
+            seen.append((item, done()))
+    assert seen == [(1, 1), (2, 2)]
+
+
+def test_threads_are_those_that_openmp_is_told(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert cores() == 1
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert cores() >= 1
+
+
+def test_a_run_on_one_core_and_on_many_is_the_same(toy_registry, monkeypatch):
+    def run(threads):
+        monkeypatch.setattr(runner, "cores", lambda: threads)
+        recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)
+        running = Runner(recipe, toy_registry, t.ArchivePath())
+        acquire = running._acquire
+
+        def recorded():
+            stream = acquire()
+            stream.recorded = True
+            return stream
+
+        monkeypatch.setattr(running, "_acquire", recorded)
+        result = running.run().model_dump(mode="json")
+        timing = result.pop("timing")
+        return json.dumps(result), timing, list(toy.acquired)
+
+    one, timing, acquired = run(1)
+    many, other, _ = run(3)
+    assert one == many
+    assert timing.keys() == other.keys() and acquired

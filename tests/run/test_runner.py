@@ -1,0 +1,241 @@
+"""The lazy run, and the log as an archive."""
+
+import gc
+import json
+import weakref
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye import types as t
+from flangeye.errors import StageError
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.restart import FromNothing, restart_at
+from flangeye.run.runner import Runner
+from tests import toy
+from tests.conftest import TOY_RECIPE, replaced
+
+
+@pytest.fixture
+def execute(toy_registry, tmp_path):
+    """Run recipe text with a log; return the result and the log."""
+    runs = []
+
+    def run(text, at=None, log=None):
+        recipe = parse_recipe(text, "toy", toy_registry)
+        start = restart_at(log, recipe, at) if log else FromNothing()
+        path = tmp_path / f"{len(runs)}.mcap"
+        recorder = Recorder(path, {"recipe.yaml": text}, recipe.header.log.clouds == "full")
+        toy_registry.hooks.register(recorder)
+        runs.append(recorder)
+        try:
+            result = Runner(recipe, toy_registry, t.ArchivePath()).run(start)
+        finally:
+            toy_registry.hooks.unregister(recorder)
+            recorder.close()
+        return result, read_run(path)
+
+    return run
+
+
+def without_timing(result):
+    return {k: v for k, v in result.model_dump(mode="json").items() if k != "timing"}
+
+
+def test_the_same_recipe_gives_the_same_result_bit_for_bit(execute):
+    first, second = execute(TOY_RECIPE)[0], execute(TOY_RECIPE)[0]
+    assert json.dumps(without_timing(first)) == json.dumps(without_timing(second))
+    assert first.status == "verified"
+    assert first.truth.rms_over_workspace < 1e-3
+
+
+def test_a_solver_that_stops_pulling_stops_the_acquisition(execute):
+    execute(TOY_RECIPE.replace("- solve.toy", "- solve.toy: {at_most: 4}"))
+    assert toy.acquired == ["000", "001", "002", "003"]
+
+
+def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(execute):
+    plain = toy.acquire.function
+
+    def unread(seed, params):
+        made = plain(seed, params)
+        angles = (np.array([0.1, np.nan if i == 2 else 0.2]) for i in range(params.count))
+        captures = (replace(c, joints=q) for c, q in zip(made, angles, strict=True))
+        return t.Captures(captures, made.source, params.count)
+
+    with replaced(toy.acquire, unread):
+        result, log = execute(TOY_RECIPE)
+    reason = "joint 2 is nan: the arm's driver had no angle to give"
+    assert [(r.id, r.stage, r.reason) for r in log.rejections] == [("002", "acquire.toy", reason)]
+    (aside,) = [o for o in result.observations if not o.used]
+    assert (aside.id, aside.reason) == ("002", f"acquire.toy: {reason}")
+    assert "002" not in log.poses
+
+
+def test_captures_are_not_kept(execute):
+    alive, most = weakref.WeakSet(), []
+    plain = toy.segment.function
+
+    def watched(capture):
+        alive.add(capture)
+        gc.collect()
+        most.append(len(alive))
+        return plain(capture)
+
+    with replaced(toy.segment, watched):
+        execute(TOY_RECIPE.replace("count: 6", "count: 30"))
+    assert max(most) <= 2
+
+
+def test_a_bad_capture_is_data(execute):
+    result, log = execute(TOY_RECIPE.replace("count: 6", "count: 6, bad: 2"))
+    aside = [o for o in result.observations if not o.used]
+    assert [(o.id, o.reason) for o in aside] == [
+        ("000", "segment.toy: no finite point"), ("001", "segment.toy: no finite point"),
+    ]  # fmt: skip
+    assert [r.id for r in log.rejections] == ["000", "001"]
+    assert result.status == "verified"
+
+
+def test_verification_captures_are_kept_from_the_solver(execute):
+    result, log = execute(TOY_RECIPE.replace("count: 6", "count: 6, verification: 2"))
+    assert {o.id for o in result.observations} == {"002", "003", "004", "005"}
+    assert result.verifications["4.verify.toy"].figures["views"] == 2
+    assert [v.id for v in log.views()] == ["000", "001"]
+
+
+def test_views_that_an_acquire_step_adds_reach_the_verification(execute, monkeypatch):
+    plain = toy.acquire.function
+    monkeypatch.setitem(toy.acquire.needs, "views", t.Views | None)
+
+    def with_a_view(seed, views, params):
+        flange = t.FlangeCloud(t.PointCloud(t.CAMERA, toy.CROSS), np.zeros(3), [0, 0, -1.0])
+        pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
+        views.append(t.VerificationView("published", flange, pose))
+        return plain(seed, params)
+
+    with replaced(toy.acquire, with_a_view):
+        result, _ = execute(TOY_RECIPE)
+    assert result.verifications["4.verify.toy"].figures["views"] == 1
+
+
+def test_a_refused_calibration_keeps_its_evidence(execute):
+    result, log = execute(TOY_RECIPE.replace("2 mm", "0.001 mm"))
+    assert result.status == "refused"
+    assert result.refused.startswith("verify.toy: 0.0")
+    assert log.complete
+    assert log.result["verifications"]["4.verify.toy"]["passed"] is False
+
+
+def test_weld_runs_only_after_verification(execute):
+    text = TOY_RECIPE + "  - seam.toy\n  - weld.toy\n"
+    _, log = execute(text)
+    assert [e.step for e in log.entries][-2:] == ["5.seam.toy", "6.weld.toy"]
+    _, refused = execute(text.replace("2 mm", "0.001 mm"))
+    assert refused.of_kind("weld") == []
+
+
+SEAM_RECIPE = TOY_RECIPE + "  - scan.toy\n  - seam.toy\n  - weld.toy\n"
+
+
+def test_a_seam_and_its_true_error_are_in_the_result(execute):
+    result, log = execute(SEAM_RECIPE)
+    assert result.seam.length == pytest.approx(np.sqrt(2))
+    assert result.seam.truth.rms == pytest.approx(0, abs=1e-12)
+    assert result.seam.truth.inside == 1
+    assert result.provenance.notes[-1] == "scanned"
+    assert log.last(t.WorkpieceScan).cloud.xyz.shape == (4, 3)
+
+
+@pytest.mark.parametrize("at", ["verify.toy", "scan.toy", "seam.toy", "weld.toy"])
+def test_a_seam_is_planned_again_from_the_log(execute, at):
+    first, log = execute(SEAM_RECIPE)
+    again, _ = execute(SEAM_RECIPE, at, log)
+    assert without_timing(again) == without_timing(first)
+
+
+@pytest.mark.parametrize("at", ["segment.toy", "fit.toy", "solve.toy", "verify.toy", "3"])
+def test_a_log_is_an_archive(execute, at):
+    text = TOY_RECIPE.replace("seed: 3", "seed: 3\nlog: {clouds: full}")
+    text = text.replace("count: 6", "count: 7, bad: 1, verification: 2")
+    first, log = execute(text)
+    toy.acquired.clear()
+    again, second_log = execute(text, at, log)
+    assert toy.acquired == []
+    assert without_timing(again) == without_timing(first)
+    if at != "verify.toy":
+        third, _ = execute(text, "solve.toy", second_log)
+        assert third.transforms == first.transforms
+
+
+def test_what_a_log_cannot_give_is_said(execute):
+    _, log = execute(TOY_RECIPE)
+    with pytest.raises(StageError, match="holds thinned scans only, which cannot be segmented"):
+        execute(TOY_RECIPE, "segment.toy", log)
+    with pytest.raises(StageError, match="that is the whole recipe; leave out --from"):
+        execute(TOY_RECIPE, "acquire.toy", log)
+    with pytest.raises(StageError) as error:
+        execute(TOY_RECIPE, "solve.robust", log)
+    assert str(error.value) == (
+        "--at solve.robust: the recipe has no such step; its steps are acquire.toy, segment.toy, "
+        "fit.toy, solve.toy, verify.toy"
+    )
+
+
+def test_too_few_poses_stop_the_run(execute):
+    with pytest.raises(StageError, match="solve.toy: 3 poses needed, 2 given"):
+        execute(TOY_RECIPE.replace("count: 6", "count: 2"))
+
+
+def test_a_plugin_that_breaks_is_named(execute):
+    with replaced(toy.fit, lambda cloud, params: 1 / 0), pytest.raises(StageError) as error:
+        execute(TOY_RECIPE)
+    assert str(error.value) == (
+        "2.fit.toy: failed with ZeroDivisionError: division by zero; this is a mistake in the "
+        "plugin (FLANGEYE_DEBUG=1 shows where)"
+    )
+
+
+def test_stopwatch_charges_each_step_its_own_time(execute):
+    result, _ = execute(TOY_RECIPE)
+    assert set(result.timing) == {
+        "0.acquire.toy", "1.segment.toy", "2.fit.toy", "3.solve.toy", "4.verify.toy",
+    }  # fmt: skip
+    assert result.timing["1.segment.toy"].calls == 6
+
+
+def test_values_survive_the_log_bit_for_bit(execute):
+    result, log = execute(TOY_RECIPE)
+    logged = log.calibration()
+    assert np.array_equal(
+        logged.base_T_camera.transform.matrix, result.transforms["base_T_camera"].matrix
+    )
+    assert [o.id for o in log.observations()] == [o.id for o in result.observations]
+    for observation, told in zip(log.observations(), result.observations, strict=True):
+        assert observation.circle.centre.tolist() == told.centre_in_camera
+
+
+def test_a_refining_step_changes_the_calibration_that_is_verified(execute):
+    text = TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy")
+    result, log = execute(text)
+    assert result.provenance.notes[-1] == "refined"
+    assert log.calibration("solve.toy").notes == ()
+    assert log.calibration().notes == ("refined",)
+    again, _ = execute(text, "verify.toy", log)
+    assert without_timing(again) == without_timing(result)
+
+
+def test_what_is_solved_again_is_refined_again(execute):
+    told = []
+
+    def verify(calibration, solve, views, params):
+        told.append(solve([pair.observation for pair in calibration.pairs[1:]]))
+        return t.Verification(True, "as it is", {})
+
+    with replaced(toy.verify, verify):
+        execute(TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy"))
+    assert told[0].notes == ("refined",)
+    assert len(told[0].pairs) == 5

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flangeye.units import format_quantity, parse_quantity
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "si"),
+    [
+        ("31.5 mm", "length", 0.0315),
+        ("0.3mm", "length", 0.0003),
+        ("  1e-3 m ", "length", 0.001),
+        ("-5 um", "length", -5e-6),
+        ("180 deg", "angle", np.pi),
+        ("500 ms", "duration", 0.5),
+        ("2 N/mm", "stiffness", 2000.0),
+    ],
+)
+def test_a_quantity_becomes_si(text, kind, si):
+    assert parse_quantity(text, kind) == si
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (0.3, "'0.3' has no unit: a length needs one (mm, m, um, for example '31.5 mm')"),
+        ("0.3", "'0.3' has no unit: a length needs one (mm, m, um, for example '31.5 mm')"),
+        (
+            "5 deg",
+            "'5 deg' is no length, it has a unit of angle: a length needs mm, m, um, for example "
+            "'31.5 mm'",
+        ),
+        (
+            "5 parsec",
+            "'5 parsec' has an unknown unit: a length needs mm, m, um, for example '31.5 mm'",
+        ),
+        (
+            "wide",
+            "'wide' is not a length: write a number and a unit (mm, m, um, for example '31.5 mm')",
+        ),
+        (True, "a length is a number with a unit (mm, m, um, for example '31.5 mm')"),
+        (None, "a length is a number with a unit (mm, m, um, for example '31.5 mm')"),
+        ("1e999 mm", "'1e999 mm' is out of any range"),
+        (
+            "nan mm",
+            "'nan mm' is not a length: write a number and a unit (mm, m, um, for example '31.5 mm')",
+        ),
+    ],
+)
+def test_a_quantity_that_is_none_says_what_is_allowed(value, message):
+    with pytest.raises(ValueError) as error:
+        parse_quantity(value, "length")
+    assert str(error.value) == message
+
+
+@given(st.floats(-1e6, 1e6), st.sampled_from(["length", "angle", "duration", "speed", "force"]))
+def test_formatting_reads_back_to_the_same_float(si, kind):
+    assert parse_quantity(format_quantity(si, kind), kind) == si

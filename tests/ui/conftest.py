@@ -1,0 +1,96 @@
+"""A server of the pages in a folder of its own, and a browser without a network."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.report.test_browser import FLAGS
+
+LOCAL = [f for f in FLAGS if "host-resolver" not in f] + [
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+]
+
+
+@dataclass
+class Served:
+    """A running ``flangeye ui``."""
+
+    folder: Path
+    address: str
+    port: int
+    process: subprocess.Popen
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def serve(folder: Path) -> Served:
+    port = free_port()
+    words = ["ui", str(folder), "--port", str(port), "--no-browser"]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTEST", "NICEGUI"))}
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "flangeye.cli", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if found := re.match(r"open (\S+)", line):
+            wait_for(port)
+            return Served(folder, found[1], port, process)
+    raise AssertionError("the server did not start")
+
+
+def wait_for(port: int) -> None:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+    raise AssertionError(f"nothing listens on {port}")
+
+
+def ended(served: Served) -> None:
+    served.process.send_signal(signal.SIGINT)
+    try:
+        served.process.wait(10)
+    except subprocess.TimeoutExpired:
+        served.process.kill()
+    if served.process.stdout:
+        served.process.stdout.close()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    pytest.importorskip("nicegui", reason="nicegui is not installed")
+    running = serve(tmp_path)
+    yield running
+    ended(running)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium on this machine: apt-get install chromium")
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=chromium, args=LOCAL)
+        yield launched
+        launched.close()

@@ -1,0 +1,154 @@
+"""Fuzz every reader: python -m tools.fuzz [CASES] [--target NAME] [--seed N] [--coverage SECONDS].
+
+Each target runs in a process of its own, in a folder with canaries: a Python module of a library's
+name and a program. What counts as a find: any exception but a FlangeyeError, a signal, more than
+20 s or 2 GB for one input, a canary that ran. Finds are kept in tests/fuzz/seeds/TARGET/, where the
+fast tests read them again. With --coverage, atheris guides the search instead (pip install atheris;
+it has wheels for some versions of Python only).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+from flangeye.files.children import keep_current_folder_out
+from tests.fuzz.damage import spoilt
+from tests.fuzz.targets import SEEDS, TARGETS, Target, survives
+
+HANG = 20
+MEMORY_KB = 2_000_000
+
+
+def main() -> None:
+    """Run the targets and print a table."""
+    asked = _arguments()
+    keep_current_folder_out()
+    names = [asked.target] if asked.target else list(TARGETS)
+    each = -(-asked.cases // len(names))
+    print(f"{'target':14} {'inputs':>8} {'read':>8} {'refused':>8} {'finds':>6} {'seconds':>8}")
+    total = 0
+    for name in names:
+        began = time.monotonic()
+        read, refused, finds = _in_child(name, each, asked)
+        total += finds
+        print(
+            f"{name:14} {read + refused + finds:8} {read:8} {refused:8} {finds:6} "
+            f"{time.monotonic() - began:8.1f}",
+            flush=True,
+        )
+    sys.exit(bool(total))
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("cases", nargs="?", type=int, default=100_000)
+    parser.add_argument("--target", choices=TARGETS)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--coverage", type=int, metavar="SECONDS", default=0)
+    return parser.parse_args()
+
+
+def _in_child(name: str, cases: int, asked: argparse.Namespace) -> tuple[int, int, int]:
+    """Return how many inputs were read, refused, and found to break something."""
+    spawn = multiprocessing.get_context("spawn")
+    counts = spawn.Array("q", 3)
+    done = 0
+    while done < cases:  # a process that dies has one find, and the next goes on behind it
+        work = _covered if asked.coverage else _fuzzed
+        child = spawn.Process(
+            target=work, args=(name, done, cases, asked.seed, counts, asked.coverage)
+        )
+        child.start()
+        child.join()
+        if child.exitcode == 0:
+            break
+        counts[2] += 1
+        print(f"{name}: the process ended with {child.exitcode} at input {sum(counts)}", flush=True)
+        done = sum(counts)
+    return counts[0], counts[1], counts[2]
+
+
+def _fuzzed(name: str, first: int, cases: int, seed: int, counts, seconds: int) -> None:
+    target = TARGETS[name]
+    with tempfile.TemporaryDirectory() as made:
+        folder = _with_canaries(Path(made))
+        sound = target.seeds(folder)
+        for number in range(first, cases):
+            chance = random.Random(f"{seed} {name} {number}")
+            _once(name, target, folder, spoilt(chance.choice(sound), chance), counts)
+
+
+def _once(name: str, target: Target, folder: Path, raw: bytes, counts) -> None:
+    path = folder / f"input{target.suffix}"
+    path.write_bytes(raw)
+    (SEEDS / name).mkdir(parents=True, exist_ok=True)
+    last = SEEDS / name / "last"  # kept if the process dies of it
+    last.write_bytes(raw)
+    signal.signal(signal.SIGALRM, _hung)
+    signal.alarm(HANG)
+    try:
+        counts[0 if survives(target, path) else 1] += 1
+    except BaseException:
+        counts[2] += 1
+        last.rename(last.with_name(hashlib.sha256(raw).hexdigest()[:12]))
+        traceback.print_exc()
+    finally:
+        signal.alarm(0)
+    last.unlink(missing_ok=True)
+    if (folder / "PWNED").exists() or resource.getrusage(
+        resource.RUSAGE_SELF
+    ).ru_maxrss > MEMORY_KB:
+        last.write_bytes(raw)
+        os._exit(3)
+
+
+def _hung(*_: object) -> None:
+    raise TimeoutError(f"more than {HANG} s")
+
+
+def _with_canaries(folder: Path) -> Path:
+    for module in ("yaml", "struct", "zstandard"):
+        (folder / f"{module}.py").write_text(f"open({str(folder / 'PWNED')!r}, 'w')\n")
+    program = folder / "evil.sh"
+    program.write_text(f"#!/bin/sh\ntouch {folder / 'PWNED'}\n")
+    program.chmod(0o755)
+    os.chdir(folder)
+    return folder
+
+
+def _covered(name: str, first: int, cases: int, seed: int, counts, seconds: int) -> None:
+    """Let atheris look for inputs that reach new code."""
+    import atheris
+
+    with atheris.instrument_imports(include=["flangeye", "flangeye_plugins"]):
+        import flangeye_plugins  # noqa: F401
+
+    target, folder = TARGETS[name], _with_canaries(Path(tempfile.mkdtemp()))
+    corpus = folder / "corpus"
+    corpus.mkdir()
+    for number, raw in enumerate(target.seeds(folder)):
+        (corpus / str(number)).write_bytes(raw)
+    words = [
+        sys.argv[0],
+        str(corpus),
+        f"-max_total_time={seconds}",
+        f"-timeout={HANG}",
+        f"-seed={seed + 1}",
+    ]
+    atheris.Setup(words, lambda raw: _once(name, target, folder, raw, counts))
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

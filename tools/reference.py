@@ -1,0 +1,115 @@
+"""The generated pages of docs/reference: commands, stages and parts, result.json.
+
+mkdocs calls :func:`on_files` when it builds the documentation, so they are never out of date.
+"""
+
+from __future__ import annotations
+
+import json
+
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from typer.main import get_command
+
+from flangeye.cli import app
+from flangeye.plugin.registry import load_registry
+from flangeye.plugin.stage import KINDS, PARTS, Plugin
+from flangeye.result import Result
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages to the documentation; a hook of mkdocs."""
+    for name, text in pages().items():
+        files.append(File.generated(config, f"reference/{name}", content=text))
+    return files
+
+
+def pages() -> dict[str, str]:
+    """Return each page by its file's name."""
+    return {"cli.md": _commands(), "stages.md": _stages(), "result.md": _result()}
+
+
+def _commands() -> str:
+    group = get_command(app)
+    lines = ["# Commands", "", "`flangeye COMMAND --help` says the same.", ""]
+    for name, command in sorted(group.commands.items()):
+        if command.hidden:
+            continue
+        context = typer.Context(command, info_name=f"flangeye {name}")
+        usage = " ".join([f"flangeye {name}", *command.collect_usage_pieces(context)])
+        lines += [f"## {name}", "", (command.help or "").strip(), "", "```text", usage, "```", ""]
+        rows = [parameter.get_help_record(context) for parameter in command.get_params(context)]
+        shown = [row for row in rows if row and not row[0].startswith("-h")]
+        if shown:
+            lines += ["| | |", "|---|---|"]
+            lines += [f"| `{_cell(option)}` | {_cell(text)} |" for option, text in shown] + [""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _stages() -> str:
+    registry = load_registry()
+    lines = ["# Stages and parts", "", "`flangeye stages NAME` shows one with its parameters.", ""]
+    offered = [*registry.stages.values(), *registry.parts.values()]
+    meanings = {kind: contract.meaning for kind, contract in KINDS.items()}
+    meanings |= {kind: part.meaning for kind, part in PARTS.items()}
+    for kind, meaning in meanings.items():
+        of_kind = sorted((p for p in offered if p.kind == kind), key=lambda plugin: plugin.name)
+        if of_kind:
+            lines += [f"## {kind}", "", f"{meaning[0].upper()}{meaning[1:]}.", ""]
+            lines += [line for plugin in of_kind for line in _plugin(plugin, registry.owners)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _plugin(plugin: Plugin, owners: dict[str, str]) -> list[str]:
+    lines = [
+        f"### `{plugin.name}`",
+        "",
+        plugin.summary,
+        "",
+        f"From plugin `{owners[plugin.name]}`.",
+        "",
+    ]
+    fields = plugin.params.model_fields if plugin.params else {}
+    if fields:
+        lines += ["| parameter | default | meaning |", "|---|---|---|"]
+        for name, field in fields.items():
+            default = (
+                "required"
+                if field.is_required()
+                else f"`{_cell(field.get_default(call_default_factory=True))}`"
+            )
+            lines.append(f"| `{name}` | {default} | {_cell(field.description or '')} |")
+        lines.append("")
+    return lines
+
+
+def _result() -> str:
+    schema = Result.model_json_schema()
+    lines = [
+        "# `result.json`", "",
+        "SI units and radians. `flangeye schema --result` prints the JSON Schema.", "",
+        "| key | meaning |", "|---|---|",
+    ]  # fmt: skip
+    for name, field in schema["properties"].items():
+        lines.append(f"| `{name}` | {_cell(field.get('description', ''))} |")
+    for name, model in sorted(schema.get("$defs", {}).items()):
+        if "properties" in model:
+            lines += [
+                "",
+                f"## {name}",
+                "",
+                _cell(model.get("description", "").partition("\n")[0]),
+                "",
+            ]
+            lines += ["| key | type | meaning |", "|---|---|---|"]
+            for key, field in model["properties"].items():
+                kind = (
+                    field.get("type") or json.dumps(field.get("$ref", "")).strip('"').split("/")[-1]
+                )
+                lines.append(f"| `{key}` | {kind} | {_cell(field.get('description', ''))} |")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _cell(value: object) -> str:
+    return " ".join(str(value).split()).replace("|", "\\|").replace("<", "&lt;")
