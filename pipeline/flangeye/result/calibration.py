@@ -105,12 +105,20 @@ def _answer(calibration: t.HandEye, of_all: float | None, inliers: float | None)
 
 
 def _expected(calibration: t.HandEye, inliers: float | None) -> float | None:
-    """Return the error to expect at the work: what poses held out show, less the centres' noise."""
+    """Return the error to expect at the work: what poses held out show, less the centres' noise.
+
+    Never less than what the covariance of the pose alone makes of it: where the noise explains all
+    that the poses held out show, the pose is still only known that well.
+    """
     used = [pair.observation.feature for pair in calibration.pairs if pair.used]
     if inliers is None or not used:
         return None
     noise = float(np.mean([np.trace(feature.centre_covariance) for feature in used]))
-    return float(np.sqrt(max(inliers**2 - noise, 0.0)))
+    camera = calibration.camera
+    places = camera.transform.apply(np.array([feature.centre for feature in used]))
+    of_pose = covariance_at(camera.covariance, camera.about, places)
+    least = float(np.trace(of_pose, axis1=1, axis2=2).mean())
+    return float(np.sqrt(max(inliers**2 - noise, least)))
 
 
 def observations_result(
