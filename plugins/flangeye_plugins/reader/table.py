@@ -24,11 +24,11 @@ from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import recording_of, scans_in
+from flangeye.files.tables import Column, TextTable, number_of, read_text_table
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, turning
 from flangeye.types import FLANGE, FLANGE2, Floats
 from flangeye.units import param
-from flangeye_plugins.reader.columns import Column, TextTable, number_of, read_text_table
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
 from flangeye_plugins.reader.written import POINT, WrittenParams
 from flangeye_plugins.reader.yaml_poses import numbers, read_document, value_at

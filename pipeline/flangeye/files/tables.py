@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flangeye import StageError
+from flangeye.errors import StageError
 from flangeye.files.regular import read_text
 from flangeye.types import Floats
 

@@ -1,0 +1,48 @@
+"""What a folder does not show: answered by a flag, by a person, or by a default that is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from flangeye.errors import RecipeError
+
+Prompt = Callable[[str, str | None], str]
+"""Asks a person; takes the question and the default, returns the answer."""
+
+
+@dataclass
+class Questions:
+    """Where answers come from.
+
+    Attributes:
+        given: Answers by flag; None where it was not given.
+        prompt: Asks a person, or None where there is nobody.
+        assumed: What was taken by default, told at the end.
+    """
+
+    given: Mapping[str, str | None] = field(default_factory=dict)
+    prompt: Prompt | None = None
+    assumed: list[str] = field(default_factory=list)
+
+    def ask(self, flag: str, question: str, default: str | None, example: str = "") -> str:
+        """Return the answer to a question.
+
+        Args:
+            flag: The option that answers it.
+            question: For people.
+            default: What is likely; None where nothing is.
+            example: An answer, for the message where there is none.
+
+        Raises:
+            RecipeError: Nothing is likely, nobody can be asked; names the flag to add.
+        """
+        answer = self.given.get(flag)
+        if answer is not None:
+            return answer
+        if self.prompt is not None:
+            return self.prompt(f"{question} (--{flag})", default)
+        if default is None:
+            raise RecipeError(f"{question}: nothing tells; add --{flag} {example}".rstrip())
+        self.assumed.append(f"{question}: {default} (--{flag} says otherwise)")
+        return default

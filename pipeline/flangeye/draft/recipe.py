@@ -1,0 +1,268 @@
+"""From what was seen and answered to a recipe's text."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flangeye.draft.convention import table_params
+from flangeye.draft.questions import Questions
+from flangeye.draft.sights import Sights
+from flangeye.errors import RecipeError, StageError
+from flangeye.files.clouds import read_cloud
+from flangeye.files.recording import Archive
+from flangeye.files.scans import CLOUDS, IMAGES
+from flangeye.files.yaml_lines import parse_value
+from flangeye.models.cloud_unit import detect_unit, median_distance
+from flangeye.models.loading import load_model
+from flangeye.models.scanners import ScannerData
+from flangeye.plugin.registry import Registry
+from flangeye.plugin.stage import BoundPart
+from flangeye.recipe.load import parse_recipe
+
+PLATE = "ISO 9409-1-50-4-M6"
+"""What most small arms carry."""
+POSES_LINE = "cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
+PRINTED = ("charuco", "checkerboard", "aruco")
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A recipe, and what to tell of it.
+
+    Attributes:
+        text: YAML.
+        told: What was found in the archive, a line each.
+    """
+
+    text: str
+    told: Sequence[str]
+
+
+def draft_recipe(sights: Sights, out: Path, questions: Questions, registry: Registry) -> Draft:
+    """Return a recipe for what was seen.
+
+    Args:
+        sights: What the folder holds.
+        out: Where the recipe will be; its paths start there.
+        questions: For what cannot be seen.
+        registry: The plugins on offer.
+
+    Raises:
+        FlangeyeError: Something is missing that no answer gives; says which line to add.
+    """
+    robot = _robot(questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", NONE))
+    reader = _reader(sights, questions, registry, robot)
+    archive = _bound(reader, registry)(sights.folder)
+    stage, target = _what(archive, questions)
+    head = _head(sights.folder, robot, target, questions)
+    first: dict[str, Any] = {"path": os.path.relpath(sights.folder, out.parent)}
+    first |= {} if reader == "auto" else {"reader": reader}
+    data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
+    return Draft(_yaml(data), _told(archive, reader))
+
+
+def _robot(answer: str) -> dict[str, Any]:
+    if answer == NONE:
+        return {}
+    return {"urdf": answer} if answer.endswith(".urdf") else {"model": answer}
+
+
+# --- how the archive is read
+
+
+def _reader(
+    sights: Sights, questions: Questions, registry: Registry, robot: Mapping[str, Any]
+) -> Any:
+    """Return the reader as a recipe writes it: given, known by the layout, or made for a table."""
+    given = questions.given.get("reader")
+    if given is not None:
+        return parse_value(given, "--reader")
+    try:
+        _bound("auto", registry)(sights.folder)
+    except StageError as error:
+        reason = str(error)
+    else:
+        return "auto"
+    if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in sights.files):
+        return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
+    if sights.tables:
+        scans = bool(sights.of(CLOUDS) or sights.of(IMAGES))
+        return {"table": table_params(sights.tables, questions, _maker(robot), scans)}
+    raise StageError(_missing(sights, reason))
+
+
+def _bound(reader: Any, registry: Registry) -> BoundPart:
+    """Return a reader with its parameters, checked as a recipe's are."""
+    probe = {"title": "draft", "steps": [{"acquire.centres": {"reader": reader}}, "solve.svd"]}
+    try:
+        params: Any = parse_recipe(json.dumps(probe), "probe", registry).steps[0].params
+    except RecipeError as error:
+        # Of the probe's file nobody knows.
+        told = str(error).replace("probe:1: steps.0.acquire.centres.reader", "--reader")
+        raise RecipeError(told.replace("--reader.", "--reader ")) from None
+    bound: BoundPart = params.reader
+    return bound
+
+
+def _maker(robot: Mapping[str, Any]) -> str | None:
+    return load_model("robots", robot["model"]).maker if "model" in robot else None
+
+
+def _missing(sights: Sights, reason: str) -> str:
+    """Say what is missing, and the line that would bring it."""
+    scans = sights.of(CLOUDS) or sights.of(IMAGES)
+    if sights.arrays:
+        first, *others = (array.partition(" ")[0] for array in sights.arrays)
+        target = f', target: {{at: "{others[0]}", length: m}}' if others else ""
+        return (
+            f"{sights.folder}: holds arrays; say which are the arm's poses: --reader 'matrices: "
+            f'{{robot: "{first}", length: m{target}}}\''
+        )
+    if scans:
+        return (
+            f"{sights.folder}: holds {len(scans)} scans, but nothing that says where the flange "
+            f"was; put poses.csv beside them, its first line: {POSES_LINE}; then a line for each, "
+            f"{scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
+        )
+    return f"{sights.folder}: holds no scans and no table of poses; {reason}"
+
+
+# --- what is in it
+
+
+def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
+    """Return the acquire stage, and the target: its name with parameters, empty where measured."""
+    records = archive.recordings
+    if any(r.cloud for r in records):
+        answer = questions.ask(
+            "target", "what is seen (flange, sphere, charuco, checkerboard, aruco)", "flange"
+        )
+        return "acquire.archive", _target(answer)
+    if any(r.image for r in records):
+        example = "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
+        answer = questions.ask("target", "which printed target is seen", None, example)
+        return "acquire.images", _target(answer)
+    if any(r.camera_T_target is not None for r in records):
+        return "acquire.samples", {}
+    if any(r.centre_in_camera is not None for r in records):
+        return "acquire.centres", {}
+    raise StageError(f"{archive.root}: holds poses, but neither scans nor what the camera measured")
+
+
+def _target(answer: str) -> dict[str, Any]:
+    value = parse_value(answer, "--target")
+    target = {value: {}} if isinstance(value, str) else value
+    known = ("flange", "sphere", *PRINTED)
+    if not isinstance(target, dict) or len(target) != 1 or next(iter(target)) not in known:
+        raise RecipeError(f"--target {answer}: is none of {', '.join(known)}, with parameters")
+    return target
+
+
+def _head(
+    folder: Path, robot: dict[str, Any], target: dict[str, Any], questions: Questions
+) -> dict[str, Any]:
+    """Return the recipe's sections above its steps."""
+    head: dict[str, Any] = {"title": f"Calibration from {folder.resolve().name}"}
+    feature = {"sphere": target["sphere"]} if "sphere" in target else {}
+    if "flange" in target and not _has_plate(robot):
+        question = "which plate the flange is ('flangeye standards')"
+        feature = {"standard": questions.ask("plate", question, PLATE)}
+    if "flange" in target and not robot:
+        robot, feature = {"flange": feature["standard"]}, {}
+    scanner = questions.ask("scanner", "which scanner ('flangeye scanners')", NONE)
+    configuration = _configuration(target, questions)
+    named: Any = robot["model"] if set(robot) == {"model"} else robot
+    sections = {
+        "robot": named, "scanner": {} if scanner == NONE else scanner,
+        "feature": feature, "configuration": configuration,
+    }  # fmt: skip
+    return head | {name: section for name, section in sections.items() if section}
+
+
+def _has_plate(robot: Mapping[str, Any]) -> bool:
+    if "model" not in robot:
+        return False
+    return load_model("robots", robot["model"]).flange.standard is not None
+
+
+def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
+    """Return who carries what; empty for a camera beside the robot that sees its flange."""
+    carried = questions.ask("camera", "what carries the camera (base or flange)", "base")
+    if carried not in ("base", "flange"):
+        raise RecipeError(f"--camera {carried}: is neither base nor flange")
+    if carried == "flange":
+        return {"name": "eye-in-hand", "place": "unknown"}
+    known = "flange" in target or "sphere" in target
+    return {} if known else {"name": "eye-on-base", "place": "unknown"}
+
+
+def _steps(stage: str, target: Mapping[str, Any]) -> list[Any]:
+    found: list[Any] = []
+    if "flange" in target:
+        found = ["segment.flange", "fit.rim"]
+    elif "sphere" in target:
+        found = ["segment.sphere", "fit.sphere"]
+    elif target:
+        found = [{f"fit.{name}": params} for name, params in target.items()]
+    return [*found, "solve.robust", "verify.holdout"]
+
+
+# --- what to tell
+
+
+def _told(archive: Archive, reader: Any) -> list[str]:
+    records = archive.recordings
+    seen = {
+        "a cloud": sum(r.cloud is not None for r in records),
+        "an image": sum(r.image is not None for r in records),
+        "a measured target": sum(
+            r.camera_T_target is not None or r.centre_in_camera is not None for r in records
+        ),
+    }
+    with_what = ", ".join(f"{n} with {what}" for what, n in seen.items() if n)
+    told = [f"{len(records)} poses ({archive.layout}), {with_what}"]
+    if reader != "auto":
+        told.append(f"reader: {json.dumps(reader, ensure_ascii=False)}")
+    first = next((r.cloud for r in records if r.cloud), None)
+    if first is not None:
+        told.append(_of_cloud(first))
+    return [*told, *archive.notes]
+
+
+def _of_cloud(path: Path) -> str:
+    cloud = read_cloud(path)
+    size = " x ".join(map(str, reversed(cloud.xyz.shape[:-1])))
+    far = median_distance(cloud)
+    try:
+        unit = detect_unit(path, far, ScannerData(model="the scanner"))
+    except StageError as error:
+        return str(error)
+    return f"{path.name}: {size} points, at {far:.4g} {unit} (median)"
+
+
+def _yaml(data: Mapping[str, Any]) -> str:
+    """Return a recipe's text: a line a section, a line a step."""
+    lines = [f"{key}: {_flow(value)}" for key, value in data.items() if key != "steps"]
+    return "\n".join([*lines, "steps:", *(f"  - {_step(step)}" for step in data["steps"])]) + "\n"
+
+
+def _step(step: Any) -> str:
+    if isinstance(step, str):
+        return step
+    ((name, params),) = step.items()
+    return f"{name}: {_flow(params)}"
+
+
+def _flow(value: Any) -> str:
+    text = yaml.safe_dump(
+        value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10_000
+    )
+    return text.removesuffix("...\n").strip()

@@ -1,0 +1,265 @@
+"""``flangeye init``: from folders as newcomers have them to a recipe that passes check, or a line."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from flangeye.cli import app
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+
+SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
+POSES = [(np.array([0.4, -0.1, 0.3]) + 0.05 * k * np.array([1, -1, (-1) ** k]),
+          Rotation.from_rotvec([0.3 * k, 2.0 - 0.2 * k, 0.1])) for k in range(5)]  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec").mkdir()
+    return tmp_path / "rec"
+
+
+def clouds(folder, count=5):
+    for k in range(count):
+        grid = np.stack(np.meshgrid(range(20), range(10)), axis=-1).reshape(-1, 2) * 10.0
+        points = np.column_stack([grid, np.full(200, 800.0 + k)])
+        np.savetxt(folder / f"scan_{k}.xyz", points)
+
+
+def table(folder, heading, row, name="log.csv", separator=","):
+    lines = [heading] * bool(heading)
+    lines += [separator.join(map(str, row(k, *pose))) for k, pose in enumerate(POSES)]
+    (folder / name).write_text("\n".join(lines) + "\n")
+
+
+def init(*words, typed=None):
+    line = ["init", "rec", *map(str, words)]
+    if typed is None:
+        line.append("--yes")
+    done = CliRunner().invoke(app, line, input=typed)
+    if done.exception and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.output
+
+
+def recipe(folder):
+    return load_recipe(folder.parent / "recipe.yaml", load_registry())
+
+
+def read_poses(folder):
+    first = recipe(folder).steps[0].params
+    return np.array([r.base_T_flange for r in first.reader(first.path).recordings])
+
+
+def kuka(k, place, turn):
+    return [*(1e3 * place), *turn.as_euler("ZYX", degrees=True)]
+
+
+def vector(k, place, turn):
+    return [*(1e3 * place), *turn.as_rotvec()]
+
+
+def quaternion(k, place, turn):
+    return [*place, *turn.as_quat()]
+
+
+def german(k, place, turn):
+    return [f"scan_{k}.xyz", *(str(x).replace(".", ",") for x in kuka(k, place, turn))]
+
+
+def matrix(k, place, turn):
+    return np.vstack([np.column_stack([turn.as_matrix(), 1e3 * place]), [0, 0, 0, 1]]).ravel()
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "separator", "words"),
+    [
+        ("X,Y,Z,A,B,C", kuka, ",", []),
+        ("Datei;X;Y;Z;A;B;C", german, ";", []),
+        ("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad", vector, ",", ["--rotation", "vector"]),
+        ("X Y Z Rx Ry Rz", vector, " ", ["--robot", "ur5"]),
+        ("u,v,w,alpha,beta,gamma", kuka, ",", ["--columns", "u,v,w,4,5,6", "--rotation", "kuka"]),
+        ("pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,"
+         "pose.orientation.y,pose.orientation.z,pose.orientation.w", quaternion, ",", []),
+        ("", matrix, "\t", []),
+    ],
+)  # fmt: skip
+def test_a_table_is_read_as_its_heading_says(folder, heading, row, separator, words):
+    clouds(folder)
+    table(folder, heading, row, separator=separator)
+    told = init(*words)
+    expected = [np.block([[t.as_matrix(), p[:, None]], [np.zeros(3), 1]]) for p, t in POSES]
+    np.testing.assert_allclose(read_poses(folder), expected, atol=1e-9)
+    assert "clouds: 5 .xyz" in told
+    assert "5 poses (table, log.csv), 5 with a cloud" in told
+    assert "scan_0.xyz: 200 points, at 807.6 mm (median)" in told
+    assert "recipe.yaml: ok, 5 steps; next: flangeye run recipe.yaml" in told
+
+
+def test_defaults_are_told_and_answers_are_not(folder):
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    told = init("--robot", "ur5", "--scanner", "phoxi-m")
+    assert "assumed: what carries the camera (base or flange): base (--camera says" in told
+    assert "--robot says" not in told
+    assert recipe(folder).header.robot.model == "ur5"
+
+
+def test_it_asks_what_it_cannot_see(folder):
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    init(typed="ur5\nflange\nphoxi-m\nbase\n")
+    assert recipe(folder).header.scanner.model == "phoxi-m"
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "words", "stage"),
+    [
+        ("x,y,z,qx,qy,qz,qw,marker_x,marker_y,marker_z,marker_qx,marker_qy,marker_qz,marker_qw",
+         lambda k, p, t: [*p, *t.as_quat(), *p, *t.as_quat()], [], "acquire.samples"),
+        ("x,y,z,qx,qy,qz,qw,u,v,w", lambda k, p, t: [*p, *t.as_quat(), *p],
+         ["--target-columns", "u,v,w"], "acquire.centres"),
+        ("x,y,z,qx,qy,qz,qw,cam x [mm],cam y [mm],cam z [mm]",
+         lambda k, p, t: [*p, *t.as_quat(), *p], ["--camera", "flange"], "acquire.centres"),
+    ],
+)  # fmt: skip
+def test_what_the_camera_measured_may_stand_in_the_table(folder, heading, row, words, stage):
+    table(folder, heading, row)
+    init(*words)
+    checked = recipe(folder)
+    assert checked.steps[0].stage.name == stage
+    assert checked.header.configuration.place == "unknown"
+    assert len(read_poses(folder)) == 5
+
+
+def test_two_streams_are_joined_by_time(folder):
+    arm = "".join(f"{0.1 * k},{0.1 * (k // 10)},0,0.5,0,0,0,1\n" for k in range(60))
+    seen = "".join(f"{0.5 + k},{0.1 * k},0,0.4,0,0,0,1\n" for k in range(6))
+    (folder / "arm.csv").write_text("time,x,y,z,qx,qy,qz,qw\n" + arm)
+    (folder / "seen.csv").write_text("t,target_x,target_y,target_z,target_qx,target_qy,target_qz,"
+                                     "target_qw\n" + seen)  # fmt: skip
+    init()
+    assert recipe(folder).steps[0].params.reader.params.target.time == "t"
+
+
+def test_images_need_to_know_the_target(folder):
+    table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
+    for k in range(5):
+        cv2.imwrite(str(folder / f"{k}.png"), np.zeros((8, 8), np.uint8))
+    init("--target", "charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}")
+    names = [step.stage.name for step in recipe(folder).steps]
+    assert names == ["acquire.images", "fit.charuco", "solve.robust", "verify.holdout"]
+
+
+def test_zivids_folder_is_known(folder):
+    clouds(folder)
+    for k in range(5):
+        (folder / f"scan_{k}.xyz").rename(folder / f"img{k}.xyz")
+        rows = matrix(k, *POSES[k]).reshape(4, 4).tolist()
+        (folder / f"pos{k}.yaml").write_text(f"FloatMatrix: {{Data: {rows}}}\n")
+    init()
+    assert np.abs(read_poses(folder)[:, :3, 3]).max() < 1
+
+
+def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder):
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    init("--out", "of_sample.yaml")
+    of_sample = load_recipe(folder.parent / "of_sample.yaml", load_registry()).steps[0].params
+    recorded = of_sample.reader(folder).recordings
+    poses = np.array([r.base_T_flange for r in recorded])
+    (folder / "poses.csv").unlink()
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)
+    rows = np.hstack([1e3 * poses[:, :3, 3], turns])
+    np.savetxt(folder / "pendant.txt", rows, delimiter=",", header="X,Y,Z,A,B,C", comments="")
+    init()
+    np.testing.assert_allclose(read_poses(folder), poses, atol=1e-9)
+
+
+def odd_heading(folder):
+    clouds(folder)
+    table(folder, "u,v,w,alpha,beta,gamma", kuka)
+
+
+def angles_of_nobody(folder):
+    clouds(folder)
+    table(folder, "x,y,z,rx,ry,rz", vector)
+
+
+def images(folder):
+    table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
+    for k in range(5):
+        cv2.imwrite(str(folder / f"{k}.png"), np.zeros((8, 8), np.uint8))
+
+
+def sample(folder):
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+
+
+def arrays(folder):
+    piles = {name: np.tile(np.eye(4), (5, 1, 1)) for name in ("robot", "seen")}
+    np.savez(folder / "poses.npz", **piles)
+
+
+@pytest.mark.parametrize(
+    ("made", "words", "line"),
+    [
+        (clouds, [], "rec: holds 5 scans, but nothing that says where the flange was; put "
+         "poses.csv beside them, its first line: cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad; then "
+         "a line for each, scan_0.xyz,412.1,-33.0,501.7,2.91,0.12,-0.03"),
+        (odd_heading, [], "rec/log.csv: which columns are the arm's pose is not plain from "
+         "u, v, w, alpha, beta, gamma; add --columns with their names, or numbers from 1, position "
+         "first: --columns x,y,z,a,b,c --rotation kuka"),
+        (odd_heading, ["--columns", "u,v,ww,4,5,6"],
+         "rec/log.csv: has no column 'ww'; known: w"),
+        (angles_of_nobody, [], "how the rotation in columns rx, ry, rz is written (ur, kuka, "
+         "fanuc, abb, yaskawa, staubli, kawasaki, doosan, halcon, rpy, quaternion_xyzw, "
+         "quaternion_wxyz, vector, xyz, ZYX, …): nothing tells; add --rotation vector"),
+        (images, [], "which printed target is seen: nothing tells; add --target 'charuco: "
+         "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
+        (arrays, [], "rec: holds arrays; say which are the arm's poses: --reader 'matrices: "
+         "{robot: \"poses.npz:robot\", length: m, target: {at: \"poses.npz:seen\", length: m}}'"),
+        (lambda folder: table(folder, "x,y,z,qx,qy,qz,qw", quaternion), [],
+         "rec/log.csv: has poses of the arm, but there are no scans beside it, and no "
+         "columns of what the camera saw; add --target-columns NAMES, or put the scans there"),
+        (lambda folder: (folder / "notes.md").write_text("x"), [],
+         "rec: holds no scans and no table of poses; rec: no reader knows this layout"),
+        (lambda folder: None, [],
+         "rec: is empty; put the clouds or images and their poses there"),
+        (lambda folder: folder.rmdir(), [],
+         "rec: is no folder; name the one that holds the recordings"),
+        (sample, ["--camera", "wrist"], "--camera wrist: is neither base nor flange"),
+        (sample, ["--target", "cube"],
+         "--target cube: is none of flange, sphere, charuco, checkerboard, aruco, with "
+         "parameters"),
+        (sample, ["--reader", "table"], "--reader table.rotation: is missing\n--reader table.length: "),
+        (odd_heading, ["--table", "a.csv"],
+         "--table a.csv: is no table of poses; known: log.csv"),
+        (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "no robot 'ur55'"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_one_line_with_what_to_add(folder, made, words, line):
+    made(folder)
+    done = CliRunner().invoke(app, ["init", "rec", "--yes", *words])
+    assert str(done.exception).startswith(line)
+    assert getattr(done.exception, "exit_code", None) == 2
+    assert not (folder.parent / "recipe.yaml").exists()
+
+
+def test_a_recipe_is_not_written_over(folder):
+    sample(folder)
+    init("--robot", "ur5")
+    done = CliRunner().invoke(app, ["init", "rec", "--yes"])
+    assert str(done.exception) == "recipe.yaml: is there already; take another name with --out"
+
+
+def test_a_question_without_an_answer_names_the_option(folder):
+    sample(folder)
+    done = CliRunner().invoke(app, ["init", "rec"], input="")
+    assert str(done.exception) == (
+        "which arm ('flangeye robots', or a .urdf) (--robot): was not answered; give the option, "
+        "or --yes for the defaults"
+    )
