@@ -20,13 +20,22 @@ def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> 
         bins: Number of equal sectors about the centre; those without points give none.
         outer: Farthest if true, nearest otherwise.
     """
+    at_edge = fringe(flat, centre, bins, 0.0, outer)
+    sector = sectors(flat[at_edge] - centre, bins)
+    return at_edge[np.unique(sector, return_index=True)[1]]
+
+
+def fringe(flat: Floats, centre: Floats, bins: int, depth: float, outer: bool = True) -> Indices:
+    """Return the points at most ``depth`` [m] behind the one at the edge of their sector.
+
+    Arguments as for :func:`edge_points`.
+    """
     offsets = flat - centre
     reach = np.hypot(offsets[:, 0], offsets[:, 1]) * (1 if outer else -1)
     sector = sectors(offsets, bins)
     best = np.full(bins, -np.inf)
     np.maximum.at(best, sector, reach)
-    at_edge = np.flatnonzero(reach == best[sector])
-    return at_edge[np.unique(sector[at_edge], return_index=True)[1]]
+    return np.flatnonzero(reach >= best[sector] - depth)
 
 
 def sectors(offsets: Floats, bins: int) -> Indices:

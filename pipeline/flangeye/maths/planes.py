@@ -21,6 +21,9 @@ T = TypeVar("T", bound=np.generic)
 ROUNDS = 20
 """Times that a plane is fitted to the points it chooses, at most."""
 
+RESTLESS = 0.01
+"""Share of a thinned group's points that may still change sides before the whole group is asked."""
+
 ENOUGH = 2000
 """Points that tell one plane from another."""
 
@@ -43,11 +46,12 @@ class Plane(NamedTuple):
 
     def heights(self, points: Floats) -> Floats:
         """Return the (N,) signed distances of (N, 3) points, positive along the normal."""
-        return np.asarray((points - self.point) @ self.normal)
+        return np.asarray(points @ self.normal - self.point @ self.normal)
 
     def flatten(self, points: Floats) -> Floats:
         """Return the (N, 2) coordinates of (N, 3) points along the plane's two axes."""
-        return np.asarray((points - self.point) @ basis_of_plane(self.normal)[:2].T)
+        axes = basis_of_plane(self.normal)[:2]
+        return np.asarray(points @ axes.T - axes @ self.point)
 
     def lift(self, flat: Floats) -> Floats:
         """Return the (..., 3) points of (..., 2) coordinates in the plane."""
@@ -96,10 +100,12 @@ def robust_planes(
         return []
     few = [points[:: 1 + len(points) // ENOUGH] for points in groups]
     rows, slabs = _Rows.of(few, rough), _Slabs.at(rough, gates)
-    _of_majority(rows, slabs)
-    _opened(rows, slabs, sigmas)
-    if any(len(some) < len(points) for some, points in zip(few, groups, strict=True)):
-        _opened(_Rows.of(groups, rough), slabs, sigmas)
+    more = any(len(some) < len(points) for some, points in zip(few, groups, strict=True))
+    restless = RESTLESS if more else 0.0
+    _of_majority(rows, slabs, restless)
+    _opened(rows, slabs, sigmas, restless)
+    if more:
+        _opened(_Rows.of(groups, rough), slabs, sigmas, 0.0)
     return slabs.planes(rough)
 
 
@@ -162,8 +168,8 @@ class _Slabs:
         """Turn some planes to the (Q, K) points chosen: total least squares."""
         counts = np.count_nonzero(chosen, axis=1)[:, None]
         weighted = rows.xyz * chosen[:, None]
-        means = np.einsum("pik->pi", weighted).astype(np.float64) / counts
-        about_rough = np.einsum("pik,pjk->pij", weighted, rows.xyz) / counts[..., None]
+        means = weighted.sum(axis=2, dtype=np.float64) / counts
+        about_rough = weighted @ rows.xyz.transpose(0, 2, 1) / counts[..., None]
         scatter = about_rough - means[:, :, None] * means[:, None]
         normals = np.linalg.eigh(scatter)[1][..., 0]
         away = (normals * self.towards[which]).sum(axis=1) < 0
@@ -179,7 +185,7 @@ class _Slabs:
         ]
 
 
-def _of_majority(rows: _Rows, slabs: _Slabs) -> None:
+def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
     """Turn each plane to the nearest half of the points in its own slab, until it is theirs.
 
     Concentration steps of least trimmed squares (Rousseeuw and Van Driessen 1999).
@@ -191,7 +197,8 @@ def _of_majority(rows: _Rows, slabs: _Slabs) -> None:
         half = _medians(off, some.there & (off <= slabs.gates[going][:, None]))
         slabs.halves[going] = np.where(np.isnan(half), slabs.gates[going], half)
         nearest = some.there & (off <= slabs.halves[going][:, None])
-        changed = (np.count_nonzero(nearest, axis=1) >= 3) & (nearest != chosen[going]).any(axis=1)
+        enough = np.count_nonzero(nearest, axis=1) >= 3
+        changed = enough & _differ(nearest, chosen[going], restless)
         going[going] = changed
         if not changed.any():
             break
@@ -199,7 +206,7 @@ def _of_majority(rows: _Rows, slabs: _Slabs) -> None:
         slabs.fit(some.some(changed), chosen[going], going)
 
 
-def _opened(rows: _Rows, slabs: _Slabs, sigmas: float) -> None:
+def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
     """Fit each plane to all points in its slab, and open the slab to their noise, until at rest."""
     going, chosen = slabs.found.copy(), np.zeros_like(rows.there)
     for _ in range(ROUNDS):
@@ -209,12 +216,18 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float) -> None:
         thickness = np.maximum(slabs.halves[going], THINNEST)[:, None]
         near = some.there & (slabs.off(some, going) <= thickness)
         slabs.found[going] = enough = np.count_nonzero(near, axis=1) >= 3
-        changed = enough & (near != chosen[going]).any(axis=1)
+        changed = enough & _differ(near, chosen[going], restless)
         going[going] = changed
         some, chosen[going] = some.some(changed), near[changed]
         slabs.fit(some, chosen[going], going)
         slabs.sigmas[going] = SIGMA_OF_MAD * _medians(slabs.off(some, going), chosen[going])
         slabs.halves[going] = np.minimum(slabs.gates[going], sigmas * slabs.sigmas[going])
+
+
+def _differ(chosen: Mask, before: Mask, share: float) -> Mask:
+    """Return (P,) whether more than a share of the points that a plane has chosen are new."""
+    changed = np.count_nonzero(chosen != before, axis=1)
+    return np.asarray(changed > share * np.count_nonzero(chosen, axis=1))
 
 
 def _medians(values: Floats, which: Mask) -> Floats:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.maths.planes import Plane, fit_plane, robust_plane, thinned
-from flangeye.types import Floats
+from flangeye.maths.planes import Plane, robust_plane, thinned
+from flangeye.types import Floats, Indices
 
 ACROSS, FEWEST = 5, 20
 """Patches across a face, each with this many points at least."""
@@ -23,9 +23,8 @@ def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: flo
     Returns:
         The plane, or None when fewer than three points lie near it.
     """
-    flat = rough.flatten(points)
-    reach = np.hypot(flat[:, 0], flat[:, 1])
-    candidates = points[(reach >= ring[0]) & (reach < ring[1])]
+    reach = np.hypot(*rough.flatten(points).T)
+    candidates = points.compress((reach >= ring[0]) & (reach < ring[1]), axis=0)
     if len(candidates) < 3:
         return None
     plane = robust_plane(candidates, likeliest_plane(candidates, rough), gate)
@@ -45,9 +44,34 @@ def likeliest_plane(points: Floats, rough: Plane) -> Plane:
         rough: Rough plane; its axes lay the patches out.
     """
     sample = thinned(points)
-    flat = rough.flatten(sample)
+    normals, levels = _planes_of_patches(sample, _patches(rough.flatten(sample)), rough)
+    off = np.abs(normals @ (sample - rough.point).T - levels[:, None])
+    best = int(np.argmin(np.median(off, axis=1)))
+    if best == 0:
+        return rough
+    return Plane(rough.point + levels[best] * normals[best], normals[best], 0.0)
+
+
+def _patches(flat: Floats) -> Indices:
+    """Return which of ``ACROSS`` x ``ACROSS`` patches each of (N, 2) points lies in."""
     low, high = flat.min(axis=0), flat.max(axis=0)
-    cell = np.minimum(((flat - low) / (high - low + 1e-12) * ACROSS).astype(int), ACROSS - 1)
-    patches = [sample[(cell == (i, j)).all(axis=1)] for i in range(ACROSS) for j in range(ACROSS)]
-    planes = [fit_plane(patch, rough.normal) for patch in patches if len(patch) >= FEWEST]
-    return min([rough, *planes], key=lambda plane: float(np.median(np.abs(plane.heights(sample)))))
+    cell = np.minimum(((flat - low) / (high - low + 1e-12) * ACROSS).astype(np.intp), ACROSS - 1)
+    return np.asarray(cell @ [ACROSS, 1])
+
+
+def _planes_of_patches(points: Floats, patch: Indices, rough: Plane) -> tuple[Floats, Floats]:
+    """Return normals (P, 3) and levels (P,) above the rough plane's point; first the rough plane's.
+
+    The least-squares planes of all patches with enough points, in one computation.
+    """
+    offsets = points - rough.point
+    members = (patch == np.arange(ACROSS**2)[:, None]).astype(np.float64)
+    members = members[members.sum(axis=1) >= FEWEST]
+    counts = members.sum(axis=1)[:, None]
+    means = members @ offsets / counts
+    products = (offsets[:, :, None] * offsets[:, None]).reshape(-1, 9)
+    scatter = (members @ products / counts).reshape(-1, 3, 3) - means[:, :, None] * means[:, None]
+    normals = np.linalg.eigh(scatter)[1][..., 0]
+    normals *= np.where(normals @ rough.normal < 0, -1.0, 1.0)[:, None]
+    levels = (normals * means).sum(axis=1)
+    return np.vstack([rough.normal, normals]), np.append(0.0, levels)

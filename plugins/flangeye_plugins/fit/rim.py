@@ -8,7 +8,7 @@ from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.maths.planes import Plane, fit_plane
+from flangeye.maths.planes import Plane, fit_plane, thinned
 from flangeye.models.bolt_pattern import roll_angle
 from flangeye.models.targets import Flange
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Rejected
@@ -97,7 +97,7 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
     if face is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
-    flat = face.flatten(points[_on_face(face, points, params)])
+    flat = face.flatten(points.compress(_on_face(face, points, params), axis=0))
     if len(flat) < FEWEST_POINTS:
         return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
     start = face.flatten(cloud.centre[None])[0]
@@ -153,13 +153,14 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
     radius = np.hypot(offsets[:, 0], offsets[:, 1])
     rim, *bore = rings.circles.radii
     inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
+    inner = points.compress(inside, axis=0)
     plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
     # The face is near enough already for a few rounds of its own slab to settle it.
-    for _ in range(3):
-        near = inside & (np.abs(plane.heights(points)) < half)
-        if near.sum() < FEWEST_POINTS:
+    for some in (thinned(inner), thinned(inner), inner):
+        near = some.compress(np.abs(plane.heights(some)) < half, axis=0)
+        if len(near) < FEWEST_POINTS:
             return face
-        plane = fit_plane(points[near], face.normal)
+        plane = fit_plane(near, face.normal)
     return plane
 
 
@@ -172,7 +173,7 @@ def _feature(
     axes = basis_of_plane(plane.normal)
     heights = plane.heights(points)
     near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
-    about_centre = (points[near] - centre) @ axes[:2].T
+    about_centre = (points.compress(near, axis=0) - centre) @ axes[:2].T
     of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
     to_flange = flange.details.thickness if flange.bore is None else 0.0
     return CircleFeature(

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.circles import edge_points, sectors, vote_centre
+from flangeye.maths.circles import edge_points, fringe, sectors, vote_centre
+from flangeye.maths.planes import thinned
 from flangeye.types import Floats, Indices
 from flangeye_plugins.fit.circles import (
     Circles,
@@ -18,8 +19,12 @@ from flangeye_plugins.fit.circles import (
 )
 from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance
 
-ROUNDS, SETTLED = 12, 1e-7
-"""Rounds of choosing edge points and fitting, at most, and the last one's step [m]."""
+ROUNDS, NEAR, SETTLED = 12, 1e-4, 1e-7
+"""Rounds of choosing edge points and fitting, at most, and the last one's step [m]: with a few of
+the points, and with all."""
+
+FRINGE = 1e-3
+"""How deep behind an edge its points are kept while the circles settle [m]."""
 
 SEARCHED = ((0.8, 1.1), (0.75, 1.3))
 """Where the edges of rim and bore are sought, in nominal radii."""
@@ -68,16 +73,30 @@ def find_rings(flat: Floats, nominal: Floats, start: Floats, scale: float) -> Ri
         start: (2,) a point inside the bore, or near the centre [m].
         scale: Distance at which an edge point's weight is a half [m].
     """
-    bins = _sectors_for(flat, nominal)
-    edges = [flat[edge_points(flat, start, int(n), k == 0)] for k, n in enumerate(bins)]
+    few = thinned(flat)
+    bins = _sectors_for(few, nominal)
+    edges = [few[edge_points(few, start, int(n), k == 0)] for k, n in enumerate(bins)]
     votes = tuple((e, float(r)) for e, r in zip(edges, nominal, strict=True))
     circles = Circles(vote_centre(votes, start, float(nominal[0])), nominal)
-    # Which points are at the edge depends on the centre, and the centre on them.
+    if len(few) < len(flat):
+        circles = _settled(few, circles, nominal, bins, scale, NEAR).circles
+        bins = _sectors_for(flat, nominal)
+        flat, _ = _edges_near(flat, circles.centre, nominal, bins, FRINGE)
+    return _settled(flat, circles, nominal, bins, scale, SETTLED)
+
+
+def _settled(
+    flat: Floats, circles: Circles, nominal: Floats, bins: Indices, scale: float, within: float
+) -> Rings:
+    """Return the circles through the points at the edges, once their centre has come to rest.
+
+    Which points are at the edge depends on the centre, and the centre on them.
+    """
     for _ in range(ROUNDS):
         before = circles.centre
         points, ring = _edges_near(flat, circles.centre, nominal, bins)
         circles = fit_concentric(points, ring, circles, scale)
-        if np.abs(circles.centre - before).max() < SETTLED:
+        if np.abs(circles.centre - before).max() < within:
             break
     return Rings(circles, points, ring, bins)
 
@@ -94,14 +113,22 @@ def _sectors_for(flat: Floats, nominal: Floats) -> Indices:
 
 
 def _edges_near(
-    flat: Floats, centre: Floats, nominal: Floats, bins: Indices
+    flat: Floats, centre: Floats, nominal: Floats, bins: Indices, depth: float = 0.0
 ) -> tuple[Floats, Indices]:
-    """Return the edge points near each nominal circle, and which circle each belongs to."""
+    """Return the edge points near each nominal circle, and which circle each belongs to.
+
+    With a depth, all points that are at most so far [m] behind them.
+    """
     offsets = flat - centre
-    share = np.hypot(offsets[:, 0], offsets[:, 1])[:, None] / nominal
+    reach = np.hypot(offsets[:, 0], offsets[:, 1])
     found = []
     for k, (low, high) in enumerate(SEARCHED[: len(nominal)]):
-        near = flat[(share[:, k] > low) & (share[:, k] < high)]
-        found.append(near[edge_points(near, centre, int(bins[k]), outer=k == 0)])
+        inside = (reach > low * nominal[k]) & (reach < high * nominal[k])
+        near, outer, count = flat.compress(inside, axis=0), k == 0, int(bins[k])
+        found.append(
+            near[fringe(near, centre, count, depth, outer)]
+            if depth
+            else near[edge_points(near, centre, count, outer)]
+        )
     ring = np.repeat(np.arange(len(found)), [len(f) for f in found])
     return np.concatenate(found), ring

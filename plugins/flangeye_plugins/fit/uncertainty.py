@@ -37,11 +37,11 @@ def clustered_covariance(
     """
     groups = int(cluster.max()) + 1
     p = jacobian.shape[1]
-    each = (jacobian * (weights * residual)[:, None]).T
+    each = jacobian.T * (weights * residual)
     scores = np.stack([np.bincount(cluster, column, groups) for column in each], axis=1)
     occupied = np.count_nonzero(np.bincount(cluster))
     slope = weights if curvature is None else curvature
-    bread = np.linalg.pinv(jacobian.T @ (jacobian * slope[:, None]))
+    bread = np.linalg.pinv((jacobian.T * slope) @ jacobian)
     small_sample = occupied / max(occupied - p, 1)
     return np.asarray(small_sample * bread @ (scores.T @ scores) @ bread)
 
@@ -59,5 +59,5 @@ def plane_covariance(offsets: Floats, heights: Floats) -> Floats:
     radius = np.hypot(offsets[:, 0], offsets[:, 1])
     third = np.minimum((3 * radius / radius.max()).astype(np.intp), 2)
     cluster = 2 * STRETCHES * third + sectors(offsets, 2 * STRETCHES)
-    jacobian = np.column_stack([-offsets, -np.ones(len(offsets))])
+    jacobian = -np.stack([*offsets.T, np.ones(len(offsets))]).T
     return clustered_covariance(jacobian, heights, np.ones(len(offsets)), cluster)
