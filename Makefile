@@ -23,7 +23,7 @@ test: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -m "not slow and realtime"
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m "not realtime"
+	$(BIN)/python -m pytest -q -n 2 -m "not realtime" --hypothesis-profile=search
 	$(BIN)/python -m pytest -q -m realtime
 
 check: $(VENV)/.dev

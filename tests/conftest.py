@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pluggy
 import pytest
+from hypothesis import settings
 
 from flangeye.plugin import hookspecs
 from flangeye.plugin.registry import Registry
@@ -19,6 +20,11 @@ collect_ignore = ["vendor_example"]
 # What flangeye remembers for its user is not the tests' to change, nor to read.
 _CACHE = tempfile.TemporaryDirectory(prefix="flangeye-tests-")
 os.environ["XDG_CACHE_HOME"] = _CACHE.name
+
+# The same examples each time, so that a red run is the change's doing; `make test-all` searches on.
+settings.register_profile("same", derandomize=True)
+settings.register_profile("search", derandomize=False)
+settings.load_profile("same")
 
 # A suite in the background of a script ignores Ctrl-C, and so would every process it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)

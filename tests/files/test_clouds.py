@@ -416,9 +416,13 @@ def test_published_clouds_are_read_as_open3d_reads_them(ancorasir):
         np.testing.assert_allclose(ours, np.asarray(theirs.points), rtol=1e-6)
 
 
-def test_a_scan_of_three_million_points_is_read_well_within_a_second(tmp_path):
+def test_a_scan_of_three_million_points_is_read_at_a_few_times_the_cost_of_its_bytes(tmp_path):
     path = tmp_path / "a.pcd"
     write_cloud(path, PointCloud(CAMERA, np.ones((1544, 2064, 3), np.float32)))
-    began = time.perf_counter()
+    began = time.process_time()
+    for _ in range(3):
+        np.fromfile(path, np.float32).copy()
+    of_bytes = time.process_time() - began
+    began = time.process_time()
     assert read_cloud(path).xyz.shape == (1544, 2064, 3)
-    assert time.perf_counter() - began < 0.8
+    assert time.process_time() - began < 5 * of_bytes

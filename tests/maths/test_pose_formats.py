@@ -41,7 +41,8 @@ def test_any_order_of_angles_is_the_product_of_its_turns(pose, order, angle):
     turns = [about(axis.lower(), value) for axis, value in zip(order, degrees, strict=True)]
     # Turns about fixed axes are applied from the left, about turned ones from the right.
     product = turns[0] @ turns[1] @ turns[2] if order.isupper() else turns[2] @ turns[1] @ turns[0]
-    np.testing.assert_allclose(product, pose[:3, :3], atol=1e-9)
+    # Within 1e-7 rad of the orders' singularity SciPy gives the third angle as zero.
+    np.testing.assert_allclose(product, pose[:3, :3], atol=2e-7)
     np.testing.assert_allclose(convention.matrix([0, 0, 0, *angles])[:3, :3], product, atol=1e-9)
 
 

@@ -9,6 +9,9 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.motion.clearance import ArmVolume, segment_distance
 
+A_POINT = 2e-6
+"""A segment shorter than a micrometre counts as a point [m]."""
+
 coordinates = st.lists(st.floats(-1, 1), min_size=12, max_size=12)
 
 
@@ -21,8 +24,8 @@ def test_segment_distance_is_the_smallest_of_all_pairs_of_points(numbers):
     brute = np.linalg.norm(points1[:, None] - points2[None], axis=-1).min()
     found = float(segment_distance(first, second))
     spacing = (np.ptp(first, axis=0) + np.ptp(second, axis=0)).max() / 20
-    assert found <= brute + 1e-9
-    assert found >= brute - spacing - 1e-9
+    assert found <= brute + A_POINT
+    assert found >= brute - spacing - A_POINT
 
 
 def test_segment_distance_works_on_many_at_once():

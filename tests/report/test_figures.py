@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from base64 import b64decode
 from collections.abc import Callable
 from pathlib import Path
@@ -40,13 +39,10 @@ def test_plotly_accepts_every_figure(make_run: Make) -> None:
         go.Figure(json.loads(figure))  # raises at the first unknown or wrong attribute
 
 
-def test_the_page_is_small_and_quickly_made(make_run: Make, tmp_path: Path) -> None:
+def test_the_page_is_small(make_run: Make, tmp_path: Path) -> None:
     log = make_run(ids=[f"pose-{i}" for i in range(60)], points=4500)
     path = tmp_path / "report.html"
     write_report(log, path)
-    start = time.perf_counter()
-    write_report(log, path)
-    assert time.perf_counter() - start < 1.5
     assert path.stat().st_size < 8_000_000
 
 

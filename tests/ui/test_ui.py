@@ -245,16 +245,17 @@ stop  for           flange at (mm, base)    tilt  way       time
     np.testing.assert_allclose(stops[1].place, [0.4, -0.0125, 0.29])
 
 
-def test_a_large_scan_is_thin_within_a_second() -> None:
+def test_thinning_a_large_scan_costs_less_than_making_its_message() -> None:
     from flangeye.log import foxglove
     from flangeye.types import PointCloud
     from flangeye_ui.process import POINTS, thinned
 
     xyz = np.random.default_rng(0).normal(size=(3_200_000, 3)).astype(np.float32)
+    began = time.process_time()
     data = foxglove.point_cloud(PointCloud("camera", xyz), xyz, 0).SerializeToString()
-    began = time.perf_counter()
+    made = time.process_time()
     thin = thinned(data)
-    assert time.perf_counter() - began < 1.0
+    assert time.process_time() - made < made - began
     assert POINTS <= len(thin) <= 2 * POINTS
 
 
