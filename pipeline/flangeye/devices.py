@@ -261,6 +261,8 @@ class RobotDriver:
     Attributes:
         name: Name of the part.
         open: Connects; raises DeviceError where it cannot.
+        read: Connects to read the arm's state and for nothing else: starts no program on the
+            controller and commands nothing. None where the driver has no way to.
         in_this_process: Whether it must run in the process that owns the terminal, because it
             talks to a person.
         simulated: Whether its arm moves nothing, so that no permission is needed and experiments
@@ -269,6 +271,7 @@ class RobotDriver:
 
     name: str
     open: Callable[[], Robot] = field(compare=False, repr=False)
+    read: Callable[[], Robot] | None = field(default=None, compare=False, repr=False)
     in_this_process: bool = False
     simulated: bool = False
 
@@ -288,6 +291,12 @@ class ScannerDriver:
 
 @dataclass(frozen=True)
 class MotionAllowed:
-    """Whether the person asked for motion (``--move``); without it, nothing moves."""
+    """Whether the person asked for motion (``--move``); without it, nothing moves.
+
+    Attributes:
+        allowed: Whether the arm may be moved.
+        offline: Whether it is not even to be read (``--offline``).
+    """
 
     allowed: bool = False
+    offline: bool = False

@@ -26,7 +26,12 @@ def test_without_move_the_plan_is_shown_and_nothing_moves(cell):
     rows = [line.split() for line in out.splitlines()[2:7]]
     assert [row[0] for row in rows] == ["0000", "0001", "0002", "0003", "0004"]
     assert all("direct" in row or "home" in row for row in rows)
-    assert out.splitlines()[-1] == "nothing moved: --move lets the arm go"
+    assert out.splitlines()[-2:] == [
+        f"ur5e at {cell.controller.host} was read: no program was started on it, nothing was "
+        "commanded",
+        "nothing moved: --move lets the arm go",
+    ]
+    assert not [line for line in cell.control.log() if "program" in line]
     assert (cell.control.truth().joints == before).all()
     assert not (cell.folder / "run").exists()
 

@@ -79,6 +79,15 @@ def test_the_chain_is_the_makers(kuka):
     assert np.abs(solutions - [0.3, -1.0, 1.2, 0.4, 0.9, 0.2]).max(axis=1).min() < 1e-6
 
 
+def test_the_slowest_joint_that_turns_bounds_its_speed(kuka):
+    text = kuka.read_text()
+    assert robot_from_urdf(kuka).joint_speed == 1.0
+    kuka.write_text(text.replace('velocity="1"', 'velocity="3.5"', 4))
+    assert robot_from_urdf(kuka).joint_speed == 1.0
+    kuka.write_text(text.replace('velocity="1"', 'velocity="0"'))
+    assert robot_from_urdf(kuka).joint_speed == pytest.approx(np.pi)
+
+
 def test_each_link_has_a_capsule_about_its_mesh(kuka):
     robot = robot_from_urdf(kuka)
     assert [volume.link for volume in robot.volumes] == list(range(7))

@@ -321,3 +321,56 @@ def test_live_and_simulated_runs_say_what_kinematics_are_for():
         "r.yaml:5: steps.0.acquire.simulated: needs the scanner's field of view and noise: write "
         "scanner: phoxi-m ('flangeye scanners' lists them, 'flangeye new-scanner' writes one)",
     ]
+
+
+DRIVEN = """\
+title: T
+robot: {{model: {model}, driver: {{manual: {{convention: kuka}}}}, limits: {limits}}}
+steps: [segment.flange]
+"""
+SOUND = "{centre: [450 mm, 0 mm, 500 mm], size: [1 m, 1 m, 900 mm]}"
+
+
+@pytest.mark.parametrize(
+    ("model", "limits", "expected"),
+    [
+        ("ur10e", f"{{box: {SOUND}, joint_speed: 120 deg/s}}", []),
+        (
+            "ur10e",
+            f"{{box: {SOUND}, joint_speed: 121 deg/s}}",
+            ["robot.limits.joint_speed: at most 120 deg/s for a ur10e, not 121 deg/s"],
+        ),
+        (
+            "ur5e",
+            f"{{box: {SOUND}, joint_speed: 3000 deg/s}}",
+            ["robot.limits.joint_speed: at most 180 deg/s for a ur5e, not 3000 deg/s"],
+        ),
+        (
+            "ur5e",
+            "{box: {centre: [9 m, 0 m, 0 m], size: [1 m, 1 m, 1 m]}}",
+            [
+                "robot.limits.box: is no box for a ur5e, which reaches 1.31 m from its base: each "
+                "side is at most 5.25 m, and some of it is within reach"
+            ],
+        ),
+        (
+            "ur5e",
+            "{box: {centre: [0 m, 0 m, 0 m], size: [1e300 m, 1 m, 1 m]}}",
+            [
+                "robot.limits.box: is no box for a ur5e, which reaches 1.31 m from its base: each "
+                "side is at most 5.25 m, and some of it is within reach"
+            ],
+        ),
+        (
+            "ur5e",
+            "{box: {centre: [0 m, 0 m, 0 m], size: [-1 m, 0 m, 1 m]}}",
+            [
+                "robot.limits.box.size.0: must be greater than 0 in SI units, not '-1 m'",
+                "robot.limits.box.size.1: must be greater than 0 in SI units, not '0 m'",
+            ],
+        ),
+    ],
+)
+def test_limits_are_held_against_the_arms_own_data(model, limits, expected):
+    told = mistakes(DRIVEN.format(model=model, limits=limits), load_registry())
+    assert [line.partition(": ")[2] for line in told if "robot.limits" in line] == expected

@@ -43,7 +43,7 @@ def tactile_calibrate(
 
 @app.command()
 @app.command("loopback", hidden=True)  # its former name
-def emulator(
+def emulator(  # noqa: PLR0913  one for each option
     robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     faults: Annotated[
@@ -66,6 +66,9 @@ def emulator(
         int | None,
         typer.Option(min=0, help="Give the arm errors of its joints' zeros, drawn with this seed."),
     ] = None,
+    with_input: Annotated[
+        bool, typer.Option("--with-input", help="End when standard input does, as a child process.")
+    ] = False,
 ) -> None:
     """Be a robot's controller on loopback, for its own driver to connect to."""
     from flangeye.models.emulator import EmulatorOptions, find_emulator, read_height, read_joints
@@ -80,5 +83,6 @@ def emulator(
         floor=read_height(floor) if floor is not None else None,
         faults=tuple(faults or ()),
         seed=seed,
+        with_input=with_input,
     )
     find_emulator(offered, model).serve(options)

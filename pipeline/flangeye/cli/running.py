@@ -49,7 +49,13 @@ def run(  # noqa: PLR0913  one for each option
     ] = None,
     move: Annotated[
         bool,
-        typer.Option("--move", help="Move the arm; without it the plan is checked and shown."),
+        typer.Option(
+            "--move",
+            help="Move the arm; without it the arm is only read, the plan checked and shown.",
+        ),
+    ] = False,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Without --move: plan without asking the arm at all.")
     ] = False,
     resume: Annotated[
         Path | None,
@@ -58,13 +64,17 @@ def run(  # noqa: PLR0913  one for each option
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
+    from flangeye.errors import StageError
     from flangeye.run.folder import RunFolder
     from flangeye.run.session import Start
     from flangeye.types import ArchivePath
 
+    if move and offline:
+        raise StageError("--move and --offline: an arm that is not asked cannot be moved")
     registry = load_plugins()
     checked, point = _recipe_of(recipe, resume, registry, overrides or ())
-    start = Start(ArchivePath(archive), point or _point(checked, source, at), MotionAllowed(move))
+    motion = MotionAllowed(move, offline)
+    start = Start(ArchivePath(archive), point or _point(checked, source, at), motion)
     folder = RunFolder.create(checked.name, out)
     result = _record(checked, registry, folder, start)
     if result.status == "refused":

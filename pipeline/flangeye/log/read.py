@@ -262,6 +262,11 @@ class RunLog:
         """Whether the raw scans were logged whole."""
         return bool(self.poses) and all(meta["full"] for meta in self.poses.values())
 
+    @property
+    def last_joints(self) -> Any:
+        """(n,) joint angles at the last capture [rad]; None where they are not known."""
+        return self._pose(next(reversed(self.poses)))[1] if self.poses else None
+
     def _pose(self, capture: str) -> tuple[t.Poses, Any]:
         """Return the controllers' poses by frame, and the joint angles."""
         meta = self.poses[capture]

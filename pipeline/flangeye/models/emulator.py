@@ -26,6 +26,7 @@ class EmulatorOptions:
         faults: What shall go wrong, in the words of the controller.
         seed: Draws errors of the joints' zeros, as large as the robot's ``joint_accuracy``; None
             for an arm that stands exactly where it says.
+        with_input: Whether it ends when its standard input does.
     """
 
     robot: RobotModel
@@ -34,6 +35,7 @@ class EmulatorOptions:
     floor: float | None = None
     faults: tuple[str, ...] = ()
     seed: int | None = None
+    with_input: bool = False
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,9 @@ class RobotModel(Model):
     volumes_missing: str = Field("", description="Why there are none, where a plan needs them.")
     repeatability: Length = param("0.1 mm")
     joint_speed: AngularSpeed = param(
-        "180 deg/s", gt=0, description="No joint is told to turn faster, whatever a recipe says."
+        "180 deg/s",
+        gt=0,
+        description="Of the slowest joint, as the maker has it: no recipe may ask for more.",
     )
     joint_accuracy: Angle = param(
         "0.3 mrad",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from flangeye.types import Floats
 from flangeye.units import SI
 
 MAX_BYTES = 10_000_000
-MOVES = ("revolute", "continuous", "prismatic")
+TURNS = ("revolute", "continuous")
+MOVES = (*TURNS, "prismatic")
 FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame")
 """Ends of the names that makers give the flange's frame, z outwards; the surest first."""
 
@@ -137,7 +138,16 @@ def _assemble(
         volumes=() if missing else tuple(volumes),
         volumes_missing=missing,
         source=f"URDF {urdf.path.name}",
+        **_joint_speed(chain),
     )
+
+
+def _joint_speed(chain: Iterable[ET.Element]) -> dict[str, SI]:
+    """Return the speed of the slowest joint that turns [rad/s], where the file has any."""
+    limits = [joint.find("limit") for joint in chain if joint.get("type") in TURNS]
+    told = [float(limit.get("velocity", "0")) for limit in limits if limit is not None]
+    speeds = [speed for speed in told if 0 < speed < np.inf]
+    return {"joint_speed": SI(min(speeds))} if speeds else {}
 
 
 def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:

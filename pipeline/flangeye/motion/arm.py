@@ -29,7 +29,17 @@ OPENING = 30.0
 SILENCE = 2.0 * PATIENCE
 """A guard that says nothing for so long while the arm is under way is lost [s]."""
 
+GUARD = "guard"
+"""Name of the process that watches an arm."""
+
 Told = Callable[[RobotState], None]
+
+
+def run_number() -> int:
+    """Return the number of the run's process, in the run itself and in its guard alike."""
+    if multiprocessing.current_process().name == GUARD:
+        return os.getppid()
+    return os.getpid()
 
 
 class WatchedArm:
@@ -166,7 +176,7 @@ def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterato
         process = spawn.Process(
             target=watchdog_process,
             args=(theirs, charge._replace(keyboard=keyboard), heard),
-            name="guard",
+            name=GUARD,
             daemon=True,
         )
         process.start()

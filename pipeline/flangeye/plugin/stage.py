@@ -225,6 +225,11 @@ class Part(Plugin):
     simulated: bool = False
     interactive: bool = False
 
+    @property
+    def can_only_read(self) -> bool:
+        """Whether a robot part takes ``reads_only``, with which it starts and commands nothing."""
+        return "reads_only" in self.needs
+
     def bind(self, params: Params | None = None) -> BoundPart:
         """Return the part with its parameters, as a step's parameter holds it."""
         return BoundPart(self, params if params or not self.params else self.params())
@@ -470,8 +475,9 @@ def _check_call(declared: Part, kind: PartKind) -> None:
         )
 
 
-_GIVEN = ("params", "siblings")
-"""Arguments that any part may have: its parameters, and the other parts of its kind."""
+_GIVEN = ("params", "siblings", "reads_only")
+"""Arguments that any part may have: its parameters, the other parts of its kind, and, for a robot,
+whether the arm is opened to be read and for nothing else."""
 
 
 def _fits(got: Any, wanted: Any) -> bool:

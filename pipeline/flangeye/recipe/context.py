@@ -26,6 +26,7 @@ from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.standards import FlangeStandard, load_standard
 from flangeye.models.targets import Flange, Sphere, flange_of, wrist_circle_of
 from flangeye.models.urdf import robot_from_urdf
+from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.header import (
     ConfigurationSection,
     FeatureSection,
@@ -209,12 +210,7 @@ def _devices(header: Header, context: Context, complain: Complain) -> None:
     if robot and robot.driver:
         if robot.limits is None:
             complain(("robot",), "a robot with a driver needs limits, for example " + LIMITS)
-        context[RobotDriver] = RobotDriver(
-            robot.driver.part.name,
-            partial(robot.driver, context.get(RobotModel)),
-            robot.driver.part.interactive,
-            robot.driver.part.simulated,
-        )
+        context[RobotDriver] = _robot_driver(robot.driver, context.get(RobotModel))
         context[LimitsSection] = robot.limits
         if robot.limits and (model := context.get(RobotModel)):
             _check_limits(robot.limits, model, complain)
@@ -222,3 +218,11 @@ def _devices(header: Header, context: Context, complain: Complain) -> None:
         context[ScannerDriver] = ScannerDriver(
             scanner.driver.part.name, partial(scanner.driver, context.get(ScannerModel))
         )
+
+
+def _robot_driver(driver: BoundPart, model: RobotModel | None) -> RobotDriver:
+    part, opened = driver.part, partial(driver, model)
+    # A driver that talks to a person, or moves nothing, has nothing to command in the first place.
+    harmless = opened if part.interactive or part.simulated else None
+    read = partial(opened, reads_only=True) if part.can_only_read else harmless
+    return RobotDriver(part.name, opened, read, part.interactive, part.simulated)

@@ -276,12 +276,14 @@ class _Checker:
 
 
 def leave_out(data: dict[Hashable, Any], paths: Iterable[tuple[Hashable, ...]]) -> None:
-    """Take the deepest part of each path that exists out of a recipe's data."""
+    """Take the deepest part of each path that exists out of a recipe's data, and rows whole."""
     gone: list[tuple[Hashable, ...]] = []
     for path in paths:
         if any(path[: len(each)] == each for each in gone):
             continue
         there = _existing(data, path)
+        while there and isinstance(there[-1], int):  # else the row's other elements would move up
+            there = there[:-1]
         if not there:
             data[path[0]] = PLACEHOLDERS[path[0]]
             continue

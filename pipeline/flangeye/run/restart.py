@@ -179,7 +179,7 @@ class FromEarlierRun(FromNothing):
     def resumed(self) -> t.Resumed:
         """The captures it took, whatever became of them."""
         aside = {rejection.id for rejection in self.log.rejections}
-        return t.Resumed(frozenset({*self.log.finished, *aside}))
+        return t.Resumed(frozenset({*self.log.finished, *aside}), self.log.last_joints)
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
         """Return what is left to take, told what became of the rest."""

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NewType, Protocol
 
+from flangeye.types.arrays import Array
+
 
 @dataclass(frozen=True)
 class ArchivePath:
@@ -41,11 +43,17 @@ class Progress:
     required: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Resumed:
-    """Captures that an earlier run already took, by id; a source leaves them out."""
+    """What an earlier run left.
+
+    Attributes:
+        done: Captures that it took, by id; a source leaves them out.
+        joints: (n,) angles of the arm at its last capture [rad], if they are known.
+    """
 
     done: frozenset[str]
+    joints: Array | None = None
 
 
 Seed = NewType("Seed", int)

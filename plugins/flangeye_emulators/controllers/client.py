@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import socket
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.motion.arm import run_number
 from flangeye.types import Floats
 from flangeye_emulators.controllers.contact import Surface
 
@@ -18,6 +20,17 @@ PORT = 29998
 
 PATIENCE = 5.0
 """Longest wait for an answer [s]."""
+
+AUTO = "auto"
+"""In a recipe: the address of this run alone."""
+
+OWN = ipaddress.IPv4Network("127.64.0.0/10")
+"""As many addresses of this machine as Linux has process numbers."""
+
+
+def address_of(host: str) -> str:
+    """Return a host's address; for ``auto`` one that no other run on this machine has now."""
+    return str(OWN[run_number() % OWN.num_addresses]) if host == AUTO else host
 
 
 class EmulatorTruth(NamedTuple):

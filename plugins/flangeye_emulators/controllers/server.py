@@ -77,6 +77,12 @@ def _precise_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
+def _end_with_input(ended: asyncio.Event) -> None:
+    """End with whoever started it: its end of standard input closes, even if it is killed."""
+    if not os.read(sys.stdin.fileno(), 4096):
+        ended.set()
+
+
 def _take_precedence() -> None:
     """Make the cycle punctual: run before others, and keep the collector's rounds short.
 
@@ -132,6 +138,8 @@ class Server:
         ended = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, ended.set)
+        if self._options.with_input:
+            asyncio.get_running_loop().add_reader(sys.stdin, _end_with_input, ended)
         for text in self._options.faults:
             self._add_fault(text)
         await self._network.listen()

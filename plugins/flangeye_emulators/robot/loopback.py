@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated, Any, Self
 
 from pydantic import Field
@@ -12,11 +13,12 @@ from pydantic import Field
 from flangeye.devices import DeviceError, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command
+from flangeye.files.load import busy
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import BoundPart, Choose, Params, part
 from flangeye.types import Floats, Transform
 from flangeye.units import Angle
-from flangeye_emulators.controllers.client import EmulatorControl
+from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
 
 STARTING = 20.0
 """Longest time for a controller to start, on a machine that is busy [s]."""
@@ -26,9 +28,12 @@ class LoopbackParams(Params):
     """Parameters of ``robot.emulator``."""
 
     driver: Annotated[BoundPart, Choose("robot")] = Field(
-        description="The arm's own driver, for example {ur_rtde: {host: 127.0.0.5}}."
+        description="The arm's own driver, for example {ur_rtde: {host: auto}}; auto is an address "
+        "of this run alone."
     )
-    host: str = Field("127.0.0.5", description="Address the controller listens on.")
+    host: str | None = Field(
+        None, description="Address the controller listens on; the driver's host when not given."
+    )
     joints: tuple[Angle, ...] | None = Field(
         None, description="Where the arm stands at first; the controller's own choice if not given."
     )
@@ -41,46 +46,68 @@ class LoopbackParams(Params):
 
 
 @part("robot.emulator", formerly=("robot.loopback",))
-def robot_loopback(model: RobotModel, params: LoopbackParams) -> Robot:
+def robot_loopback(model: RobotModel, params: LoopbackParams, reads_only: bool = False) -> Robot:
     """Start a controller on loopback and open it with the arm's own driver.
 
-    The controller is ``flangeye emulator``, a process that ends with the run; one that already
-    listens at that address is used, and left running.
+    The controller is ``flangeye emulator``, a process that ends with the run, however that ends.
+    One that somebody started at an address the recipe names is used, left running, and told of in
+    the arm's name.
 
     Raises:
         DeviceError: The controller does not start, or the driver cannot open it.
     """
-    controller = None if _listens(params.host) else _start(model, params)
+    driver, host = _at_address(params)
+    controller = None if _listens(host) else _start(model, params, host)
+    if controller is None and AUTO in (params.host, _host_of(params.driver)):
+        raise DeviceError(
+            f"robot.emulator: something listens at {host}, which is this run's own address: "
+            "end it, then start again"
+        )
+    words = {"reads_only": True} if reads_only and driver.part.can_only_read else {}
     try:
-        return OnEmulator(params.driver(model), controller)
+        return OnEmulator(driver(model, **words), controller)
     except BaseException:
         _end(controller)
         raise
 
 
-def _start(model: RobotModel, params: LoopbackParams) -> subprocess.Popen[str]:
-    words = ["emulator", model.model, "--host", params.host]
+def _at_address(params: LoopbackParams) -> tuple[BoundPart, str]:
+    """Return the arm's driver, its address filled in, and the controller's address."""
+    connects = address_of(_host_of(params.driver))
+    listens = connects if params.host is None else address_of(params.host)
+    if params.driver.params is None:
+        return params.driver, listens
+    told = params.driver.params.model_copy(update={"host": connects})
+    return replace(params.driver, params=told), listens
+
+
+def _host_of(driver: BoundPart) -> str:
+    return str(getattr(driver.params, "host", AUTO))
+
+
+def _start(model: RobotModel, params: LoopbackParams, host: str) -> subprocess.Popen[str]:
+    words = ["emulator", model.model, "--host", host, "--with-input"]
     if params.joints is not None:
         words += ["--joints", " ".join(map(repr, params.joints)) + " rad"]
     words += [word for fault in params.faults for word in ("--fault", fault)]
     words += [] if params.joint_errors is None else ["--seed", str(params.joint_errors)]
     controller = subprocess.Popen(
         python_command("-m", "flangeye.cli", *words),
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,  # closed by the system when this process ends, killed or not
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,  # Ctrl-C is for the run, which stops the arm first
     )
     started = time.monotonic()
-    while not _listens(params.host):
+    while not _listens(host):
         if controller.poll() is not None:
             said = controller.stderr.read().strip() if controller.stderr else ""
             raise DeviceError(f"robot.emulator: the controller did not start: {said}")
         if time.monotonic() - started > STARTING:
             _end(controller)
             raise DeviceError(
-                f"robot.emulator: the controller did not start within {STARTING:.0f} s"
+                f"robot.emulator: the controller did not start within {STARTING:.0f} s{busy()}"
             )
         time.sleep(0.05)
     return controller
@@ -108,7 +135,8 @@ class OnEmulator:
 
     def __init__(self, robot: Robot, controller: subprocess.Popen[str] | None) -> None:
         self._robot, self._controller = robot, controller
-        self.name, self.period = f"{robot.name} (loopback)", robot.period
+        whose = "emulated" if controller else "emulated, by a controller that was running already"
+        self.name, self.period = f"{robot.name} ({whose})", robot.period
         self.flange_T_tool: Transform | None = robot.flange_T_tool
 
     def state(self) -> RobotState:

@@ -19,7 +19,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, CAMERA, PointCloud, Transform, Truth
 from flangeye.units import Duration, Length, param
-from flangeye_emulators.controllers.client import EmulatorControl
+from flangeye_emulators.controllers.client import AUTO, EmulatorControl, address_of
 from flangeye_emulators.world.scanner import CameraPose, scanner_of
 from flangeye_emulators.world.scene import CellScene, Stance
 from flangeye_plugins.scanner.opened import OpenScanner
@@ -34,7 +34,9 @@ SAME_ARM = 1e-3
 class LoopbackParams(Params):
     """Parameters of ``scanner.emulator``."""
 
-    host: str = Field("127.0.0.1", description="Where the controller on loopback listens.")
+    host: str = Field(
+        AUTO, description="Where the controller listens; auto: where this run's own does."
+    )
     robot: str = Field("ur5e", description="What it moves: a model of data/robots, or a file.")
     camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     workspace: tuple[Length, Length, Length] = param(
@@ -71,7 +73,7 @@ def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scan
             "scanner.emulator: the recipe must say which scanner to be: scanner.model"
         )
     try:
-        control = EmulatorControl(params.host, patience=PATIENCE)
+        control = EmulatorControl(address_of(params.host), patience=PATIENCE)
     except FlangeyeError as error:
         raise DeviceError(f"scanner.emulator: {error}") from None
     scanner = LoopbackScanner(model, params, control)

@@ -32,6 +32,7 @@ from flangeye.models.targets import Flange
 from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.reach import Margins
+from flangeye.motion.reading import read_state
 from flangeye.motion.route import Barred
 from flangeye.motion.supervision import Sample
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
@@ -51,10 +52,10 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye.units import Angle, Length, param
+from flangeye.units import Angle, JointPosition, Length, param
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
-HOW_TO_MOVE = "\nnothing moved: --move lets the arm go"
+HOW_TO_MOVE = "nothing moved: --move lets the arm go"
 
 
 class LiveParams(Params):
@@ -78,6 +79,11 @@ class LiveParams(Params):
         lt=1,
         description="Poses keep away from singularities: smallest singular value of the Jacobian, "
         "lengths in units of the arm's reach.",
+    )
+    home: tuple[JointPosition, ...] | None = Field(
+        None,
+        description="Joint angles at which the arm stands before a run; a plan that does not ask "
+        "the arm (--offline) begins there.",
     )
     moved: Length = param(
         "0.05 mm", gt=0, description="A scan during which the flange moved by more is set aside."
@@ -111,7 +117,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         arm: Opens the arm.
         eye: Opens the scanner.
         limits: What the arm must keep to.
-        motion: Whether it may move at all; if not, the plan is shown.
+        motion: Whether it may move at all; if not, the arm is only read, and the plan is shown.
         seed: Decides the poses.
         journal: Hears where the arm is.
         params: See :class:`LiveParams`.
@@ -131,8 +137,8 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         return itinerary
 
     if not motion.allowed:
-        start = _where(arm, robot, allowed)
-        raise NothingMoved(planned(start).shown(start) + HOW_TO_MOVE)
+        start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
+        raise NothingMoved("\n".join([planned(start).shown(start), how, HOW_TO_MOVE]))
     with ExitStack() as opening:
         guard = opening.enter_context(watched(arm, robot, allowed, partial(journal, "arm")))
         require_inside(guard.state, allowed)
@@ -169,14 +175,34 @@ def require_inside(state: RobotState, allowed: MotionLimits) -> None:
         )
 
 
-def _where(arm: RobotDriver, robot: RobotModel, allowed: MotionLimits) -> Floats | None:
-    """Return the joint angles at which the arm stands; None where it does not answer."""
+def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
+    """Return the joint angles at which the arm stands, None where it cannot be read; and a word."""
     try:
-        with watched(arm, robot, allowed) as opened:
-            require_inside(opened.state, allowed)
-            return opened.state.joints
-    except DeviceError:
-        return None
+        name, state = read_state(arm)
+    except DeviceError as error:
+        return None, f"the arm was not read, so the way to the first stop is not known: {error}"
+    require_inside(state, allowed)
+    return state.joints, f"{name} was read: no program was started on it, nothing was commanded"
+
+
+def _offline(
+    params: LiveParams, robot: RobotModel, resumed: Resumed | None
+) -> tuple[Floats | None, str]:
+    """Return the joint angles a plan begins at without the arm, None where nobody says; and a word.
+
+    Raises:
+        StageError: acquire.live's home is of another arm.
+    """
+    if resumed is not None and resumed.joints is not None:
+        return resumed.joints, "offline: the plan begins where the arm stood at its last capture"
+    if params.home is None:
+        return None, "offline: no home in acquire.live, so the way to the first stop is not known"
+    if len(params.home) != len(robot.joints):
+        raise StageError(
+            f"acquire.live: home has {len(params.home)} angles, a {robot.model} has "
+            f"{len(robot.joints)} joints"
+        )
+    return np.array(params.home), "offline: the plan begins at acquire.live's home"
 
 
 def _fingerprint(arm: RobotDriver, eye: ScannerDriver, scanner: Scanner) -> str:

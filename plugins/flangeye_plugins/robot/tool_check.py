@@ -61,8 +61,13 @@ def require_model(name: str, state: RobotState, model: RobotModel) -> None:
     """Do nothing when the flange is where the model's kinematics put it.
 
     Raises:
-        DeviceError: It is not.
+        DeviceError: It is not, or has another number of joints.
     """
+    if len(state.joints) != len(model.joints):
+        raise DeviceError(
+            f"{name}: it has {len(state.joints)} joints and a {model.model} {len(model.joints)}: "
+            "is robot.model the arm that stands there?"
+        )
     expected = Arm(model).flange(state.joints)
     if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
         off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])

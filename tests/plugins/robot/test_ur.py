@@ -15,7 +15,7 @@ from flangeye_plugins.robot.ur import worker
 from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
 from tests.emulators.controllers.process import Process, free_address
 from tests.plugins.robot.behaviour import DrivesAnArm
-from tests.plugins.robot.cell import arrived, in_time, moved, open_ur, until
+from tests.plugins.robot.cell import UR5E, arrived, in_time, moved, open_ur, until
 
 pytest.importorskip("rtde_control")
 
@@ -99,6 +99,38 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         robot.stop()
         off = robot.state().base_T_flange.translation - target.translation
         assert np.linalg.norm(off) < 1e-4
+
+
+def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with_tool):
+    host, control = with_tool.host, with_tool.control
+    before = control.log()
+    control.fault("remote-control-off")
+    with pytest.raises(DeviceError, match="local control"):
+        open_ur(host, tool=TOOL)
+    params = UrRtdeParams(host=host, tool=TOOL)
+    with robot_ur_rtde(UR5E, params, reads_only=True) as robot:
+        truth = control.truth()
+        np.testing.assert_allclose(
+            robot.state().base_T_flange.matrix, truth.base_T_flange, atol=1e-9
+        )
+        with pytest.raises(DeviceError):
+            robot.move_joints(truth.joints, 0.1, 0.1)
+    assert [line for line in control.log()[len(before) :] if "program" in line] == []
+    control.clear()
+
+
+def test_a_tool_that_the_recipe_does_not_know_is_noticed_by_reading_alone(with_tool):
+    with pytest.raises(DeviceError, match="its flange is .* mm from where a ur5e has it"):
+        robot_ur_rtde(UR5E, UrRtdeParams(host=with_tool.host), reads_only=True)
+
+
+def test_an_arm_with_more_joints_than_the_controller_is_refused(controller):
+    with pytest.raises(DeviceError, match="it has 6 joints and a franka-panda 7: is robot.model"):
+        robot_ur_rtde(
+            load_model("robots", "franka-panda"),
+            UrRtdeParams(host=controller.host),
+            reads_only=True,
+        )
 
 
 def test_another_arm_than_the_recipes_is_refused(controller):

@@ -70,7 +70,7 @@ class AuboParams(Params):
 
 
 @part("robot.aubo")
-def robot_aubo(model: RobotModel, params: AuboParams) -> Robot:
+def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) -> Robot:
     """An arm of AUBO with an ARCS controller, through its JSON-RPC interface.
 
     On the pendant: power on, brakes released, the payload of what is mounted, no program running.
@@ -80,6 +80,7 @@ def robot_aubo(model: RobotModel, params: AuboParams) -> Robot:
     Args:
         model: The arm; its kinematics are compared with what the controller says.
         params: See :class:`AuboParams`.
+        reads_only: Ask only; closing stops nothing, and the arm may be in any mode.
 
     Raises:
         DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
@@ -88,11 +89,11 @@ def robot_aubo(model: RobotModel, params: AuboParams) -> Robot:
     name = f"{model.model} at {params.host}"
     client = AuboClient(sdk, name, params.host, params.user, params.password)
     try:
-        robot = AuboRobot(name, client)
+        robot = AuboRobot(name, client, reads_only)
         require_tool(name, "aubo", robot.offset, params.tool.flange_T_tool(POSE), SHOWN)
         state = robot.state()
         require_model(name, state, model)
-        if state.message:
+        if state.message and not reads_only:
             raise DeviceError(f"{name}: {state.message}")
     except DeviceError:
         client.close()
@@ -110,13 +111,13 @@ class AuboRobot:
         offset: (4, 4) ``flange_T_tool`` as the controller has it.
     """
 
-    def __init__(self, name: str, client: AuboClient) -> None:
+    def __init__(self, name: str, client: AuboClient, reads_only: bool = False) -> None:
         """Read the tool and the cycle of a connected controller.
 
         Raises:
             DeviceError: It does not tell.
         """
-        self.name, self._client = name, client
+        self.name, self._client, self._reads_only = name, client, reads_only
         self.period = float(client.ask("cycle time", client.config.getCycletime))
         self.offset = POSE.matrix(client.ask("tool", client.state.getActualTcpOffset))
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
@@ -206,8 +207,9 @@ class AuboRobot:
         """Stop the arm and let go of the connection."""
         if self._closed:
             return
-        with contextlib.suppress(DeviceError):
-            self.stop()
+        if not self._reads_only:
+            with contextlib.suppress(DeviceError):
+                self.stop()
         self._closed = True
         self._client.close()
 

@@ -35,11 +35,11 @@ class Facts(NamedTuple):
     period: float
 
 
-def require_ready(name: str, host: str) -> Facts:
-    """Return what there is to know of a controller that can be driven.
+def facts_of(name: str, host: str, to_drive: bool = True) -> Facts:
+    """Return what there is to know of a controller that answers and, if asked, can be driven.
 
     Raises:
-        DeviceError: It cannot: nobody answers, the network is slow, or it is not ready.
+        DeviceError: Nobody answers; or it cannot be driven: it is not ready, the network is slow.
     """
     try:
         with ask_dashboard(host, PATIENCE) as ask:
@@ -52,7 +52,7 @@ def require_ready(name: str, host: str) -> Facts:
     version, safety, power, remote = said
     # One answer may be late because this computer is busy; all of them are where the network is.
     trouble = _trouble(safety.rpartition(" ")[2], power.rpartition(" ")[2], remote, min(trips))
-    if trouble:
+    if trouble and to_drive:
         raise DeviceError(f"{name}: {trouble}")
     found = _VERSION.search(version)
     # CB3 controllers (version 3) have cycles of 8 ms, all later ones of 2 ms.

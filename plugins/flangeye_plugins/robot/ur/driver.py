@@ -48,7 +48,7 @@ class UrRtdeParams(Params):
 
 
 @part("robot.ur_rtde")
-def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
+def robot_ur_rtde(model: RobotModel, params: UrRtdeParams, reads_only: bool = False) -> Robot:
     """An arm of Universal Robots, e-Series or CB3, through the library ur_rtde.
 
     On the pendant: power on, brakes released, Remote Control, the payload of what is mounted in
@@ -57,6 +57,8 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
     Args:
         model: The arm; its kinematics are compared with what the controller says.
         params: See :class:`UrRtdeParams`.
+        reads_only: Open RTDE's receiving side alone. The client library starts its program on the
+            controller for the other side only; the arm may be in local control, or switched off.
 
     Raises:
         DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.
@@ -64,12 +66,15 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams) -> Robot:
     load_sdk("rtde_control", "robot.ur_rtde", "pip install 'flangeye[ur]'")
     name = f"{model.model} at {params.host}"
     began = time.monotonic()
-    facts = dashboard.require_ready(name, params.host)
-    link = Link(name, params.host, facts.period, OPENING - (time.monotonic() - began))
+    facts = dashboard.facts_of(name, params.host, to_drive=not reads_only)
+    patience = OPENING - (time.monotonic() - began)
+    link = Link(name, params.host, facts.period, patience, reads_only)
+    expected = params.tool.flange_T_tool(SHOWN)
     try:
-        robot = UrRobot(name, params.host, facts.period, link)
-        expected = params.tool.flange_T_tool(SHOWN)
-        require_tool(name, "ur_rtde", robot.offset, expected, SHOWN)
+        # Which tool is set only the other side tells: a wrong one shows in where the flange is.
+        offset = expected if reads_only else POSE.matrix(link.request("tool"))
+        require_tool(name, "ur_rtde", offset, expected, SHOWN)
+        robot = UrRobot(name, params.host, facts.period, link, offset)
         require_model(name, robot.state(), model)
     except DeviceError:
         link.close()
@@ -87,17 +92,13 @@ class UrRobot:
         offset: (4, 4) ``flange_T_tool`` as the controller has it.
     """
 
-    def __init__(self, name: str, host: str, period: float, link: Link) -> None:
-        """Read the tool of a connected controller.
-
-        Raises:
-            DeviceError: It does not tell.
-        """
+    def __init__(self, name: str, host: str, period: float, link: Link, offset: Floats) -> None:
+        """Take over a connection to a controller whose tool is ``offset`` (4, 4)."""
         self.name, self.period = name, period
         self._host, self._link = host, link
         self._seen = self._commanded = 0
         self._posed: tuple[int, Floats] = (-1, np.eye(4))
-        self.offset = POSE.matrix(self._link.request("tool"))
+        self.offset = offset
         self._tool_T_flange = np.linalg.inv(self.offset)
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
 

@@ -65,7 +65,9 @@ class Sample(NamedTuple):
 class Link:
     """A connection of the client library to one controller, in a process of its own."""
 
-    def __init__(self, name: str, host: str, period: float, patience: float) -> None:
+    def __init__(
+        self, name: str, host: str, period: float, patience: float, reads_only: bool = False
+    ) -> None:
         """Start the process and connect.
 
         Args:
@@ -73,6 +75,7 @@ class Link:
             host: Address of the controller.
             period: Length of its cycle [s].
             patience: Longest time to wait [s].
+            reads_only: Whether samples are wanted alone: no program is started on the controller.
 
         Raises:
             DeviceError: It cannot connect, or not in time; nothing is left behind.
@@ -88,7 +91,7 @@ class Link:
         command = python_command(worker.__file__, host, str(period), str(memory))
         with theirs:
             self._process = subprocess.Popen(
-                [*command, str(theirs.fileno())],
+                [*command, str(theirs.fileno()), *(["read"] if reads_only else [])],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

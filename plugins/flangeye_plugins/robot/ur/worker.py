@@ -91,7 +91,9 @@ class Clock:
 class Publisher(threading.Thread):
     """Writes every new sample into the mapped file."""
 
-    def __init__(self, receive: Any, commander: Commander, memory: mmap.mmap, period: float):
+    def __init__(
+        self, receive: Any, commander: Commander | Onlooker, memory: mmap.mmap, period: float
+    ) -> None:
         super().__init__(daemon=True)
         self._receive, self._commander = receive, commander
         self._memory, self._period = memory, period
@@ -224,6 +226,23 @@ class Commander:
             raise Refused("the controller did not take the command")
 
 
+class Onlooker:
+    """Stands where the commander does in a process that reads and does nothing else."""
+
+    remote = -1
+
+    def busy(self) -> bool:
+        """Return False: nothing was commanded."""
+        return False
+
+    def idle(self) -> None:
+        """Do nothing when no command comes."""
+
+    def give_up(self) -> None:
+        """End the process; the arm never heard of it."""
+        os._exit(0)
+
+
 class RemoteControl(threading.Thread):
     """Asks the dashboard whether the control is still remote."""
 
@@ -269,7 +288,7 @@ def read_remote(answer: str) -> int:
     return {"true": 1, "false": 0}.get(answer.lower(), -1)
 
 
-def serve(line: socket.socket, commander: Commander) -> None:
+def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
     """Do what comes through the socket until it ends."""
     while True:
         ready, _, _ = select.select([line], [], [], KICK)
@@ -282,7 +301,7 @@ def serve(line: socket.socket, commander: Commander) -> None:
         line.send(json.dumps(answer(commander, json.loads(request))).encode())
 
 
-def answer(commander: Commander, request: dict[str, Any]) -> dict[str, Any]:
+def answer(commander: Commander | Onlooker, request: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to one request, after doing it."""
     try:
         given = getattr(commander, request.pop("do"))(**request)
@@ -302,16 +321,14 @@ def take_precedence() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
 
-def connect(host: str) -> tuple[Any, Any]:
-    """Return the library's interfaces for reading and for commands, the watchdog set.
+def connect(host: str) -> Any:
+    """Return the library's interface for commands, the watchdog set: it starts a program.
 
     Raises:
         Exception: Whatever the library raises.
     """
     import rtde_control
-    import rtde_receive
 
-    receive = rtde_receive.RTDEReceiveInterface(host)
     until = time.monotonic() + TAKEN
     while True:
         try:
@@ -324,27 +341,30 @@ def connect(host: str) -> tuple[Any, Any]:
             time.sleep(0.1)
     if not control.setWatchdog(WATCHDOG):
         raise Refused("the controller did not take the watchdog")
-    return control, receive
+    return control
 
 
-def main(host: str, period: float, memory: Path, channel: int) -> None:
+def main(host: str, period: float, memory: Path, channel: int, reads_only: bool) -> None:
     """Connect, say so, and serve."""
     # First of all, so that the library's threads are as punctual.
     take_precedence()
     line = socket.socket(fileno=channel)
     try:
-        control, receive = connect(host)
+        import rtde_receive
+
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        commander = Onlooker() if reads_only else Commander(connect(host), receive, period)
     except Exception as error:
         line.send(json.dumps({"ok": False, "error": one_line(error)}).encode())
         os._exit(1)
-    commander = Commander(control, receive, period)
     with memory.open("r+b") as file:
         mapped = mmap.mmap(file.fileno(), SIZE)
     Publisher(receive, commander, mapped, period).start()
-    RemoteControl(host, commander).start()
+    if isinstance(commander, Commander):
+        RemoteControl(host, commander).start()
     line.send(json.dumps({"ok": True, "given": None}).encode())
     serve(line, commander)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))
+    main(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]), "read" in sys.argv)
