@@ -1,8 +1,9 @@
-"""Kill runs at random moments: python -m tools.kill [COUNT] [--seed N] [--recipe NAME …].
+"""Kill runs at random moments: python -m tools.kill [COUNT] [--seed N] [--kind NAME …].
 
-Each run is killed (-9) with its process group at a random moment of its duration. Afterwards: the
-log can be read and has every capture that was finished, ``run --from`` goes on from it, and no
-process of the run is left.
+Each run is killed (-9), alone or with its process group, at a random moment of its duration.
+Afterwards: what was finished before is in the log and can be read; the run is gone on with
+(``--resume``, ``--from``, or the batch's own command); and of the killed one no process, no
+temporary file and no shared memory is left, and so no port.
 """
 
 from __future__ import annotations
@@ -15,77 +16,196 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
+from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command
 from flangeye.log.read import read_run
 
-RECIPES = ("ur5_phoxi-m_sample", "ur5_phoxi-m_simulated")
+MARK = "FLANGEYE_KILLED"
+"""In the environment of a run and of all that it starts."""
+
+LINGER = 5.0
+"""Longest time until what a killed run started has ended by itself [s]."""
+
+ENOUGH = 5
+"""Observations from which a calibration can be solved again."""
+
+FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
+
+
+class Kind(NamedTuple):
+    """A kind of run: its command without ``--out``, and the one that goes on from a folder."""
+
+    command: tuple[str, ...]
+    goes_on: Callable[[Path], tuple[str, ...] | None]
+
+
+def _solved_again(recipe: str) -> Callable[[Path], tuple[str, ...] | None]:
+    def command(out: Path) -> tuple[str, ...] | None:
+        if len(read_run(out).observations()) < ENOUGH:
+            return None
+        return ("run", recipe, "--from", str(out), "--at", "solve.robust", "--out", f"{out}-again")
+
+    return command
+
+
+def _resumed(out: Path) -> tuple[str, ...] | None:
+    log = read_run(out)
+    if not log.gathered or log.result is not None:
+        return None
+    return ("run", "--resume", str(out), "--move", "--out", f"{out}-again")
+
+
+def _recorded(recipe: str) -> Kind:
+    return Kind(("run", recipe), _solved_again(recipe))
+
+
+BATCH = ("batch", "ur5_phoxi-m_simulated", "--repeat", "3", "--workers", "2", "--no-report")
+FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
+KINDS = {
+    "archive": _recorded("ur5_phoxi-m_sample"),
+    "simulated": _recorded("ur5_phoxi-m_simulated"),
+    "live": Kind(("run", "ur5e_phoxi-m_loopback", "--move", *FEWER), _resumed),
+    "weld": _recorded("ur10e_phoxi-m_weld_simulated"),
+    "batch": Kind(BATCH, lambda out: (*BATCH, "--out", str(out))),
+}
 
 
 def main() -> None:
-    """Kill, look, and print a line for each recipe."""
+    """Kill, look, and print a line for each kind."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("count", nargs="?", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--recipe", nargs="+", default=RECIPES)
+    parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     asked = parser.parse_args()
-    chance, wrong = random.Random(asked.seed), 0
-    for recipe in asked.recipe:
+    each, wrong = asked.count // len(asked.kind), 0
+    print("kind       kills  within  logs  captures  gone on  faults", flush=True)
+    for name in asked.kind:
         with tempfile.TemporaryDirectory() as folder:
-            duration = _timed(recipe, Path(folder) / "whole")
-            faults = [f for i in range(asked.count // len(asked.recipe))
-                      for f in _killed(recipe, Path(folder) / str(i), chance.uniform(0, duration))]  # fmt: skip
-        print(f"{recipe}: {asked.count // len(asked.recipe)} kills within {duration:.1f} s, "
-              f"{len(faults)} faults", *faults, sep="\n  ", flush=True)  # fmt: skip
-        wrong += len(faults)
+            trial = Trial(KINDS[name], Path(folder), random.Random(f"{name} {asked.seed}"))
+            trial.kill(each)
+        print(trial.row(name, each), *trial.faults, sep="\n  ", flush=True)
+        wrong += len(trial.faults)
     sys.exit(bool(wrong))
 
 
-def _command(recipe: str, out: Path, *more: str) -> list[str]:
-    return python_command("-m", "flangeye.cli", "run", recipe, "--out", str(out), *more)
+class Trial:
+    """The kills of one kind, and what came of them."""
 
+    def __init__(self, kind: Kind, folder: Path, chance: random.Random) -> None:
+        self.faults: list[str] = []
+        self._kind, self._folder, self._chance = kind, folder, chance
+        self._logs = self._captures = self._gone_on = 0
+        self._duration = 0.0
 
-def _timed(recipe: str, out: Path) -> float:
-    began = time.monotonic()
-    subprocess.run(_command(recipe, out), capture_output=True, check=True)
-    return time.monotonic() - began
+    def kill(self, count: int) -> None:
+        """Time one whole run, then kill ``count`` of them."""
+        began = time.monotonic()
+        whole = self._start(self._kind.command, self._folder / "whole")
+        if whole.wait() not in (0, 1):
+            raise SystemExit(f"{self._kind.command} ends with {whole.returncode}")
+        self._duration = time.monotonic() - began
+        for number in range(count):
+            after = self._chance.uniform(0, self._duration)
+            self.faults += [f"{after:.1f} s: {fault}" for fault in self._killed(number, after)]
 
-
-def _killed(recipe: str, out: Path, after: float) -> list[str]:
-    """Return what was wrong after a kill."""
-    run = subprocess.Popen(_command(recipe, out), stdout=subprocess.DEVNULL,
-                           stderr=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
-    time.sleep(after)
-    with suppress(ProcessLookupError):
-        os.killpg(run.pid, signal.SIGKILL)
-    run.wait()
-    faults = [] if _gone(run.pid) else [f"{after:.2f} s: a process is left"]
-    if not (out / "run.mcap").exists():
-        return faults
-    log = read_run(out / "run.mcap")
-    if log.damage or any(capture not in log.poses for capture in log.finished if log.poses):
-        faults.append(f"{after:.2f} s: damaged: {log.damage}")
-    if len(log.observations()) >= 5:
-        again = _command(
-            recipe,
-            out.with_name(f"{out.name}-again"),
-            "--from",
-            str(log.path),
-            "--at",
-            "solve.robust",
+    def row(self, name: str, count: int) -> str:
+        """Return the line of the table."""
+        return (
+            f"{name:10} {count:5} {self._duration:5.0f} s {self._logs:5} {self._captures:9} "
+            f"{self._gone_on:8} {len(self.faults):7}"
         )
-        if (told := subprocess.run(again, capture_output=True, text=True)).returncode == 2:
-            faults.append(f"{after:.2f} s: {told.stderr.strip()}")
-    return faults
+
+    def _killed(self, number: int, after: float) -> Iterator[str]:
+        out = self._folder / str(number)
+        shared = set(Path("/dev/shm").iterdir())
+        run = self._start((*self._kind.command, "--out", str(out)), out)
+        with suppress(subprocess.TimeoutExpired):
+            run.wait(after)
+        before = {log: set(_finished(log)) for log in out.rglob("run.mcap")}
+        kill = os.killpg if self._chance.random() < 0.5 else os.kill
+        with suppress(ProcessLookupError):
+            kill(run.pid, signal.SIGKILL)
+        run.wait()
+        yield from self._left(out, shared)
+        for log, finished in before.items():
+            yield from self._lost(log, finished)
+        yield from self._stuck(out)
+
+    def _left(self, out: Path, shared: set[Path]) -> Iterator[str]:
+        """Yield what is left of a killed run besides its folder."""
+        until = time.monotonic() + LINGER
+        while (left := _marked(str(out))) and time.monotonic() < until:
+            time.sleep(0.1)
+        for pid, command in left.items():
+            yield f"a process is left: {command}"
+            os.kill(pid, signal.SIGKILL)
+        for path in [*_temporary(out).iterdir(), *(set(Path("/dev/shm").iterdir()) - shared)]:
+            yield f"{path} is left"
+
+    def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
+        """Yield what of a log cannot be read though it was finished before."""
+        self._logs += 1
+        try:
+            log = read_run(path)
+        except FlangeyeError as error:
+            yield str(error)
+            return
+        told = {str(entry.capture) for entry in log.entries} | {r.id for r in log.rejections}
+        self._captures += len(log.finished)
+        yield from log.damage
+        yield from (f"{path}: {capture} is lost" for capture in finished - set(log.finished))
+        yield from (f"{path}: {capture} is empty" for capture in set(log.finished) - told)
+
+    def _stuck(self, out: Path) -> Iterator[str]:
+        """Go on, and yield why it did not."""
+        try:
+            command = self._kind.goes_on(out) if any(out.rglob("run.mcap")) else None
+        except FlangeyeError:
+            return  # the log was killed before its first message, which is no loss
+        if command is None:
+            return
+        self._gone_on += 1
+        again = self._start(command, out, stderr=subprocess.PIPE)
+        if again.wait() not in (0, 1):
+            yield f"{' '.join(command)}: {again.stderr.read().decode().strip()}"
+
+    def _start(self, command: tuple[str, ...], out: Path, **streams: int) -> subprocess.Popen:
+        """Start a command; what it starts has the folder's name in its environment."""
+        _temporary(out).mkdir(exist_ok=True)
+        environment = {**os.environ, MARK: str(out), "TMPDIR": str(_temporary(out))}
+        options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, **streams}
+        words = command if "--out" in command else (*command, "--out", str(out))
+        return subprocess.Popen(
+            python_command("-m", "flangeye.cli", *words),
+            env=environment, start_new_session=True, stdin=subprocess.DEVNULL, **options,
+        )  # fmt: skip
 
 
-def _gone(group: int) -> bool:
-    with suppress(ProcessLookupError):
-        os.killpg(group, 0)
-        return False
-    return True
+def _temporary(out: Path) -> Path:
+    return out.with_name(f"{out.name}-tmp")
+
+
+def _finished(log: Path) -> list[str]:
+    try:
+        return read_run(log).finished
+    except FlangeyeError:
+        return []
+
+
+def _marked(out: str) -> dict[int, str]:
+    """Return the processes that a run started and that still live, with their commands."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if f"{MARK}={out}".encode() in (process / "environ").read_bytes().split(b"\0"):
+                words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                found[int(process.name)] = words
+    return found
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import subprocess
 import tempfile
 import weakref
 import zlib
-from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -82,24 +81,23 @@ class Link:
         """
         self._name = name
         self._gone = ""
-        self._folder = tempfile.TemporaryDirectory(prefix="flangeye-")
-        memory = Path(self._folder.name) / "sample"
-        memory.write_bytes(bytes(worker.SIZE))
-        with memory.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), worker.SIZE)
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        command = python_command(worker.__file__, host, str(period), str(memory))
-        with theirs:
+        # A file without a name: nothing of it is left, however both processes end.
+        with theirs, tempfile.TemporaryFile(buffering=0) as memory:
+            memory.write(bytes(worker.SIZE))
+            self._memory = mmap.mmap(memory.fileno(), worker.SIZE)
+            shared = [memory.fileno(), theirs.fileno()]
+            words = [host, str(period), *map(str, shared), *(["read"] if reads_only else [])]
             self._process = subprocess.Popen(
-                [*command, str(theirs.fileno()), *(["read"] if reads_only else [])],
-                pass_fds=[theirs.fileno()],
+                python_command(worker.__file__, *words),
+                pass_fds=shared,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 # Ctrl-C is for us alone: we stop the arm, through this process.
                 start_new_session=True,
             )
-        self._end = weakref.finalize(self, _let_go, self._line, self._process, self._folder)
+        self._end = weakref.finalize(self, _let_go, self._line, self._process)
         try:
             self._answer("connect", patience)
         except DeviceError:
@@ -196,9 +194,7 @@ def _sample_of(body: bytes) -> Sample | None:
     )  # fmt: skip
 
 
-def _let_go(
-    line: socket.socket, process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]
-) -> None:
+def _let_go(line: socket.socket, process: subprocess.Popen[bytes]) -> None:
     """End what an owner that forgot to close has left; also at the interpreter's exit."""
     line.close()
     try:
@@ -206,4 +202,3 @@ def _let_go(
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    folder.cleanup()

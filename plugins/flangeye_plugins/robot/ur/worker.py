@@ -23,7 +23,6 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 SAMPLE = struct.Struct("<2q5i24d")
@@ -344,7 +343,7 @@ def connect(host: str) -> Any:
     return control
 
 
-def main(host: str, period: float, memory: Path, channel: int, reads_only: bool) -> None:
+def main(host: str, period: float, memory: int, channel: int, reads_only: bool) -> None:
     """Connect, say so, and serve."""
     # First of all, so that the library's threads are as punctual.
     take_precedence()
@@ -357,9 +356,7 @@ def main(host: str, period: float, memory: Path, channel: int, reads_only: bool)
     except Exception as error:
         line.send(json.dumps({"ok": False, "error": one_line(error)}).encode())
         os._exit(1)
-    with memory.open("r+b") as file:
-        mapped = mmap.mmap(file.fileno(), SIZE)
-    Publisher(receive, commander, mapped, period).start()
+    Publisher(receive, commander, mmap.mmap(memory, SIZE), period).start()
     if isinstance(commander, Commander):
         RemoteControl(host, commander).start()
     line.send(json.dumps({"ok": True, "given": None}).encode())
@@ -367,4 +364,4 @@ def main(host: str, period: float, memory: Path, channel: int, reads_only: bool)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]), "read" in sys.argv)
+    main(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]), "read" in sys.argv)
