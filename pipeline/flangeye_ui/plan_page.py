@@ -31,7 +31,7 @@ class Stop:
     """One row of the plan that the command prints.
 
     Attributes:
-        id: Of the capture.
+        id: Identifier of the capture.
         role: What it is for.
         place: (3,) of the flange in the base [m].
         way: How the arm gets there, how long it takes, or why it is barred.

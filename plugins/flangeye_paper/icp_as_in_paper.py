@@ -23,7 +23,7 @@ class PaperIcpParams(Params):
         description="Normals of the CAD cloud: as Open3D up to 0.7 computed them, with its defect "
         "on flat faces, or sound ones.",
     )
-    iterations: int = Field(30, ge=1, description="Of ICP, at most; 30 was the default.")
+    iterations: int = Field(30, ge=1, description="Iterations of ICP at most; 30 was the default.")
     change: float = Field(
         1e-6,
         ge=0,

@@ -30,7 +30,7 @@ class Stop:
 
     Attributes:
         iterations: At most so many.
-        change: Of the matched share, and of their rms distance in the cloud's unit.
+        change: Least change of the matched share, and of their rms distance in the cloud's unit.
     """
 
     iterations: int
@@ -104,7 +104,7 @@ class IcpFit:
     Attributes:
         motion: (4, 4) that takes the source onto the target.
         iterations: How many steps it took.
-        share: Of the source's points that matched.
+        share: Share of the source's points that matched.
         rms: Distance of the matched pairs.
     """
 

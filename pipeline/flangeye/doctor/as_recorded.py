@@ -32,7 +32,7 @@ def in_configuration(
     """Add who carries what, and where the target is in what carries it.
 
     Args:
-        session: Of one arm beside its camera, as far as is known.
+        session: The session of one arm beside its camera, as far as is known.
         configuration: Says otherwise.
         arm: The arm's kinematics, where a link carries the camera.
         states: What else was recorded, by the samples' ids.

@@ -172,8 +172,8 @@ class Misfit(NamedTuple):
     """Errors of the best calibration, rms over the samples.
 
     Attributes:
-        position: Of the target's centre [m].
-        angle: Of its normal or rotation [rad]; None where only centres were seen.
+        position: Position residual of the target's centre [m].
+        angle: Angular residual of its normal or rotation [rad]; None where only centres were seen.
     """
 
     position: float
@@ -190,13 +190,13 @@ class Finding:
     """One mistake that a check found.
 
     Attributes:
-        name: Of the mistake, in a word or two.
+        name: The mistake, in a word or two.
         what: One sentence: what is wrong, and with which samples.
         fix: What to do: the recipe's line to change, where one helps.
         samples: Ids of the samples it concerns; empty for all of them.
         before: Errors as things are; None where they say nothing.
         after: The same once it is mended.
-        probability: Of so large an improvement in a session without this mistake, every
+        probability: Probability of so large an improvement in a session without this mistake, every
             alternative that was tried counted.
         gain: Logarithm of the likelihood ratio, less what further parameters cost; ranks findings.
         corrected_session: The session without the mistake, to look for others; None where only

@@ -57,7 +57,7 @@ class MovedFlange:
         """Give the (N, n) joint angles [rad], on each branch they may be on.
 
         Args:
-            starts: Of the search for branches; few find one, many all.
+            starts: Number of starts of the search for branches; few find one, many all.
         """
         arm = self.kinematics
         if arm is None:

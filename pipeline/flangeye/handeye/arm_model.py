@@ -60,7 +60,7 @@ class ArmFit:
         base_T_camera: (4, 4) for the arm with these parameters.
         parameters: (n, 4) to add to zeros [rad], a, d [m] and alpha [rad].
         covariance: (6 + 4n, 6 + 4n) of the pose (rotation, translation at ``about``), and them.
-        information: Of the sightings alone about the same, in units of the priors.
+        information: Information of the sightings alone about the same, in units of the priors.
         about: (3,) in ``base`` [m].
         scatter: Variance along one axis beyond the centres' own noise [m^2].
     """

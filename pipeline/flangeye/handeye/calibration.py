@@ -60,8 +60,8 @@ class Options:
     Attributes:
         normals: Whether circles' normals count.
         normal_bias: Standard deviation of a tilt common to all normals [rad].
-        robot_noise: Of the poses the arm reports, where it is known.
-        pose_noise: Of the arm's position per axis, where it is known [m].
+        robot_noise: Standard deviations of the poses the arm reports, where it is known.
+        pose_noise: Standard deviation of the arm's position per axis, where it is known [m].
         limits: What has to be known, and how well.
         tool_offset: Whether an offset of the seen circle is looked for.
         joint_offsets: Whether joint offsets are looked for.

@@ -58,8 +58,8 @@ def noise_of(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -
     the more, as long as the rotations do not speak against it; the rest is added evenly.
 
     Args:
-        turned: Of N rotations.
-        shifted: Of N translations.
+        turned: Residuals of the N rotations.
+        shifted: Residuals of the N translations.
         own: (N, 6, 6) covariances of the features, order (rotation, translation).
         arms: (N, 6, 6) those of typical arms' poses; zero where nothing is known of them.
     """

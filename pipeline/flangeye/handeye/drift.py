@@ -173,7 +173,7 @@ def verdict(checks: Information, prior: Floats, corners: Floats, test: DriftTest
     """Judge the last of the checks; every change found is its first.
 
     Args:
-        checks: Of n checks in order.
+        checks: The n checks in order.
         prior: (6, 6) covariance of the calibration about ``about``.
         corners: (8, 3) of the work, from ``about`` [m].
         test: How it is set.

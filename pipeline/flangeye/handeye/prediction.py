@@ -20,7 +20,7 @@ def prediction_covariance(
     Args:
         calibration: The calibration.
         observation: A pose that took no part in it.
-        corrected: Of the arm corrected as the calibration has it; else of the arm as reported.
+        corrected: Whether the arm is corrected as the calibration has it, not taken as reported.
     """
     estimate, feature = calibration.camera, observation.feature
     turn = estimate.transform.rotation

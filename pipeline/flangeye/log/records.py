@@ -40,7 +40,7 @@ class Channel(NamedTuple):
         schema: Name of the messages' schema.
         schema_encoding: ``jsonschema`` or ``protobuf``.
         schema_data: The schema itself.
-        encoding: Of the messages: ``json`` or ``protobuf``.
+        encoding: Encoding of the messages: ``json`` or ``protobuf``.
     """
 
     topic: str
@@ -108,7 +108,7 @@ class LogFile:
 
         Args:
             file: Stands at the log's first byte; may wait for more.
-            size: Of the file, where it is known [bytes]: no record is longer.
+            size: Size of the file, where it is known [bytes]: no record is longer.
 
         Raises:
             NotMcapError: It is no MCAP file.

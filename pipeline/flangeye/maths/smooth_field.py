@@ -63,7 +63,7 @@ def displacement_covariance(field: SmoothField, places: Floats, corrected: bool)
     Args:
         field: The field.
         places: In ``base`` [m].
-        corrected: Of the arm corrected by the field; else of the arm as reported.
+        corrected: Whether poses are those of the arm corrected by the field, not as reported.
     """
     moved = effects(field, places)
     if corrected:

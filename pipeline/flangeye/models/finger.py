@@ -24,7 +24,7 @@ class Tag(Model):
 
     dictionary: str = Field("DICT_4X4_50", description="OpenCV's name of the dictionary.")
     id: int = Field(0, ge=0)
-    side: Length = param(gt=0, description="Of the black square.")
+    side: Length = param(gt=0, description="Side of the black square.")
 
 
 class Lens(Model):
@@ -77,7 +77,7 @@ class Finger(Model):
     along_sigma: Length = param(
         "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
     )
-    radius: Length = param(gt=0, description="Of the tip's ball.")
+    radius: Length = param(gt=0, description="Radius of the tip's ball.")
     travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
     calibration: Calibration | None = None
     source: str

@@ -20,8 +20,8 @@ UNTURNED = ("0 deg", "0 deg", "0 deg")
 class Recess(Model):
     """A slot milled into the face along a circle, with round ends, such as Franka's three."""
 
-    angle: Angle = param(description="Of its middle, about the flange's z.")
-    radius: Length = param(gt=0, description="Of the circle its centre line follows.")
+    angle: Angle = param(description="Direction of its middle, about the flange's z.")
+    radius: Length = param(gt=0, description="Radius of the circle its centre line follows.")
     half_span: Angle = param(description="Half the angle its centre line covers, ends aside.")
     width: Length = param(gt=0)
     depth: Length = param(gt=0)

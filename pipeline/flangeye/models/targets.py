@@ -98,7 +98,7 @@ class Sphere(BaseModel):
     """A calibration sphere that the flange carries. All SI.
 
     Attributes:
-        radius: Of the sphere.
+        radius: Radius of the sphere.
         centre_in_flange: Its centre in ``flange``.
     """
 

@@ -30,8 +30,8 @@ class Urdf:
     """A URDF file, read.
 
     Attributes:
-        path: Of the file.
-        name: Of the robot.
+        path: Path of the file.
+        name: Name of the robot.
         links: By name.
         above: Link's name -> the joint that carries it.
     """

@@ -58,7 +58,7 @@ class WorkpieceFile(Model):
 
     title: str
     cad: str = Field(description="STL or PLY file with triangles, beside this one.")
-    unit: LengthUnit = Field(description="Of the CAD's coordinates and of the seams' points.")
+    unit: LengthUnit = Field(description="Unit of the CAD's coordinates and of the seams' points.")
     seams: tuple[SeamLine, ...] = Field(min_length=1)
     source: str = ""
 

@@ -19,9 +19,9 @@ class MotionLimits:
     Attributes:
         low: (3,) corner of the box the flange's centre stays in, in ``base`` [m].
         high: (3,) the opposite corner [m].
-        speed: Of the flange [m/s].
-        acceleration: Of the flange [m/s^2].
-        joint_speed: Of every joint [rad/s].
+        speed: Largest speed of the flange [m/s].
+        acceleration: Largest acceleration of the flange [m/s^2].
+        joint_speed: Largest speed of any joint [rad/s].
         lower: (n,) joint angles [rad].
         upper: (n,) joint angles [rad].
     """

@@ -68,7 +68,7 @@ class Reach:
             robot: The arm.
             scanner: What looks at it.
             base_T_camera: (4, 4) where that stands.
-            radius: Of the disc that has to be in view [m].
+            radius: Radius of the disc that has to be in view [m].
             margins: What a real arm has to keep to besides.
         """
         self.arm = Arm(robot)

@@ -30,8 +30,8 @@ class Leg(NamedTuple):
 
     Attributes:
         joints: (n,) where it ends [rad].
-        speed: Of the leading joint [rad/s].
-        acceleration: Of the leading joint [rad/s^2].
+        speed: Speed of the leading joint [rad/s].
+        acceleration: Acceleration of the leading joint [rad/s^2].
         seconds: What it takes.
     """
 

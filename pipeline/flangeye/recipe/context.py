@@ -49,7 +49,7 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
 
     Args:
         header: The sections.
-        folder: Of the recipe; files it names are beside it.
+        folder: Folder of the recipe; files it names are beside it.
         complain: Told each mistake: where, and what.
     """
     context: Context = {t.Seed: header.seed}

@@ -37,9 +37,11 @@ class LimitsSection(Section):
     """What the arm must keep to; required where a driver is named, for a real arm may be there."""
 
     box: BoxSection = Field(description="The flange's centre stays inside, in the robot's base.")
-    speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Of the flange.")
-    acceleration: Acceleration = param("300 mm/s^2", gt=0, le=3.0, description="Of the flange.")
-    joint_speed: AngularSpeed = param("30 deg/s", gt=0, description="Of every joint.")
+    speed: Speed = param("100 mm/s", gt=0, le=1.0, description="Largest speed of the flange.")
+    acceleration: Acceleration = param(
+        "300 mm/s^2", gt=0, le=3.0, description="Largest acceleration of the flange."
+    )
+    joint_speed: AngularSpeed = param("30 deg/s", gt=0, description="Largest speed of any joint.")
     joints: tuple[tuple[Angle, Angle], ...] | None = Field(
         None, description="Lower and upper angle of each joint; the model's own when not given."
     )

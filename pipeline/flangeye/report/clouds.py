@@ -33,7 +33,7 @@ class Panel:
     """One capture's cloud and fit.
 
     Attributes:
-        id: Of the capture.
+        id: Identifier of the capture.
         why: Why this one is shown.
         facts: Name and value, for the caption.
         figure: For plotly, in the circle's own axes.

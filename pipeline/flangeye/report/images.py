@@ -25,12 +25,12 @@ class ImageView:
     """An image, cut around the target.
 
     Attributes:
-        id: Of the capture.
+        id: Identifier of the capture.
         data: The picture, a data URI.
         box: (x, y, width, height) of what is shown, in the image [px].
         corners: Where each corner was detected, x and y [px].
         misses: (x1, y1, x2, y2) of the line for each corner [px].
-        radius: Of the circles about the corners [px].
+        radius: Radius of the circles about the corners [px].
         summary: What it shows in words.
     """
 

@@ -99,7 +99,7 @@ def target_centres(facts: Facts, frame: str, pose: Floats | None, size: float) -
         facts: The run.
         frame: What the drawing is in.
         pose: (4, 4) of the camera in it.
-        size: Of the symbols.
+        size: Diameter of the symbols.
     """
     what = "flange" if frame == t.BASE else "target"
     groups = []

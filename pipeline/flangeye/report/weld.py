@@ -25,7 +25,7 @@ class WeldDrawing:
         summary: In words.
         paths: In the plane of the work.
         offsets: From the plan, along it.
-        deviation: Of the torch, from the seam as felt, and from the true one in a simulation.
+        deviation: Distance of the torch from the seam as felt, and in a simulation as it is.
         contact: Deflection over time, with the controller's phases.
         speeds: Over time.
         loop: How the loop kept time: name, value with unit.

@@ -90,7 +90,7 @@ class TransformErrorResult(_Part):
     """Simulation only: how far one transform is off."""
 
     rotation: float = Field(description="[rad]")
-    translation: float = Field(description="Of the point its covariance is taken about [m].")
+    translation: float = Field(description="Error of the point its covariance is taken about [m].")
 
 
 class TruthResult(_Part):
@@ -101,7 +101,7 @@ class TruthResult(_Part):
         default_factory=dict, description="Every unknown, as it really is."
     )
     errors: dict[str, TransformErrorResult] = Field(
-        default_factory=dict, description="Of every unknown, where its covariance is taken."
+        default_factory=dict, description="Error of every unknown, where its covariance is taken."
     )
     error_at_centroid: float = Field(description="At the workspace's centre [m].")
     rms_over_workspace: float = Field(description="Over the workspace box [m].")
@@ -134,8 +134,10 @@ class SeamResult(_Part):
     openings: Matrix = Field(description="(N, 3) unit vectors towards the torch.")
     covariance: list[Matrix] = Field(description="(N, 3, 3) of the points [m^2].")
     tube: Vector = Field(description="(N) with 95 % the seam is not further off than this [m].")
-    half_angle: float | None = Field(None, description="Of the groove [rad].")
-    half_width: float | None = Field(None, description="Of the groove at its shoulders [m].")
+    half_angle: float | None = Field(None, description="Half angle of the groove [rad].")
+    half_width: float | None = Field(
+        None, description="Half width of the groove at its shoulders [m]."
+    )
     figures: dict[str, float] = Field(description="What the seam step reports.")
     notes: list[str]
     truth: SeamTruthResult | None = None
@@ -167,9 +169,9 @@ class FieldResult(_Part):
     """A smooth displacement over the workspace; flangeye.maths.smooth_field evaluates it."""
 
     about: Vector = Field(description="Middle of the calibration's poses, in the base [m].")
-    length: float = Field(description="Over which it changes [m].")
+    length: float = Field(description="Correlation length of the field [m].")
     rigid: Matrix = Field(description="6xK, the rigid motion that each feature is less.")
-    weights: Vector = Field(description="Of the K features [m].")
+    weights: Vector = Field(description="Weights of the K features [m].")
 
 
 class CorrectionResult(_Part):
@@ -226,7 +228,7 @@ class Provenance(_Part):
     plugins: dict[str, str]
     recipe: str
     recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
-    input_hash: str = Field(description="Of everything the captures are made from.")
+    input_hash: str = Field(description="Hash of everything the captures are made from.")
     seed: int
     notes: list[str] = Field(description="What the source and the solver want people to know.")
 

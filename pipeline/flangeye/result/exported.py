@@ -13,7 +13,7 @@ def calibrated_pose(result: Result, anyway: bool = False) -> t.CalibratedPose:
     """Return the camera's pose with what has to be said of it.
 
     Args:
-        result: Of a run.
+        result: Result of a run.
         anyway: Give a refused one too; its remarks say so.
 
     Raises:

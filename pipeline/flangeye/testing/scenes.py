@@ -77,7 +77,7 @@ class Scene:
         xyz: (H, W, 3) organised points [m], NaN where there is none.
         centre: (3,) of the flange's face, or of the ball [m].
         normal: (3,) of the face, towards the camera.
-        radius: Of the rim, or of the ball [m].
+        radius: Radius of the rim, or of the ball [m].
     """
 
     xyz: Floats

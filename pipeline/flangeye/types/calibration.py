@@ -42,7 +42,7 @@ class SmoothField:
 
     Attributes:
         about: (3,) middle of the calibration's poses, in ``base`` [m].
-        length: Over which it changes [m].
+        length: Correlation length of the field [m].
         rigid: (6, K) rotation and translation about the middle that each feature is less.
         weights: (K,) of the features [m].
         covariance: (K, K) of the weights [m^2].

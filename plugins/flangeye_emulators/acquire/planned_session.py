@@ -104,7 +104,7 @@ class SessionParams(Params):
         False, description="The first arm's flange only moves, and turns about the vertical."
     )
     in_turns: bool = Field(
-        False, description="Of two arms, one rests at its first pose while the other moves."
+        False, description="With two arms, one rests at its first pose while the other moves."
     )
 
 

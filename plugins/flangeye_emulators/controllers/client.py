@@ -39,8 +39,8 @@ class EmulatorTruth(NamedTuple):
     Attributes:
         base_T_flange: (4, 4)
         joints: (n,) true angles [rad]: reported ones plus the errors of the joints' zeros.
-        speed: Of the fastest joint [rad/s]; zero where the arm stands.
-        time: Of the controller [s], as RTDE's timestamp.
+        speed: Speed of the fastest joint [rad/s]; zero where the arm stands.
+        time: Clock of the controller [s], as RTDE's timestamp.
     """
 
     base_T_flange: Floats
@@ -60,7 +60,7 @@ class EmulatorControl:
 
         Args:
             host: Address of the controller.
-            port: Of its control channel.
+            port: Port of its control channel.
             patience: Longest wait for an answer [s].
 
         Raises:

@@ -29,7 +29,7 @@ class Profile:
         """Plan the fastest ride over pieces of a path, each with its own speed limit.
 
         Args:
-            lengths: Of the pieces, in the path's measure (metres, or radians of a joint).
+            lengths: Lengths of the pieces, in the path's measure (metres, or radians of a joint).
             speeds: Limit on each piece, positive.
             acceleration: Limit everywhere, positive.
         """

@@ -45,7 +45,7 @@ class Compliance:
 
     Attributes:
         share: (3,) displacement of the tag per displacement of the tip, in the tool's axes.
-        tilt: Of the tag per lateral displacement of the tip [rad/m].
+        tilt: Tilt of the tag per lateral displacement of the tip [rad/m].
         stiffening: Relative loss of ``share`` at a displacement of 2 mm.
         camera_R_tool: (3, 3) how the camera is mounted.
         rest: (3,) of the undeformed tag in the camera [m].

@@ -33,7 +33,8 @@ class SimulatedFingerParams(Params):
     )
     seam: str = Field("groove", description="Name of the seam in that file.")
     position: tuple[Length, Length, Length] = param(
-        ("600 mm", "0 mm", "250 mm"), description="Of the origin of its CAD, in base."
+        ("600 mm", "0 mm", "250 mm"),
+        description="Position of the workpiece's CAD origin in the base.",
     )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
@@ -43,9 +44,13 @@ class SimulatedFingerParams(Params):
     latency: Duration = param("30 ms", ge=0, description="From the exposure to the image.")
     jitter: Duration = param("5 ms", ge=0, description="Standard deviation of the latency.")
     dropped: float = Field(0.02, ge=0, lt=1, description="Share of images that never arrive.")
-    noise: float = Field(3.0, ge=0, description="Of the image, standard deviation [grey levels].")
-    blur: float = Field(0.7, gt=0, description="Of the image, standard deviation [px].")
-    glare: float = Field(60.0, ge=0, description="Of a wandering reflection [grey levels].")
+    noise: float = Field(
+        3.0, ge=0, description="Noise of the image, standard deviation [grey levels]."
+    )
+    blur: float = Field(0.7, gt=0, description="Blur of the image, standard deviation [px].")
+    glare: float = Field(
+        60.0, ge=0, description="Brightness of a wandering reflection [grey levels]."
+    )
     world: WorldParams = Field(
         default_factory=WorldParams,
         description="What is true and differs from the files: arm, tool, finger, clock, workpiece, "

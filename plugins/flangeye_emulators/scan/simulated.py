@@ -25,7 +25,8 @@ class SimulatedScanParams(Params):
         "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
     )
     position: tuple[Length, Length, Length] = param(
-        ("600 mm", "0 mm", "250 mm"), description="Of the origin of its CAD, in base."
+        ("600 mm", "0 mm", "250 mm"),
+        description="Position of the workpiece's CAD origin in the base.",
     )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."

@@ -99,7 +99,7 @@ class LoopbackScanner(OpenScanner):
 
         Args:
             model: Which scanner to be.
-            params: Of the driver.
+            params: Parameters of the driver.
             control: Open control channel of the controller.
         """
         faults, distortion = np.random.default_rng(params.seed).spawn(2)

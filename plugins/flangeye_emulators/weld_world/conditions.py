@@ -13,10 +13,10 @@ class Condition(NamedTuple):
 
     Attributes:
         world: What is true, by section.
-        settings: Of the controller, beside its defaults.
+        settings: Settings of the controller, beside its defaults.
         planned: Shift [m] and turn [rad] of the plan.
         belief: What the files say of the tool, beside its defaults.
-        half_angle: Of the groove [rad], as planned too, where it is not the usual one.
+        half_angle: Half angle of the groove [rad], as planned too, where it is not the usual one.
     """
 
     world: Mapping[str, Mapping[str, Any]] = {}

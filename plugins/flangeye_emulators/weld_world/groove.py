@@ -35,7 +35,7 @@ class Section:
     """The groove's cross-section.
 
     Attributes:
-        half_angle: Of each wall from the vertical [rad].
+        half_angle: Half angle of each wall from the vertical [rad].
         depth: From the plate's face to the root [m].
     """
 
@@ -103,7 +103,7 @@ class Tip:
     """A ball on springs.
 
     Attributes:
-        radius: Of the ball [m].
+        radius: Radius of the ball [m].
         lateral: Stiffness across the finger [N/m].
         axial: Stiffness along the finger [N/m].
         friction: Coulomb coefficient, along the seam and across it.

@@ -28,7 +28,7 @@ class ToolTruth(Params):
         ("0 mm", "0 mm", "0 mm"), description="Tip: ahead, to the left, up."
     )
     torch: tuple[Length, Length] = param(("0 mm", "0 mm"), description="Torch: ahead, to the left.")
-    yaw: Angle = param("0 deg", description="Of finger and torch about the tool's axis.")
+    yaw: Angle = param("0 deg", description="Turn of finger and torch about the tool's axis.")
 
 
 class FingerTruth(Params):
@@ -46,7 +46,9 @@ class FingerTruth(Params):
     creep: float = Field(0.0, description="Share by which a displacement grows in time.")
     creep_time: Duration = param("10 s", gt=0)
     friction: float = Field(0.1, ge=0, le=1, description="Coulomb coefficient, along and across.")
-    noise: Length = param("10 um", ge=0, description="Of a measurement, across; 6 times that up.")
+    noise: Length = param(
+        "10 um", ge=0, description="Standard deviation of a measurement across; 6 times that up."
+    )
 
 
 class ClockTruth(Params):
@@ -85,7 +87,7 @@ class WorkpieceTruth(Params):
     wave: Length = param("0 mm", ge=0, description="Amplitude with which its edges wander.")
     wave_length: Length = param("10 mm", gt=0)
     bow: Length = param("0 mm", description="How far its middle is aside of the CAD's curve.")
-    half_angle: Angle = param("0 deg", description="Of its walls, more than the CAD's.")
+    half_angle: Angle = param("0 deg", description="Added to the CAD's half angle of its walls.")
     half_angle_wave: Angle = param("0 deg", ge=0, description="Amplitude of its variation.")
     root_gap: Length = param("0 mm", ge=0, description="Between the plates.")
     tacks: tuple[Tack, ...] = ()

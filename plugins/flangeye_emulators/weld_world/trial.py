@@ -50,7 +50,7 @@ class Trial:
         controller: As it ended.
         rows: (K, 9) columns as :class:`Row` has them.
         phases: K names.
-        length: Of the true seam [m].
+        length: Length of the true seam [m].
     """
 
     controller: Controller
@@ -85,8 +85,8 @@ class Start:
 
     Attributes:
         position: (3,) of the tip, undeformed, as reported [m].
-        angle: Of the tool [rad].
-        period: Of a cycle [s].
+        angle: Angle of the tool [rad].
+        period: Period of a cycle [s].
         longest: When it is broken off [s].
     """
 

@@ -34,11 +34,11 @@ class Verdict:
     """A weld in one world.
 
     Attributes:
-        seed: Of the world.
+        seed: Seed of the world.
         outcome: ``done``, or why not.
         done: Whether it was reported done.
-        largest: Of the torch's true distances from the seam [m]; 0 where it did not weld.
-        rms: Of them [m].
+        largest: Largest of the torch's true distances from the seam [m]; 0 where it did not weld.
+        rms: Root mean square of those distances [m].
         outside: Largest share of its stated bound that the torch was away by.
         inside: Share of the seam on which the torch was within its 95 % band.
     """

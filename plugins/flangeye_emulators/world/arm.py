@@ -45,11 +45,17 @@ class ArmErrors(Params):
         description="kind: joint zeros as small as the robot's joint_accuracy, nothing else; "
         "real: as published recordings show arms to be. The sizes below replace single ones.",
     )
-    zeros: Angle | None = param(None, ge=0, description="Of the joints' zeros; real: 1 mrad.")
-    lengths: Length | None = param(
-        None, ge=0, description="Of each Denavit-Hartenberg length and offset; real: 0.15 mm."
+    zeros: Angle | None = param(
+        None, ge=0, description="Standard deviation of the joints' zeros; real: 1 mrad."
     )
-    twists: Angle | None = param(None, ge=0, description="Of each link's twist; real: 0.2 mrad.")
+    lengths: Length | None = param(
+        None,
+        ge=0,
+        description="Standard deviation of each link length and joint offset; real: 0.15 mm.",
+    )
+    twists: Angle | None = param(
+        None, ge=0, description="Standard deviation of each link's twist; real: 0.2 mrad."
+    )
     eccentricity: Angle | None = param(
         None,
         ge=0,

@@ -34,7 +34,7 @@ class Plate:
     """One sample workpiece.
 
     Attributes:
-        name: Of its files.
+        name: Name of its files.
         title: For people.
         root: y of the groove's root at x, (N,) to (N,) [m]; its slope at both ends is zero.
         straight: Whether two stations are enough.

@@ -34,9 +34,9 @@ class Year:
 
     Attributes:
         checks: How many, three a day.
-        scans: Of the flange at each.
+        scans: Scans of the flange at each.
         centre_noise: Standard deviation of a fitted centre per axis [m].
-        normal_noise: Of a fitted normal [rad].
+        normal_noise: Standard deviation of a fitted normal [rad].
         arm_noise: Repeatability per axis [m].
         daily: Amplitude of the day's temperature [K].
         seasonal: Amplitude of the year's [K].
@@ -73,7 +73,7 @@ class Watched:
     """What the monitor gets of a year.
 
     Attributes:
-        sightings: Of every check.
+        sightings: Sightings of every check.
         prior: (6, 6) covariance of the calibration about :data:`ABOUT`.
         scanner: (3,) where the scanner stands, by the calibration [m].
     """

@@ -25,7 +25,7 @@ class Stop(NamedTuple):
     """A pose to scan at.
 
     Attributes:
-        id: Of the capture that is taken there.
+        id: Identifier of the capture taken there.
         role: What it is for.
         pose: Where, and the joints that do it.
     """

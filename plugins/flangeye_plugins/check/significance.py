@@ -30,10 +30,10 @@ class Significance(NamedTuple):
     """How an alternative compares with the session as it is.
 
     Attributes:
-        which: Of the alternatives.
+        which: Index of the alternative.
         before: Errors of the session as it is.
         after: Errors of the alternative.
-        probability: Of so much better a fit without a mistake, alternatives counted.
+        probability: Probability of so much better a fit without a mistake, alternatives counted.
         gain: Logarithm of the likelihood ratio less what further parameters cost (Schwarz 1978).
     """
 

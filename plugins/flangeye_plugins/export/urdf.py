@@ -26,7 +26,8 @@ class OpticalParams(Params):
     """Where the optical frame is in the mount link."""
 
     position: tuple[Length, Length, Length] = param(
-        ("0 mm", "0 mm", "0 mm"), description="Of the optical frame's origin in the mount link."
+        ("0 mm", "0 mm", "0 mm"),
+        description="Position of the optical frame's origin in the mount link.",
     )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("-90 deg", "0 deg", "-90 deg"),

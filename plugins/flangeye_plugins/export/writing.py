@@ -21,14 +21,18 @@ class NamedParams(Params):
     """What the pose is called."""
 
     name: str = Field(
-        "camera", pattern=NAME, description="Of the pose in the other program, and of the file."
+        "camera",
+        pattern=NAME,
+        description="Name of the pose in the other program, and of the file.",
     )
 
 
 class NumberedParams(NamedParams):
     """What the pose is called, and where the controller keeps it."""
 
-    number: int = Field(1, ge=0, le=999, description="Of the frame or tool in the controller.")
+    number: int = Field(
+        1, ge=0, le=999, description="Number of the frame or tool in the controller."
+    )
 
 
 class FramesParams(NamedParams):

@@ -130,7 +130,7 @@ def fit_cap(
     Args:
         points: (N, 3) in ``camera`` [m].
         start: (3,) rough centre [m].
-        radius: Of the sphere, or where to begin [m].
+        radius: Radius of the sphere, or where to begin [m].
         max_incidence: Largest angle of the surface's normal to the line of sight [rad].
         free: Whether the radius is fitted.
     """

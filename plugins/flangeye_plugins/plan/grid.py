@@ -16,7 +16,9 @@ Point = tuple[Length, Length, Length]
 class GridParams(Params):
     """Parameters of ``plan.grid``."""
 
-    centre: Point | None = Field(None, description="Of the grid; before the scanner if not given.")
+    centre: Point | None = Field(
+        None, description="Centre of the grid; before the scanner if not given."
+    )
     size: Point = param(
         ("300 mm", "300 mm", "200 mm"), description="Edges of the grid along the base's axes."
     )

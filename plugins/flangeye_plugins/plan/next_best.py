@@ -24,7 +24,9 @@ BEYOND = 1.6
 class NextBestParams(Params):
     """Parameters of ``plan.next_best``."""
 
-    centre: Point | None = Field(None, description="Of the work; before the scanner if not given.")
+    centre: Point | None = Field(
+        None, description="Centre of the work; before the scanner if not given."
+    )
     size: Point = param(
         ("300 mm", "300 mm", "200 mm"),
         description="Edges of the work along the base's axes: where the matrix has to be right.",

@@ -37,7 +37,9 @@ class PairingParams(Params):
         "100 ms", gt=0, description="Largest time between a measurement and the arm's next pose."
     )
     distance: Length = param(
-        "5 mm", gt=0, description="Of an arm that never stands still: how far apart its poses are."
+        "5 mm",
+        gt=0,
+        description="For an arm that never stands still: distance between the poses taken.",
     )
     angle: Angle = param("2 deg", gt=0, description="The same for turning; either will do.")
 

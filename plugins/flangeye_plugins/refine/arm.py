@@ -50,9 +50,15 @@ class ArmParams(Params):
 
     zeros: Angle = param("5 mrad", gt=0, description="Deviation of a joint's zero to expect.")
     lengths: Length = param(
-        "0.5 mm", ge=0, description="Of a Denavit-Hartenberg length or offset; 0: zeros alone."
+        "0.5 mm",
+        ge=0,
+        description="Standard deviation to expect of a link length or offset; 0: zeros alone.",
     )
-    twists: Angle = param("1 mrad", ge=0, description="Of a link's twist; 0: left as they are.")
+    twists: Angle = param(
+        "1 mrad",
+        ge=0,
+        description="Standard deviation to expect of a link's twist; 0: left as they are.",
+    )
     propose: int = Field(
         6, ge=0, description="How many poses to propose that would tell more of the arm."
     )

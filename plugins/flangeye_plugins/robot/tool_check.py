@@ -40,7 +40,7 @@ def require_tool(
     """Do nothing when the controller's tool is the recipe's.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         driver: Its driver.
         offset: (4, 4) the controller's.
         expected: (4, 4) the recipe's.

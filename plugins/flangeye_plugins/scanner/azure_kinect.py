@@ -53,7 +53,7 @@ class AzureKinectParams(Params):
     )
     device: int = Field(0, ge=0, description="Which camera, if there are several.")
     depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
-        Field("NFOV_UNBINNED", description="Of the camera; a recording has its own.")
+        Field("NFOV_UNBINNED", description="Depth mode of the camera; a recording has its own.")
     )
     timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
     python: MachineName = Field(

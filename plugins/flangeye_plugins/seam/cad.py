@@ -43,7 +43,9 @@ class CadParams(ArmParams):
     max_refuted: float = Field(
         0.05, gt=0, lt=1, description="Largest share of it, and at the seam, that is not there."
     )
-    max_residual: Length = param("0.5 mm", gt=0, description="Of the scan from the CAD, rms.")
+    max_residual: Length = param(
+        "0.5 mm", gt=0, description="Largest rms distance of the scan from the CAD."
+    )
     max_deviation: Length = param(
         "2 mm", gt=0, description="Largest standard deviation of the registration at the seam."
     )

@@ -47,10 +47,14 @@ class GrooveParams(ArmParams):
     )
     spacing: Length = param("2 mm", gt=0, description="Between the planned points.")
     max_width: Length = param("30 mm", gt=0, description="Across the groove, at its shoulders.")
-    max_depth: Length = param("25 mm", gt=0, description="Of the root below the face.")
-    min_length: Length = param("40 mm", gt=0, description="Of the groove.")
+    max_depth: Length = param(
+        "25 mm", gt=0, description="Largest depth of the root below the face."
+    )
+    min_length: Length = param("40 mm", gt=0, description="Least length of the groove.")
     max_residual: Length = param(
-        "0.5 mm", gt=0, description="Of the cross-sections' roots from a smooth line, rms."
+        "0.5 mm",
+        gt=0,
+        description="Largest distance of the cross-sections' roots from a smooth line, rms.",
     )
     distinct: float = Field(
         0.7, gt=0, lt=1, description="A groove longer than this share of the longest is its equal."

@@ -25,7 +25,7 @@ class CadPart:
         workpiece: What was read.
         centre: (3,) middle of its box [m].
         corners: (8, 3) of its box [m].
-        diagonal: Of its box [m].
+        diagonal: Diagonal of its bounding box [m].
     """
 
     def __init__(self, workpiece: Workpiece) -> None:

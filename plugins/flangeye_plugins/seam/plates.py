@@ -51,7 +51,7 @@ class Hollow:
     Attributes:
         face: The face.
         line: (M, 2) along its middle, in the face's frame, at even steps [m].
-        length: Of that line [m].
+        length: Length of that line [m].
     """
 
     face: Face

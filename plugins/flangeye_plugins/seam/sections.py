@@ -34,8 +34,8 @@ class Root:
         covariance: (N, 3, 3); nothing along it, which is no error of a line [m^2].
         half_angle: Between a wall and the face's normal [rad].
         half_width: At the face [m].
-        residual: Of the sections from the smooth line, rms [m].
-        share: Of the sections that showed two walls.
+        residual: Distance of the sections from the smooth line, rms [m].
+        share: Share of the sections that showed two walls.
     """
 
     points: Floats

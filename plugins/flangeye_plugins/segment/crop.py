@@ -17,7 +17,7 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
         xyz: (N, 3) or (H, W, 3) the scan [m].
         view: Its coarse view; of an organised scan, only the part about the disc is touched.
         disc: Where.
-        radius: Of the disc [m].
+        radius: Radius of the disc [m].
         margin: How far off its plane and outside its circle points are kept; off the plane four
             times its noise, if that is more [m].
     """

@@ -85,7 +85,7 @@ def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -
     propose planes, and each gathers the points around.
 
     Args:
-        pieces: Of the scene.
+        pieces: Pieces of the scene.
         reach: How far from its patch a part may extend [m].
         scatter: Largest standard deviation about a plane of what is flat [m].
         fewest: Points that are worth a search.

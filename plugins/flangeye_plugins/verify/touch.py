@@ -17,16 +17,18 @@ class Touch(Params):
 
     seen: tuple[Length, Length, Length] = Field(description="In the camera, from a scan.")
     position: tuple[Length, Length, Length] = Field(
-        description="Of the flange in the base, as the pendant shows it with the tip on the point."
+        description="Position of the flange in the base, by the pendant, with the tip on the point."
     )
-    rpy: tuple[Angle, Angle, Angle] = Field(description="Of the flange: roll, pitch, yaw.")
+    rpy: tuple[Angle, Angle, Angle] = Field(
+        description="Orientation of the flange: roll, pitch, yaw."
+    )
 
 
 class TouchParams(Params):
     """Parameters of ``verify.touch``."""
 
     tip: tuple[Length, Length, Length] = Field(
-        description="Of the tool, in the flange frame: as its own calibration has it."
+        description="Position of the tool in the flange frame, as its own calibration has it."
     )
     touches: tuple[Touch, ...] = Field(
         min_length=1, description="Three or more at different places and heights tell most."

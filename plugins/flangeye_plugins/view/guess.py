@@ -22,7 +22,9 @@ WIDEST = 0.6
 class GuessParams(Params):
     """Parameters of ``view.guess``."""
 
-    position: tuple[Length, Length, Length] = Field(description="Of the scanner, in the base.")
+    position: tuple[Length, Length, Length] = Field(
+        description="Position of the scanner, in the base."
+    )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
     )

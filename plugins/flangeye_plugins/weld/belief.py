@@ -31,10 +31,10 @@ class Belief:
         distance: From the torch to the tip [m].
         lateral: Stiffness across the finger [N/m].
         axial: Stiffness along the finger [N/m].
-        half_angle: Of the joint's walls [rad]; None where it is not known.
+        half_angle: Half angle of the joint's walls [rad]; None where it is not known.
         noise: Standard deviations of one measurement across and up [m].
-        torch_sigma: Of the torch across the tool, relative to the tip [m].
-        along_sigma: Of the distance from the torch to the tip [m].
+        torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
+        along_sigma: Standard deviation of the distance from the torch to the tip [m].
         two_walls: Whether there is a wall on the other side too.
     """
 

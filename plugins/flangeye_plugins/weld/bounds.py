@@ -24,7 +24,7 @@ class Bounds:
         """Stop a tip that is astray, or that is pressed harder than it may be.
 
         Args:
-            pose: Of the tool.
+            pose: Pose of the tool.
             progress: Arc length of the tip's progress on the plan [m].
             felt: What is new.
 

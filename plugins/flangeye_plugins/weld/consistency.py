@@ -48,7 +48,7 @@ class Seating:
 
         Args:
             s: Arc length [m].
-            offset: Of the tip to the left of the plan [m].
+            offset: Distance of the tip to the left of the plan [m].
             height: Above the plan's [m].
         """
         self._samples.append((s, offset, height))

@@ -133,7 +133,7 @@ class Follower:
         """Estimate how far the torch may be from the seam, and stop where that is too far.
 
         Args:
-            error: Of the torch from the refined path [m].
+            error: Error of the torch from the refined path [m].
             slant: Sine of the angle between the tool and the path.
         """
         if not self._touching:

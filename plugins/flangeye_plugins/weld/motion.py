@@ -19,7 +19,7 @@ class ToolPose:
     Attributes:
         time: [s].
         position: (3,) of the robot's end point P_r: where the tip would be, undeformed [m].
-        angle: Of the tool's direction t_d from the plane's x [rad], continuous over turns.
+        angle: Angle of the tool's direction t_d from the plane's x [rad], continuous over turns.
     """
 
     time: float

@@ -60,11 +60,11 @@ class Learned:
 
     Attributes:
         gain: The finger shows displacements larger by this share.
-        gain_sigma: Of it.
+        gain_sigma: Its standard deviation.
         width: Half width of play and hysteresis [m].
         stamp: Timestamps are late by this [s].
-        dead_time: Of the arm [s].
-        lag: Of the arm [s].
+        dead_time: Dead time of the arm [s].
+        lag: Lag of the arm [s].
         unexplained: rms that the model leaves [m].
         noise: Standard deviation of one measurement across [m].
     """

@@ -17,16 +17,18 @@ Mode = Literal["tactile", "as_printed", "vision"]
 class Following(Params):
     """The controller's parameters; names in brackets are the paper's."""
 
-    speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Of the tip along the seam.")
+    speed: Speed = param("5 mm/s", gt=0, le=0.05, description="Speed of the tip along the seam.")
     side: Literal["left", "right"] = Field(
         "left", description="Which wall of the groove to press, seen along the seam."
     )
     deflection: Length = param(
-        "2 mm", gt=0, le=0.01, description="Of the tip against the wall (delta_d)."
+        "2 mm", gt=0, le=0.01, description="Deflection of the tip against the wall (delta_d)."
     )
-    preload: Length = param("1.5 mm", gt=0, le=0.01, description="Of the tip into the groove.")
+    preload: Length = param(
+        "1.5 mm", gt=0, le=0.01, description="Displacement of the tip into the groove."
+    )
     servo_gain: float = Field(3.0, gt=0, le=20, description="k_p of the deflection servo [1/s].")
-    height_gain: float = Field(3.0, ge=0, le=20, description="Of the preload [1/s].")
+    height_gain: float = Field(3.0, ge=0, le=20, description="Gain of the preload's control [1/s].")
     cross_track_gain: float = Field(
         1.0, ge=0, le=5, description="How fast an error of the torch is taken back [1/s]."
     )
@@ -54,9 +56,11 @@ class Following(Params):
     astray: Length = param(
         "20 mm", gt=0, description="Farther from the plan the tip stops the weld."
     )
-    ramp: Speed = param("2 mm/s", gt=0, description="At which the wanted deflection changes.")
+    ramp: Speed = param("2 mm/s", gt=0, description="Slew rate of the deflection set-point.")
     release: Speed = param(
-        "0.8 mm/s", gt=0, description="At which the wanted deflection ends before the seam does."
+        "0.8 mm/s",
+        gt=0,
+        description="Slew rate at which the deflection set-point ends before the seam does.",
     )
     force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
     stale: Duration = param(
@@ -114,8 +118,12 @@ class WeldTactileParams(Following):
     clearance: Length = param(
         "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
     )
-    approach_speed: Speed = param("50 mm/s", gt=0, description="Of the flange on its way there.")
-    approach_joint_speed: AngularSpeed = param("20 deg/s", gt=0, description="Of the joints.")
+    approach_speed: Speed = param(
+        "50 mm/s", gt=0, description="Speed of the flange on its way there."
+    )
+    approach_joint_speed: AngularSpeed = param(
+        "20 deg/s", gt=0, description="Speed of the joints on the way there."
+    )
     start_angle: Angle = param(
-        "0 deg", ge=-np.pi, le=np.pi, description="Of the tool to the seam, at the start."
+        "0 deg", ge=-np.pi, le=np.pi, description="Angle of the tool to the seam at the start."
     )

@@ -25,11 +25,11 @@ class Cycle(NamedTuple):
     Attributes:
         time: On the robot's clock [s].
         position: (3,) of the robot's end point P_r.
-        angle: Of the tool.
+        angle: Angle of the tool.
         touches: Numbers of the sights that were used first in this cycle.
         velocity: (3,) commanded.
         turn: Angular velocity commanded.
-        phase: Of the controller, after this cycle.
+        phase: Phase of the controller, after this cycle.
         tip: Arc length of the tip's progress.
         torch: Arc length of the torch's progress.
         wanted: Deflection asked of the tip.

@@ -47,7 +47,7 @@ class Finding:
         since: The first check after the change, if there was one.
         statistic: The test's, over its threshold.
         part: What explains it best, in words; empty while nothing changed.
-        probability: Of that part, among scanner, arm and flange.
+        probability: Probability of that part, among scanner, arm and flange.
     """
 
     check: int

@@ -15,7 +15,7 @@ def write_state(url: str, node: str, finding: Finding) -> None:
     Args:
         url: ``opc.tcp://host:port``.
         node: ``ns=2;s=flangeye``.
-        finding: Of the last check.
+        finding: Finding of the last check.
 
     Raises:
         StageError: asyncua is missing, the server does not answer, or there is no such node.

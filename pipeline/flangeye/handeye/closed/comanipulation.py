@@ -86,7 +86,7 @@ def with_translations(given: Triple, rotations: Triple) -> Triple:
 
     Args:
         given: A, B, C, each (N, 4, 4).
-        rotations: Of X, Y, Z, each (3, 3).
+        rotations: Rotations of X, Y, Z, each (3, 3).
     """
     (a, b, c), (x, y, z) = given, rotations
     rows = np.zeros((len(a), 3, 9))

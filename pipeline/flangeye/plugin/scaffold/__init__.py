@@ -28,7 +28,7 @@ def write_plugin(name: str, kind: str, into: Path) -> Path:
     """Write a package and return its folder.
 
     Args:
-        name: Of the package and of the plugin, ``KIND.NAME``: lower case, words joined by ``_``.
+        name: Name of package and plugin, ``KIND.NAME``: lower case, words joined by ``_``.
         kind: One of :func:`kinds`.
         into: Folder in which the package's own folder is made.
 

@@ -40,7 +40,7 @@ class Conditions:
     """What the person says of the place, for it is not measured.
 
     Attributes:
-        temperature: Of the air [°C], or None.
+        temperature: Temperature of the air [°C], or None.
         spread: Between the coldest and the warmest moment of use [K], or None.
         place: Where it was done.
         operator: Who did it.

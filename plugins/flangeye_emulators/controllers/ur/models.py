@@ -17,7 +17,7 @@ class ControlBox:
     """A generation of control boxes.
 
     Attributes:
-        version: Of the software it says it runs: major, minor, bugfix, build.
+        version: Software version it reports: major, minor, bugfix, build.
         rate: Control cycles and data packages per second [Hz].
     """
 

@@ -21,7 +21,7 @@ class OutputRecipe:
     """Variables that are sent to a client again and again.
 
     Attributes:
-        types: Of each variable; ``NOT_FOUND`` where there is none of that name.
+        types: Type of each variable; ``NOT_FOUND`` where there is none of that name.
         valid: Whether all were found.
     """
 
@@ -45,8 +45,8 @@ class InputRecipe:
     """Variables that a client sends together.
 
     Attributes:
-        names: Of the variables.
-        types: Of each; ``NOT_FOUND`` where there is none of that name.
+        names: Names of the variables.
+        types: Type of each; ``NOT_FOUND`` where there is none of that name.
         valid: Whether all were found.
     """
 

@@ -38,10 +38,10 @@ class AuboClient:
 
         Args:
             sdk: The module ``pyaubo_sdk``.
-            name: Of the robot, for messages.
+            name: Name of the robot, for messages.
             host: Address of the controller.
             user: Account on it.
-            password: Of that account.
+            password: Password of that account.
 
         Raises:
             DeviceError: Nobody answers, or the login fails.

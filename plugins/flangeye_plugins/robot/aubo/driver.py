@@ -62,7 +62,9 @@ class AuboParams(Params):
 
     host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
     user: str = Field("aubo", description="Account on the controller.")
-    password: str = Field("123456", description="Of that account; this is the one it comes with.")
+    password: str = Field(
+        "123456", description="Password of that account; the default is the factory's."
+    )
     tool: ToolOffset = Field(
         default_factory=ToolOffset,
         description="What the controller's tool is set to; no tool when not given.",

@@ -27,7 +27,7 @@ def require_answer(name: str, host: str, realtime: bool) -> None:
     """Connect once, and let go again.
 
     Args:
-        name: Of the robot, for messages.
+        name: Name of the robot, for messages.
         host: Address of the controller.
         realtime: Whether to insist on a real-time kernel.
 

@@ -42,7 +42,7 @@ def fault(
     Args:
         numbers: As typed, in the convention.
         convention: The one that was agreed.
-        reach: Of the arm, from the origin of its base [m].
+        reach: Reach of the arm, from the origin of its base [m].
         asked: (4, 4) where the arm was to go; None where any pose will do.
         tolerance: How near to it counts as there.
     """

@@ -27,7 +27,7 @@ class Facts(NamedTuple):
     """What the dashboard says.
 
     Attributes:
-        version: Of the controller's software.
+        version: Version of the controller's software.
         period: Length of its cycle [s].
     """
 

@@ -70,7 +70,7 @@ class Link:
         """Start the process and connect.
 
         Args:
-            name: Of the robot, for messages.
+            name: Name of the robot, for messages.
             host: Address of the controller.
             period: Length of its cycle [s].
             patience: Longest time to wait [s].

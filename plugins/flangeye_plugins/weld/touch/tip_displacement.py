@@ -22,7 +22,7 @@ class TipDisplacement:
         displacement: (3,) of the tip from where it rests [m].
         rotation: (3,) rotation vector of the tag, from how it rests [rad].
         covariance: (3, 3) of the displacement [m^2].
-        confidence: Of the tag's detection, 0 to 1.
+        confidence: Confidence of the tag's detection, 0 to 1.
     """
 
     time_ns: int
