@@ -20,7 +20,7 @@ from flangeye.batch.page import write_page
 from flangeye.batch.plan import BatchSession, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
-from flangeye.batch.software import software_of
+from flangeye.batch.software import Software, software_of
 from flangeye.batch.tables import table_of, write_tables
 from flangeye.batch.work import STARTS, Job
 
@@ -46,7 +46,13 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     """
     check_installed()
     software = software_of(registry)
-    sessions = plan(request, registry, software)
+    return run_sessions(request, plan(request, registry, software), software, console)
+
+
+def run_sessions(
+    request: Request, sessions: list[BatchSession], software: Software, console: Console
+) -> Batch:
+    """Do as :func:`run_batch` with sessions that are planned, of whatever recipes."""
     job = Job(_out(request, sessions).absolute(), request.report, software)
     batch = Batch(_out(request, sessions), _finished_earlier(job, sessions), 0)
     batch.known = len(batch.outcomes)

@@ -233,3 +233,33 @@ def batch(  # noqa: PLR0913  one argument an option
     say(summary_text(done))
     if not done.accepted:
         raise typer.Exit(1)
+
+
+@app.command()
+def regress(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Of manifests; those that come with it if not given.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes on this machine; default one for each core."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("regressions"),
+) -> None:
+    """Run known recordings and compare: status, closure, and what the doctor finds.
+
+    A manifest says where a recording lies, how it is read and what is expected; one whose
+    recording is absent is skipped, and said so. Exit codes: 0 all as expected, 1 one differs,
+    2 a manifest is wrong.
+    """
+    from rich.console import Console
+
+    from flangeye.files.bundled import bundled
+    from flangeye.regress import compare, read_manifests
+
+    manifests = read_manifests(folder or bundled("data") / "manifests")
+    comparisons = compare(manifests, out, workers, load_plugins(), Console(stderr=True))
+    for comparison in comparisons:
+        say(comparison.line())
+    if any(comparison.verdict == "DIFFERS" for comparison in comparisons):
+        raise typer.Exit(1)

@@ -1,0 +1,149 @@
+"""Run the recordings that are there as one batch, and hold each against its manifest."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from flangeye.batch.command import run_sessions
+from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.plan import BatchSession, plan
+from flangeye.batch.request import Request
+from flangeye.batch.software import software_of
+from flangeye.doctor import examine, open_session
+from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.regress.manifest import Expected, Manifest
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from flangeye.plugin.registry import Registry
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What became of one manifest.
+
+    Attributes:
+        name: The manifest's file, without its ending.
+        verdict: Whether the run is as expected, or did not take place.
+        told: What differs, what was found, or why it was skipped.
+    """
+
+    name: str
+    verdict: Literal["as expected", "DIFFERS", "skipped"]
+    told: str
+
+    def line(self) -> str:
+        """Return the comparison for people."""
+        return f"{self.verdict:11}  {self.name}: {self.told}"
+
+
+def compare(
+    manifests: Mapping[Path, Manifest],
+    out: Path,
+    workers: int | None,
+    registry: Registry,
+    console: Console,
+) -> list[Comparison]:
+    """Return how the recordings of manifests compare with what is expected, in their order.
+
+    Args:
+        manifests: By their files.
+        out: Folder of the batch; what finished there with the same software is not run again.
+        workers: Processes; None for one a core.
+        registry: The plugins.
+        console: Where progress is shown.
+
+    Raises:
+        FlangeyeError: The batch cannot start, or a manifest's recipe is wrong.
+    """
+    there = {file: m for file, m in manifests.items() if _recording(file, m).exists()}
+    sessions = {file: _session(file, m, registry) for file, m in there.items()}
+    outcomes = _run(
+        list(sessions.values()), Request("", workers=workers, out=out), registry, console
+    )
+    return [
+        _compared(
+            file.stem, m.expected, outcomes[sessions[file].id], out / sessions[file].id, registry
+        )
+        if file in there
+        else Comparison(file.stem, "skipped", f"{_recording(file, m)} is not there; {m.source}")
+        for file, m in manifests.items()
+    ]
+
+
+def _recording(file: Path, manifest: Manifest) -> Path:
+    return Path(os.path.normpath(file.parent / Path(manifest.recording).expanduser()))
+
+
+def _session(file: Path, manifest: Manifest, registry: Registry) -> BatchSession:
+    near = file.parent / manifest.recipe
+    reader = [] if manifest.reader is None else [f"steps.0.reader={json.dumps(manifest.reader)}"]
+    request = Request(
+        str(near) if near.is_file() else manifest.recipe,
+        (_recording(file, manifest),),
+        (*reader, *manifest.overrides),
+    )
+    try:
+        (session,) = plan(request, registry, software_of(registry))
+    except FlangeyeError as error:
+        raise RecipeError(f"{file}: {error}") from None
+    return session
+
+
+def _run(
+    sessions: Sequence[BatchSession], request: Request, registry: Registry, console: Console
+) -> Mapping[str, SessionOutcome]:
+    if not sessions:
+        return {}
+    once = list({session.id: session for session in sessions}.values())
+    return run_sessions(request, once, software_of(registry), console).outcomes
+
+
+def _compared(
+    name: str, expected: Expected, outcome: SessionOutcome, run: Path, registry: Registry
+) -> Comparison:
+    told: list[str] = [outcome.status]
+    differs: list[str] = []
+    if outcome.status != expected.status:
+        reason = f" ({outcome.reason})" if outcome.reason else ""
+        differs.append(f"{outcome.status}{reason}, expected {expected.status}")
+    if expected.closure is not None and expected.tolerance is not None:
+        (told if _near(outcome, expected) else differs).append(_closure(outcome, expected))
+    if expected.findings is not None:
+        found = _findings(run, registry)
+        same = sorted(found) == sorted(expected.findings)
+        line = f"findings {', '.join(found) or 'none'}"
+        (told if same else differs).append(
+            line if same else f"{line}, expected {', '.join(expected.findings) or 'none'}"
+        )
+    if differs:
+        return Comparison(name, "DIFFERS", "; ".join(differs))
+    return Comparison(name, "as expected", "; ".join(told))
+
+
+def _near(outcome: SessionOutcome, expected: Expected) -> bool:
+    found, closure, tolerance = outcome.holdout_median_m, expected.closure, expected.tolerance
+    return None not in (found, closure, tolerance) and abs(found - closure) <= tolerance  # type: ignore[operator]
+
+
+def _closure(outcome: SessionOutcome, expected: Expected) -> str:
+    found = outcome.holdout_median_m
+    mm = "none" if found is None else f"{found * 1e3:.3f} mm"
+    return (
+        f"closure {mm}, expected {(expected.closure or 0) * 1e3:.3f} +- "
+        f"{(expected.tolerance or 0) * 1e3:.3f} mm"
+    )
+
+
+def _findings(run: Path, registry: Registry) -> list[str]:
+    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
+    try:
+        return [f.name for f in examine(open_session(run, registry, None), checks).findings]
+    except FlangeyeError as error:
+        return [f"not examined: {error}"]
