@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from flangeye.recipe.load import Recipe, find_recipe, load_recipe
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.segment.flange import segment_flange
-from flangeye_plugins.solve.robust import solve_robust
+from flangeye_plugins.solve.robust import RobustParams, solve_poses, solve_robust
 from flangeye_plugins.solve.svd import solve_svd
 
 
@@ -183,6 +183,33 @@ def robust() -> tuple[Work, Work]:
     )
 
 
+def _matrix() -> Work:
+    """A yardstick that no change of ours moves."""
+    square = np.random.default_rng(0).normal(size=(300, 300))
+    return Work(lambda: np.linalg.eigh(square @ square.T), "eigenvectors of a 300 x 300 matrix")
+
+
+def robust_circles() -> tuple[Work, Work]:
+    """solve.robust of 50 circles with normals, the arm's error looked for; 50 ms are asked for."""
+    from tests.handeye.cells import CONFIGURATIONS, session
+
+    cell = CONFIGURATIONS["eye-on-base, flange"]
+    made = session(cell, np.random.default_rng(0), n=50, feature="normal")
+    call = partial(solve_poses, made.observations, RobustParams(), None, cell)
+    return Work(call, "50 circles with normals"), _matrix()
+
+
+def robust_poses() -> tuple[Work, Work]:
+    """solve.robust of 200 whole poses, noise correlated, 8 % wrong; 1 s is asked for."""
+    from tests.handeye.cells import CONFIGURATIONS, session, wandering
+
+    cell = CONFIGURATIONS["eye-in-hand, marker"]
+    rng = np.random.default_rng(1)
+    made = wandering(session(cell, rng, n=200, tilt=0.4), rng)
+    call = partial(solve_poses, made.observations, RobustParams(), None, cell)
+    return Work(call, "200 poses, correlated noise, 8 % wrong"), _matrix()
+
+
 def read() -> tuple[Work, Work]:
     """A binary PCD of a full scan beside numpy's reading of its bytes."""
     cloud = stages()["capture"].cloud
@@ -313,6 +340,8 @@ CASES = {
     "fit.ransac_circle": ransac,
     "solve.svd": solve,
     "solve.robust": robust,
+    "solve.robust, circles": robust_circles,
+    "solve.robust, poses": robust_poses,
     "archive to matrix": archive,
     "acquire.simulated": acquire,
     "read_cloud": read,
@@ -327,6 +356,8 @@ GOALS = {
     "segment.flange": "20",
     "segment.flange, loose": "40",
     "fit.rim": "0.06",
+    "solve.robust, circles": "6",
+    "solve.robust, poses": "100",
     "archive to matrix": "3 s",
     "acquire.simulated": "1.2",
     "log": "0.4",

@@ -163,3 +163,18 @@ def errors(found, truth):
     error = found.transform.matrix @ np.linalg.inv(truth)
     shift = error[:3, :3] @ found.about + error[:3, 3] - found.about
     return np.concatenate([rotation_log(error[:3, :3]), shift])
+
+
+def wandering(made, rng, turn=2e-3, shift=1e-3, wrong=0.08):
+    """Return a session of poses with noise that lasts for some twenty poses, and wrong ones."""
+    walk, out = np.zeros(6), []
+    for o in made.observations:
+        walk = 0.95 * walk + np.sqrt(1 - 0.95**2) * rng.standard_normal(6)
+        off = np.concatenate([turn * walk[:3], shift * walk[3:]])
+        if rng.random() < wrong:
+            off = np.concatenate([rng.normal(0, 0.5, 3), rng.normal(0, 0.1, 3)])
+        pose = o.feature.camera_T_target.matrix
+        moved = rigid(rotation_exp(off[:3]) @ pose[:3, :3], pose[:3, 3] + off[3:])
+        feature = PoseFeature(Transform(CAMERA, TARGET, moved), o.feature.covariance)
+        out.append(replace(o, feature=feature))
+    return replace(made, observations=out)

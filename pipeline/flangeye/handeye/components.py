@@ -19,6 +19,8 @@ FINEST = 1e-7
 
 LARGEST = 1e8
 """Factor on a noise beyond which nothing is looked for."""
+STEPS = 40
+"""Of Newton's method for a factor, at most; three are usual."""
 
 
 @dataclass(frozen=True)
@@ -103,14 +105,15 @@ class Residuals:
         squares, shares = self._along(own, further)
         if np.isinf(wanted) or squares.sum() <= wanted:
             return 0.0
-        low, high = 0.0, 1.0
-        while (squares / (1 + high * shares)).sum() > wanted and high < LARGEST:
-            low, high = high, 4 * high
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            more = (squares / (1 + middle * shares)).sum() > wanted
-            low, high = (middle, high) if more else (low, middle)
-        return high
+        # Newton on the reciprocal of the sum, which is concave: it climbs to the answer from below.
+        factor = 0.0
+        for _ in range(STEPS):
+            terms = squares / (1 + factor * shares)
+            total, slope = terms.sum(), (terms * shares / (1 + factor * shares)).sum()
+            if total <= wanted * (1 + 1e-9) or factor > LARGEST:
+                break
+            factor += total * (total - wanted) / (wanted * max(slope, 1e-300))
+        return float(min(factor, LARGEST))
 
     def extra(self, own: Floats) -> tuple[float, float]:
         """Return the variance to add, and the scale of the covariances, at most one."""

@@ -32,7 +32,10 @@ ITERATIONS, SETTLED = 60, 1e-11
 """Steps at most; a step that could better the sum of squares by no more than this is the last."""
 LEAST_DAMPING = 1e-12
 """Keeps the equations solvable where the poses tell nothing of a direction, and slows nothing."""
-ROUNDS = 12
+ROUNDS, GRADUATIONS = 12, 4
+"""Of noise and inliers found in turn, at most; and how often these by graduation."""
+STEPS_OF_ROUND = 2
+"""While the noise is not yet known, the unknowns need not be to the last digit."""
 GRADUATION = 1.4
 """Factor between the steps of graduated non-convexity: Yang et al. (2020)."""
 TINY = 1e-9
@@ -125,18 +128,18 @@ class Solution:
 
 
 def climb(
-    problem: Problem, start: Unknowns, noise: Noise, shares: Floats, iterations: int = ITERATIONS
+    problem: Problem, found: Solution, noise: Noise, shares: Floats, iterations: int = ITERATIONS
 ) -> Solution:
     """Return the most likely unknowns near a start, each measurement counting by its share.
 
     Args:
         problem: What is given.
-        start: Where to begin.
+        found: Where to begin, weighed for this problem.
         noise: Noise beyond the stated covariances; not estimated here.
         shares: (N,) from 0 to 1.
         iterations: Steps at most.
     """
-    here, damping = weigh(problem, start, noise, shares), LEAST_DAMPING
+    here, damping = _weighed(problem, found.at, found.linear, noise, shares), LEAST_DAMPING
     for _ in range(iterations):
         step, gain = _step(here, damping)
         if gain < SETTLED * max(1.0, here.cost) or damping > 1e8:
@@ -150,19 +153,26 @@ def climb(
 
 def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solution:
     """Return some values of the unknowns with what the measurements say of them."""
-    s, k = problem.measurements, len(problem.nuisance)
-    if len(at.nuisance) != k:
-        at = replace(at, nuisance=np.zeros(k))
-    linear = linearise(s, problem.loop, at, problem.arms, problem.nuisance)
+    if len(at.nuisance) != len(problem.nuisance):
+        at = replace(at, nuisance=np.zeros(len(problem.nuisance)))
+    linear = linearise(problem.measurements, problem.loop, at, problem.arms, problem.nuisance)
+    return _weighed(problem, at, linear, noise, shares)
+
+
+def _weighed(
+    problem: Problem, at: Unknowns, linear: Linear, noise: Noise, shares: Floats
+) -> Solution:
+    s = problem.measurements
     weights, basis = weights_of(s, linear, noise), free_columns(s, problem.loop, at, problem.tilt)
-    jacobian = (linear.jacobian @ basis).reshape(len(s) * 6, -1)
-    weighted = (weights @ linear.jacobian @ basis).reshape(len(s) * 6, -1)
+    jacobian = linear.jacobian.reshape(len(s) * 6, -1) @ basis
+    weighted = (weights @ jacobian.reshape(len(s), 6, -1)).reshape(len(s) * 6, -1)
     squares = (linear.residuals * (weights @ linear.residuals[..., None])[..., 0]).sum(axis=1)
     counting = np.repeat(shares, 6)
     known, mean = problem.prior(noise)
     surprise = np.concatenate([np.zeros(18), at.tilt, at.nuisance]) - mean
-    information = jacobian.T @ (counting[:, None] * weighted) + basis.T @ (known[:, None] * basis)
-    slope = weighted.T @ (counting * linear.residuals.ravel()) - basis.T @ (known * surprise)
+    counted = counting[:, None] * weighted
+    information = jacobian.T @ counted + basis.T @ (known[:, None] * basis)
+    slope = counted.T @ linear.residuals.ravel() - basis.T @ (known * surprise)
     cost = float(shares @ squares + known @ surprise**2)
     return Solution(
         at, basis, information, linear, weights, noise, shares > 0.5, np.inf, squares, cost, slope
@@ -189,9 +199,10 @@ def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
         start: Where to begin.
         noise: First guess of the noise beyond the stated covariances.
     """
-    found = climb(problem, start, noise, np.ones(len(problem.measurements)))
+    every = np.ones(len(problem.measurements))
+    found = climb(problem, weigh(problem, start, noise, every), noise, every)
     inliers = np.zeros(len(problem.measurements), dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(GRADUATIONS):
         found = _graduate(problem, found)
         if (found.inliers == inliers).all() or found.inliers.sum() < 3:
             break
@@ -201,11 +212,16 @@ def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
 
 
 def agreeing(problem: Problem, found: Solution) -> Solution:
-    """Return the fit to the measurements that agree with the others, begun at those of a fit."""
+    """Return the fit to the measurements that agree with the others, begun at those of a fit.
+
+    Those of the fit may be of another model of the same measurements.
+    """
+    found, before = weigh(problem, found.at, found.noise, found.inliers.astype(float)), set()
     for _ in range(ROUNDS):
         found = with_noise(problem, found)
         squares, agree = judged(problem, found)
-        if (agree == found.inliers).all() or agree.sum() < 3:
+        before.add(found.inliers.tobytes())
+        if agree.tobytes() in before or agree.sum() < 3:
             break
         found = replace(found, inliers=agree)
     return replace(found, squares=squares)
@@ -245,10 +261,10 @@ def gates(problem: Problem, freedom: float) -> Floats:
 
 def _graduate(problem: Problem, start: Solution) -> Solution:
     limits, noise = gates(problem, start.freedom), start.noise
-    found = climb(problem, start.at, noise, start.inliers.astype(float))
+    found = climb(problem, start, noise, start.inliers.astype(float))
     largest = float((found.squares / limits).max())
     if largest <= 1.0:
-        return replace(climb(problem, found.at, noise, np.ones(len(limits))), freedom=start.freedom)
+        return replace(climb(problem, found, noise, np.ones(len(limits))), freedom=start.freedom)
     mu = 1.0 / (2.0 * largest - 1.0)
     shares = np.ones(len(limits))
     while mu < 1e8:
@@ -256,10 +272,10 @@ def _graduate(problem: Problem, start: Solution) -> Solution:
         # Early on all shares are small, and only their ratios matter.
         if (np.minimum(shares, 1 - shares) < 1e-6).all() or shares.max() < 1e-9:
             break
-        found = climb(problem, found.at, noise, shares, iterations=2)
+        found = climb(problem, found, noise, shares, iterations=1)
         mu *= GRADUATION
     shares = (shares > 0.5).astype(float)
-    return replace(climb(problem, found.at, noise, shares), freedom=start.freedom)
+    return replace(climb(problem, found, noise, shares), freedom=start.freedom)
 
 
 def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solution:
@@ -274,16 +290,17 @@ def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solutio
         refit: Whether the unknowns follow the weights; else they stay.
     """
     shares, freedom, both = found.inliers.astype(float), np.inf, np.inf
-    solve = climb if refit else weigh
-    found = solve(problem, found.at, found.noise, shares)
+    few, many = (STEPS_OF_ROUND, ITERATIONS) if refit else (0, 0)
     if problem.stated:
-        return found
+        return climb(problem, found, found.noise, shares, many)
+    found = climb(problem, found, found.noise, shares, few)
     for _ in range(ROUNDS):
         before = found.noise
         noise, freedom, both = _components(problem, found)
-        found = solve(problem, found.at, noise, shares)
+        found = climb(problem, found, noise, shares, few)
         if before.is_close(noise):
             break
+    found = climb(problem, found, found.noise, shares, many)
     return replace(found, freedom=freedom, all_freedom=both)
 
 

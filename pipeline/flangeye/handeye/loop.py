@@ -99,8 +99,10 @@ def linearise(
     chain = _Chain(measurements, at)
     jacobian = np.zeros((len(measurements), 6, COLUMNS + len(at.nuisance)))
     jacobian[:, :, :6] = chain.of_camera()
-    jacobian[:, :, 6:12] = chain.of_second_base()
-    jacobian[:, :, 12:18] = chain.of_place()
+    if loop.y:
+        jacobian[:, :, 6:12] = chain.of_second_base()
+    if loop.z:
+        jacobian[:, :, 12:18] = chain.of_place()
     jacobian[:, :3, 18:COLUMNS] = (chain.turns @ at.z[:3, :3])[:, :, :2]
     residuals = chain.residuals()
     of_camera, of_target = chain.of_camera_arm(), chain.of_arm()
@@ -135,9 +137,11 @@ class _Chain:
     def residuals(self) -> Floats:
         s, at = self._s, self._at
         predicted = self.turns @ at.z[:3, :3] @ rotation_exp(np.append(at.tilt, 0.0))
-        whole = rotation_log(s.rotations @ np.swapaxes(predicted, 1, 2))
-        normals = _between(predicted[:, :, 2], s.rotations[:, :, 2])
-        turned = np.where((s.freedoms == 6)[:, None], whole, normals)
+        turned, whole = np.zeros((len(s), 3)), s.freedoms == 6
+        if whole.any():
+            turned[whole] = rotation_log(s.rotations[whole] @ np.swapaxes(predicted[whole], 1, 2))
+        if not whole.all():
+            turned[~whole] = _between(predicted[~whole, :, 2], s.rotations[~whole, :, 2])
         out = np.concatenate([turned, s.centres - self._from_camera @ self._eye.T], axis=1)
         return np.asarray((s.projectors @ out[..., None])[..., 0])
 
@@ -170,7 +174,7 @@ def _apply(poses: Floats, points: Floats) -> Floats:
 
 def _between(first: Floats, second: Floats) -> Floats:
     """Return the (N, 3) shortest rotation vectors that take unit vectors to others."""
-    cross = np.cross(first, second)
+    cross = (hat(first) @ second[..., None])[..., 0]
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
     angle = np.arctan2(sine, (first * second).sum(axis=1, keepdims=True))
     return np.asarray(cross * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0))

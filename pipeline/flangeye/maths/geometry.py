@@ -8,6 +8,9 @@ import numpy as np
 
 from flangeye.types import Floats
 
+NEAR_HALF_A_TURN = -0.9
+"""Cosine below which a rotation's axis is read off its quaternion."""
+
 
 def hat(v: Floats) -> Floats:
     """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
@@ -47,6 +50,31 @@ def _rotation_exp_of_one(x: float, y: float, z: float) -> Floats:
 
 def rotation_log(rotation: Floats) -> Floats:
     """Return the rotation vectors (..., 3) [rad] of (..., 3, 3), their length at most pi."""
+    r = np.asarray(rotation, dtype=np.float64)
+    # Half the skew part is the sine times the axis, half the trace less one the cosine.
+    sines = 0.5 * _skew_part(r)
+    length = np.sqrt((sines**2).sum(axis=-1, keepdims=True))
+    cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1)[..., None] - 1.0)
+    if (cosine < NEAR_HALF_A_TURN).any():
+        return _rotation_log_anywhere(r)
+    ratio = np.arctan2(length, cosine) / np.maximum(length, 1e-300)
+    return np.asarray(sines * np.where(length < 1e-12, 1.0, ratio))
+
+
+def _skew_part(r: Floats) -> Floats:
+    """Return (..., 3) what a (..., 3, 3) matrix has more below its diagonal than above."""
+    return np.stack(
+        [
+            r[..., 2, 1] - r[..., 1, 2],
+            r[..., 0, 2] - r[..., 2, 0],
+            r[..., 1, 0] - r[..., 0, 1],
+        ],
+        axis=-1,
+    )
+
+
+def _rotation_log_anywhere(rotation: Floats) -> Floats:
+    """Return the rotation vectors by quaternions: near half a turn the sine tells no axis."""
     q = quaternion_from_rotation(rotation)
     xyz, w = q[..., :3], q[..., 3:]
     length = np.linalg.norm(xyz, axis=-1, keepdims=True)
@@ -67,14 +95,7 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
     k = np.empty((*r.shape[:-2], 4, 4))
     k[..., :3, :3] = symmetric - trace * np.eye(3)
     k[..., 3, 3] = trace[..., 0, 0]
-    k[..., :3, 3] = k[..., 3, :3] = np.stack(
-        [
-            r[..., 2, 1] - r[..., 1, 2],
-            r[..., 0, 2] - r[..., 2, 0],
-            r[..., 1, 0] - r[..., 0, 1],
-        ],
-        axis=-1,
-    )
+    k[..., :3, 3] = k[..., 3, :3] = _skew_part(r)
     q = np.linalg.eigh(k)[1][..., -1]
     return np.asarray(np.where(q[..., 3:] >= 0, q, -q))
 
