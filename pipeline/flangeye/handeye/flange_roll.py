@@ -31,9 +31,9 @@ def roll_note(
     turns = roll_of(observations, base_R_camera)
     if len(turns) < FEWEST:
         return (
-            "a constant turn of the plate about its own axis (clocking) does not show, for holes "
-            f"were told apart in {len(turns)} of {len(observations)} poses: the camera's pose "
-            "does not depend on it"
+            "a constant turn of the plate about its own axis (flange roll) does not show, for the "
+            f"holes were told apart in {len(turns)} of {len(observations)} poses: the camera's "
+            "pose does not depend on it"
         )
     mean = np.angle(np.exp(1j * turns).mean())  # the angles may lie about half a turn
     off = np.angle(np.exp(1j * (turns - mean)))
@@ -44,8 +44,8 @@ def roll_note(
     deviation = np.hypot(1.25 * of_one / np.sqrt(len(turns)), rotation)
     return (
         f"the plate is turned by {np.degrees(middle):.2f} +- {np.degrees(deviation):.2f} deg about "
-        f"its own axis against the controller's frame (clocking, from the holes in {len(turns)} "
-        "poses): the camera's pose does not depend on it"
+        f"its own axis against the controller's frame (flange roll, from the bolt pattern in "
+        f"{len(turns)} poses): the camera's pose does not depend on it"
     )
 
 

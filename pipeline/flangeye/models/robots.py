@@ -39,7 +39,7 @@ class FlangeDetails(Model):
     bore_depth: Length = param("6 mm", description="Depth of the centring bore.")
     thickness: Length = param("6 mm", description="Height of the plate above the wrist.")
     pin_angle: Angle | None = param(
-        None, description="Where the pin hole is, about the flange's z; without it no clocking."
+        None, description="Where the pin hole is, about the flange's z; without it no flange roll."
     )
     wrist: Length = param("75 mm", description="Diameter of the wrist's housing behind the plate.")
     wrist_length: Length = param("40 mm", description="Length of that housing, from the face.")

@@ -24,7 +24,7 @@ MOVES_WELL = 0.5
 FOLD = np.radians(120.0)
 """An arm that is under way does not turn a joint farther from home: it would fold over."""
 
-CLOCKINGS = 8
+ROLLS = 8
 """How many directions of the flange's x axis are tried for the one the arm likes best."""
 
 TABLE = 0.0
@@ -116,8 +116,8 @@ class Reach:
     def _rolls(self, centre: Floats) -> list[Floats]:
         """Return poses (4, 4) at a point that look at the scanner, turned about that view."""
         poses = []
-        for step in range(CLOCKINGS):
-            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / CLOCKINGS)
+        for step in range(ROLLS):
+            turn = rotation_from_rpy(np.pi, 0.0, 2 * np.pi * step / ROLLS)
             poses.append(rigid(self._base_T_camera[:3, :3] @ turn, centre))
         return poses
 

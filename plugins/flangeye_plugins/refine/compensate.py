@@ -57,7 +57,7 @@ def refine_compensate(
     the paper's, holds for an error of this direction only.
 
     The answer then is right for that one view, its noise, the arm's error there and the flange's
-    own clocking included: the notes say what it does to the poses that were solved from. The
+    own roll included: the notes say what it does to the poses that were solved from. The
     covariance grows by the step taken, as if it were one standard deviation.
 
     Raises:

@@ -37,7 +37,7 @@ class Registration:
         motion: (4, 4) that takes the measured points onto the surface.
         rms: Distance of the matched points from the surface afterwards [m].
         overlap: Share of the measured points that matched.
-        clocking_seen: Whether rotation about the plate's axis was determined.
+        roll_seen: Whether rotation about the plate's axis was determined.
     """
 
     motion: Floats

@@ -142,10 +142,12 @@ def clocked(poses: Sequence[Observation], turn: float) -> list[Observation]:
 
 
 @pytest.mark.parametrize("turn", [0.84, -90.0, 180.0])
-def test_a_constant_clocking_is_estimated_from_the_holes(ur5: RobotModel, turn: float) -> None:
+def test_a_constant_flange_roll_is_estimated_from_the_holes(ur5: RobotModel, turn: float) -> None:
     plain = simulate(ur5, 20)
     calibration = solver(ur5)(clocked(plain, np.radians(turn)))
-    (note,) = [n for n in calibration.notes if "(clocking, from the holes in 20 poses)" in n]
+    (note,) = [
+        n for n in calibration.notes if "(flange roll, from the bolt pattern in 20 poses)" in n
+    ]
     found, deviation = (float(n) for n in re.findall(r"by (\S+) \+- (\S+) deg", note)[0])
     assert abs((found - turn + 180) % 360 - 180) <= 4 * deviation
     assert deviation < 0.2
@@ -155,10 +157,10 @@ def test_a_constant_clocking_is_estimated_from_the_holes(ur5: RobotModel, turn: 
     )
 
 
-def test_a_clocking_that_cannot_be_told_is_named(ur5: RobotModel) -> None:
+def test_a_flange_roll_that_cannot_be_told_is_named(ur5: RobotModel) -> None:
     assert (
-        "a constant turn of the plate about its own axis (clocking) does not show, for holes were "
-        "told apart in 0 of 20 poses: the camera's pose does not depend on it"
+        "a constant turn of the plate about its own axis (flange roll) does not show, for the holes "
+        "were told apart in 0 of 20 poses: the camera's pose does not depend on it"
     ) in solver(ur5)(simulate(ur5, 20)).notes
 
 

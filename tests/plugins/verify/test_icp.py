@@ -241,8 +241,8 @@ def test_error_holdout_needs_three_poses() -> None:
     )
 
 
-def test_the_published_flange_clocking_is_found(ancorasir: Path) -> None:
-    """Published H, verification cloud and CAD: 0.5-0.6 mm at the flange, clocking 0.84 deg.
+def test_the_published_flange_roll_is_found(ancorasir: Path) -> None:
+    """Published H, verification cloud and CAD: 0.5-0.6 mm at the flange, roll 0.84 deg.
 
     The paper prints (-0.26, +-0.27, -0.35) mm at the camera's origin, where an ICP stopped early.
     """
