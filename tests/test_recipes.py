@@ -67,10 +67,6 @@ def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
         words += ["--move"]
     told = flangeye(*words, cwd=tmp_path)
     result = json.loads((tmp_path / "run" / "result.json").read_text())
-    if "2019-sample" in name:  # six poses nearly in line
-        assert (told.returncode, result["status"]) == (1, "refused")
-        assert "centres lie on a line" in result["refused"]
-        return
     assert told.returncode == 0, told.stderr
     assert result["status"] == "verified"
     if result["weld"]:

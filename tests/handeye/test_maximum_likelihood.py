@@ -181,6 +181,23 @@ def test_poses_that_are_all_the_same():
     assert refusal(made, StageError) == ("all 5 poses are the same: move the arm between captures")
 
 
+@pytest.mark.parametrize("feature", ["normal", "centre"])
+def test_normals_tell_the_turn_about_a_line_of_centres(feature):
+    """As well as a tilt common to all of them is known; without normals nothing does."""
+    along = np.tile(np.eye(4), (6, 1, 1))
+    along[:, 0, 3] = np.linspace(-0.12, 0.12, 6)
+    made = session(
+        CONFIGURATIONS["eye-on-base, flange"], np.random.default_rng(11), n=6, poses=along,
+        feature=feature,
+    )  # fmt: skip
+    if feature == "centre":
+        assert "lie on a line along base" in refusal(made)
+        return
+    found = solve(made).camera
+    assert np.degrees(np.abs(errors(found, made.truth["base_T_camera"])[:3]).max()) < 0.3
+    assert 0.05 < np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])) < 0.3
+
+
 def test_a_mirrored_camera_is_recognised():
     made = session(MARKER, np.random.default_rng(12), n=15)
     flip = np.diag([1.0, 1.0, -1.0, 1.0])

@@ -85,6 +85,9 @@ def unobservable(problem: Problem, found: Solution, limits: ObservabilityLimits)
     weights = weights_of(problem.measurements.where(kept), found.linear.where(kept), FLOOR)
     jacobian = found.linear.jacobian[kept] @ found.basis
     information = np.einsum("nai,nab,nbj->ij", jacobian, weights, jacobian, optimize=True)
+    # What normals have in common is known beforehand, and all else is left to the poses.
+    known, _ = problem.prior(found.noise)
+    information += found.basis.T @ (known[:, None] * found.basis)
     scale = _scale(found.basis, limits)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     weak = found.basis @ (scale[:, None] * vectors[:, values < 1.0])
