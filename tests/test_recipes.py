@@ -9,6 +9,7 @@ import pytest
 
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.log.read import read_run
+from flangeye.models.cell import Cell
 from flangeye.models.configuration import Configuration
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe, recipe_names
@@ -91,6 +92,7 @@ CONFIGURATIONS = [name for name in NAMES if name.startswith("configurations/")]
 
 
 COARSER = {
+    "acquire.simulated_cell": [],
     "acquire.simulated_session": ["steps.0.resolution=0.3"],
     "acquire.simulated_images": [
         "steps.0.resolution=0.3", "steps.0.lens.size=[800, 640]", "steps.0.lens.focal_length=875",
@@ -112,7 +114,8 @@ def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
     folder = RunFolder.create(name, tmp_path / "run")
     result = record_run(checked, registry, folder, Start(), report=False)
     assert result.status == "verified"
-    assert set(result.transforms) == set(checked.context[Configuration].unknowns)
+    layout = checked.context.get(Cell) or checked.context[Configuration]
+    assert set(result.transforms) == set(layout.unknowns)
     assert sum(o.used for o in result.observations) >= 0.8 * len(result.observations)
     assert result.truth.rms_over_workspace < 6 * result.workspace.predicted_rms
     (limit,) = [s.params.max_rms for s in checked.steps if s.stage.name == "verify.holdout"]

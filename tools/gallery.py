@@ -20,11 +20,16 @@ CONFIGURATIONS = {
     "eye-on-arm-2": "eye-on-arm, case 2",
     "two-arms": "two arms",
     "four-axes": "four axes, eye-in-hand",
+    "two-scanners": "two fixed scanners and one arm",
+    "two-arms-three-scanners": "two arms with a scanner each and one between",
+    "arm-on-rail": "an arm on a rail",
+    "hand-and-wall": "a scanner in the hand, one on the wall",
 }
 """Recipes of recipes/configurations, by the first word of their name."""
 
 INPUTS = {
     "acquire.simulated": "simulated cell",
+    "acquire.simulated_cell": "simulated marker",
     "acquire.simulated_session": "simulated scans",
     "acquire.simulated_marker": "simulated marker",
     "acquire.simulated_images": "simulated images",
@@ -52,13 +57,17 @@ def _row(name, recipe):
     solver = " + ".join(s for s in steps if s.startswith(("solve.", "refine.")))
     cells = [
         f"[{name}]({name}.yaml)",
-        header.robot.model,
+        header.robot.model if header.robot else _arms(header.cell),
         header.scanner.model if header.scanner else "",
         INPUTS[steps[0]],
         solver,
         header.title,
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def _arms(cell) -> str:
+    return " and ".join(arm.model for arm in cell.arms.values())
 
 
 def configurations() -> str:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 STAGES = {
     "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
+    "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:acquire_simulated_cell",
     "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
     "acquire_simulated_marker",
     "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"

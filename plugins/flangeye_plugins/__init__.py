@@ -21,6 +21,7 @@ STAGES = {
     "fit.aruco": "flangeye_plugins.fit.boards:fit_aruco",
     "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
     "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",
+    "solve.cell": "flangeye_plugins.solve.cell:solve_cell",
     "solve.robust": "flangeye_plugins.solve.robust:solve_robust",
     "solve.svd": "flangeye_plugins.solve.svd:solve_svd",
     "solve.iterative": "flangeye_plugins.solve.iterative:solve_iterative",

@@ -229,9 +229,7 @@ def test_the_loop_closes_for_two_arms():
     target = first.base_T_flange.matrix @ x @ first.feature.camera_T_target.matrix
     second = Transform(BASE2, FLANGE2, np.linalg.inv(y) @ target @ np.linalg.inv(z))
     pair = [replace(first, poses=by_frame(first.base_T_flange, second))]
-    mapped, expected = mapped_and_expected(
-        configuration, transforms, carriers_of(configuration, pair, None), pair
-    )
+    mapped, expected = mapped_and_expected(configuration.ends(transforms, pair), pair)
     assert np.allclose(mapped, expected, atol=1e-12)
 
 

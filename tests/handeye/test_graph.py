@@ -1,10 +1,13 @@
 """Several cameras, arms, rails and targets at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.handeye.graph import Frame, Sighting, chain, solve_graph
+from flangeye.handeye.graph import Sighting, solve_graph
+from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -158,3 +161,56 @@ def test_frames_that_lead_to_two_roots_are_refused():
         solve_graph({"a": Frame("base"), "b": Frame("floor")}, [])
     with pytest.raises(StageError, match="stands on itself"):
         solve_graph({"a": Frame("b"), "b": Frame("a")}, [])
+
+
+def arm_noise(frames):
+    moved = [n for n, f in frames.items() if f.place is not None and f.place.ndim == 3]
+    return {name: np.diag([1e-4**2] * 3 + [5e-5**2] * 3) for name in moved}
+
+
+def test_wrong_sightings_of_every_pair_are_set_aside():
+    name = "a scanner in the hand and one on the wall that never see the same thing"
+    frames, unknown, pairs = CELLS[name]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    sightings = seen(frames, pairs, np.random.default_rng(3))
+    wrong = [1, 8, 15, 20]
+    for i in wrong:
+        sightings[i] = replace(sightings[i], pose=pose(0.3, 0, 0, 0.1, 0, 0) @ sightings[i].pose)
+    found = solve_graph(given, sightings, arm_noise(frames))
+    assert set(wrong) <= set(np.flatnonzero(~found.inliers))
+    assert found.inliers.sum() >= len(sightings) - len(wrong) - 1
+    for each in unknown:
+        assert np.linalg.norm(error(found.places[each], frames[each].place)[3:]) < 1e-3
+
+
+def test_the_noise_of_what_moves_is_found_from_the_residuals():
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    rng = np.random.default_rng(4)
+    shaken = frames["flange"].place.copy()
+    shaken[:, :3, 3] += 5e-4 * rng.standard_normal((N, 3))
+    actual = {**frames, "flange": Frame("base", shaken)}
+    sightings = seen(actual, pairs, rng)
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    noise = {"flange": np.diag([1e-6**2] * 3 + [5e-5**2] * 3)}
+    found = solve_graph(given, sightings, noise)
+    assert 5e-5 * np.sqrt(found.movers) == pytest.approx(5e-4, rel=0.35)
+
+
+def test_circles_on_the_flange_itself_tie_two_scanners():
+    """Centres with normals: the flange's own circle, its place known, its turn not seen."""
+    frames, _, _ = CELLS["two fixed scanners and one arm"]
+    frames = {**frames, "marker": Frame("flange", np.eye(4))}
+    given = {**frames, "left": Frame("base"), "right": Frame("base")}
+    circles = []
+    pairs = [("left", "marker"), ("right", "marker")]
+    for s in seen(frames, pairs, np.random.default_rng(5)):
+        normal = s.pose[:3, 2]
+        projector = np.eye(6)
+        projector[:3, :3] -= np.outer(normal, normal)
+        spun = s.pose @ pose(0, 0, 2.0, 0, 0, 0)
+        circles.append(replace(s, pose=spun, projector=projector))
+    found = solve_graph(given, circles)
+    for each in ("left", "right"):
+        off = error(found.places[each], frames[each].place)
+        assert off @ np.linalg.solve(found.covariances[each], off) < 22.5
+        assert np.linalg.norm(off[3:]) < 1e-3

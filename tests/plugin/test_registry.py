@@ -110,7 +110,7 @@ def test_a_stage_says_which_configurations_it_serves():
         stage("solve.x", serves=["eye-on-wall"])
     assert str(caught.value) == (
         "stage 'solve.x' serves 'eye-on-wall', which is no configuration; known: eye-on-base, "
-        "eye-in-hand, eye-on-arm, two-arms"
+        "eye-in-hand, eye-on-arm, two-arms, cell"
     )
 
 

@@ -129,8 +129,8 @@ def test_a_good_recipe_resolves_to_itself(toy_registry):
             STEPS.replace("title: T", "titel: T"),
             ["r.yaml:1: title: is missing",
              "r.yaml:1: titel: unknown key 'titel'; did you mean 'title'? (allowed: title, "
-             "description, robot, second_robot, scanner, configuration, feature, workspace, seed, "
-             "log, steps)"],
+             "description, robot, second_robot, scanner, configuration, cell, feature, "
+             "workspace, seed, log, steps)"],
         ),
         (
             "robot: {model: ur55}\n" + STEPS,

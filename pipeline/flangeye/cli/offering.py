@@ -13,12 +13,13 @@ from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_reci
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: every mistake, with its line; what it has to find."""
+    from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
     from flangeye.recipe.load import find_recipe
 
     checked = read_recipe(recipe, load_plugins(), overrides)
     say(f"{find_recipe(recipe)}: ok, {len(checked.steps)} steps")
-    say(checked.context[Configuration].describe())
+    say((checked.context.get(Cell) or checked.context[Configuration]).describe())
 
 
 @app.command()

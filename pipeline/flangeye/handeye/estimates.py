@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.maths.geometry import adjoint_shift
 from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import Configuration, carriers_of, mapped_and_expected
+from flangeye.models.configuration import Configuration, mapped_and_expected
 from flangeye.types import Floats, HandEye, Observation, Pair, Transform, TransformEstimate
 
 
@@ -60,8 +60,8 @@ def points_of_interest(
 
     The middle of what the camera saw; for a target's place the target itself.
     """
-    carriers = carriers_of(configuration, observations, arm)
-    mapped, _ = mapped_and_expected(configuration, transforms, carriers, observations)
+    ends = configuration.ends(transforms, observations, arm)
+    mapped, _ = mapped_and_expected(ends, observations)
     seen = np.array([o.feature.centre for o in observations])
     camera, *others = configuration.unknowns
     points = {name: transforms[name].translation for name in others}
@@ -78,8 +78,8 @@ def pairs_of(
     reasons: Sequence[str | None],
 ) -> tuple[Pair, ...]:
     """Return every observation with its residual in ``base``, and why it was not used."""
-    carriers = carriers_of(configuration, observations, arm)
-    mapped, expected = mapped_and_expected(configuration, transforms, carriers, observations)
+    ends = configuration.ends(transforms, observations, arm)
+    mapped, expected = mapped_and_expected(ends, observations)
     return tuple(
         Pair(o, residual, reason is None, reason)
         for o, residual, reason in zip(observations, mapped - expected, reasons, strict=True)

@@ -2,48 +2,51 @@ r"""Any number of cameras, arms, rails and targets at once: one graph of frames.
 
 Every frame stands on another, down to one root. What stands still on its parent is known or
 unknown; what an arm or a rail moves is measured at each time. A sighting of a target by a camera
-closes a loop:
+closes a loop in that graph:
 
     root_T_camera(t)^-1 · root_T_target(t) = camera_T_target
 
 The unknowns are those for which the squared errors of all sightings, each weighed by its own
-covariance, are least (Levenberg-Marquardt on SE(3), analytic Jacobians). Cameras that never see the
-same thing are tied by the arms between them.
+covariance and that of what carried its ends, are least (Levenberg-Marquardt on SE(3), analytic
+Jacobians). Cameras that never see the same thing are tied by the arms between them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flangeye.errors import CalibrationRefused, StageError
-from flangeye.maths.geometry import hat, invert, rigid, rotation_exp, rotation_log
-from flangeye.types import Floats, Indices
+from flangeye.errors import CalibrationRefused
+from flangeye.maths.frame_graph import Frame, chain, composed, root_of
+from flangeye.maths.geometry import (
+    hat,
+    invert,
+    rigid,
+    rotation_between,
+    rotation_exp,
+    rotation_log,
+)
+from flangeye.maths.statistics import chi2_quantile, covariance_inflation
+from flangeye.types import Floats, Indices, Mask
 
-ITERATIONS, STARTS = 60, 24
-"""Of the descent, and random starts of it; the best counts."""
+ITERATIONS, STARTS = 60, 60
+"""Of the descent, and random starts of it at most."""
+AGREE = 1e-3
+"""Two starts whose costs differ by this share ended in one valley, which then is the answer."""
 SOLVED = 1e-10
 """A step as small as this ends a descent [rad, m]."""
-EXPLAINED = 3.0
-"""A cost per degree of freedom, of which a descent that ended in the right valley has one."""
 UNKNOWN = 1e-9
 """Directions of less information than this share of the most are not told."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What stands on what.
-
-    Attributes:
-        parent: The frame it stands on.
-        place: (4, 4) parent_T_frame where it is known and still; (M, 4, 4) where it is measured at
-            M times; None where it is still and to be found.
-    """
-
-    parent: str
-    place: Floats | None = None
+ROUNDS = 4
+"""Of finding the movers' noise, and what it makes of the sightings."""
+GATE = 0.9995
+"""A good sighting is set aside with one in two thousand's probability."""
+TURNS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+"""Onto the rotation of a residual."""
+SIZES = np.logspace(-3, 4, 141)
+"""Factors on the movers' variances that are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +57,9 @@ class Sighting:
         time: Index of the measured poses.
         camera: Its frame.
         target: Its frame.
-        pose: (4, 4) camera_T_target.
+        pose: (4, 4) camera_T_target; of a circle's the turn about z means nothing.
         covariance: (6, 6) of a left perturbation in ``camera``, rotation before translation.
+        projector: (6, 6) onto what was measured.
     """
 
     time: int
@@ -63,6 +67,7 @@ class Sighting:
     target: str
     pose: Floats
     covariance: Floats
+    projector: Floats = field(default_factory=lambda: np.eye(6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,131 +76,301 @@ class Solved:
 
     Attributes:
         places: (4, 4) parent_T_frame by frame.
-        covariances: (6, 6) of each, a left perturbation in its parent.
+        covariances: (6, 6) of each: a turn about its origin, in its parent, and a shift.
+        joint: (6 K, 6 K) covariance of all, in the order of ``places``.
         residuals: (N, 6) of the sightings, rotation before translation, in ``camera``.
+        squares: (N,) of the residuals, in units of their covariance.
+        inliers: (N,) which sightings count.
+        movers: Factor on the stated variances of what moves, as the residuals show it.
     """
 
     places: Mapping[str, Floats]
     covariances: Mapping[str, Floats]
+    joint: Floats
     residuals: Floats
+    squares: Floats
+    inliers: Mask
+    movers: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """All sightings of one target by one camera: (M,), (M, 4, 4), and (M, 6, 6) to unit noise."""
+    """All sightings of one target by one camera.
+
+    Attributes:
+        camera: Its frame.
+        target: Its frame.
+        rows: (M,) which of all sightings.
+        times: (M,) of each.
+        poses: (M, 4, 4).
+        whole: (M,) whether the turn about the target's z was measured.
+    """
 
     camera: str
     target: str
+    rows: Indices
     times: Indices
     poses: Floats
-    whiteners: Floats
+    whole: Mask
 
 
-def solve_graph(frames: Mapping[str, Frame], sightings: Sequence[Sighting]) -> Solved:
+def solve_graph(
+    frames: Mapping[str, Frame],
+    sightings: Sequence[Sighting],
+    noise: Mapping[str, Floats] | None = None,
+) -> Solved:
     """Find every frame whose place is unknown.
 
     Args:
         frames: By name; the root has no entry.
         sightings: N of them.
+        noise: (6, 6) covariance of the measured place of what moves, by frame: a turn about its
+            origin and a shift, alike in all directions. Its ratios are believed; its size is found
+            from the residuals, and what then lies beyond is set aside. Without it the sightings'
+            own covariances are all there is, and all count.
 
     Raises:
         StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
         CalibrationRefused: The sightings leave something unknown: it says what.
     """
-    _root(frames)
-    unknown = [name for name, frame in frames.items() if frame.place is None]
-    pairs = _pairs(sightings)
-    places = _best(frames, pairs, unknown, 6 * (len(sightings) - len(unknown)))
-    residuals, jacobian = _linearised(frames, pairs, places)
-    information = np.einsum("nij,nik->jk", jacobian, jacobian)
-    _refuse_unknown(information, unknown)
-    covariance = np.linalg.inv(information)
-    blocks = {n: covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(unknown)}
-    plain = np.linalg.solve(np.concatenate([p.whiteners for p in pairs]), residuals[..., None])
-    return Solved(places, blocks, plain[..., 0])
+    root_of(frames)
+    graph = _Graph.of(frames, sightings)
+    own = _whiteners(graph.covariances, graph.projectors)
+    places = _best(graph, own)
+    every = np.ones(len(sightings), bool)
+    if noise is None:
+        return _solved(graph, _descend(graph, places, own), own, every, 1.0)
+    for _ in range(ROUNDS):
+        carried = graph.carried(places, noise)
+        size, kept, whiteners = _weighed(graph, graph.residuals(places), carried)
+        places = _descend(graph, places, whiteners * kept[:, None, None])
+    return _solved(graph, places, whiteners, kept, size)
+
+
+def _solved(
+    graph: _Graph, places: Mapping[str, Floats], whiteners: Floats, kept: Mask, size: float
+) -> Solved:
+    residuals, jacobian = graph.linearised(places)
+    information = information_of(whiteners[kept] @ jacobian[kept])
+    _refuse_unknown(information, list(places))
+    freedom = float(graph.freedoms[kept].sum()) - len(information)
+    wider = covariance_inflation(max(freedom, 1.0), 6)
+    joint = np.asarray(np.linalg.inv(information) * wider, dtype=np.float64)
+    blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(places)}
+    squares = _squares(whiteners, residuals)
+    return Solved(places, blocks, joint, residuals, squares, kept, size)
+
+
+def information_of(jacobian: Floats) -> Floats:
+    """Return J^T J of (N, 6, P) rows of unit covariance."""
+    return np.asarray(np.einsum("nij,nik->jk", jacobian, jacobian))
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """Frames and what was sighted."""
+
+    frames: Mapping[str, Frame]
+    pairs: Sequence[_Pair]
+    covariances: Floats
+    projectors: Floats
+
+    @classmethod
+    def of(cls, frames: Mapping[str, Frame], sightings: Sequence[Sighting]) -> _Graph:
+        projectors = np.array([s.projector for s in sightings]).reshape(-1, 6, 6)
+        covariances = np.array([s.covariance for s in sightings]).reshape(-1, 6, 6)
+        return cls(frames, _pairs(sightings), covariances, projectors)
+
+    @property
+    def unknown(self) -> list[str]:
+        return [name for name, frame in self.frames.items() if frame.place is None]
+
+    @property
+    def freedoms(self) -> Floats:
+        return np.asarray(np.trace(self.projectors, axis1=1, axis2=2).round())
+
+    def residuals(self, places: Mapping[str, Floats]) -> Floats:
+        """Return the (N, 6) errors of the sightings, across what was measured alone."""
+        out = np.zeros((len(self.projectors), 6))
+        for pair in self.pairs:
+            out[pair.rows] = _residuals(self._at(pair, places), pair)
+        return np.asarray((self.projectors @ out[..., None])[..., 0])
+
+    def linearised(self, places: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+        """Return (N, 6) residuals and their (N, 6, 6 K) Jacobian."""
+        return self.residuals(places), self.projectors @ self._effects(places, list(places))
+
+    def carried(self, places: Mapping[str, Floats], noise: Mapping[str, Floats]) -> Floats:
+        """Return the (N, 6, 6) covariance that the movers' noise has in the camera."""
+        effects = self._effects(places, list(noise))
+        stated = np.zeros((6 * len(noise),) * 2)
+        for i, covariance in enumerate(noise.values()):
+            stated[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = covariance
+        return np.asarray(effects @ stated @ np.swapaxes(effects, 1, 2))
+
+    def _at(self, pair: _Pair, places: Mapping[str, Floats]) -> dict[str, Frame]:
+        """Return the frames at the times of a pair, all places known."""
+        out = {}
+        for name, frame in self.frames.items():
+            place = np.asarray(places.get(name, frame.place))
+            out[name] = replace(frame, place=place if place.ndim == 2 else place[pair.times])
+        return out
+
+    def _effects(self, places: Mapping[str, Floats], moved: Sequence[str]) -> Floats:
+        """Return (N, 6, 6 K): how K frames turn and move what is seen, in ``camera``."""
+        out = np.zeros((len(self.projectors), 6, 6 * len(moved)))
+        for pair in self.pairs:
+            out[pair.rows] = _effects(self._at(pair, places), pair, moved)
+        return out
 
 
 def _pairs(sightings: Sequence[Sighting]) -> list[_Pair]:
     """Return the sightings by who saw whom."""
     out = []
     for camera, target in dict.fromkeys((s.camera, s.target) for s in sightings):
-        of = [s for s in sightings if (s.camera, s.target) == (camera, target)]
-        whiteners = np.linalg.inv(np.linalg.cholesky(np.array([s.covariance for s in of])))
+        rows = [i for i, s in enumerate(sightings) if (s.camera, s.target) == (camera, target)]
+        of = [sightings[i] for i in rows]
         times, poses = np.array([s.time for s in of]), np.array([s.pose for s in of])
-        out.append(_Pair(camera, target, times, poses, whiteners))
+        whole = np.array([np.trace(s.projector) > 5.5 for s in of])
+        out.append(_Pair(camera, target, np.array(rows), times, poses, whole))
     return out
 
 
-def _best(
-    frames: Mapping[str, Frame], pairs: Sequence[_Pair], unknown: Sequence[str], freedom: int
-) -> dict[str, Floats]:
-    """Return the lowest of many descents; the first that explains the sightings ends the search."""
+def _residuals(frames: Mapping[str, Frame], pair: _Pair) -> Floats:
+    """Return (M, 6): what takes the measured targets of a pair to the predicted ones."""
+    seen = _each(frames, pair.camera, pair)
+    seen = invert(seen) @ _each(frames, pair.target, pair)
+    whole = rotation_log(seen[:, :3, :3] @ np.swapaxes(pair.poses[:, :3, :3], 1, 2))
+    turns = rotation_between(pair.poses[:, :3, 2], seen[:, :3, 2])
+    turns[pair.whole] = whole[pair.whole]
+    return np.concatenate([turns, seen[:, :3, 3] - pair.poses[:, :3, 3]], axis=1)
+
+
+def _each(frames: Mapping[str, Frame], name: str, pair: _Pair) -> Floats:
+    return np.broadcast_to(composed(frames, name), (len(pair.times), 4, 4))
+
+
+def _effects(frames: Mapping[str, Frame], pair: _Pair, moved: Sequence[str]) -> Floats:
+    """Return (M, 6, 6 K): how each frame turns and moves the target in ``camera``."""
+    out = np.zeros((len(pair.times), 6, 6 * len(moved)))
+    index = {name: 6 * i for i, name in enumerate(moved)}
+    back = np.swapaxes(_each(frames, pair.camera, pair)[:, :3, :3], 1, 2)
+    tip = _each(frames, pair.target, pair)[:, :3, 3]
+    for end, sign in ((pair.target, 1.0), (pair.camera, -1.0)):
+        before = np.eye(4)
+        for name in chain(frames, end):
+            after = before @ np.asarray(frames[name].place)
+            if name in index:
+                # A turn about the place's own origin, in its parent's axes, and a shift of it.
+                turns, column = sign * back @ before[..., :3, :3], index[name]
+                arm = hat((back @ (tip - after[..., :3, 3])[..., None])[..., 0])
+                out[:, :3, column : column + 3] += turns
+                out[:, 3:, column : column + 3] -= arm @ turns
+                out[:, 3:, column + 3 : column + 6] += turns
+            before = after
+    return out
+
+
+# --- noise ---------------------------------------------------------------------------------------
+
+
+def _whiteners(covariances: Floats, projectors: Floats) -> Floats:
+    """Return (N, 6, 6) that make errors of unit covariance, none across what was not measured."""
+    values, vectors = np.linalg.eigh(projectors @ covariances @ projectors)
+    roots = np.where(values > 1e-16, 1 / np.sqrt(np.maximum(values, 1e-16)), 0.0)
+    return np.asarray((vectors * roots[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _squares(whiteners: Floats, residuals: Floats) -> Floats:
+    return np.asarray(((whiteners @ residuals[..., None])[..., 0] ** 2).sum(axis=1))
+
+
+def _weighed(graph: _Graph, residuals: Floats, carried: Floats) -> tuple[float, Mask, Floats]:
+    """Return the size of the movers' noise, the sightings within it, and the whiteners with it.
+
+    The size at which of each pair half of the sightings lie within the half they should; then, of
+    those within the gate, that at which their squares come to their freedoms.
+    """
+    freedoms = graph.freedoms
+    half = np.array([chi2_quantile(0.5, int(f)) for f in freedoms])
+    gates = np.array([chi2_quantile(GATE, int(f)) for f in freedoms])
+    each = [_whiteners(graph.covariances + size * carried, graph.projectors) for size in SIZES]
+    squares = np.array([_squares(whiteners, residuals) for whiteners in each])
+    rough = _first_below(np.array([_middles(graph, s / half).max() for s in squares]), 1.0)
+    kept = squares[rough] < gates
+    wanted = max(freedoms[kept].sum() - 6 * len(graph.unknown), 1.0)
+    best = _first_below((squares * kept).sum(axis=1), wanted)
+    return float(SIZES[best]), squares[best] < gates, each[best]
+
+
+def _middles(graph: _Graph, squares: Floats) -> Floats:
+    """Return (N,) the median over the sightings of the same pair: each pair has outliers alone."""
+    out = np.zeros(len(squares))
+    for pair in graph.pairs:
+        out[pair.rows] = np.median(squares[pair.rows])
+    return out
+
+
+def _first_below(falling: Floats, level: float) -> int:
+    below = np.flatnonzero(falling <= level)
+    return int(below[0]) if len(below) else len(falling) - 1
+
+
+# --- descent -------------------------------------------------------------------------------------
+
+
+def _best(graph: _Graph, whiteners: Floats) -> dict[str, Floats]:
+    """Return the lowest of many descents that leave outliers behind; two that agree end it.
+
+    Rotations go first: without the places they have far fewer valleys to end in.
+    """
     rng, best, least = np.random.default_rng(0), {}, np.inf
     for _ in range(STARTS):
-        places = _descend(frames, pairs, {name: _anywhere(rng) for name in unknown})
-        cost = _cost(frames, pairs, places)
+        start = {name: _anywhere(rng) for name in graph.unknown}
+        turned = _descend(graph, start, whiteners @ TURNS, robust=True)
+        places = _descend(graph, turned, whiteners, robust=True)
+        cost = float(_middles(graph, _squares(whiteners, graph.residuals(places))).sum())
+        if abs(cost - least) <= AGREE * least + 1e-12:
+            return places
         if cost < least:
             best, least = places, cost
-        if cost < EXPLAINED * max(freedom, 1):
-            break
     return best
 
 
-def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
-    """Return the frames from the root to one, the root left out."""
-    path: list[str] = []
-    while name in frames:
-        if name in path:
-            raise StageError(f"frame '{name}' stands on itself; every frame leads to one root")
-        path.insert(0, name)
-        name = frames[name].parent
-    return path
-
-
-def _root(frames: Mapping[str, Frame]) -> str:
-    roots = sorted({frames[chain(frames, name)[0]].parent for name in frames})
-    if len(roots) != 1:
-        raise StageError(
-            f"the frames stand on {' and '.join(roots)}, which nothing ties; say on what they stand"
-        )
-    return roots[0]
-
-
 def _anywhere(rng: np.random.Generator) -> Floats:
-    turn = rotation_exp(rng.uniform(-np.pi, np.pi) * _unit(rng.standard_normal(3)))
+    axis = rng.standard_normal(3)
+    turn = rotation_exp(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis))
     return rigid(turn, rng.uniform(-0.5, 0.5, 3))
 
 
-def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.linalg.norm(vector))
-
-
-def _place(
-    frames: Mapping[str, Frame], places: Mapping[str, Floats], name: str, times: Indices
-) -> Floats:
-    known = frames[name].place
-    if known is None:
-        return places[name]
-    return known[times] if known.ndim == 3 else known
-
-
 def _descend(
-    frames: Mapping[str, Frame], pairs: Sequence[_Pair], places: dict[str, Floats]
+    graph: _Graph, places: Mapping[str, Floats], whiteners: Floats, robust: bool = False
 ) -> dict[str, Floats]:
-    """Return the places at the bottom of the valley they start in (Levenberg-Marquardt)."""
-    cost, damping = _cost(frames, pairs, places), 1e-2
+    """Return the places at the bottom of the valley they start in (Levenberg-Marquardt).
+
+    Args:
+        graph: What was sighted.
+        places: Where to start.
+        whiteners: (N, 6, 6) weights of the residuals.
+        robust: Whether sightings count less the further they are beyond most (Geman-McClure, its
+            width from each pair's median, so that it narrows as the fit improves).
+    """
+    damping, places = 1e-2, dict(places)
     for _ in range(ITERATIONS):
-        residuals, jacobian = _linearised(frames, pairs, places)
-        normal = np.einsum("nij,nik->jk", jacobian, jacobian)
-        gradient = np.einsum("nij,ni->j", jacobian, residuals)
+        residuals, jacobian = graph.linearised(places)
+        squares = _squares(whiteners, residuals)
+        width = np.maximum(4 * _middles(graph, squares), 1e-12) if robust else np.inf
+        weights = whiteners / (1 + squares / width)[:, None, None]
+        rows, errors = weights @ jacobian, (weights @ residuals[..., None])[..., 0]
+        normal, gradient = information_of(rows), np.einsum("nij,ni->j", rows, errors)
         damped = normal + damping * np.diag(np.diag(normal) + 1e-12)
         step = -np.linalg.solve(damped, gradient)
         moved = _moved(places, step)
-        after = _cost(frames, pairs, moved)
-        if after > cost:
+        after = _squares(whiteners, graph.residuals(moved))
+        if (after / (1 + after / width)).sum() > (squares / (1 + squares / width)).sum():
             damping = min(10 * damping, 1e12)
             continue
-        places, cost, damping = moved, after, damping / 10
+        places, damping = moved, max(damping / 10, 1e-10)
         if np.abs(step).max() < SOLVED:
             break
     return places
@@ -205,62 +380,7 @@ def _moved(places: Mapping[str, Floats], step: Floats) -> dict[str, Floats]:
     out = {}
     for i, (name, place) in enumerate(places.items()):
         turn, shift = step[6 * i : 6 * i + 3], step[6 * i + 3 : 6 * i + 6]
-        turned = rotation_exp(turn)
-        out[name] = rigid(turned @ place[:3, :3], place[:3, 3] + shift)
-    return out
-
-
-def _cost(
-    frames: Mapping[str, Frame], pairs: Sequence[_Pair], places: Mapping[str, Floats]
-) -> float:
-    return float(sum((_residuals(frames, p, places) ** 2).sum() for p in pairs))
-
-
-def _residuals(frames: Mapping[str, Frame], pair: _Pair, places: Mapping[str, Floats]) -> Floats:
-    """Return the (M, 6) errors of a pair's sightings, of unit covariance."""
-    camera = _composed(frames, places, pair.camera, pair.times)
-    seen = invert(camera) @ _composed(frames, places, pair.target, pair.times)
-    turn = rotation_log(seen[:, :3, :3] @ np.swapaxes(pair.poses[:, :3, :3], 1, 2))
-    error = np.concatenate([turn, seen[:, :3, 3] - pair.poses[:, :3, 3]], axis=1)
-    return np.asarray((pair.whiteners @ error[..., None])[..., 0])
-
-
-def _composed(
-    frames: Mapping[str, Frame], places: Mapping[str, Floats], name: str, times: Indices
-) -> Floats:
-    pose = np.tile(np.eye(4), (len(times), 1, 1))
-    for each in chain(frames, name):
-        pose = pose @ _place(frames, places, each, times)
-    return pose
-
-
-def _linearised(
-    frames: Mapping[str, Frame], pairs: Sequence[_Pair], places: Mapping[str, Floats]
-) -> tuple[Floats, Floats]:
-    """Return (N, 6) residuals of unit covariance and their (N, 6, 6 K) Jacobian, pair by pair."""
-    residuals = [_residuals(frames, pair, places) for pair in pairs]
-    jacobians = [pair.whiteners @ _effects(frames, pair, places) for pair in pairs]
-    return np.concatenate(residuals), np.concatenate(jacobians)
-
-
-def _effects(frames: Mapping[str, Frame], pair: _Pair, places: Mapping[str, Floats]) -> Floats:
-    """Return (M, 6, 6 K): how each unknown turns and moves the target in ``camera``."""
-    out = np.zeros((len(pair.times), 6, 6 * len(places)))
-    index = {name: 6 * i for i, name in enumerate(places)}
-    back = np.swapaxes(_composed(frames, places, pair.camera, pair.times)[:, :3, :3], 1, 2)
-    tip = _composed(frames, places, pair.target, pair.times)[:, :3, 3]
-    for end, sign in ((pair.target, 1.0), (pair.camera, -1.0)):
-        before = np.tile(np.eye(4), (len(pair.times), 1, 1))
-        for name in chain(frames, end):
-            after = before @ _place(frames, places, name, pair.times)
-            if name in index:
-                # A turn about the place's own origin, in its parent's axes, and a shift of it.
-                turns, column = sign * back @ before[:, :3, :3], index[name]
-                arm = hat((back @ (tip - after[:, :3, 3])[..., None])[..., 0])
-                out[:, :3, column : column + 3] += turns
-                out[:, 3:, column : column + 3] -= arm @ turns
-                out[:, 3:, column + 3 : column + 6] += turns
-            before = after
+        out[name] = rigid(rotation_exp(turn) @ place[:3, :3], place[:3, 3] + shift)
     return out
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flangeye.handeye.components import FINEST, Noise
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance
-from flangeye.maths.geometry import hat, rotation_exp, rotation_log
+from flangeye.maths.geometry import hat, rotation_between, rotation_exp, rotation_log
 from flangeye.types import Floats
 
 COLUMNS = 20
@@ -141,7 +141,7 @@ class _Chain:
         if whole.any():
             turned[whole] = rotation_log(s.rotations[whole] @ np.swapaxes(predicted[whole], 1, 2))
         if not whole.all():
-            turned[~whole] = _between(predicted[~whole, :, 2], s.rotations[~whole, :, 2])
+            turned[~whole] = rotation_between(predicted[~whole, :, 2], s.rotations[~whole, :, 2])
         out = np.concatenate([turned, s.centres - self._from_camera @ self._eye.T], axis=1)
         return np.asarray((s.projectors @ out[..., None])[..., 0])
 
@@ -170,14 +170,6 @@ class _Chain:
 
 def _apply(poses: Floats, points: Floats) -> Floats:
     return np.asarray((poses[:, :3, :3] @ points[:, :, None])[..., 0] + poses[:, :3, 3])
-
-
-def _between(first: Floats, second: Floats) -> Floats:
-    """Return the (N, 3) shortest rotation vectors that take unit vectors to others."""
-    cross = (hat(first) @ second[..., None])[..., 0]
-    sine = np.linalg.norm(cross, axis=1, keepdims=True)
-    angle = np.arctan2(sine, (first * second).sum(axis=1, keepdims=True))
-    return np.asarray(cross * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0))
 
 
 def free_columns(

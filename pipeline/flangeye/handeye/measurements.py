@@ -135,7 +135,7 @@ def measurements_of(
     if not observations:
         raise StageError("no pose to solve with: every capture was set aside, each for its reason")
     carriers = carriers_of(configuration, observations, arm)
-    each = [_measured(o, normals) for o in observations]
+    each = [measured(o, normals) for o in observations]
     rotations, covariances, projectors = (np.array(column) for column in zip(*each, strict=True))
     return Measurements(
         a=carriers.camera,
@@ -149,8 +149,8 @@ def measurements_of(
     )
 
 
-def _measured(observation: Observation, normals: bool) -> tuple[Floats, Floats, Floats]:
-    """Return rotation, covariance and projector of one feature."""
+def measured(observation: Observation, normals: bool) -> tuple[Floats, Floats, Floats]:
+    """Return (3, 3) rotation, (6, 6) covariance and (6, 6) projector of one feature."""
     feature = observation.feature
     if isinstance(feature, PoseFeature):
         return feature.camera_T_target.rotation, feature.covariance, np.eye(6)

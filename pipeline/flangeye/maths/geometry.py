@@ -83,6 +83,14 @@ def _rotation_log_anywhere(rotation: Floats) -> Floats:
     return np.asarray(xyz * np.where(length < 1e-12, 2.0, ratio))
 
 
+def rotation_between(first: Floats, second: Floats) -> Floats:
+    """Return the (N, 3) shortest rotation vectors that take unit vectors (N, 3) to others."""
+    cross = (hat(first) @ second[..., None])[..., 0]
+    sine = np.linalg.norm(cross, axis=1, keepdims=True)
+    angle = np.arctan2(sine, (first * second).sum(axis=1, keepdims=True))
+    return np.asarray(cross * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0))
+
+
 def quaternion_from_rotation(rotation: Floats) -> Floats:
     """Return unit quaternions (..., 4) xyzw, w >= 0, of (..., 3, 3) (Bar-Itzhack 2000).
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -45,6 +46,8 @@ CARRIERS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 EVERY = tuple(CARRIERS)
 """What a stage declares that serves every configuration: ``@stage("solve.x", serves=EVERY)``."""
+CELL = "cell"
+"""And one that serves cells of many cameras and targets: ``serves=(CELL,)``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +96,21 @@ class Configuration:
     def describe(self) -> str:
         """Return one line: the name, the loop and what is unknown in it."""
         return f"{self.name}: {self.equation}; to be found: {', '.join(self.unknowns)}"
+
+    def ends(
+        self,
+        transforms: Mapping[str, Transform],
+        observations: Sequence[Observation],
+        arm: Arm | None = None,
+    ) -> Ends:
+        """Return where camera and target of each observation are; see :class:`Layout`."""
+        carriers = carriers_of(self, observations, arm)
+        camera, target = carriers.camera @ transforms[self.unknowns[0]].matrix, carriers.target
+        if self.other_base:
+            target = transforms[self.other_base].matrix @ target
+        placed = self.place
+        place = transforms[f"{self.target}_T_{TARGET}"].matrix if placed is None else placed
+        return Ends(camera, target @ place)
 
 
 DEFAULT = Configuration(place=np.eye(4))
@@ -162,37 +180,48 @@ def _link(frame: str, observation: Observation, arm: Arm | None) -> Floats:
     return np.asarray(arm.frames(observation.joints)[index])
 
 
-def mapped_and_expected(
-    configuration: Configuration,
-    transforms: Mapping[str, Transform],
-    carriers: Carriers,
-    observations: Sequence[Observation],
-) -> tuple[Floats, Floats]:
-    """Return where observations saw their targets, and where these should be: (N, 3) in ``base``.
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where N observations have their two ends, by the controllers and the transforms.
 
-    Args:
-        configuration: The loop.
-        transforms: Its unknowns, found, by name.
-        carriers: What the controllers say.
-        observations: What was seen.
+    Attributes:
+        camera: (N, 4, 4) of the camera, in ``base``.
+        target: (N, 4, 4) of the target, in ``base``.
     """
+
+    camera: Floats
+    target: Floats
+
+
+class Layout(Protocol):
+    """What stands on what: a :class:`Configuration`, or a cell of many cameras and targets."""
+
+    @property
+    def is_default(self) -> bool:
+        """Whether it is a camera beside the robot that looks at the flange's own circle."""
+        ...
+
+    def ends(
+        self,
+        transforms: Mapping[str, Transform],
+        observations: Sequence[Observation],
+        arm: Arm | None = None,
+    ) -> Ends:
+        """Return where camera and target of each observation are.
+
+        Args:
+            transforms: The unknowns, found, by name.
+            observations: N of them.
+            arm: The arm's kinematics; needed where a link carries the camera.
+        """
+        ...
+
+
+def mapped_and_expected(ends: Ends, observations: Sequence[Observation]) -> tuple[Floats, Floats]:
+    """Return where targets were seen, and where they should be: (N, 3) each, in ``base``."""
     seen = np.array([o.feature.centre for o in observations]).reshape(-1, 3)
     offsets = np.array([o.centre_in_mount for o in observations]).reshape(-1, 3)
-    camera = carriers.camera @ transforms[configuration.unknowns[0]].matrix
-    target = target_poses(configuration, transforms, carriers)
-    return _apply(camera, seen), _apply(target, offsets)
-
-
-def target_poses(
-    configuration: Configuration, transforms: Mapping[str, Transform], carriers: Carriers
-) -> Floats:
-    """Return the (N, 4, 4) base_T_target that the controllers and the transforms speak for."""
-    poses, other = carriers.target, configuration.other_base
-    if other:
-        poses = transforms[other].matrix @ poses
-    if configuration.place is not None:
-        return np.asarray(poses @ configuration.place)
-    return np.asarray(poses @ transforms[f"{configuration.target}_T_{TARGET}"].matrix)
+    return _apply(ends.camera, seen), _apply(ends.target, offsets)
 
 
 def _apply(poses: Floats, points: Floats) -> Floats:

@@ -21,13 +21,15 @@ def workspace_of(source: t.Source, given: t.Box | None, pairs: Sequence[t.Pair])
 def work_of(calibration: t.HandEye, source: t.Source, given: t.Box | None) -> t.Box | None:
     """Return where the work is, in the frame that carries the camera.
 
-    That of :func:`workspace_of` where it is the base; where the robot moves the camera, the box
-    around what it looked at.
+    That of :func:`workspace_of` where it is the base; where the robot moves the camera, and in a
+    cell, the box around what it looked at.
     """
-    if calibration.camera.transform.parent == t.BASE:
+    camera = calibration.camera.transform
+    if camera.parent == t.BASE and (given or source.workspace or camera.child == t.CAMERA):
         return workspace_of(source, given, calibration.pairs)
-    seen = np.array([pair.observation.feature.centre for pair in calibration.pairs])
-    return _around(calibration.camera.transform.apply(seen.reshape(-1, 3)))
+    observed = [p.observation for p in calibration.pairs if p.observation.camera == camera.child]
+    seen = np.array([o.feature.centre for o in observed])
+    return _around(camera.apply(seen.reshape(-1, 3)))
 
 
 def _around(points: t.Array) -> t.Box | None:

@@ -29,7 +29,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
-from flangeye.models.configuration import EVERY
+from flangeye.models.configuration import CELL, EVERY
 
 
 class Params(BaseModel):
@@ -358,18 +358,19 @@ def stage(
     Args:
         name: ``kind.name``.
         serves: Configurations it can work in besides the default, by name;
-            :data:`flangeye.models.configuration.EVERY` for all.
+            :data:`flangeye.models.configuration.EVERY` for all,
+            and ``CELL`` for cells.
         formerly: Names it had, which recipes may still use for one version.
 
     Raises:
         TypeError: The signature breaks the contract of the stage's kind, or a configuration is
             not known.
     """
-    unknown = sorted(set(serves) - set(EVERY))
+    unknown = sorted(set(serves) - {*EVERY, CELL})
     if unknown:
         raise TypeError(
             f"stage '{name}' serves '{unknown[0]}', which is no configuration; known: "
-            f"{', '.join(EVERY)}"
+            f"{', '.join((*EVERY, CELL))}"
         )
 
     def declare(function: Callable[..., Any]) -> Stage:

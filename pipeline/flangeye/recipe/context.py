@@ -16,7 +16,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
-from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.models.cell import Cell
 from flangeye.models.configuration import CARRIERS, LINK, Configuration
 from flangeye.models.factory import as_built
 from flangeye.models.loading import load_model
@@ -27,12 +27,11 @@ from flangeye.models.standards import FlangeStandard, load_standard
 from flangeye.models.targets import Flange, Sphere, flange_of, wrist_circle_of
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.stage import BoundPart
+from flangeye.recipe.cell import cell_of, place_of
 from flangeye.recipe.header import (
-    ConfigurationSection,
     FeatureSection,
     Header,
     LimitsSection,
-    PlaceSection,
     RobotSection,
     ScannerSection,
 )
@@ -68,7 +67,10 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     if second := header.second_robot:
         place = ("second_robot", "model")
         offer(SecondRobot, place, lambda: SecondRobot(_model(second.model, folder)))
-    offer(Configuration, ("configuration",), lambda: _configuration(header, context))
+    if header.cell:
+        context[Cell] = cell_of(header, partial(_model, folder=folder), complain)
+    else:
+        offer(Configuration, ("configuration",), lambda: _configuration(header, context))
     if _plate_named(header, context):
         offer(Flange, ("feature",), lambda: _flange(header, context.get(RobotModel), folder))
     _devices(header, context, complain)
@@ -162,7 +164,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
     if target not in targets:
         allowed = " or ".join(targets)
         raise RecipeError(f"{section.name}: the target is carried by {allowed}, not by {target}")
-    return Configuration(section.name, camera, target, _place(section))
+    return Configuration(section.name, camera, target, place_of(section.place))
 
 
 def _require_link(camera: str, context: Context) -> None:
@@ -177,12 +179,6 @@ def _require_link(camera: str, context: Context) -> None:
             f"eye-on-arm: the camera is carried by a link, {links[0]} to {links[-1]}, not by "
             f"{camera}; write for example camera: {links[len(links) // 2 - 1]}"
         )
-
-
-def _place(section: ConfigurationSection) -> Any:
-    if isinstance(section.place, PlaceSection):
-        return rigid(rotation_from_rpy(*section.place.rpy), np.asarray(section.place.position))
-    return np.eye(4) if section.place == "known" else None
 
 
 def _check_limits(limits: LimitsSection, robot: RobotModel, complain: Complain) -> None:

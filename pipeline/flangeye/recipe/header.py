@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import CoreSchema
 
 from flangeye.plugin.stage import BoundPart, Choose
@@ -50,16 +57,19 @@ class LimitsSection(Section):
 class NamedSection(Section):
     """A section whose one word is its model: ``robot: ur10e``."""
 
+    word: ClassVar[str] = "model"
+
     @model_validator(mode="before")
     @classmethod
     def _from_a_word(cls, given: Any) -> Any:
-        return {"model": given} if isinstance(given, str) else given
+        return {cls.word: given} if isinstance(given, str) else given
 
     @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        word = {"type": "string", "description": "A model's name."}
+        what = "A model's name." if cls.word == "model" else "The frame it stands on."
+        word = {"type": "string", "description": what}
         return {"anyOf": [handler(core_schema), word]}
 
 
@@ -176,6 +186,9 @@ class PlaceSection(Section):
     )
 
 
+Place = Literal["known", "unknown"] | PlaceSection
+
+
 class ConfigurationSection(Section):
     """Who carries the camera and who the target; what has to be found follows."""
 
@@ -188,11 +201,77 @@ class ConfigurationSection(Section):
     target: str | None = Field(
         None, description="Frame that carries the target: flange, base or flange2."
     )
-    place: Literal["known", "unknown"] | PlaceSection = Field(
+    place: Place = Field(
         "known",
         description="Where the target is in that frame: known (at the origin, as the robot's own "
         "circles are), unknown (a marker), or its position and rpy.",
     )
+
+
+FrameName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", min_length=1)]
+ON = "What it stands on: base, or an arm, a rail or a positioner of the cell by name."
+KNOWN: Any = Field(
+    "known",
+    description="Where its base is on that: known (at its origin), unknown (to be found), or "
+    "position and rpy.",
+)
+TO_FIND: Any = Field("unknown", description="Where it is on that: unknown (to be found), or known.")
+
+
+class CellArmSection(NamedSection):
+    """An arm of a cell."""
+
+    model: str = Field(
+        description="A model that 'flangeye robots' lists, or a .yaml file of your own."
+    )
+    on: str = Field("base", description=ON)
+    place: Place = KNOWN
+
+
+class AxisSection(Section):
+    """What rails and positioners have in common."""
+
+    axis: tuple[float, float, float] = Field(description="Its direction in its base.")
+    on: str = Field("base", description=ON)
+    place: Place = KNOWN
+
+    @field_validator("axis")
+    @classmethod
+    def _points_somewhere(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(axis):
+            raise ValueError("the axis has no direction; write for example [1, 0, 0]")
+        return axis
+
+
+class RailSection(AxisSection):
+    """A rail of a cell."""
+
+    travel: tuple[Length, Length] = param(("-1 m", "1 m"), description="Lowest and highest.")
+
+
+class PositionerSection(AxisSection):
+    """A positioner of a cell: a plate that turns."""
+
+    travel: tuple[Angle, Angle] = param(("-180 deg", "180 deg"), description="Lowest and highest.")
+
+
+class StandingSection(NamedSection):
+    """A camera or a target of a cell; its one word is what it stands on."""
+
+    word: ClassVar[str] = "on"
+
+    on: str = Field("base", description=ON)
+    place: Place = TO_FIND
+
+
+class CellSection(Section):
+    """Several cameras, arms, rails and targets: what stands on what. One run solves all of it."""
+
+    arms: dict[FrameName, CellArmSection] = Field(default_factory=dict)
+    rails: dict[FrameName, RailSection] = Field(default_factory=dict)
+    positioners: dict[FrameName, PositionerSection] = Field(default_factory=dict)
+    cameras: dict[FrameName, StandingSection] = Field(min_length=1)
+    targets: dict[FrameName, StandingSection] = Field(min_length=1)
 
 
 class WorkspaceSection(BoxSection):
@@ -216,6 +295,7 @@ class Header(Section):
     second_robot: SecondRobotSection | None = None
     scanner: ScannerSection | None = None
     configuration: ConfigurationSection = Field(default_factory=ConfigurationSection)
+    cell: CellSection | None = None
     feature: FeatureSection = Field(default_factory=FeatureSection)
     workspace: WorkspaceSection | None = None
     seed: int = Field(0, ge=0, description="The only source of randomness.")

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, get_args
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed, RobotDriver, ScannerDriver
-from flangeye.models.configuration import DEFAULT, Configuration
+from flangeye.models.cell import Cell
+from flangeye.models.configuration import CELL, DEFAULT, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.targets import Flange, Sphere
@@ -65,6 +66,11 @@ SECTIONS: Mapping[Any, Offer] = {
         ("configuration",),
         "configuration: {name: eye-in-hand, place: unknown}",
     ),
+    Cell: Offer(
+        "a cell",
+        ("cell",),
+        "cell: {arms: {arm: ur5}, cameras: {left: base, right: base}, targets: {board: arm}}",
+    ),
     SecondRobot: Offer("the second arm", ("second_robot",), "second_robot: ur5"),
     RobotDriver: Offer(
         "the arm's driver",
@@ -90,6 +96,13 @@ WHAT_FOR = {
     "weld": "to lead the torch along the seam",
 }
 """Why a stage needs kinematics, by the longest start of its name."""
+IN_A_CELL = {
+    "acquire": "use acquire.simulated_cell",
+    "solve": "use solve.cell",
+    "verify": "use verify.holdout",
+    "export": "leave it out: calibration.yaml carries every transform of the cell",
+}
+"""What to do instead of a step that serves one camera and one target alone."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +135,7 @@ class StepOrder:
             complain: Told each mistake: where, and what.
             given: What stages may ask for from the start, by type.
         """
+        self._cell = Cell in given
         self._configuration: Configuration = given.get(Configuration) or DEFAULT
         self._circles = True
         self._complain = complain
@@ -139,6 +153,9 @@ class StepOrder:
         self._check_place(at, kind)
         takes = KINDS[kind].takes
         needs = _required(stage.needs.values()) if stage else takes[:1]
+        if self._cell and stage and not _serves_cells(stage):
+            self._complain(at, f"{name} serves no cell; {IN_A_CELL.get(kind, 'leave it out')}")
+            needs = []
         for need in needs:
             self._need(at, need, _what_for(name))
         if stage and kind == "fit":
@@ -174,6 +191,8 @@ class StepOrder:
 
     def _check_configuration(self, at: tuple[Hashable, ...], stage: Stage) -> None:
         """Refuse a stage in a configuration that it does not declare to serve."""
+        if self._cell:
+            return
         if not self._configuration.is_default:
             if self._configuration.name in stage.serves:
                 return
@@ -199,6 +218,12 @@ class StepOrder:
             later = list(KINDS)[self._rank]
             self._complain(at, f"{_a(kind)} step cannot come after {_a(later)} step")
         self._rank = max(self._rank, rank)
+
+
+def _serves_cells(stage: Stage) -> bool:
+    if stage.kind in ("segment", "fit"):  # these see one capture, whoever took it
+        return True
+    return CELL in stage.serves or Cell in map(bare, stage.needs.values())
 
 
 def bare(need: Any) -> Any:

@@ -13,8 +13,7 @@ from flangeye.maths.geometry import covariance_at, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import (
     DEFAULT,
-    Configuration,
-    carriers_of,
+    Layout,
     mapped_and_expected,
 )
 from flangeye.result.contract import (
@@ -31,7 +30,7 @@ from flangeye.result.contract import (
     WorkspaceResult,
 )
 
-Robots = tuple[Configuration, Arm | None]
+Robots = tuple[Layout, Arm | None]
 
 
 def transforms_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
@@ -134,6 +133,7 @@ def observations_result(
 def _observation(pair: t.Pair) -> ObservationResult:
     feature = pair.observation.feature
     circle = feature if isinstance(feature, t.CircleFeature) else None
+    alone = pair.observation.camera == t.CAMERA
     return ObservationResult(
         id=pair.observation.id,
         centre_in_camera=feature.centre.tolist(),
@@ -142,7 +142,9 @@ def _observation(pair: t.Pair) -> ObservationResult:
         covariance=feature.centre_covariance.tolist(),
         arc_coverage=circle.arc_coverage if circle else None,
         clocking=circle.roll if circle else None,
-        tcp_in_base=pair.observation.tcp_in_base.tolist(),
+        tcp_in_base=pair.observation.tcp_in_base.tolist() if alone else None,
+        camera=None if alone else pair.observation.camera,
+        target=None if alone else pair.observation.target,
         residual=float(np.linalg.norm(pair.residual)),
         residual_in_base=pair.residual.tolist(),
         used=pair.used,
@@ -181,7 +183,7 @@ def truth_result(
         calibration: The estimate.
         truth: What the simulation knows.
         box: The workspace.
-        robots: The configuration, and the kinematics of the arm whose error was corrected.
+        robots: What stands on what, and the kinematics of the arm whose error was corrected.
     """
     error = calibration.camera.transform.matrix @ truth.camera.inverse().matrix
     known = {x.name: x for x in (truth.camera, *truth.others)}
@@ -205,11 +207,10 @@ def _at_work(
     """Return the rms distance of what is seen from where the (corrected) arm has it [m]."""
     if calibration is None or not unseen:
         return None
-    configuration, arm = robots
+    layout, arm = robots
     corrected = [corrected_observation(o, calibration.correction, arm) for o in unseen]
     transforms = {name: x.transform for name, x in calibration.transforms.items()}
-    carriers = carriers_of(configuration, corrected, arm)
-    mapped, expected = mapped_and_expected(configuration, transforms, carriers, corrected)
+    mapped, expected = mapped_and_expected(layout.ends(transforms, corrected, arm), corrected)
     return float(np.sqrt(((mapped - expected) ** 2).sum(axis=1).mean()))
 
 

@@ -52,6 +52,8 @@ class ObservationResult(_Part):
     arc_coverage: float | None = Field(None, description="Share of the rim that was seen.")
     clocking: float | None = Field(None, description="Angle of the hole pattern [rad], if seen.")
     tcp_in_base: Vector | None = None
+    camera: str | None = Field(None, description="Which camera of a cell saw it.")
+    target: str | None = Field(None, description="Which target of a cell it saw.")
     residual: float | None = Field(None, description="Distance of mapped centre and TCP [m].")
     residual_in_base: Vector | None = Field(None, description="Mapped centre minus TCP [m].")
     used: bool

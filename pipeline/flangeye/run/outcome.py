@@ -10,7 +10,8 @@ import numpy as np
 from flangeye import result as r
 from flangeye import types as t
 from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import DEFAULT, Configuration
+from flangeye.models.cell import Cell
+from flangeye.models.configuration import DEFAULT, Configuration, Layout
 from flangeye.models.robots import RobotModel
 from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import Registry
@@ -113,9 +114,11 @@ def result_of(
     return result
 
 
-def _robots(recipe: Recipe) -> tuple[Configuration, Arm | None]:
-    robot = recipe.context.get(RobotModel)
-    return recipe.context.get(Configuration) or DEFAULT, Arm(robot) if robot else None
+def _robots(recipe: Recipe) -> tuple[Layout, Arm | None]:
+    given = recipe.context
+    robot = given.get(RobotModel)
+    layout = given.get(Cell) or given.get(Configuration) or DEFAULT
+    return layout, Arm(robot) if robot else None
 
 
 def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.types.arrays import Array, freeze
-from flangeye.types.frames import FrameMismatchError, Placed, Poses, Transform
+from flangeye.types.frames import CAMERA, TARGET, FrameMismatchError, Placed, Poses, Transform
 from flangeye.types.scans import FlangeCloud
 
 
@@ -110,12 +110,23 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Observation(Placed):
-    """A fitted feature and the robot poses it belongs to: one equation for the solver."""
+    """A fitted feature and the robot poses it belongs to: one equation for the solver.
+
+    Attributes:
+        id: Of the capture.
+        feature: What was measured.
+        poses: What the controllers reported, by frame.
+        joints: (n,) joint angles [rad], when known.
+        camera: Frame of the camera that saw it; a cell has several.
+        target: Frame of what it saw.
+    """
 
     id: str
     feature: Feature
     poses: Poses
     joints: Array | None = None
+    camera: str = CAMERA
+    target: str = TARGET
 
     @property
     def circle(self) -> CircleFeature:

@@ -20,13 +20,14 @@ from flangeye.maths.statistics import (
     largest_error_quantile,
     squared_distances,
 )
+from flangeye.models.cell import Cell
 from flangeye.models.configuration import (
+    CELL,
     DEFAULT,
     EVERY,
     Configuration,
-    carriers_of,
+    Layout,
     mapped_and_expected,
-    target_poses,
 )
 from flangeye.models.robots import RobotModel
 from flangeye.models.workspace import work_of
@@ -77,7 +78,7 @@ class HeldOut:
     tilts: Floats
 
 
-@stage("verify.holdout", serves=EVERY)
+@stage("verify.holdout", serves=(*EVERY, CELL))
 def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     calibration: HandEye,
     solve: Solver,
@@ -86,6 +87,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     observations: Observations | None = None,
     robot: RobotModel | None = None,
     configuration: Configuration | None = None,
+    cell: Cell | None = None,
     seed: Seed = Seed(0),  # noqa: B008  a NewType is the int itself
 ) -> Verification:
     """Deal the poses into folds, solve without each in turn, and measure the error on it.
@@ -108,7 +110,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         return Verification(
             False, f"without one fold of {len(folds)} there is no answer: {error}", {}
         )
-    given = configuration or DEFAULT, Arm(robot) if robot else None
+    given = cell or configuration or DEFAULT, Arm(robot) if robot else None
     held = hold_out(poses, folds, [each.as_reported() for each in solved], given)
     whole = held
     if calibration.as_corrected():
@@ -156,14 +158,14 @@ def hold_out(
     observations: Sequence[Observation],
     folds: Sequence[NDArray[np.intp]],
     solved: Sequence[HandEye],
-    given: tuple[Configuration, Arm | None],
+    given: tuple[Layout, Arm | None],
 ) -> HeldOut:
     """Measure each fold by the calibration without it."""
     n = len(observations)
     held = HeldOut(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.full(n, np.nan))
-    configuration, arm = given
+    layout, arm = given
     for fold, calibration in zip(folds, solved, strict=True):
-        if not configuration.is_default:
+        if not layout.is_default:
             _measure_loop(calibration, observations, fold, given, held)
             continue
         for i in fold:
@@ -176,17 +178,16 @@ def _measure_loop(
     calibration: HandEye,
     observations: Sequence[Observation],
     fold: NDArray[np.intp],
-    given: tuple[Configuration, Arm | None],
+    given: tuple[Layout, Arm | None],
     held: HeldOut,
 ) -> None:
-    """Measure a fold of any configuration: where the camera says the target is, and the arms."""
-    configuration, arm = given
+    """Measure a fold of any layout: where the camera says the target is, and the arms."""
+    layout, arm = given
     poses = [corrected_observation(observations[i], calibration.correction, arm) for i in fold]
     transforms = {name: x.transform for name, x in calibration.transforms.items()}
-    carriers = carriers_of(configuration, poses, arm)
-    mapped, expected = mapped_and_expected(configuration, transforms, carriers, poses)
-    axes = target_poses(configuration, transforms, carriers)[:, :3, 2]
-    turns = carriers.camera[:, :3, :3] @ calibration.camera.transform.rotation
+    ends = layout.ends(transforms, poses, arm)
+    mapped, expected = mapped_and_expected(ends, poses)
+    turns, axes = ends.camera[:, :3, :3], ends.target[:, :3, 2]
     held.errors[fold] = mapped - expected
     for i, pose, turn, axis in zip(fold, poses, turns, axes, strict=True):
         held.covariances[i] = turn @ pose.feature.centre_covariance @ turn.T

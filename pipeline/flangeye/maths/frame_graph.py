@@ -1,0 +1,65 @@
+"""What stands on what: a graph of frames, down to one root. Arrays only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.types import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What stands on what.
+
+    Attributes:
+        parent: The frame it stands on.
+        place: (4, 4) parent_T_frame where it is known and still; (M, 4, 4) where it is measured at
+            M times; None where it is still and to be found.
+    """
+
+    parent: str
+    place: Floats | None = None
+
+
+def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
+    """Return the frames from the root to one, the root left out.
+
+    Raises:
+        StageError: A frame stands on itself.
+    """
+    path: list[str] = []
+    while name in frames:
+        if name in path:
+            raise StageError(f"frame '{name}' stands on itself; every frame leads to one root")
+        path.insert(0, name)
+        name = frames[name].parent
+    return path
+
+
+def root_of(frames: Mapping[str, Frame]) -> str:
+    """Return what everything stands on.
+
+    Raises:
+        StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
+    """
+    roots = sorted({frames[chain(frames, name)[0]].parent for name in frames})
+    if len(roots) != 1:
+        raise StageError(
+            f"the frames stand on {' and '.join(roots)}, which nothing ties; say on what they stand"
+        )
+    return roots[0]
+
+
+def composed(frames: Mapping[str, Frame], name: str) -> Floats:
+    """Return root_T_frame, (4, 4) or (M, 4, 4); every place on the way is known.
+
+    The root itself is the identity.
+    """
+    pose = np.eye(4)
+    for each in chain(frames, name):
+        pose = pose @ np.asarray(frames[each].place)
+    return pose

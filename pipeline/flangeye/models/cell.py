@@ -1,0 +1,135 @@
+"""A cell: any number of arms, rails, positioners, cameras and targets, and what stands on what.
+
+What moves has two frames: ``NAME_base``, which stands somewhere, and ``NAME``, which its controller
+places in that base: an arm's flange, a rail's carriage, a positioner's plate. Cameras and targets
+stand on these, or on the root of the cell, ``base``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.maths.frame_graph import Frame, chain, composed
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.models.configuration import Ends
+from flangeye.models.robots import RobotModel
+from flangeye.types import Array, Floats, Observation, Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A rail or a positioner: one axis.
+
+    Attributes:
+        direction: (3,) unit vector in its base.
+        turns: Whether the plate turns about it; else the carriage slides along it.
+        travel: Lowest and highest value [rad or m].
+    """
+
+    direction: Array
+    turns: bool
+    travel: tuple[float, float]
+
+    def place(self, value: float) -> Floats:
+        """Return (4, 4) of carriage or plate in its base, at a value [rad or m]."""
+        moved = value * np.asarray(self.direction)
+        if self.turns:
+            return rigid(rotation_exp(moved), np.zeros(3))
+        return rigid(np.eye(3), moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What stands on what.
+
+    Attributes:
+        frames: By name. The place of what moves is None here: observations have it.
+        movers: What moves which frame.
+        cameras: Frames of cameras, in the recipe's order.
+        targets: Frames of targets.
+    """
+
+    frames: Mapping[str, Frame]
+    movers: Mapping[str, RobotModel | Axis]
+    cameras: tuple[str, ...]
+    targets: tuple[str, ...]
+
+    is_default = False
+
+    @property
+    def unknown_frames(self) -> tuple[str, ...]:
+        """Frames whose place is to be found, the cameras' first."""
+        unknown = [n for n, f in self.frames.items() if f.place is None and n not in self.movers]
+        return tuple(sorted(unknown, key=lambda name: name not in self.cameras))
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """Names of the transforms to find, the cameras' first."""
+        return tuple(map(self.name_of, self.unknown_frames))
+
+    def name_of(self, frame: str) -> str:
+        """Return ``parent_T_frame``."""
+        return f"{self.frames[frame].parent}_T_{frame}"
+
+    def describe(self) -> str:
+        """Return one line: where each camera and target stands, and what is unknown."""
+        ends = (*self.cameras, *self.targets)
+        chains = (" - ".join(("base", *chain(self.frames, end))) for end in ends)
+        return f"cell: {'; '.join(chains)}; to be found: {', '.join(self.unknowns)}"
+
+    def graph(
+        self,
+        observations: Sequence[Observation],
+        transforms: Mapping[str, Transform] | None = None,
+    ) -> dict[str, Frame]:
+        """Return the frames with the places that N observations have of them.
+
+        Args:
+            observations: Their controllers' poses.
+            transforms: The unknowns by name, where they were found.
+
+        Raises:
+            StageError: An observation lacks the pose of something that moves.
+        """
+        found = {x.child: x.matrix for x in (transforms or {}).values()}
+        measured = {name: _measured(name, observations) for name in self.movers}
+        places = found | measured
+        return {
+            name: replace(frame, place=places.get(name, frame.place))
+            for name, frame in self.frames.items()
+        }
+
+    def ends(
+        self,
+        transforms: Mapping[str, Transform],
+        observations: Sequence[Observation],
+        arm: Arm | None = None,
+    ) -> Ends:
+        """Return where camera and target of each observation are; see ``Layout``."""
+        frames = self.graph(observations, transforms)
+        return Ends(
+            _of_each(frames, [o.camera for o in observations]),
+            _of_each(frames, [o.target for o in observations]),
+        )
+
+
+def _measured(name: str, observations: Sequence[Observation]) -> Floats:
+    for observation in observations:
+        if name not in observation.poses:
+            raise StageError(
+                f"observation {observation.id} has no pose of '{name}', which moves in this cell; "
+                f"it has {', '.join(observation.poses) or 'none'}"
+            )
+    return np.array([o.poses[name].matrix for o in observations]).reshape(-1, 4, 4)
+
+
+def _of_each(frames: Mapping[str, Frame], names: Sequence[str]) -> Floats:
+    """Return (N, 4, 4): of each observation the frame that it names."""
+    count = len(names)
+    poses = {n: np.broadcast_to(composed(frames, n), (count, 4, 4)) for n in set(names)}
+    return np.array([poses[name][i] for i, name in enumerate(names)]).reshape(-1, 4, 4)

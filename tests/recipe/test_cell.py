@@ -1,0 +1,104 @@
+"""The ``cell`` section: what stands on what, and every mistake in it, word for word."""
+
+import numpy as np
+import pytest
+
+from flangeye.errors import RecipeError
+from flangeye.models.cell import Axis, Cell
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import parse_recipe
+
+STEPS = "steps: [acquire.simulated_cell, solve.cell, verify.holdout]\n"
+TWO = "cell: {arms: {arm: ur5}, cameras: {left: base, right: base}, targets: {marker: arm}}\n"
+
+
+def parsed(text):
+    return parse_recipe("title: T\n" + text, "r.yaml", load_registry())
+
+
+def mistakes(text):
+    with pytest.raises(RecipeError) as error:
+        parsed(text)
+    return str(error.value).splitlines()
+
+
+def test_a_cell_says_what_is_to_be_found():
+    cell = parsed(TWO + STEPS).context[Cell]
+    assert cell.unknowns == ("base_T_left", "base_T_right", "arm_T_marker")
+    assert cell.describe() == (
+        "cell: base - left; base - right; base - arm_base - arm - marker; "
+        "to be found: base_T_left, base_T_right, arm_T_marker"
+    )
+    assert isinstance(cell.movers["arm"], RobotModel)
+
+
+def test_rails_and_positioners_move_along_and_about_their_axis():
+    text = (
+        "cell: {rails: {rail: {axis: [0, 2, 0]}}, positioners: {table: {axis: [0, 0, 1], "
+        "place: unknown}}, arms: {arm: {model: ur5, on: rail}}, cameras: {hand: arm}, "
+        "targets: {part: {on: table, place: {position: [1 m, 0 m, 0 m]}}}}\n"
+    )
+    cell = parsed(text + STEPS).context[Cell]
+    assert cell.unknowns == ("arm_T_hand", "base_T_table_base")
+    rail, table = cell.movers["rail"], cell.movers["table"]
+    assert isinstance(rail, Axis)
+    assert rail.place(0.5)[:3, 3] == pytest.approx([0, 0.5, 0])
+    assert table.place(np.pi / 2)[:3, 0] == pytest.approx([0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            TWO.replace("marker: arm", "marker: amr"),
+            "r.yaml:2: cell.targets.marker.on: 'amr' is nothing that carries: write base or arm",
+        ),
+        (
+            TWO.replace("right: base", "arm: base"),
+            "r.yaml:2: cell.cameras.arm: 'arm' is one of the arms already; choose another name",
+        ),
+        (
+            TWO.replace("right: base", "base: base"),
+            "r.yaml:2: cell.cameras.base: 'base' is the cell's root already; choose another name",
+        ),
+        (
+            TWO.replace("arm: ur5", "arm: ur5, other: ur5"),
+            "r.yaml:2: cell: 'other' and 'arm' both stand at the origin of base; write place: "
+            "unknown for one of them, or its position",
+        ),
+        (
+            TWO.replace("arm: ur5", "arm: {model: ur5, on: arm}"),
+            "r.yaml:2: cell: 'arm' stands on itself; everything leads to base",
+        ),
+        (
+            "robot: ur5\n" + TWO,
+            "r.yaml:3: cell: says itself what stands where; leave out robot",
+        ),
+        (
+            TWO.replace("ur5", "ur55"),
+            "r.yaml:2: cell.arms.arm.model: no robot 'ur55'; known: ur5, ur5e, or a .yaml file",
+        ),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_cell_is_named_with_its_line(text, expected):
+    found = mistakes(text + STEPS)
+    assert found == [expected]
+
+
+def test_steps_for_one_camera_are_refused_in_a_cell():
+    found = mistakes(
+        TWO + "steps: [acquire.simulated_marker, solve.robust, verify.holdout, export.matrix]\n"
+    )
+    assert found == [
+        "r.yaml:3: steps.0.acquire.simulated_marker: acquire.simulated_marker serves no cell; use "
+        "acquire.simulated_cell",
+        "r.yaml:3: steps.1.solve.robust: solve.robust serves no cell; use solve.cell",
+        "r.yaml:3: steps.3.export.matrix: export.matrix serves no cell; leave it out: "
+        "calibration.yaml carries every transform of the cell",
+    ]
+
+
+def test_a_cells_steps_are_refused_without_one():
+    found = mistakes("robot: ur5\n" + STEPS)
+    assert "needs a cell: write cell: {arms: {arm: ur5}" in found[0]
