@@ -11,7 +11,7 @@ PACKAGES = ("pipeline/flangeye", "plugins/flangeye_plugins", "plugins/flangeye_e
 
 MODULES = {
     "subprocess", "multiprocessing", "pty", "runpy", "ctypes", "cffi", "pickle", "marshal",
-    "shelve", "dill", "cloudpickle", "zipfile", "tarfile", "zipimport", "imp", "sqlite3",
+    "shelve", "dill", "cloudpickle", "zipfile", "tarfile", "fsspec", "zipimport", "imp", "sqlite3",
     "urllib", "http", "requests", "socket", "socketserver", "websockets", "ftplib", "telnetlib",
 }  # fmt: skip
 """Imported, these start, load or reach something."""

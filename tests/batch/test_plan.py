@@ -34,8 +34,10 @@ def test_grid_times_seeds(sessions):
 
 
 def test_archives_times_values(sessions, archive_recipe, archives):
-    found = sessions(archive_recipe, archives=tuple(archives), grid=("steps.4.max_rms=1 mm,2 mm",))
-    assert [s.archive for s in found] == archives * 2
+    found = sessions(
+        archive_recipe, archives=tuple(map(str, archives)), grid=("steps.4.max_rms=1 mm,2 mm",)
+    )
+    assert [s.archive for s in found] == [str(path) for path in archives] * 2
     assert all("<" not in s.id and "/" not in s.id for s in found)
     assert found[0].id.startswith("replay_one.txt_")
 
@@ -81,7 +83,7 @@ def test_what_cannot_start_is_one_line(sessions, wanted, message):
 
 def test_an_archive_for_a_recipe_that_simulates(sessions, archives):
     with pytest.raises(BatchError) as caught:
-        sessions(archives=(archives[0],))
+        sessions(archives=(str(archives[0]),))
     assert str(caught.value) == (
         f"acquire.toy takes no archive, and {archives[0]} is given; leave it out"
     )
@@ -89,12 +91,12 @@ def test_an_archive_for_a_recipe_that_simulates(sessions, archives):
 
 def test_the_same_archive_twice(sessions, archive_recipe, archives):
     with pytest.raises(BatchError, match="asked for twice: /.*one.txt and /.*one.txt"):
-        sessions(archive_recipe, archives=(archives[0], archives[0]))
+        sessions(archive_recipe, archives=(str(archives[0]),) * 2)
 
 
 def test_a_key_holds_all_that_decides_the_result(sessions, recipe, archive_recipe, archives):
     def key(name=archive_recipe, archive=archives[0], **more):
-        return sessions(name, archives=(archive,), **more)[0].key
+        return sessions(name, archives=(str(archive),), **more)[0].key
 
     first = key()
     assert key() == first
@@ -117,7 +119,7 @@ def test_large_files_are_known_by_size_and_time(sessions, archive_recipe, tmp_pa
     small.write_text("a")
 
     def key():
-        return sessions(archive_recipe, archives=(folder,))[0].key
+        return sessions(archive_recipe, archives=(str(folder),))[0].key
 
     first = key()
     os.utime(small, ns=(1, 1))

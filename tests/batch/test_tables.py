@@ -100,7 +100,7 @@ def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries):
 
 
 def test_archives_are_told_apart_by_what_differs():
-    paths = [Path("/data/a/poses"), Path("/data/b/poses"), Path(f"/data/{EVIL}")]
+    paths = ["/data/a/poses", "/data/b/poses", f"/data/{EVIL}"]
     page = render(table_of([(session(i, path), outcome()) for i, path in enumerate(paths)]))
     assert '<td class="">a/poses</td>' in page
     assert EVIL not in page

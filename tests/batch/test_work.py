@@ -68,7 +68,7 @@ def test_what_goes_wrong_is_the_outcome(work, what, status, reason):
 
 
 def test_no_archive(work, archive_recipe, archives):
-    outcome = work(name=archive_recipe, archives=(archives[2],))
+    outcome = work(name=archive_recipe, archives=(str(archives[2]),))
     assert outcome.status == "failed"
     assert outcome.reason == f"{archives[2]}: no such archive"
     assert not work.folder.exists()

@@ -13,6 +13,7 @@ from typing import Any
 
 from flangeye import types as t
 from flangeye.batch.software import Software
+from flangeye.files.elsewhere import is_url, print_of
 from flangeye.plugin.stage import BoundPart, Params
 from flangeye.recipe.load import Recipe
 from flangeye.result import sha256
@@ -36,6 +37,10 @@ class Fingerprints:
             self._known[path] = _fingerprint(path)
         return self._known[path]
 
+    def of_archive(self, archive: str) -> str:
+        """Return the same for an archive by path, or by URL from what its store says."""
+        return print_of(archive) if is_url(archive) else self.of(Path(archive))
+
     def of_recipe(self, recipe: Recipe) -> list[str]:
         """Return path and fingerprint of every file or folder that a step's parameters name."""
         paths = {path.absolute() for step in recipe.steps for path in _paths(step.params)}
@@ -43,13 +48,13 @@ class Fingerprints:
 
 
 def session_key(
-    recipe: Recipe, archive: Path | None, software: Software, prints: Fingerprints
+    recipe: Recipe, archive: str | None, software: Software, prints: Fingerprints
 ) -> str:
     """Return the hash of a recipe, the files it names, its input and what computes."""
     # The resolved recipe has only the names of the models that the header's files describe.
     models = [value for kind, value in recipe.context.items() if kind not in (t.Box, t.Seed)]
     files = prints.of_recipe(recipe)
-    given = [str(archive), prints.of(archive)] if archive else []
+    given = [archive, prints.of_archive(archive)] if archive else []
     return sha256(json.dumps([recipe.resolved(), repr(models), files, given, software]))
 
 

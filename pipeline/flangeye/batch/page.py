@@ -17,6 +17,7 @@ from flangeye.batch.outcome import ACCEPTED, STATUSES
 from flangeye.batch.request import BatchError
 from flangeye.batch.tables import Row, Table
 from flangeye.files.bundled import VERSION
+from flangeye.files.elsewhere import is_url
 from flangeye.files.written import write_whole
 from flangeye.report.units import degrees, duration, millimetres
 
@@ -97,7 +98,7 @@ def render(table: Table) -> str:
 def _with_short_archives(table: Table) -> Table:
     """Return the table with what archives have in common left out of their paths."""
     paths = {row["archive"] for row in table.rows if row["archive"]}
-    if not paths:
+    if not paths or any(map(is_url, paths)):
         return table
     common = Path(os.path.commonpath([Path(path).parent for path in paths]))
     rows = [row | {"archive": str(Path(row["archive"]).relative_to(common))} for row in table.rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from flangeye import types as t
 from flangeye.batch.keys import Fingerprints, session_key
@@ -13,6 +13,7 @@ from flangeye.batch.request import SEED, BatchError, Request
 from flangeye.batch.software import Software
 from flangeye.batch.variants import variants
 from flangeye.errors import RecipeError
+from flangeye.files.elsewhere import is_url
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe, find_recipe, load_recipe
 
@@ -25,7 +26,7 @@ class BatchSession:
         id: Name of its folder: readable, and unique by ``key``.
         key: Hash of everything that decides its result.
         recipe: Absolute path.
-        archive: Absolute path, if any.
+        archive: Absolute path or URL, if any.
         overrides: All of them, those of the grid and the seed included.
         varied: Path in the recipe -> value as written, for what differs between sessions.
         seed: The recipe's, or the repetition's.
@@ -34,7 +35,7 @@ class BatchSession:
     id: str
     key: str
     recipe: Path
-    archive: Path | None
+    archive: str | None
     overrides: tuple[str, ...]
     varied: Mapping[str, str]
     seed: int
@@ -66,11 +67,11 @@ def plan(request: Request, registry: Registry, software: Software) -> list[Batch
     return sessions
 
 
-def _archives(base: Recipe, given: Sequence[Path]) -> list[Path | None]:
+def _archives(base: Recipe, given: Sequence[str]) -> list[str | None]:
     acquire = base.steps[0].stage
     if given and t.ArchivePath not in acquire.needs.values():
         raise BatchError(f"{acquire.name} takes no archive, and {given[0]} is given; leave it out")
-    return [path.absolute() for path in given] or [None]
+    return [at if is_url(at) else str(Path(at).absolute()) for at in given] or [None]
 
 
 def _variant(path: Path, registry: Registry, overrides: Sequence[str]) -> Recipe:
@@ -81,8 +82,8 @@ def _variant(path: Path, registry: Registry, overrides: Sequence[str]) -> Recipe
         raise RecipeError(str(error).replace("--set ", "--set-grid ")) from None
 
 
-def _session_id(recipe: str, archive: Path | None, key: str) -> str:
-    name = f"{recipe}_{archive.name}" if archive else recipe
+def _session_id(recipe: str, archive: str | None, key: str) -> str:
+    name = f"{recipe}_{PurePath(archive).name}" if archive else recipe
     return f"{re.sub(r'[^A-Za-z0-9._=-]+', '-', name)[:80].lstrip('.-')}_{key[:12]}"
 
 

@@ -35,7 +35,7 @@ class Request:
 
     Attributes:
         recipe: File, or name of a bundled recipe.
-        archives: Recordings to run on; none for recipes that simulate.
+        archives: Recordings to run on, paths or URLs; none for recipes that simulate.
         overrides: ``PATH=VALUE``, the same in every session.
         grid: ``PATH=a,b,c``: every combination is run.
         repeat: How many seeds, counted up from the recipe's; None for the recipe's alone.
@@ -48,7 +48,7 @@ class Request:
     """
 
     recipe: str
-    archives: tuple[Path, ...] = ()
+    archives: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     grid: tuple[str, ...] = ()
     repeat: int | None = None

@@ -67,7 +67,7 @@ def _row(session: BatchSession, outcome: SessionOutcome) -> Row:
     return {
         "session": session.id,
         "recipe": session.recipe.stem,
-        "archive": str(session.archive) if session.archive else None,
+        "archive": session.archive,
         **session.varied,
         "seed": session.seed,
         **asdict(outcome),

@@ -20,6 +20,7 @@ from flangeye.batch.outcome import (
 from flangeye.batch.plan import BatchSession
 from flangeye.batch.software import Software, check_software, software_of
 from flangeye.errors import FlangeyeError, StageError
+from flangeye.files.elsewhere import archive_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye.run.folder import RunFolder
@@ -86,9 +87,9 @@ def _calibrated(job: Job, session: BatchSession, registry: Registry) -> SessionO
     path = job.out / session.id
     shutil.rmtree(path, ignore_errors=True)  # the rest of a start that came to no end
     folder = RunFolder.create(recipe.name, path)
-    result = record_run(
-        recipe, registry, folder, Start(ArchivePath(session.archive)), job.report, job.out / LIBRARY
-    )
+    with archive_at(session.archive) as archive:
+        start = Start(ArchivePath(archive))
+        result = record_run(recipe, registry, folder, start, job.report, job.out / LIBRARY)
     report = f"{session.id}/report.html" if job.report else None
     return replace(outcome_of(result), report=report)
 

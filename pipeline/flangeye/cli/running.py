@@ -29,13 +29,20 @@ def run(  # noqa: PLR0913  one for each option
         typer.Argument(help="A recipe file, or the name of a bundled recipe."),
     ] = None,
     archive: Annotated[
-        Path | None,
-        typer.Option(help="Recordings to run on, for recipes that start with acquire.archive."),
+        str | None,
+        typer.Option(
+            metavar="PATH|URL",
+            help="Recordings to run on, for recipes that start with acquire.archive; "
+            "s3://, gs://, az://, https:// and zip:// are streamed.",
+        ),
     ] = None,
     overrides: Overrides = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the run's files; default runs/<time>_<recipe>."),
+        str | None,
+        typer.Option(
+            metavar="PATH|URL",
+            help="Folder for the run's files; default runs/<time>_<recipe>.",
+        ),
     ] = None,
     source: Annotated[
         Path | None,
@@ -65,6 +72,7 @@ def run(  # noqa: PLR0913  one for each option
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
     from flangeye.errors import StageError
+    from flangeye.files.elsewhere import archive_at, results_at
     from flangeye.run.folder import RunFolder
     from flangeye.run.session import Start
     from flangeye.types import ArchivePath
@@ -73,12 +81,13 @@ def run(  # noqa: PLR0913  one for each option
         raise StageError("--move and --offline: an arm that is not asked cannot be moved")
     registry = load_plugins()
     checked, point = _recipe_of(recipe, resume, registry, overrides or ())
-    motion = MotionAllowed(move, offline)
-    start = Start(ArchivePath(archive), point or _point(checked, source, at), motion)
-    folder = RunFolder.create(checked.name, out)
-    result = _record(checked, registry, folder, start)
-    if result.status == "refused":
-        _advise(folder.log, registry)
+    point = point or _point(checked, source, at)
+    with results_at(out) as results, archive_at(archive) as recordings:
+        start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline))
+        folder = RunFolder.create(checked.name, results)
+        result = _record(checked, registry, folder, start)
+        if result.status == "refused":
+            _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
@@ -87,8 +96,9 @@ def _advise(log: Path, registry: Registry) -> None:
     """Say what to do about a refusal: the doctor's command, and what it finds first."""
     from flangeye.cli.logs import of_foreign
     from flangeye.doctor import examine, open_session
+    from flangeye.files.elsewhere import told
 
-    say(f"\nwhat to do: flangeye doctor {log}")
+    say(told(f"\nwhat to do: flangeye doctor {log}"))
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
         with of_foreign(log, "it cannot be examined"):
@@ -141,6 +151,7 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
     from rich.console import Console
 
     from flangeye.cli.terminal import ProgressBar, print_result
+    from flangeye.files.elsewhere import told
     from flangeye.run.restart import restart_hint, resumable
     from flangeye.run.session import record_run
 
@@ -150,16 +161,16 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
-            say(f"what was gathered is in {folder.log}", err=True)
-            say(f"with other parameters: {restart_hint(recipe, folder.log)}", err=True)
+            say(told(f"what was gathered is in {folder.log}"), err=True)
+            say(told(f"with other parameters: {restart_hint(recipe, folder.log)}"), err=True)
             if resumable(recipe):
                 moving = " --move" if start.motion.allowed else ""
-                say(f"go on with it: flangeye run --resume {folder.path}{moving}", err=True)
+                say(told(f"go on with it: flangeye run --resume {folder.path}{moving}"), err=True)
         raise
     print_result(Console(), result)
     names = ("report.html", "calibration.yaml", "result.json", "run.mcap")
     written = [name for name in names if (folder.path / name).exists()]
-    say(f"\n{folder.path}/: {'  '.join(written)}")
+    say(told(f"\n{folder.path}/: {'  '.join(written)}"))
     return result
 
 
@@ -177,8 +188,11 @@ def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:
 def batch(  # noqa: PLR0913  one argument an option
     recipe: RecipeName,
     archives: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Recordings, a session each; none for recipes that simulate."),
+        list[str] | None,
+        typer.Argument(
+            metavar="[PATH|URL]...",
+            help="Recordings, a session each; none for recipes that simulate.",
+        ),
     ] = None,
     overrides: Overrides = None,
     grid: Annotated[

@@ -18,6 +18,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
+from flangeye.files.elsewhere import digest_elsewhere
 from flangeye.types import FLANGE, Floats, Role
 
 MIN_CAPTURES = 3
@@ -163,7 +164,7 @@ def _check_motion(root: Path, recordings: Sequence[Recording], whole: bool) -> N
 
 
 def digests_of(files: Iterable[Path]) -> dict[Path, str]:
-    """Return the SHA-256 of every file's content.
+    """Return the SHA-256 of every file's content; elsewhere, of the checksum the store has of it.
 
     Raises:
         StageError: A file cannot be read.
@@ -171,11 +172,16 @@ def digests_of(files: Iterable[Path]) -> dict[Path, str]:
     digests: dict[Path, str] = {}
     for path in files:
         try:
-            with path.open("rb") as file:
-                digests[path] = hashlib.file_digest(file, "sha256").hexdigest()
+            elsewhere = digest_elsewhere(path)
+            digests[path] = elsewhere or _digest_of(path)
         except OSError as error:
             raise StageError(f"{path}: cannot be read: {error.strerror}") from None
     return digests
+
+
+def _digest_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fingerprint_of(root: Path, digests: dict[Path, str]) -> str:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.elsewhere import is_elsewhere
 from flangeye.files.recording import (
     Archive,
     Recording,
@@ -41,6 +42,7 @@ from flangeye.types import (
 from flangeye_plugins.acquire.camera import CameraParams, image_of_cloud, read_image
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
+    archive_note,
     archive_path,
     log_source,
     open_archive,
@@ -95,7 +97,7 @@ def acquire_archive(
     source = Source(
         fingerprint_of(recorded.root, digests),
         (
-            f"archive: {recorded.layout}, {recorded.root}",
+            archive_note(recorded),
             *recorded.notes,
             *notes,
             unit_told,
@@ -122,7 +124,10 @@ def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[st
     for recording, cloud in _clouds(with_cloud):
         try:
             # What is set aside must be known now, so then the inside is looked at too.
-            check_cloud_file(cloud) if unreadable == "refuse" else read_cloud(cloud)
+            if unreadable == "reject":
+                read_cloud(cloud)
+            elif not is_elsewhere(cloud):
+                check_cloud_file(cloud)
         except StageError as error:
             if unreadable == "refuse":
                 raise

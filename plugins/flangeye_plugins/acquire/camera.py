@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import Params, StageError
+from flangeye.files.elsewhere import at_hand
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
 from flangeye.files.regular import read_regular
 from flangeye.types import Image, PointCloud
@@ -77,6 +78,8 @@ def read_image(path: Path) -> Grey:
     import cv2
 
     try:
-        return decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_GRAYSCALE).astype(np.uint8)
+        with at_hand(path):
+            raw = read_regular(path, MAX_FILE)
+        return decode_image(raw, cv2.IMREAD_GRAYSCALE).astype(np.uint8)
     except ImageError as error:
         raise StageError(f"{path}: {error}") from None

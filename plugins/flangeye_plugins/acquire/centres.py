@@ -22,6 +22,7 @@ from flangeye.types import (
 from flangeye.units import Length, param
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
+    archive_note,
     archive_path,
     log_source,
     observation_of,
@@ -81,7 +82,7 @@ def _usable(archive: Archive) -> list[Recording]:
 def _notes(archive: Archive, used: int, noise: float, behind: float) -> tuple[str, ...]:
     where = f"; they lie {behind * 1e3:g} mm behind the flange" if behind else ""
     return (
-        f"archive: {archive.layout}, {archive.root}",
+        archive_note(archive),
         *archive.notes,
         *skipped_note(archive, lambda r: r.centre_in_camera is not None, "ready-made centre"),
         f"{used} ready-made centres, each taken to be good to {noise * 1e3:g} mm along each axis"

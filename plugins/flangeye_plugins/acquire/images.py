@@ -14,6 +14,7 @@ from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image
 from flangeye_plugins.acquire.camera import read_image
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
+    archive_note,
     archive_path,
     open_archive,
     poses_of,
@@ -68,7 +69,7 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     digests = digests_of([*files, *recorded.files])
     notes = (
-        f"archive: {recorded.layout}, {recorded.root}",
+        archive_note(recorded),
         *recorded.notes,
         *skipped_note(recorded, lambda r: r.image is not None, "image"),
     )

@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from flangeye import BoundPart, Choose, Params, RecipePath, StageError
+from flangeye.files.elsewhere import told
 from flangeye.files.recording import (
     Archive,
     Recording,
@@ -72,7 +73,8 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     archive: Archive = params.reader(path)
     check_ids(archive)
     recordings = [with_companion(recording) for recording in archive.recordings]
-    archive = replace(archive, recordings=recordings)
+    notes = tuple(told(note) for note in archive.notes)
+    archive = replace(archive, recordings=recordings, notes=notes)
     if not params.leave_out:
         return archive
     known = {recording.id for recording in archive.recordings}
@@ -82,6 +84,11 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     kept = [r for r in archive.recordings if r.id not in params.leave_out]
     note = f"left out as the recipe says: {', '.join(params.leave_out)}"
     return replace(archive, recordings=kept, notes=(*archive.notes, note))
+
+
+def archive_note(archive: Archive) -> str:
+    """Return the note that says which archive it is."""
+    return told(f"archive: {archive.layout}, {archive.root}")
 
 
 def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:

@@ -21,6 +21,7 @@ from flangeye.types import (
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
+    archive_note,
     archive_path,
     observation_of,
     open_archive,
@@ -53,7 +54,7 @@ def acquire_samples(archive: ArchivePath, params: SamplesParams) -> Observations
         raise StageError(f"{recorded.root}: holds no poses of a marker ({recorded.layout})")
     check_poses(recorded.root, usable, whole=True)
     notes = (
-        f"archive: {recorded.layout}, {recorded.root}",
+        archive_note(recorded),
         *recorded.notes,
         *skipped_note(recorded, lambda r: r.camera_T_target is not None, "marker"),
     )

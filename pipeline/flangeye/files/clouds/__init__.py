@@ -20,6 +20,7 @@ from flangeye.files.clouds.pcd import open_pcd
 from flangeye.files.clouds.plain import array_of, holds_numbers, load_npy, open_npy, open_text
 from flangeye.files.clouds.ply import open_ply
 from flangeye.files.clouds.table import PointTable
+from flangeye.files.elsewhere import at_hand
 from flangeye.types import CAMERA, PointCloud
 
 __all__ = [
@@ -63,8 +64,9 @@ def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
     Raises:
         StageError: The file is missing, empty, truncated, or not a point cloud.
     """
-    table = _open(path)
-    xyz = table.decode()
+    with at_hand(path):
+        table = _open(path)
+        xyz = table.decode()
     if unit != "m":
         xyz /= np.float32(PER_METRE[unit])  # exact to the last bit, which times 0.001 is not
     return PointCloud(CAMERA, xyz.reshape(*table.shape, 3))

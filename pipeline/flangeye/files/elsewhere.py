@@ -1,0 +1,218 @@
+"""Archives and results elsewhere, by URL: scans are fetched one at a time and let go again.
+
+The rest of the program knows paths alone. For an archive by URL a folder is made here that has
+every file by its name: the small ones whole, scans and images empty until somebody reads them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from flangeye.errors import FlangeyeError, StageError
+
+PROTOCOLS = ("s3", "gs", "az", "https", "zip")
+"""What a URL may begin with, or a part of one after ``::``; none of them runs anything."""
+
+LATER = (".pcd", ".ply", ".npy", ".xyz", ".csv", ".txt", ".png", ".jpg", ".jpeg", ".bmp", ".tif",
+         ".tiff")  # fmt: skip
+"""Endings of scans and images."""
+
+SMALL = 1_000_000
+"""Files up to so many bytes are fetched at once, whatever they are."""
+
+
+def is_url(place: str) -> bool:
+    """Return whether a place is a URL, not a path."""
+    return re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", place) is not None
+
+
+@contextmanager
+def archive_at(place: str | None) -> Iterator[Path | None]:
+    """Yield an archive's path: its own, or for a URL that of a folder that stands for it.
+
+    Raises:
+        StageError: Nothing is there, it cannot be reached, or the URL is of another kind.
+    """
+    if place is None or not is_url(place):
+        yield None if place is None else Path(place)
+        return
+    with TemporaryDirectory(prefix="flangeye-") as folder:
+        root = Path(folder).resolve() / (PurePosixPath(place).name or "archive")
+        _STANDING_IN[root] = stand_in = _StandIn(place, root)
+        try:
+            stand_in.lay_out()
+            yield root
+        except FlangeyeError as error:
+            error.args = tuple(told(str(each)) for each in error.args)
+            raise
+        finally:
+            del _STANDING_IN[root]
+
+
+@contextmanager
+def results_at(place: str | None) -> Iterator[Path | None]:
+    """Yield the folder to write results to; for a URL they are sent there at the end.
+
+    Raises:
+        StageError: There are files already, or it cannot be reached.
+    """
+    if place is None or not is_url(place):
+        yield None if place is None else Path(place)
+        return
+    system, root = _system(place)
+    with _reaching(place):
+        if system.exists(root) and system.find(root):
+            raise StageError(f"{place}: already holds files; name a new or empty folder")
+    with TemporaryDirectory(prefix="flangeye-") as folder:
+        local = Path(folder).resolve() / "run"
+        _STANDING_IN[local] = _StandIn(place, local)
+        try:
+            yield local
+        except FlangeyeError as error:
+            error.args = tuple(told(str(each)) for each in error.args)
+            raise
+        finally:
+            if local.is_dir():
+                with _reaching(place):
+                    system.put(f"{local}/", f"{root.rstrip('/')}/", recursive=True)
+            del _STANDING_IN[local]
+
+
+@contextmanager
+def at_hand(path: Path) -> Iterator[None]:
+    """Have a file here while it is read; only those of an archive elsewhere are not."""
+    stand_in = _of(path)
+    if stand_in is None or path not in stand_in.later:
+        yield
+        return
+    stand_in.fetch(path)
+    try:
+        yield
+    finally:
+        path.write_bytes(b"")
+
+
+def is_elsewhere(path: Path) -> bool:
+    """Return whether a file must be fetched before it can be read."""
+    stand_in = _of(path)
+    return stand_in is not None and path in stand_in.later
+
+
+def digest_elsewhere(path: Path) -> str | None:
+    """Return a hash of what the store says of a file's content; None for a file that is here."""
+    stand_in = _of(path)
+    return _state(stand_in.later[path]) if stand_in and path in stand_in.later else None
+
+
+def told(text: str) -> str:
+    """Return a text with URLs for the folders that stand for them."""
+    for root, stand_in in _STANDING_IN.items():
+        text = text.replace(str(root), stand_in.url.rstrip("/"))
+    return text
+
+
+def print_of(url: str) -> str:
+    """Return a hash of an archive's names and of what the store says of each content."""
+    stand_in = _StandIn(url, Path("/"))
+    lines = [f"{name}\0{_state(about)}\n" for name, about in sorted(stand_in.listed().items())]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+class _StandIn:
+    """A folder here that stands for one elsewhere.
+
+    Attributes:
+        url: The one elsewhere.
+        later: File here -> what the store says of it, for those that are not fetched yet.
+    """
+
+    def __init__(self, url: str, root: Path) -> None:
+        self.url, self._root = url, root
+        self._system, self._there = _system(url)
+        self.later: dict[Path, Mapping[str, Any]] = {}
+        self._names: dict[Path, str] = {}
+
+    def listed(self) -> dict[str, Mapping[str, Any]]:
+        """Return name below the URL -> what the store says of the file."""
+        with _reaching(self.url):
+            found = self._system.find(self._there, detail=True)
+        if not found:
+            raise StageError(f"{self.url}: holds nothing")
+        return {self._name_of(path): about for path, about in found.items()}
+
+    def lay_out(self) -> None:
+        """Make every file's name, and fetch the small ones."""
+        for name, about in self.listed().items():
+            path = self._root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            self._names[path] = f"{self._there.rstrip('/')}/{name}".lstrip("/")
+            if path.suffix.lower() in LATER and (about.get("size") or 0) > SMALL:
+                self.later[path] = about
+            else:
+                self.fetch(path)
+
+    def fetch(self, path: Path) -> None:
+        """Bring a file here."""
+        with _reaching(f"{self.url.rstrip('/')}/{path.relative_to(self._root)}"):
+            self._system.get_file(self._names[path], str(path))
+
+    def _name_of(self, path: str) -> str:
+        name = path.removeprefix(self._there.rstrip("/")).lstrip("/") or PurePosixPath(path).name
+        if ".." in PurePosixPath(name).parts:
+            raise StageError(f"{self.url}: holds a file called '{name}', which leads out of it")
+        return name
+
+
+_STANDING_IN: dict[Path, _StandIn] = {}
+
+
+def _of(path: Path) -> _StandIn | None:
+    return next((s for root, s in _STANDING_IN.items() if path.is_relative_to(root)), None)
+
+
+def _state(about: Mapping[str, Any]) -> str:
+    """Return a hash of size and checksum; without a checksum, of size, name and time of change."""
+    sums = [about[key] for key in ("ETag", "md5Hash", "content_md5", "CRC") if about.get(key)]
+    known = sums or (about.get("name"), about.get("mtime") or about.get("LastModified"))
+    return hashlib.sha256(f"{about.get('size')} {known}".encode()).hexdigest()
+
+
+def _system(url: str) -> tuple[Any, str]:
+    """Return the file system of a URL and the path in it."""
+    for each in url.split("::"):
+        protocol = each.partition("://")[0]
+        if "://" in each and protocol not in PROTOCOLS:
+            raise StageError(
+                f"{url}: {protocol}:// is not known; {', '.join(f'{p}://' for p in PROTOCOLS)} are"
+            )
+    try:
+        import fsspec
+
+        with _reaching(url):
+            system, path = fsspec.url_to_fs(url)
+    except ImportError as error:
+        raise StageError(
+            f"{url}: {error.name or 'fsspec'} is not installed; install with: "
+            f"{sys.executable} -m pip install 'flangeye[cloud]'"
+        ) from None
+    return system, str(path)
+
+
+@contextmanager
+def _reaching(url: str) -> Iterator[None]:
+    """Say in one line what went wrong with a store."""
+    try:
+        yield
+    except (FlangeyeError, ImportError):
+        raise
+    except Exception as error:  # each store has errors of its own
+        lines = str(error).strip().splitlines() or [""]
+        raise StageError(f"{url}: cannot be reached: {type(error).__name__}: {lines[0]}") from None

@@ -1,0 +1,174 @@
+"""Archives and results by URL: a real client and a real server, on loopback."""
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flangeye.cli import app
+from flangeye.errors import StageError
+from flangeye.files.clouds import read_cloud, write_cloud
+from flangeye.files.elsewhere import (
+    archive_at,
+    at_hand,
+    digest_elsewhere,
+    is_elsewhere,
+    is_url,
+    print_of,
+    results_at,
+    told,
+)
+from flangeye.types import CAMERA, PointCloud
+
+s3fs = pytest.importorskip("s3fs")
+moto_server = pytest.importorskip("moto.server")
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(server, monkeypatch):
+    for name, value in {
+        "AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "nobody",
+        "AWS_SECRET_ACCESS_KEY": "nothing", "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    store = s3fs.S3FileSystem()
+    store.mkdir("cell")
+    yield store
+    store.rm("cell", recursive=True)
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def archive(tmp_path):
+    """A folder with two scans beyond what is fetched at once, and a file of poses."""
+    folder = tmp_path / "archive"
+    (folder / "scans").mkdir(parents=True)
+    for i in range(2):
+        xyz = np.full((300, 400, 3), 0.5 + i, dtype=np.float32)
+        write_cloud(folder / "scans" / f"{i}.pcd", PointCloud(CAMERA, xyz))
+    (folder / "poses.csv").write_text("cloud\n")
+    return folder
+
+
+def test_scans_are_fetched_one_at_a_time_and_let_go(bucket, archive):
+    bucket.put(f"{archive}/", "cell/monday/", recursive=True)
+    with archive_at("s3://cell/monday") as root:
+        assert (root / "poses.csv").read_text() == "cloud\n"
+        for i in range(2):
+            scan = root / "scans" / f"{i}.pcd"
+            assert is_elsewhere(scan) and scan.stat().st_size == 0
+            assert read_cloud(scan).xyz[0, 0, 0] == 0.5 + i
+            assert scan.stat().st_size == 0
+        assert told(f"{root}/scans") == "s3://cell/monday/scans"
+    assert not root.exists()
+
+
+def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(bucket, archive):
+    shutil.copy(archive / "scans" / "0.pcd", archive / "scans" / "2.pcd")
+    bucket.put(f"{archive}/", "cell/monday/", recursive=True)
+    with archive_at("s3://cell/monday") as root:
+        digests = [digest_elsewhere(root / "scans" / f"{i}.pcd") for i in range(3)]
+    assert digests[0] == digests[2] != digests[1]
+    before = print_of("s3://cell/monday")
+    assert print_of("s3://cell/monday") == before
+    bucket.pipe("cell/monday/poses.csv", b"other\n")
+    assert print_of("s3://cell/monday") != before
+
+
+def test_an_archive_in_a_zip_file(archive, tmp_path):
+    with zipfile.ZipFile(tmp_path / "monday.zip", "w") as packed:
+        for file in archive.rglob("*.*"):
+            packed.write(file, file.relative_to(archive))
+    with archive_at(f"zip://::{tmp_path}/monday.zip") as root:
+        assert read_cloud(root / "scans" / "1.pcd").xyz[0, 0, 0] == 1.5
+
+
+def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket):
+    with (
+        pytest.raises(StageError, match="s3://cell/out/run.mcap"),
+        results_at("s3://cell/out") as out,
+    ):
+        out.mkdir()
+        (out / "run.mcap").write_bytes(b"log")
+        raise StageError(f"{out / 'run.mcap'}: torn")
+    assert bucket.cat("cell/out/run.mcap") == b"log"
+    with pytest.raises(StageError) as caught, results_at("s3://cell/out"):
+        pass
+    assert str(caught.value) == "s3://cell/out: already holds files; name a new or empty folder"
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("github://a:b@c/", "github://a:b@c/: github:// is not known; s3://, gs://, az://, "
+         "https://, zip:// are"),
+        ("zip://x::reference://y", "zip://x::reference://y: reference:// is not known; s3://, "
+         "gs://, az://, https://, zip:// are"),
+        ("s3://cell/nothing", "s3://cell/nothing: holds nothing"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_opened_is_one_line(bucket, url, message):
+    with pytest.raises(StageError) as caught, archive_at(url):
+        pass
+    assert str(caught.value) == message
+
+
+def test_a_store_that_does_not_answer_is_one_line(monkeypatch):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "nobody")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "nothing")
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    s3fs.S3FileSystem.clear_instance_cache()
+    with pytest.raises(StageError) as caught, archive_at("s3://cell/x"):
+        pass
+    assert str(caught.value).startswith("s3://cell/x: cannot be reached: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_name_that_leads_out_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bad.zip", "w") as packed:
+        packed.writestr("../../escaped.csv", "x")
+    url = f"zip://::{tmp_path}/bad.zip"
+    with pytest.raises(StageError, match="leads out of it"), archive_at(url):
+        pass
+    assert not list(Path(tmp_path).rglob("escaped.csv"))
+
+
+def test_a_path_is_a_path(tmp_path):
+    assert not is_url("C:\\data") and not is_url("a/b") and is_url("s3://a")
+    with archive_at(str(tmp_path)) as path, at_hand(path):
+        assert path == tmp_path
+    with archive_at(None) as nothing, results_at(None) as none:
+        assert nothing is None and none is None
+
+
+def test_a_run_from_a_bucket_into_a_bucket_has_the_result_of_one_on_disk(bucket, tmp_path):
+    sample = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
+    bucket.put(f"{sample}/", "cell/sample/", recursive=True)
+    words = ["run", "ur5_phoxi-m_sample", "--archive"]
+    for archive, out in (
+        (str(sample), str(tmp_path / "run")),
+        ("s3://cell/sample", "s3://cell/out"),
+    ):
+        done = CliRunner().invoke(app, [*words, archive, "--out", out])
+        assert done.exit_code == 0, done.output
+    assert "s3://cell/out/: report.html  calibration.yaml  result.json  run.mcap" in done.output
+    here = json.loads((tmp_path / "run" / "result.json").read_text())
+    there = json.loads(bucket.cat("cell/out/result.json"))
+    assert here["transforms"] == there["transforms"]
+    assert b"s3://cell/sample" in bucket.cat("cell/out/report.html")
+    assert b"/flangeye-" not in bucket.cat("cell/out/report.html")
