@@ -86,7 +86,7 @@ def _session(file: Path, manifest: Manifest, registry: Registry) -> BatchSession
     reader = [] if manifest.reader is None else [f"steps.0.reader={json.dumps(manifest.reader)}"]
     request = Request(
         str(near) if near.is_file() else manifest.recipe,
-        (_recording(file, manifest),),
+        (str(_recording(file, manifest)),),
         (*reader, *manifest.overrides),
     )
     try:
