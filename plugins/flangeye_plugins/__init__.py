@@ -18,6 +18,7 @@ STAGES = {
     "fit.ransac_circle": "flangeye_plugins.fit.ransac:fit_ransac_circle",
     "fit.charuco": "flangeye_plugins.fit.boards:fit_charuco",
     "fit.checkerboard": "flangeye_plugins.fit.boards:fit_checkerboard",
+    "fit.circles": "flangeye_plugins.fit.boards:fit_circles",
     "fit.aruco": "flangeye_plugins.fit.boards:fit_aruco",
     "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
     "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",

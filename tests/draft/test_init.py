@@ -152,6 +152,7 @@ def test_images_need_to_know_the_target(folder):
         cv2.imwrite(str(folder / f"{k}.png"), np.zeros((8, 8), np.uint8))
     init("--target", "charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}")
     names = [step.stage.name for step in recipe(folder).steps]
+    assert recipe(folder).steps[0].params.board.columns == 8  # it tells the camera too
     assert names == ["acquire.images", "fit.charuco", "solve.robust", "verify.holdout"]
 
 
@@ -233,7 +234,7 @@ def arrays(folder):
          "rec: is no folder; name the one that holds the recordings"),
         (sample, ["--camera", "wrist"], "--camera wrist: is neither base nor flange"),
         (sample, ["--target", "cube"],
-         "--target cube: is none of flange, sphere, charuco, checkerboard, aruco, with "
+         "--target cube: is none of flange, sphere, charuco, checkerboard, circles, aruco, with "
          "parameters"),
         (sample, ["--reader", "table"], "--reader table.rotation: is missing\n--reader table.length: "),
         (odd_heading, ["--table", "a.csv"],

@@ -12,7 +12,7 @@ from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.report import page
 from flangeye.report.cell import cell_drawing
 from flangeye.report.facts import facts_of
-from flangeye.report.images import image_view
+from flangeye.report.images import image_view, missed_view
 from flangeye.report.space import workspace_drawing
 from flangeye.types import Pair
 
@@ -22,7 +22,7 @@ NOTHING = t.PointCloud(t.CAMERA, np.zeros((0, 3), np.float32))
 CORNERS = np.array([[100, 80, 0.1, 0], [200, 80, 0, 0.1], [200, 160, -0.2, 0], [100, 160, 0, 0]])
 
 
-def logged(path, carrier=t.FLANGE, solved=True):
+def logged(path, carrier=t.FLANGE, solved=True, hidden=()):
     """Log an eye in the hand that looks at a marker, and a calibration of its truth."""
     rng = np.random.default_rng(0)
     recorder = Recorder(path, {"recipe.resolved.yaml": "title: T"}, full_clouds=False)
@@ -37,6 +37,10 @@ def logged(path, carrier=t.FLANGE, solved=True):
         feature = t.PoseFeature(seen, 1e-8 * np.eye(6), {}, CORNERS)
         recorder.flangeye_captured(step="0.acquire.x", capture=capture, seconds=0.1)
         given = {"capture": f"{i}", "seconds": 0.1}
+        if i in hidden:
+            why = "4 corners found, at least 6 are needed"
+            recorder.flangeye_capture_rejected(t.Rejection(f"{i}", "fit.x", why))
+            continue
         recorder.flangeye_stage_finished(step="1.fit.x", value=feature, **given)
         pairs.append(Pair(t.Observation(f"{i}", feature, t.by_frame(flange)), np.zeros(3), i > 0))
     if solved:
@@ -94,3 +98,14 @@ def test_the_page_is_made(tmp_path, solved):
     text = page.render(logged(tmp_path / "r.mcap", solved=solved).log)
     assert text.count("<circle cx=") == 4
     assert "The target in the image" in text
+
+
+def test_an_image_without_its_target_is_shown_with_the_reason(tmp_path):
+    facts = logged(tmp_path / "r.mcap", hidden=(2, 5))
+    view = missed_view(facts)
+    assert (view.id, view.box) == ("2", (-0.5, -0.5, 320.0, 240.0))
+    assert view.summary == (
+        "Capture 2, set aside: 4 corners found, at least 6 are needed. So it is with 1 more."
+    )
+    assert "An image without its target" in page.render(facts.log)
+    assert missed_view(logged(tmp_path / "s.mcap")) is None

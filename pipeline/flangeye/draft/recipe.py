@@ -29,7 +29,7 @@ from flangeye.recipe.load import parse_recipe
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
 POSES_LINE = "cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
-PRINTED = ("charuco", "checkerboard", "aruco")
+PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
 
 
@@ -65,6 +65,7 @@ def draft_recipe(sights: Sights, out: Path, questions: Questions, registry: Regi
     head = _head(sights.folder, robot, target, questions)
     first: dict[str, Any] = {"path": os.path.relpath(sights.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
+    first |= _camera(archive, target) if stage == "acquire.images" else {}
     data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
     return Draft(_yaml(data), _told(archive, reader))
 
@@ -143,7 +144,9 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
     records = archive.recordings
     if any(r.cloud for r in records):
         answer = questions.ask(
-            "target", "what is seen (flange, sphere, charuco, checkerboard, aruco)", "flange"
+            "target",
+            "what is seen (flange, sphere, charuco, checkerboard, circles, aruco)",
+            "flange",
         )
         return "acquire.archive", _target(answer)
     if any(r.image for r in records):
@@ -185,6 +188,16 @@ def _head(
         "feature": feature, "configuration": configuration,
     }  # fmt: skip
     return head | {name: section for name, section in sections.items() if section}
+
+
+def _camera(archive: Archive, target: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the board that tells the camera, where the archive does not."""
+    ((kind, params),) = target.items()
+    if kind == "aruco" or any(r.camera for r in archive.recordings):
+        return {}
+    called = {"spacing": "square", "diameter": "marker"}
+    sizes = {called.get(name, name): value for name, value in params.items()}
+    return {"board": {"kind": kind} | sizes}
 
 
 def _has_plate(robot: Mapping[str, Any]) -> bool:

@@ -17,7 +17,7 @@ from flangeye.types import Floats
 
 Pixels = NDArray[np.uint8]
 
-Kind = Literal["charuco", "checkerboard", "marker"]
+Kind = Literal["charuco", "checkerboard", "marker", "circles"]
 
 DICTIONARIES = (
     *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
@@ -63,12 +63,23 @@ class Board:
     @property
     def size(self) -> tuple[float, float]:
         """Width and height [m]."""
+        if self.kind == "circles":
+            return (2 * self.columns + 1) * self.square, (self.rows + 1) * self.square
         return self.columns * self.square, self.rows * self.square
 
     def inner_corners(self) -> Floats:
         """Return the (N, 3) corners between squares in ``target`` [m], row by row from the top."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         return self.place(np.asarray(np.stack([x, y], axis=-1).reshape(-1, 2) * self.square))
+
+    def circle_centres(self) -> Floats:
+        """Return the (N, 3) centres of the circles in ``target`` [m], row by row from the top.
+
+        Every other row begins half a step, which is one ``square``, further to the right.
+        """
+        row, column = np.indices((self.rows, self.columns)).reshape(2, -1)
+        places = np.stack([2 * column + row % 2 + 1, row + 1], axis=1)
+        return self.place(np.asarray(places * self.square))
 
     def outer_corners(self) -> Floats:
         """Return the (4, 3) corners in ``target`` [m], clockwise from the top left."""
@@ -107,6 +118,23 @@ def print_of(board: Board, per_square: int = 120) -> Pixels:
     if board.kind == "marker":
         marker = cv2.aruco.generateImageMarker(dictionary_of(board), board.marker_id, size[0])
         return np.asarray(marker, dtype=np.uint8)
+    if board.kind == "circles":
+        return _discs(board, per_square)
     rows, columns = np.indices((board.rows, board.columns))
     squares = np.where((rows + columns) % 2 == 0, 0, 255).astype(np.uint8)
     return np.kron(squares, np.ones((per_square, per_square), np.uint8))
+
+
+def _discs(board: Board, per_square: int) -> Pixels:
+    """Return black discs on white."""
+    import cv2
+
+    width, height = board.size
+    columns, rows = (round(length / board.square) * per_square for length in (width, height))
+    page = np.full((rows, columns), 255, np.uint8)
+    radius = round(board.marker / board.square / 2 * per_square)
+    for x, y, _ in board.circle_centres():
+        across, down = (x + width / 2) / board.square, (height / 2 - y) / board.square
+        middle = [round(16 * (place * per_square - 0.5)) for place in (across, down)]
+        cv2.circle(page, middle, 16 * radius, 0, -1, cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    return page

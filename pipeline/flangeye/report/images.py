@@ -43,6 +43,21 @@ class ImageView:
     summary: str
 
 
+def missed_view(facts: Facts) -> ImageView | None:
+    """Return the first image in which no target was found, and why; None where there is none."""
+    why = {x.id: x.reason for x in facts.log.rejections if x.stage.startswith("fit.")}
+    for capture in facts.log.captures() if why else ():
+        if capture.id in why and capture.image is not None:
+            height, width = capture.image.pixels.shape[:2]
+            more = f" So it is with {len(why) - 1} more." if len(why) > 1 else ""
+            summary = f"Capture {capture.id}, set aside: {why[capture.id]}.{more}"
+            box = (-0.5, -0.5, float(width), float(height))
+            return ImageView(
+                capture.id, _data(capture.image.pixels), box, [], [], width / 110, summary
+            )
+    return None
+
+
 def image_view(facts: Facts) -> ImageView | None:
     """Return the first image whose target was used, or any; None without images."""
     found = {

@@ -19,7 +19,7 @@ from flangeye.report.cell import cell_drawing
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
-from flangeye.report.images import image_view
+from flangeye.report.images import image_view, missed_view
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
 from flangeye.report.space import workspace_drawing
@@ -85,6 +85,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "workspace": workspace_drawing(facts),
         "panels": cloud_panels(facts),
         "image": image_view(facts),
+        "missed": missed_view(facts),
         "cell": cell_drawing(facts),
         "seam": seam_view(facts),
         "weld": weld_drawing(facts),

@@ -1,8 +1,9 @@
-"""``acquire.images``: recorded images of a calibrated camera, with robot poses."""
+"""``acquire.images``: recorded images with robot poses; of a calibrated camera, or by a board."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from pydantic import Field
@@ -12,6 +13,7 @@ from flangeye.files.clouds import LengthUnit, read_cloud
 from flangeye.files.recording import Recording, check_poses, digests_of, fingerprint_of
 from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image, PointCloud, Source
 from flangeye_plugins.acquire.camera import read_image
+from flangeye_plugins.acquire.intrinsics import SeenBoardParams, lens_of
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_note,
@@ -20,6 +22,9 @@ from flangeye_plugins.acquire.opening import (
     poses_of,
     skipped_note,
 )
+
+Camera = tuple[Floats, Floats]
+"""Matrix (3, 3) [px] and OpenCV's distortion."""
 
 
 class ImagesParams(OpeningParams):
@@ -34,13 +39,16 @@ class ImagesParams(OpeningParams):
     distortion: tuple[float, ...] = Field(
         (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
     )
-
+    board: SeenBoardParams | None = Field(
+        None,
+        description="Find the camera by the views of this board; refine focal_length, if given.",
+    )
     cloud_unit: LengthUnit = Field(
         "m", description="Unit of the clouds that lie beside the images, where the archive's "
         "layout does not say."
     )  # fmt: skip
 
-    def camera(self, recording: Recording) -> tuple[Floats, Floats] | None:
+    def camera(self, recording: Recording) -> Camera | None:
         """Return the camera matrix (3, 3) [px] and distortion: as given, or the archive's own."""
         if self.focal_length is None or self.principal_point is None:
             return recording.camera
@@ -61,32 +69,50 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
     if not usable:
         raise StageError(f"{recorded.root}: holds no images ({recorded.layout})")
     check_poses(recorded.root, usable, whole=True)
-    if any(params.camera(r) is None for r in usable):
-        raise StageError(
-            f"{recorded.root}: has images, but no camera that took them; write focal_length: "
-            "[fx, fy] and principal_point: [cx, cy]"
-        )
+    cameras, told = _cameras(recorded.root, usable, params)
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     digests = digests_of([*files, *recorded.files])
     notes = (
         archive_note(recorded),
         *recorded.notes,
         *skipped_note(recorded, lambda r: r.image is not None, "image"),
+        *told,
     )
     source = Source(fingerprint_of(recorded.root, digests), notes)
     unit = recorded.cloud_unit or params.cloud_unit
-    return Captures(_captures(usable, params, unit), source, total=len(usable), recorded=True)
+    return Captures(_captures(usable, cameras, unit), source, total=len(usable), recorded=True)
+
+
+def _cameras(
+    root: Path, usable: Sequence[Recording], params: ImagesParams
+) -> tuple[dict[str, Camera], list[str]]:
+    """Return the camera of each image by the pose's name, and what to tell of how it was found."""
+    if params.board is None:
+        cameras = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
+        if len(cameras) < len(usable):
+            raise StageError(
+                f"{root}: has images, but no camera that took them; write focal_length: [fx, fy] "
+                "and principal_point: [cx, cy], or board: {kind: charuco, …} to find it"
+            )
+        return cameras, []
+    images = {r.id: read_image(r.image) for r in usable if r.image is not None}
+    known = params.camera(usable[0])
+    start = None if known is None else Image(images[usable[0].id], *known)
+    try:
+        lens = lens_of(images, params.board.board, start)
+    except StageError as error:
+        raise StageError(f"{root}: {error}") from None
+    return dict.fromkeys(images, (lens.matrix, lens.distortion)), [lens.note()]
 
 
 def _captures(
-    usable: Sequence[Recording], params: ImagesParams, unit: LengthUnit
+    usable: Sequence[Recording], cameras: Mapping[str, Camera], unit: LengthUnit
 ) -> Iterator[Capture]:
     """Read one image at a time."""
     nothing = PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))
     for recording in usable:
-        camera = params.camera(recording)
-        if recording.image is not None and camera is not None:
-            image = Image(read_image(recording.image), *camera)
+        if recording.image is not None:
+            image = Image(read_image(recording.image), *cameras[recording.id])
             cloud = read_cloud(recording.cloud, unit) if recording.cloud else nothing
             yield Capture(
                 recording.id, cloud, poses_of(recording), recording.joints,

@@ -10,11 +10,12 @@ from pydantic import Field, model_validator
 from flangeye import Params, stage
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.boards import Board, Dictionary
+from flangeye.models.corners import Corners, find_corners
 from flangeye.types import CAMERA, TARGET, Capture, Image, PoseFeature, Rejected, Transform
 from flangeye.units import Length, param
-from flangeye_plugins.fit.corners import Corners, find_corners
 from flangeye_plugins.fit.planar import (
     PlanarPose,
+    middles_beside_centres,
     points_of,
     pose_from_points,
     poses_from_pixels,
@@ -28,6 +29,7 @@ SIZE_SIGMAS = 5.0
 SIZE_ERROR = 5e-3
 """Share by which a print may be off and nobody needs to know."""
 FEWEST_POINTS = 4
+NO_IMAGE = "there is no image; printed targets are found in the scanner's image"
 
 
 class TargetParams(Params):
@@ -92,6 +94,24 @@ class CheckerboardParams(TargetParams):
         return self
 
 
+class CirclesParams(TargetParams):
+    """Parameters of ``fit.circles``."""
+
+    columns: int = Field(ge=2, description="Circles of a row.")
+    rows: int = Field(ge=3, description="Rows, every other one shifted by half a step; odd.")
+    spacing: Length = param(gt=0, description="Distance of two rows, measured on the print.")
+    diameter: Length = param(gt=0, description="Of the circles, measured on the print.")
+
+    @model_validator(mode="after")
+    def _asymmetric(self) -> CirclesParams:
+        if self.rows % 2 == 0:
+            raise ValueError(
+                f"a grid of {self.rows} rows looks the same after half a turn; use one with an odd "
+                "number of rows"
+            )
+        return self
+
+
 class MarkerParams(DictionaryParams):
     """Parameters of ``fit.aruco``."""
 
@@ -123,6 +143,26 @@ def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeatur
     )
 
 
+@stage("fit.circles")
+def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Rejected:
+    """Find an asymmetric grid of circles, all of it.
+
+    The frame has its origin in the middle of the grid, x right, y up, z towards the camera; the
+    first row begins half a step further to the left than the second.
+    """
+    size = params.columns, params.rows, params.spacing
+    board = Board("circles", *size, params.diameter)
+    if capture.image is None:
+        return Rejected(NO_IMAGE)
+    middles = find_corners(board, capture.image)
+    if isinstance(middles, Rejected):
+        return middles
+    pose = poses_from_pixels(middles, capture.image, params.corner_noise)[0]
+    beside = middles_beside_centres(middles, capture.image, pose.matrix, params.diameter / 2)
+    centres = middles._replace(pixels=middles.pixels - beside)
+    return _fit_corners(centres, capture, capture.image, board, params)
+
+
 @stage("fit.aruco")
 def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     """Find one ArUco or AprilTag marker.
@@ -137,10 +177,16 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
 def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeature | Rejected:
     """Return a board's pose with its covariance, or why there is none."""
     if capture.image is None:
-        return Rejected("there is no image; printed targets are found in the scanner's image")
+        return Rejected(NO_IMAGE)
     corners = find_corners(board, capture.image)
     if isinstance(corners, Rejected):
         return corners
+    return _fit_corners(corners, capture, capture.image, board, params)
+
+
+def _fit_corners(
+    corners: Corners, capture: Capture, image: Image, board: Board, params: TargetParams
+) -> PoseFeature | Rejected:
     by_depth = None if params.depth == "off" else _by_depth(corners, capture, board)
     if isinstance(by_depth, Rejected):
         return by_depth
@@ -150,12 +196,12 @@ def fit_board(capture: Capture, board: Board, params: TargetParams) -> PoseFeatu
     if by_depth is None and params.depth == "only":
         return Rejected("the cloud has no depth at the corners; it must be organised as the image")
     if by_depth is not None and params.depth == "only":
-        return _feature(by_depth, corners, capture.image, by_depth=True)
-    poses = poses_from_pixels(corners, capture.image, params.corner_noise)
+        return _feature(by_depth, corners, image, by_depth=True)
+    poses = poses_from_pixels(corners, image, params.corner_noise)
     chosen = _better(poses, by_depth, corners, params)
     if isinstance(chosen, Rejected):
         return chosen
-    return _feature(chosen, corners, capture.image, by_depth=chosen is by_depth)
+    return _feature(chosen, corners, image, by_depth=chosen is by_depth)
 
 
 def _by_depth(corners: Corners, capture: Capture, board: Board) -> PlanarPose | Rejected | None:

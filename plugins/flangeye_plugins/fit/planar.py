@@ -16,8 +16,8 @@ from flangeye.maths.geometry import (
     rigid,
     rotation_exp,
 )
+from flangeye.models.corners import Corners
 from flangeye.types import Floats, Image, PointCloud
-from flangeye_plugins.fit.corners import Corners
 
 PRIOR_FREEDOM = 8
 """What is expected of the corners' noise counts as much as so many coordinates."""
@@ -122,6 +122,33 @@ def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, 
     errors = np.asarray(pixels).reshape(-1, 2) - corners.pixels
     derivatives = np.concatenate([to_rotation, to_position], axis=2)
     return errors.ravel(), derivatives.reshape(-1, 6)
+
+
+def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius: float) -> Floats:
+    """Return how far (N, 2) the middles of discs' images lie beside those of their centres [px].
+
+    A disc about P in the plane of u and v has the image with the dual conic M diag(1, 1, -1) M',
+    M = [r u, r v, P]; its middle is that of the conic (Heikkila 2000, section 3).
+
+    Args:
+        corners: The discs; their middles in the image, their centres in ``target``.
+        image: With the camera's matrix and distortion.
+        pose: (4, 4) ``camera_T_target`` [m].
+        radius: Of the discs [m].
+    """
+    import cv2
+
+    centres = corners.points @ pose[:3, :3].T + pose[:3, 3]
+    in_plane = np.broadcast_to(radius * pose[:3, :2], (len(centres), 3, 2))
+    m = np.concatenate([in_plane, centres[:, :, None]], axis=2)
+    dual = m @ np.diag([1.0, 1.0, -1.0]) @ m.transpose(0, 2, 1)
+    middles = dual[:, :, 2] / dual[:, 2:, 2] * centres[:, 2:]
+    none = np.zeros(3)
+    at = [
+        cv2.projectPoints(points, none, none, image.camera_matrix, image.distortion)[0]
+        for points in (middles, centres)
+    ]
+    return np.asarray((at[0] - at[1]).reshape(-1, 2), dtype=np.float64)
 
 
 def points_of(corners: Corners, cloud: PointCloud) -> Floats:

@@ -12,10 +12,12 @@ from flangeye_emulators.world.board_image import BoardCamera, Cover, render_boar
 from flangeye_plugins.fit.boards import (
     CharucoParams,
     CheckerboardParams,
+    CirclesParams,
     MarkerParams,
     fit_aruco,
     fit_charuco,
     fit_checkerboard,
+    fit_circles,
 )
 
 CAMERA_MATRIX = np.array([[1000.0, 0, 400], [0, 1000, 300], [0, 0, 1]])
@@ -27,12 +29,15 @@ POSE = Transform("base", "flange", np.eye(4))
 CHARUCO = Board("charuco", 7, 5, 0.03, 0.022)
 CHECKER = Board("checkerboard", 8, 5, 0.025)
 MARKER = Board("marker", 1, 1, 0.08, 0.0, "APRILTAG_36h11", 3)
+CIRCLES = Board("circles", 4, 11, 0.016, 0.014)
 OF_CHARUCO = CharucoParams(columns=7, rows=5, square=SI(0.03), marker=SI(0.022))
 OF_CHECKER = CheckerboardParams(columns=8, rows=5, square=SI(0.025))
 OF_MARKER = MarkerParams(size=SI(0.08), dictionary="APRILTAG_36h11", id=3)
+OF_CIRCLES = CirclesParams(columns=4, rows=11, spacing=SI(0.016), diameter=SI(0.014))
 FITS = {
     "charuco": (CHARUCO, fit_charuco, OF_CHARUCO),
     "checkerboard": (CHECKER, fit_checkerboard, OF_CHECKER),
+    "circles": (CIRCLES, fit_circles, OF_CIRCLES),
     "marker": (MARKER, fit_aruco, OF_MARKER),
 }
 
@@ -148,7 +153,7 @@ def test_the_better_of_image_and_depth_is_taken():
 @pytest.mark.parametrize("kind", FITS)
 def test_a_print_in_another_size_is_named_by_depth(kind):
     board, fit, params = FITS[kind]
-    field = "size" if kind == "marker" else "square"
+    field = {"marker": "size", "circles": "spacing"}.get(kind, "square")
     said = params.model_copy(update={field: getattr(params, field) / 1.03})
     rejected = fit(capture(board, looking(), depth=True), said)
     assert isinstance(rejected, Rejected)
@@ -232,3 +237,12 @@ def test_the_stated_covariance_holds_its_share(kind):
         off = error(feature, pose)
         inside.append(off @ np.linalg.solve(feature.covariance, off) < 12.6)  # 95 %
     assert np.mean(inside) > 0.8
+
+
+def test_a_grid_of_circles_that_is_symmetric_or_partly_seen_is_refused():
+    with pytest.raises(ValidationError, match="10 rows looks the same after half a turn"):
+        CirclesParams(columns=4, rows=10, spacing=SI(0.016), diameter=SI(0.014))
+    pose = looking()
+    pose[0, 3] += 0.2
+    told = fit_circles(capture(CIRCLES, pose), OF_CIRCLES)
+    assert told.reason == "no grid of 11 rows of 4 circles found; all of it must be seen"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.models.boards import Board, charuco_of, dictionary_of
+from flangeye.models.square_edges import corners_of_square
 from flangeye.types import Floats, Image, Rejected
-from flangeye_plugins.fit.edges import corners_of_square
 
 Grey = NDArray[np.uint8]
 
@@ -34,7 +34,9 @@ class Corners(NamedTuple):
 def find_corners(board: Board, image: Image) -> Corners | Rejected:
     """Find a board's corners in an image."""
     grey = _grey(image)
-    finders = {"charuco": _charuco, "checkerboard": _checkerboard, "marker": _marker}
+    finders = {
+        "charuco": _charuco, "checkerboard": _checkerboard, "marker": _marker, "circles": _circles,
+    }  # fmt: skip
     return finders[board.kind](board, grey, image)
 
 
@@ -99,6 +101,20 @@ def _checkerboard(board: Board, grey: Grey, _image: Image) -> Corners | Rejected
             "part of the board is covered or cut off, or it has more squares"
         )
     return upright
+
+
+def _circles(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
+    """Find the middles of the discs' images; they lie a little beside the images of the centres."""
+    import cv2
+
+    # Clustering, the other method, can take minutes for a grid that is cut off.
+    size, flags = (board.columns, board.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
+    found, centres = cv2.findCirclesGrid(grey, size, flags=flags)
+    if not found:
+        return Rejected(
+            f"no grid of {board.rows} rows of {board.columns} circles found; all of it must be seen"
+        )
+    return Corners(np.asarray(centres, dtype=np.float64).reshape(-1, 2), board.circle_centres())
 
 
 def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:

@@ -1,0 +1,198 @@
+"""The camera's matrix and distortion, from the views of a board that calibrate the arm too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flangeye import Params, StageError
+from flangeye.models.boards import Board, Dictionary, Kind
+from flangeye.models.corners import Corners, find_corners
+from flangeye.types import Floats, Image
+from flangeye.units import Length, param
+
+FEWEST_VIEWS = 6
+"""Views below which distortion and principal point are not told apart from tilts."""
+LEAST_TILT = 0.02
+"""How much the board's depth, as a share of it, has to change across it otherwise between views:
+the root mean square of it along the direction in which it changes most."""
+LARGEST_ERROR = 0.01
+"""Standard deviation of the focal length, as a share of it, beyond which nothing is believed."""
+ALIKE = (
+    "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
+    "[fx, fy] and principal_point: [cx, cy]"
+)
+OUTLYING = 4.0
+"""Times the median reprojection error beyond which a view takes no part."""
+COEFFICIENTS = ("k1", "k2", "p1", "p2")
+"""What is found of the lens; more is not told by as many views as a calibration of an arm has."""
+
+Grey = NDArray[np.uint8]
+
+
+class SeenBoardParams(Params):
+    """The board whose views tell the camera, as the step that fits it has it."""
+
+    kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
+    columns: int = Field(ge=3, description="Squares, or circles of a row, from left to right.")
+    rows: int = Field(ge=3, description="Squares, or rows of circles, from top to bottom.")
+    square: Length = param(gt=0, description="Edge of a square, or distance of rows of circles.")
+    marker: Length = param("0 mm", ge=0, description="Edge of a ChArUco board's markers.")
+    dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.kind == "marker":
+            raise ValueError("four corners do not tell a camera; use a board")
+        if self.kind == "charuco" and not 0 < self.marker < self.square:
+            raise ValueError("marker: a ChArUco board's markers are smaller than its squares")
+        return self
+
+    @property
+    def board(self) -> Board:
+        """The print."""
+        size = self.columns, self.rows, self.square
+        return Board(self.kind, *size, self.marker, self.dictionary)
+
+
+class Lens(NamedTuple):
+    """A camera as views of a board tell it.
+
+    Attributes:
+        matrix: (3, 3) [px].
+        distortion: (4,) k1, k2, p1, p2.
+        deviations: (8,) standard deviations of fx, fy, cx, cy [px] and of the coefficients.
+        error: Root mean square of a corner's reprojection error [px].
+        views: How many were used.
+        left_out: Those that were not: no board in them, or beside the others.
+    """
+
+    matrix: Floats
+    distortion: Floats
+    deviations: Floats
+    error: float
+    views: int
+    left_out: tuple[str, ...]
+
+    def note(self) -> str:
+        """Return what to tell of it."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        s = self.deviations
+        named = zip(COEFFICIENTS, self.distortion, s[4:], strict=True)
+        lens = ", ".join(f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named)
+        left = f"; without {', '.join(self.left_out)}" if self.left_out else ""
+        return (
+            f"camera by {self.views} views of the board: focal length {fx:.2f}, {fy:.2f} +- "
+            f"{s[0]:.2f}, {s[1]:.2f} px, principal point {cx:.2f}, {cy:.2f} +- {s[2]:.2f}, "
+            f"{s[3]:.2f} px, {lens}; corners fit to {self.error:.3f} px{left}"
+        )
+
+
+def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None) -> Lens:
+    """Return the camera that saw a board, by least squares over all corners and poses (Zhang 2000).
+
+    Args:
+        images: (H, W) each, by name.
+        board: What they show.
+        start: A camera to begin with, refined; None for one that is not known at all.
+
+    Raises:
+        StageError: Too few show the board, or they are too alike to tell the camera.
+    """
+    sizes = {pixels.shape[::-1] for pixels in images.values()}
+    if len(sizes) > 1:
+        raise StageError(f"images of {len(sizes)} sizes are not one camera's")
+    (size,) = sizes
+    seen = {name: corners for name, pixels in images.items() if (corners := _seen(board, pixels))}
+    _require_views(len(seen), len(images))
+    _require_tilted(seen)
+    lens = _fitted(seen, size, start)
+    kept = {
+        n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if not _outlies(e, lens[1])
+    }
+    if len(kept) < len(seen):
+        _require_views(len(kept), len(images))
+        lens = _fitted(kept, size, start)
+    left_out = tuple(name for name in images if name not in kept)
+    found = lens[0]._replace(left_out=left_out)
+    _require_certain(found)
+    return found
+
+
+def _seen(board: Board, pixels: Grey) -> Corners | None:
+    corners = find_corners(board, Image(pixels, np.eye(3)))
+    return corners if isinstance(corners, Corners) else None
+
+
+def _require_views(seen: int, count: int) -> None:
+    if seen < FEWEST_VIEWS:
+        raise StageError(
+            f"{seen} of {count} images show the board, {FEWEST_VIEWS} are needed to tell the "
+            "camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]"
+        )
+
+
+def _outlies(error: float, errors: Floats) -> bool:
+    return error > OUTLYING * float(np.median(errors))
+
+
+def _fitted(
+    seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
+) -> tuple[Lens, Floats]:
+    """Return the camera, and each view's reprojection error, rms [px]."""
+    import cv2
+
+    points = [corners.points.astype(np.float32) for corners in seen.values()]
+    pixels = [corners.pixels.astype(np.float32) for corners in seen.values()]
+    flags = cv2.CALIB_FIX_K3 | (cv2.CALIB_USE_INTRINSIC_GUESS if start else 0)
+    matrix = np.eye(3) if start is None else np.array(start.camera_matrix)
+    lens = np.zeros(5) if start is None else np.resize(np.append(start.distortion, np.zeros(5)), 5)
+    _, found_matrix, found_lens, _, _, sigmas, _, errors = cv2.calibrateCameraExtended(
+        points, pixels, size, matrix, lens, flags=flags
+    )
+    errors = np.asarray(errors, dtype=np.float64).ravel()
+    counts = np.array([len(each) for each in pixels])
+    # OpenCV's errors are of points, ours of a coordinate.
+    total = float(np.sqrt((errors**2 * counts).sum() / counts.sum() / 2))
+    found = Lens(
+        np.asarray(found_matrix, dtype=np.float64),
+        np.asarray(found_lens, dtype=np.float64).ravel()[:4],
+        np.asarray(sigmas, dtype=np.float64).ravel()[:8], total, len(seen), (),
+    )  # fmt: skip
+    return found, errors
+
+
+def _require_tilted(seen: Mapping[str, Corners]) -> None:
+    """Refuse parallel boards: they look alike through any lens, and least squares do not tell."""
+    changes = np.array([_depth_change(corners) for corners in seen.values()])
+    spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
+    if spread < LEAST_TILT:
+        raise StageError(
+            f"the {len(seen)} views do not tell the focal length: {ALIKE} (depth changes by "
+            f"{spread:.1%} across the board between them, {LEAST_TILT:.0%} is needed)"
+        )
+
+
+def _depth_change(corners: Corners) -> Floats:
+    """Return by how much of itself the board's depth changes across it, to the right and up (2,).
+
+    The last row of the homography is the depth, up to scale, whatever the camera.
+    """
+    import cv2
+
+    plane = corners.points[:, :2] / np.ptp(corners.points[:, :2], axis=0).max()
+    homography = np.asarray(cv2.findHomography(plane, corners.pixels)[0], dtype=np.float64)
+    return np.asarray(homography[2, :2] / homography[2, 2])
+
+
+def _require_certain(lens: Lens) -> None:
+    share = float(lens.deviations[0] / lens.matrix[0, 0])
+    if not share <= LARGEST_ERROR:
+        raise StageError(
+            f"the {lens.views} views tell the focal length to {share:.1%} only (at most "
+            f"{LARGEST_ERROR:.0%} is allowed): {ALIKE}"
+        )

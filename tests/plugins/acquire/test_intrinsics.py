@@ -1,0 +1,131 @@
+"""A camera nobody calibrated: found by the views of the board, or refined, with how well."""
+
+import cv2
+import numpy as np
+import pytest
+
+from flangeye import StageError
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.models.boards import Board
+from flangeye.types import ArchivePath, Image
+from flangeye.units import SI
+from flangeye_emulators.world.board_image import BoardCamera, render_board
+from flangeye_plugins.acquire.images import ImagesParams, acquire_images
+from flangeye_plugins.acquire.intrinsics import SeenBoardParams, lens_of
+
+MATRIX = np.array([[1000.0, 0, 407], [0, 1003, 295], [0, 0, 1]])
+LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
+CAMERA = BoardCamera(MATRIX, (800, 600), LENS)
+BOARD = Board("charuco", 7, 5, 0.03, 0.022)
+OF_BOARD = SeenBoardParams(columns=7, rows=5, square=SI(0.03), marker=SI(0.022))
+CIRCLES = Board("circles", 4, 11, 0.016, 0.014)
+
+
+def poses(count, tilt=0.45):
+    for k in range(count):
+        about = np.array([np.cos(1.9 * k), np.sin(1.9 * k), 0.0])
+        turned = np.diag([1.0, -1.0, -1.0]) @ rotation_exp(tilt * about)
+        yield rigid(
+            turned, np.array([0.05 * np.cos(k), 0.03 * np.sin(2 * k), 0.46 + 0.02 * (k % 4)])
+        )
+
+
+def images(board, count, tilt=0.45):
+    rng = np.random.default_rng(1)
+    return {
+        str(k): np.asarray(render_board(board, pose, CAMERA, rng).pixels)
+        for k, pose in enumerate(poses(count, tilt))
+    }
+
+
+@pytest.fixture(scope="module")
+def views():
+    return images(BOARD, 12)
+
+
+def misses(lens):
+    """Return how far the camera is from the true one, in its own standard deviations."""
+    k, true = lens.matrix, MATRIX
+    of_matrix = [
+        k[0, 0] - true[0, 0],
+        k[1, 1] - true[1, 1],
+        k[0, 2] - true[0, 2],
+        k[1, 2] - true[1, 2],
+    ]
+    return np.array([*of_matrix, *(lens.distortion - LENS[:4])]) / lens.deviations
+
+
+@pytest.mark.parametrize("board", [BOARD, CIRCLES])
+def test_the_camera_is_found_as_well_as_it_says(board, views):
+    lens = lens_of(views if board is BOARD else images(board, 12), board)
+    assert lens.deviations[0] < 5
+    assert np.abs(misses(lens)).max() < 6  # what detection moves all corners by is not in it
+    assert abs(lens.matrix[0, 0] - 1000) < 5
+    assert lens.error < 0.15
+
+
+def test_a_camera_that_is_nearly_known_is_refined(views):
+    rough = MATRIX + np.diag([30.0, 30.0, 0.0])
+    known = Image(views["0"], rough, np.zeros(0))
+    refined = lens_of(views, BOARD, known)
+    np.testing.assert_allclose(refined.matrix, lens_of(views, BOARD).matrix, atol=0.05)
+
+
+def test_images_without_a_board_are_left_out_and_named(views):
+    blank = np.full_like(views["0"], 90)
+    lens = lens_of({**views, "blank": blank}, BOARD)
+    assert lens.left_out == ("blank",)
+    assert lens.note().startswith("camera by 12 views of the board: focal length ")
+    assert lens.note().endswith("px; without blank")
+
+
+def test_too_few_or_too_equal_views_are_refused(views):
+    few = {name: views[name] for name in "0123"}
+    with pytest.raises(StageError, match="^4 of 4 images show the board, 6 are needed to tell the"):
+        lens_of(few, BOARD)
+    with pytest.raises(StageError, match="tilt the board by 20 deg and more to both sides"):
+        lens_of(images(BOARD, 7, tilt=0.02), BOARD)
+    with pytest.raises(StageError, match="^images of 2 sizes are not one camera's"):
+        lens_of({**few, "small": views["0"][:100]}, BOARD)
+
+
+def test_a_folder_of_images_needs_no_calibrated_camera(views, tmp_path):
+    rows = ["cloud,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"]
+    for k, (name, pixels) in enumerate(views.items()):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
+        rows.append(f"{0.1 * k},0.1,0.2,{0.1 * k},0,0")
+    (tmp_path / "poses.csv").write_text("\n".join(["x,y,z,a,b,c", *rows[1:]]))
+    reader = table_reader()
+    known = ImagesParams(path=tmp_path, reader=reader, board=OF_BOARD)
+    taken = acquire_images(ArchivePath(None), known)
+    first = next(iter(taken))
+    assert abs(first.image.camera_matrix[0, 0] - 1000) < 5
+    assert any(note.startswith("camera by 12 views") for note in taken.source.notes)
+    with pytest.raises(StageError, match=r"or board: \{kind: charuco, …\} to find it"):
+        acquire_images(ArchivePath(None), ImagesParams(path=tmp_path, reader=reader))
+
+
+def table_reader():
+    from flangeye.plugin.stage import BoundPart
+    from flangeye_plugins.reader.table import TableParams, table
+
+    params = TableParams(rotation="vector", length="m", angle="rad", pose="base_T_flange")
+    return BoundPart(table, params)
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (
+            {"kind": "marker", "columns": 3, "rows": 3},
+            "four corners do not tell a camera; use a board",
+        ),
+        (
+            {"kind": "charuco", "columns": 7, "rows": 5},
+            "marker: a ChArUco board's markers are smaller",
+        ),
+    ],
+)
+def test_a_board_that_tells_no_camera_is_refused(given, line):
+    with pytest.raises(ValueError, match=line):
+        SeenBoardParams(square=SI(0.03), **given)
