@@ -44,16 +44,16 @@ def _row(name: str, condition: Condition, seeds: int) -> tuple[str, ...]:
         trials = [try_condition(condition, seed) for seed in range(seeds)]
     except StageError as refusal:
         return name, str(seeds), "", "", "0", f"refused: {str(refusal).partition(': ')[2]}"
-    done = [trial for trial in trials if trial.done]
-    rms, largest = _errors(done)
+    rms, largest = _errors([trial for trial in trials if len(trial.errors)])
     reasons = dict.fromkeys(t.controller.reason or t.phases[-1] for t in trials if not t.done)
-    return name, str(seeds), rms, largest, str(len(done)), "; ".join(reasons)
+    return name, str(seeds), rms, largest, str(sum(t.done for t in trials)), "; ".join(reasons)
 
 
-def _errors(done: list[Trial]) -> tuple[str, str]:
-    if not done:
+def _errors(welded: list[Trial]) -> tuple[str, str]:
+    """Return rms and largest distance of what was welded, also of a weld that stopped later."""
+    if not welded:
         return "", ""
-    errors = np.concatenate([trial.errors for trial in done])
+    errors = np.concatenate([trial.errors for trial in welded])
     return f"{np.sqrt(np.mean(errors**2)) * 1e3:.3f}", f"{errors.max() * 1e3:.2f}"
 
 

@@ -77,6 +77,9 @@ class Finger(Model):
     along_sigma: Length = param(
         "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
     )
+    tip_sigma: Length = param(
+        "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
+    )
     radius: Length = param(gt=0, description="Radius of the tip's ball.")
     travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
     calibration: Calibration | None = None

@@ -63,7 +63,9 @@ CONDITIONS: Mapping[str, Condition] = {
     "heat: 1 mm around the torch": Condition(
         {"heat": {"local": "1 mm"}}, {"distortion": "0.5 mm", "max_error": "2.5 mm"}
     ),
-    "seam wavy 1 mm per 10 mm": Condition({"workpiece": {"wave": "1 mm"}}),
+    "seam wavy 1 mm per 10 mm": Condition(
+        {"workpiece": {"wave": "1 mm"}}, {"max_error": "1.5 mm"}
+    ),
     "20 mm/s": Condition({}, {"speed": "20 mm/s"}),
     "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms": Condition(
         {"arm": {"lag": "100 ms", "dead_time": "60 ms"}, "clock": {"latency": "100 ms"}},

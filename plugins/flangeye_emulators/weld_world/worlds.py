@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye_emulators.weld_world.bench import try_condition
+from flangeye_emulators.weld_world.bench import DISTANCE, try_condition
 from flangeye_emulators.weld_world.conditions import Condition
 from flangeye_emulators.weld_world.trial import Trial
 
@@ -19,14 +20,12 @@ LENGTH = 0.1
 PERIOD = 16e-3
 """Of a cycle [s]: a world takes a second or two."""
 
-OFTEN = 0.3
-"""How often each of some thirty things is wrong."""
+OFTEN = 0.4
+"""Each of some thirty things that the weld can measure is wrong at most so often; how often is a
+world's own: in some little is wrong, in others much."""
 
-BEYOND = 2.5
-"""What nothing at the weld can measure is off by up to so many of its stated sigmas."""
-
-SIGMA = {"torch": 0.05e-3, "along": 0.3e-3, "arm": 0.05e-3, "heat": 0.05e-3}
-"""What the files state of it [m]."""
+STATED = (0.02e-3, 0.12e-3)
+"""Between these a world's files state what nothing at the weld can measure, one sigma [m]."""
 
 
 @dataclass(frozen=True)
@@ -57,45 +56,110 @@ class Verdict:
         return self.done and self.outside > 1.0
 
 
+class _Draw:
+    """Draws what is wrong in one world, which has a frequency of its own for that."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng, self._often = rng, float(rng.uniform(0.0, OFTEN))
+
+    def happens(self) -> bool:
+        return bool(self.rng.uniform() < self._often)
+
+    def some(self, most: float) -> float:
+        """Return nothing in most worlds, otherwise up to ``most``."""
+        return float(self.rng.uniform(0.0, most)) if self.happens() else 0.0
+
+    def either(self, most: float) -> float:
+        """Return the same, to either side."""
+        return self.some(most) * float(self.rng.choice([-1.0, 1.0]))
+
+    def between(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def normal(self, sigma: float) -> float:
+        return sigma * float(self.rng.standard_normal())
+
+    def gaps(self) -> list[Mapping[str, Any]]:
+        if not self.happens():
+            return []
+        start, length = self.between(0.02, 0.04), self.between(5e-3, 50e-3)
+        side = int(self.rng.choice([-1, 1]))
+        return [{"start": _mm(start), "length": _mm(length), "side": side}]
+
+    def tacks(self) -> list[Mapping[str, Any]]:
+        height = self.between(0.5e-3, 2e-3)
+        return [{"start": "30 mm", "height": _mm(height)}] if self.happens() else []
+
+    def hidden(self) -> list[str] | None:
+        start, lasts = self.between(8.0, 20.0), self.between(0.1, 1.2)
+        return [_ms(start), _ms(start + lasts)] if self.happens() else None
+
+
 def drawn(seed: int) -> Condition:
-    """Return a random world: some things are wrong in it, by up to twice the envelope."""
+    """Return a random world.
+
+    What the weld can measure (finger, clock, response of the arm, workpiece) is wrong in some
+    worlds, by up to twice the envelope. What it cannot (torch, tip, yaw, path of the arm, heat) is
+    always wrong, normally distributed about the files with the sigma that they state.
+    """
     rng = np.random.default_rng([seed, 14])
-    tip = [_either(rng, 1e-3) for _ in range(3)]
-    # What the files state of the torch is where it is relative to the tip.
-    ahead = tip[0] + _either(rng, BEYOND * SIGMA["along"])
-    aside = tip[1] + _either(rng, BEYOND * SIGMA["torch"])
-    world: dict[str, dict[str, Any]] = {
-        "arm": {
-            "lag": _ms(_some(rng, 0.25)), "dead_time": _ms(_some(rng, 0.12)),
-            "wave": _mm(_some(rng, BEYOND * SIGMA["arm"])), "backlash": _mm(_some(rng, 0.1e-3)),
-            "scale": _either(rng, 2e-3), "sag": _mm(_some(rng, 0.3e-3)),
-        },
-        "tool": {
-            "tip": [_mm(x) for x in tip], "torch": [_mm(ahead), _mm(aside)],
-        },
-        "finger": {
-            "lateral": float(np.exp(_either(rng, 0.4))), "axial": float(np.exp(_either(rng, 0.8))),
-            "gain": _either(rng, 0.3), "drift": _either(rng, 0.1),
-            "rest": [_mm(_either(rng, 0.3e-3)) for _ in range(3)],
-            "play": _mm(_some(rng, 0.3e-3)), "hysteresis": _some(rng, 0.12),
-            "creep": _some(rng, 0.04), "friction": float(rng.uniform(0.0, 0.3)),
-            "noise": _mm(float(10 ** rng.uniform(-5.3, -3.9))),
-        },
+    draw = _Draw(rng)
+    torch, arm, heat = np.exp(rng.uniform(math.log(STATED[0]), math.log(STATED[1]), 3)).tolist()
+    along, tip_sigma = draw.between(0.1e-3, 0.5e-3), draw.between(0.1e-3, 0.6e-3)
+    world = {
+        "arm": _arm(draw, arm),
+        "tool": _tool(draw, tip_sigma, along, torch),
+        "finger": _finger(draw),
         "clock": {
-            "latency": _ms(_some(rng, 0.15)), "stamp": _ms(_either(rng, 0.05)),
-            "dropped": float(rng.uniform(0, 0.4)),
+            "latency": _ms(draw.some(0.2)), "stamp": _ms(draw.either(0.1)),
+            "jitter": _ms(draw.some(0.03)), "dropped": draw.some(0.6), "hidden": draw.hidden(),
         },
-        "workpiece": {
-            "wave": _mm(_some(rng, 0.5e-3)), "wave_length": _mm(float(rng.uniform(10e-3, 60e-3))),
-            "bow": _mm(_either(rng, 2e-3)), "half_angle": f"{_either(rng, 20.0)} deg",
-            "half_angle_wave": f"{_some(rng, 6.0)} deg", "root_gap": _mm(_some(rng, 1e-3)),
-            "spatter": _mm(_some(rng, 0.05e-3)), "gaps": _gaps(rng),
-            "tacks": [{"start": "30 mm"}] if rng.uniform() < 0.2 else [],
-        },
-        "heat": {"local": _mm(_either(rng, BEYOND * SIGMA["heat"]))},
+        "workpiece": _workpiece(draw),
+        "heat": {"local": _mm(draw.normal(heat))},
     }  # fmt: skip
-    speed = f"{rng.choice([5, 10])} mm/s"
-    return Condition(world, {"speed": speed}, (_some(rng, 6e-3), _some(rng, 0.05)))
+    settings = {
+        "speed": f"{rng.choice([5, 10, 20])} mm/s", "max_error": f"{rng.choice([1, 2])} mm",
+        "arm_sigma": _mm(arm), "distortion": _mm(heat),
+    }  # fmt: skip
+    belief = {"torch_sigma": torch, "along_sigma": along, "tip_sigma": tip_sigma}
+    return Condition(world, settings, (draw.some(12e-3), draw.some(0.1)), belief)
+
+
+def _arm(draw: _Draw, sigma: float) -> dict[str, Any]:
+    return {
+        "lag": _ms(draw.some(0.4)), "dead_time": _ms(draw.some(0.2)),
+        "wave": _mm(abs(draw.normal(sigma))), "wave_length": _mm(draw.between(40e-3, 200e-3)),
+        "backlash": _mm(draw.some(2 * sigma)), "repeatability": _mm(draw.some(sigma / 2)),
+        "scale": draw.either(sigma / DISTANCE), "sag": _mm(draw.some(0.5e-3)),
+    }  # fmt: skip
+
+
+def _tool(draw: _Draw, tip: float, along: float, across: float) -> dict[str, Any]:
+    off = [draw.normal(tip) for _ in range(3)]
+    turned = draw.between(0.0, 1.0)  # the share of the yaw in how far the torch is aside
+    # What the files state of the torch is where it is relative to the tip.
+    torch = (off[0] + draw.normal(along), off[1] + draw.normal(across * np.sqrt(1.0 - turned)))
+    yaw = np.degrees(draw.normal(across * np.sqrt(turned)) / DISTANCE)
+    return {"tip": [_mm(x) for x in off], "torch": [_mm(x) for x in torch], "yaw": f"{yaw} deg"}
+
+
+def _finger(draw: _Draw) -> dict[str, Any]:
+    return {
+        "lateral": float(np.exp(draw.either(0.8))), "axial": float(np.exp(draw.either(0.8))),
+        "gain": draw.either(0.4), "drift": draw.either(0.2),
+        "rest": [_mm(draw.either(0.4e-3)) for _ in range(3)], "play": _mm(draw.some(0.6e-3)),
+        "hysteresis": draw.some(0.2), "creep": draw.some(0.06),
+        "friction": draw.between(0.0, 0.3), "noise": _mm(10 ** draw.between(-5.3, -3.7)),
+    }  # fmt: skip
+
+
+def _workpiece(draw: _Draw) -> dict[str, Any]:
+    return {
+        "wave": _mm(draw.some(2e-3)), "wave_length": _mm(draw.between(8e-3, 60e-3)),
+        "bow": _mm(draw.either(4e-3)), "half_angle": f"{draw.either(25.0)} deg",
+        "half_angle_wave": f"{draw.some(10.0)} deg", "root_gap": _mm(draw.some(2e-3)),
+        "spatter": _mm(draw.some(0.1e-3)), "gaps": draw.gaps(), "tacks": draw.tacks(),
+    }  # fmt: skip
 
 
 def judged(seed: int) -> Verdict:
@@ -117,22 +181,6 @@ def judged(seed: int) -> Verdict:
 
 def _stated(trial: Trial, name: str) -> Any:
     return trial.column(name)[trial.beside]
-
-
-def _some(rng: np.random.Generator, most: float) -> float:
-    """Return nothing in most worlds, otherwise up to ``most``."""
-    return float(rng.uniform(0.0, most)) if rng.uniform() < OFTEN else 0.0
-
-
-def _either(rng: np.random.Generator, most: float) -> float:
-    return _some(rng, most) * float(rng.choice([-1.0, 1.0]))
-
-
-def _gaps(rng: np.random.Generator) -> list[Mapping[str, Any]]:
-    if rng.uniform() < 0.8:
-        return []
-    start, length = _mm(float(rng.uniform(0.02, 0.04))), _mm(float(rng.uniform(5e-3, 20e-3)))
-    return [{"start": start, "length": length, "side": int(rng.choice([-1, 1]))}]
 
 
 def _mm(metres: float) -> str:

@@ -35,6 +35,7 @@ class Belief:
         noise: Standard deviations of one measurement across and up [m].
         torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
         along_sigma: Standard deviation of the distance from the torch to the tip [m].
+        tip_sigma: Standard deviation of the tip in the flange, along each axis [m].
         two_walls: Whether there is a wall on the other side too.
     """
 
@@ -45,6 +46,7 @@ class Belief:
     noise: tuple[float, float] = (10e-6, 60e-6)
     torch_sigma: float = 0.05e-3
     along_sigma: float = 0.3e-3
+    tip_sigma: float = 0.1e-3
     two_walls: bool = True
 
     def seating(self, settings: Following) -> float | None:
@@ -78,5 +80,5 @@ def belief_of(finger: Finger, half_angle: float | None, settings: Following) -> 
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
     return Belief(
         finger.torch, lateral, axial, half_angle, noise, finger.torch_sigma, finger.along_sigma,
-        settings.joint in ("groove", "butt"),
+        finger.tip_sigma, settings.joint in ("groove", "butt"),
     )  # fmt: skip

@@ -72,11 +72,12 @@ class Seating:
 
 def _newest_from(before: Floats, newest: Floats) -> tuple[tuple[float, float], ...]:
     """Return how far aside and up the newest are from a line, each with its sigma [m]."""
-    middle = before[:, 0].mean()
-    rows = np.column_stack([np.ones(len(before)), before[:, 0] - middle])
-    line, *_ = np.linalg.lstsq(rows, before[:, 1:], rcond=None)
-    left = before[:, 1:] - rows @ line
-    ahead = newest[:, 0].mean() - middle
-    off = newest[:, 1:].mean(axis=0) - line[0] - line[1] * ahead
-    sigma = left.std(axis=0) / np.sqrt(len(newest))
+    middle = before.mean(axis=0)
+    from_middle = before - middle
+    along = from_middle[:, 0]
+    slopes = along @ from_middle[:, 1:] / max(float(along @ along), 1e-18)
+    left = from_middle[:, 1:] - along[:, None] * slopes
+    newest_from = newest.mean(axis=0) - middle
+    off = newest_from[1:] - newest_from[0] * slopes
+    sigma = np.sqrt(np.mean(left**2, axis=0) / len(newest))
     return (float(off[0]), float(sigma[0])), (float(off[1]), float(sigma[1]))

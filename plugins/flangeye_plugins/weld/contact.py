@@ -46,6 +46,11 @@ class Contact:
             self.state, self.since = ("lost" if held else "held"), time
             self._crossed = None
 
+    def hold(self, time: float, deflection: float) -> None:
+        """Take it for certain that the wall is pressed, by ``deflection`` [m]."""
+        self.state, self.since = "held", time
+        self.deflection, self._time, self._crossed = deflection, time, None
+
     def doubted(self, deflection: float, wanted: float) -> bool:
         """Whether one measurement alone speaks against contact."""
         return self.state != "held" or deflection < LOST * wanted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,11 +15,11 @@ from flangeye_plugins.weld.controller import STILL, Phase
 from flangeye_plugins.weld.motion import Command, Felt, ToolPose, Touch, Track, turned
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
-from flangeye_plugins.weld.refined import SLOPE, RefinedPath
+from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.search import Search
 from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.steering import Steering
+from flangeye_plugins.weld.steering import SLOWEST, Steering
 
 BELIEF = 0.3
 """A sample is believed when contact has not been doubted for so long after it [s]."""
@@ -37,6 +38,21 @@ PLAYED = 1.0
 
 LEANING = 0.1e-3
 """A tip that must be deflected by more, and is not, has lost its wall at the seam's end [m]."""
+
+FIRM = 0.7
+"""Share of the wanted deflection below which the tip slows down."""
+
+WAITING = 0.2
+"""Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
+
+SWERVE = 0.3e-3
+"""So far the arm may swerve from a curve while it does not know of it [m]."""
+
+SWERVE_AHEAD = 10e-3
+"""So far before a curve the tip slows down [m]."""
+
+LATE_SHARE = 0.05
+"""Weight of one image in the mean of their delays."""
 
 
 class Follower:
@@ -85,7 +101,7 @@ class Follower:
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
-        self._loose = False
+        self._loose, self._latency = False, 0.0
         self._place = plan.at(self.tip)
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
@@ -119,7 +135,7 @@ class Follower:
         point, normal = self.refined.frame(self.torch)
         velocity = self._velocity(pose, self._pace(pose, normal))
         error = float((self._torch_position(pose) - point) @ normal)
-        self._estimate(error, float(pose.direction @ normal))
+        self._estimate(error, float(pose.direction @ normal), pose.angle)
         turn = self._steering.turn(velocity[:2], pose.direction, normal, error)
         return Command(velocity, turn if velocity[:2].any() else 0.0)
 
@@ -129,16 +145,17 @@ class Follower:
         self._probing.note(pose.time, speed, self._lateral(pose))
         return Command(np.array([*(speed * self._place.normal), 0.0]), 0.0)
 
-    def _estimate(self, error: float, slant: float) -> None:
+    def _estimate(self, error: float, slant: float, angle: float) -> None:
         """Estimate how far the torch may be from the seam, and stop where that is too far.
 
         Args:
             error: Error of the torch from the refined path [m].
             slant: Sine of the angle between the tool and the path.
+            angle: Of the tool [rad].
         """
         if not self._touching:
             return
-        self.sigma = float(np.sqrt(self._variance(slant)))
+        self.sigma = float(np.sqrt(self._variance(slant, angle)))
         self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
         if not 0.0 <= self.torch <= self._plan.length:
             return
@@ -147,16 +164,20 @@ class Follower:
         elif self.lit is not None or self.torch > LEAD_IN * self._belief.distance:
             self._stop(self._too_uncertain())
 
-    def _variance(self, slant: float) -> float:
+    def _variance(self, slant: float, angle: float) -> float:
         """Return the variance of the torch's place across the seam [m^2]."""
         settings, learned = self._settings, self.learned
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
         arm, wander = settings.arm_sigma**2, settings.wander**2
-        waves = self.refined.waviness(self.torch) * arm / (arm + wander)
+        # Waves that the tip felt may be the arm's, by its share in what is expected of both.
+        waves = min(self.refined.waviness(self.torch) * arm / (arm + wander), arm)
         fixed = self._belief.fixed_variance(settings) + (self._belief.along_sigma * slant) ** 2
-        play = (PLAYED * learned.width) ** 2
-        return fixed + gain**2 + play + waves + self.refined.variance(self.torch)
+        play = (PLAYED * learned.width) ** 2 + learned.unexplained**2
+        # What the tip is off by is off for the torch too: all but what the tool has turned between.
+        turned_by = 2.0 * math.sin((angle - self.refined.angle(self.torch, angle)) / 2.0)
+        tip = (self._belief.tip_sigma * turned_by) ** 2
+        return fixed + gain**2 + play + waves + tip + self.refined.variance(self.torch)
 
     # --- what the finger says -------------------------------------------------------------------
 
@@ -166,6 +187,8 @@ class Follower:
         if pose is None:
             return
         self._seen = touch.time
+        late = (self._time or 0.0) - touch.time + self.learned.stamp
+        self._latency += LATE_SHARE * (late - self._latency)
         s, felt, deflection = self._located(pose, touch)
         if self.phase != "seeking" or self._search.found:  # friction on a face is no contact
             self.contact.update(touch.time, deflection, max(self.wanted, self._settings.probe))
@@ -174,10 +197,12 @@ class Follower:
             compression = float(touch.displacement[2] - self._search.rest[2])
             self._search.feel(touch.displacement, deflection, compression)
         elif self.phase == "probing":
-            self._probing.feel(touch.time, -self.side * deflection, felt.height)
+            moved = turned(touch.displacement - self._search.rest, pose.angle)
+            along = float(moved[:2] @ self._place.tangent)
+            self._probing.feel(touch.time, -self.side * deflection, felt.height, along)
             self._newest = pose, touch
         else:
-            self._believe(touch.time, s, felt, deflection)
+            self._believe(touch.time, s, felt, deflection, pose.angle)
 
     def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, Felt, float]:
         """Return where on the plan the tip is, the seam there, and the deflection to the wall."""
@@ -205,7 +230,7 @@ class Follower:
             before.height + share * (felt.height - before.height),
         )
 
-    def _believe(self, time: float, s: float, felt: Felt, deflection: float) -> None:
+    def _believe(self, time: float, s: float, felt: Felt, deflection: float, angle: float) -> None:
         """Keep what the tip felt, unless contact is doubtful.
 
         A finger with play is not believed while it is let go of: the tag is then on the other side.
@@ -221,7 +246,7 @@ class Follower:
             settled = time - self.contact.since > BELIEF
             if settled and s < self._plan.length - self._settings.ending / 2:
                 self._felt = self._smoothed(felt)
-                self.refined.add(time, s, felt.offset)
+                self.refined.add(time, s, felt.offset, angle)
                 self._watch(s, felt)
             self.refined.confirm(time - BELIEF)
 
@@ -291,6 +316,7 @@ class Follower:
         self._began = self._time or 0.0
         if self._newest is not None:
             _, self._felt, self.wanted = self._located(*self._newest)
+            self.contact.hold(self._seen, self.wanted)
         self._enter("following")
 
     def _enter(self, phase: Phase) -> None:
@@ -334,7 +360,7 @@ class Follower:
             target = 0.0
         rate = settings.release if self.phase == "ending" else settings.ramp
         step = rate * elapsed
-        self.wanted += float(np.clip(target - self.wanted, -step, step))
+        self.wanted += _within(target - self.wanted, step)
 
     def _progress(self, pose: ToolPose) -> None:
         reach = self._settings.speed * 0.1
@@ -352,8 +378,32 @@ class Follower:
             return 0.0
         settings = self._settings
         age = pose.time - self._seen if self._touching and self.phase != "ending" else 0.0
-        sight = float(np.clip((settings.blind - age) / (settings.blind - settings.stale), 0.0, 1.0))
-        return settings.speed * sight * self._steering.slowing(pose.direction, normal)
+        sight = min(max((settings.blind - age) / (settings.blind - settings.stale), 0.0), 1.0)
+        speed = min(settings.speed, self._agility())
+        steered = self._steering.pace(speed, pose.direction, normal, self._place.tangent)
+        return steered * sight * self._firmness()
+
+    def _agility(self) -> float:
+        """Return the speed at which the arm swerves little in the time in which it is blind.
+
+        During the delay of images and arm together it goes on straight where the seam curves.
+        """
+        delay = self._latency + self._response.delay
+        ahead = self.tip + SWERVE_AHEAD
+        sharpest = self._plan.sharpest(self.torch, ahead)
+        if delay <= 0.0 or sharpest <= 0.0:
+            return math.inf
+        return max(math.sqrt(2.0 * SWERVE / sharpest) / delay, SLOWEST * self._settings.speed)
+
+    def _firmness(self) -> float:
+        """Return the share of its speed that the tip may keep by how firmly it is on the wall.
+
+        Where the seam turns away faster than the servo follows, the tip waits for it.
+        """
+        if self.phase != "following" or not self._touching:
+            return 1.0
+        firm = self.contact.deflection / (FIRM * max(self.wanted, self._settings.probe))
+        return min(max(firm, WAITING), 1.0)
 
     def _velocity(self, pose: ToolPose, pace: float) -> Floats:
         """Return V_r (3,): along the plan; the servo (14) across it and in height."""
@@ -367,16 +417,15 @@ class Follower:
         preload = settings.preload if self._touching else 0.0
         up = -settings.height_gain * (height + preload)
         across += pace * self._drifting()
-        planar = pace * place.tangent + np.clip(across, -most, most) * place.normal
+        planar = pace * place.tangent + _within(across, most) * place.normal
         climb = pace * self._plan.climb(self.tip)
-        return np.array([*planar, climb + np.clip(up, -most, most)])
+        return np.array([*planar, climb + _within(up, most)])
 
     def _drifting(self) -> float:
         """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
         if self.phase != "following" or self.refined.empty:
             return 0.0
-        before, here = self.refined.offsets(self.tip - SLOPE * np.array([1.0, 0.0]))
-        return float(np.clip((here - before) / SLOPE, -1.0, 1.0))
+        return _within(self.refined.slope(self.tip), 1.0)
 
     def _lateral(self, pose: ToolPose) -> float:
         """Return how far the end point is to the left of the plan [m]."""
@@ -391,3 +440,8 @@ class Follower:
         if self.phase in ("bridging", "ending") and not self.refined.empty:
             return Felt(self.refined.offset(self.tip), felt.height)
         return felt
+
+
+def _within(value: float, most: float) -> float:
+    """Return a value, at most so large to both sides; NumPy's clip takes ten times as long."""
+    return min(max(value, -most), most)

@@ -12,6 +12,9 @@ from flangeye.types import Floats
 STEP = 0.5e-3
 """Spacing to which a path is resampled [m]; at a radius of 50 mm the chord misses it by 0.6 um."""
 
+CHORD = 5e-3
+"""Length over which a path's curvature is taken [m]."""
+
 
 class Place(NamedTuple):
     """One place on a path.
@@ -50,7 +53,16 @@ class Path:
         norms = np.linalg.norm(slopes[:, :2], axis=1, keepdims=True)
         self.tangents = slopes[:, :2] / norms
         self._climb = slopes[:, 2]
+        self._curvature = self._curvatures()
         self._rows = np.column_stack([self.points, self.tangents]).tolist()
+
+    def _curvatures(self) -> Floats:
+        """Return the curvature (M,) by chords: a plan's scatter must not look like curves."""
+        span = max(1, min(round(CHORD / self.step), (len(self.points) - 1) // 2))
+        chords = self.points[span:, :2] - self.points[:-span, :2]
+        angles = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        inner = np.abs(angles[span:] - angles[:-span]) / (span * self.step)
+        return np.pad(inner, (span, len(self.points) - span - len(inner)), mode="edge")
 
     def at(self, s: float) -> Place:
         """Return the place at arc length ``s``, which may lie beyond either end."""
@@ -85,6 +97,11 @@ class Path:
         if not 0.0 <= s <= self.length:
             return 0.0
         return float(self._climb[min(round(s / self.step), len(self._climb) - 1)])
+
+    def sharpest(self, start: float, end: float) -> float:
+        """Return the largest curvature between two arc lengths [1/m]; none beyond the ends."""
+        low, high = max(int(start / self.step), 0), max(int(end / self.step) + 1, 1)
+        return float(self._curvature[low:high].max(initial=0.0))
 
     def advance(self, point: Floats, s: float, reach: float) -> float:
         """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.

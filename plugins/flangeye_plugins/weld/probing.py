@@ -44,6 +44,9 @@ CLIMBED = 0.05e-3
 UNEXPLAINED = 0.04e-3
 """A finger whose displacement the sweep leaves unexplained by more is not understood [m]."""
 
+CURVED = 0.1e-3
+"""Where walls stand askew they are curved too: so much more may be left, times the tangent [m]."""
+
 LARGEST_GAIN = 0.35
 """A gain that is off by more is no drift but another finger."""
 
@@ -66,6 +69,7 @@ class Learned:
         dead_time: Dead time of the arm [s].
         lag: Lag of the arm [s].
         unexplained: rms that the model leaves [m].
+        askew: Tangent of the angle at which the walls stand to the plan.
         noise: Standard deviation of one measurement across [m].
     """
 
@@ -76,6 +80,7 @@ class Learned:
     dead_time: float = 0.0
     lag: float = 0.0
     unexplained: float = 0.0
+    askew: float = 0.0
     noise: float = 10e-6
 
 
@@ -96,7 +101,7 @@ class Probing:
         self._side, self._wanted, self._noise = side, settings.deflection, belief.noise
         self.over, self._time = False, 0.0
         self._cycles: list[tuple[float, float, float]] = []
-        self._felt: list[tuple[float, float, float]] = []
+        self._felt: list[tuple[float, float, float, float]] = []
 
     def velocity(self, elapsed: float) -> float:
         """Return the velocity of the sweep in this cycle, to the left [m/s]."""
@@ -114,9 +119,9 @@ class Probing:
         """Remember a cycle: what was told [m/s] and where the end point was, to the left [m]."""
         self._cycles.append((time, told, lateral))
 
-    def feel(self, time: float, across: float, height: float) -> None:
-        """Remember a measurement: displacement to the left, and the tip's height [m]."""
-        self._felt.append((time, across, height))
+    def feel(self, time: float, across: float, height: float, along: float) -> None:
+        """Remember a measurement: displacements to the left and forwards, the tip's height [m]."""
+        self._felt.append((time, across, height, along))
 
     def learned(self) -> Learned | str:
         """Return what was found, or why the weld must not begin."""
@@ -126,7 +131,7 @@ class Probing:
         found = self._fit(felt, cycles)
         if abs(found.gain) > LARGEST_GAIN:
             return f"the finger's gain is off by {found.gain:.0%}; calibrate it again"
-        if found.unexplained > UNEXPLAINED + found.noise:
+        if found.unexplained > UNEXPLAINED + CURVED * abs(found.askew) + found.noise:
             return (
                 "the finger's displacement is not understood: "
                 f"{found.unexplained * 1e3:.2f} mm are left unexplained by gain, play and delay"
@@ -140,19 +145,30 @@ class Probing:
 
     def _fit(self, felt: Floats, cycles: Floats) -> Learned:
         noise = max(_scatter(felt[:, 1]), self._noise[0])
-        tries = ((float(stamp), width) for stamp in STAMPS for width in REVERSALS)
-        rms, solution, sigma, stamp = min(
-            (_explained(felt, cycles, stamp, width) for stamp, width in tries),
-            key=lambda found: (
-                len(felt) * (found[0] / noise) ** 2
-                + (found[3] / USUAL_STAMP) ** 2
-                + (float(found[1][2]) / USUAL_WIDTH) ** 2
-            ),
-        )
+        stamps, widths = (grid.ravel() for grid in np.meshgrid(STAMPS, REVERSALS, indexing="ij"))
+        at = np.interp(felt[:, 0] - stamps[:, None], cycles[:, 0], cycles[:, 2])
+        rms, solutions = _explained(at, widths, felt[:, 1])
+        unlikely = len(felt) * (rms / noise) ** 2 + (stamps / USUAL_STAMP) ** 2
+        best = int(np.argmin(unlikely + (solutions[:, 2] / USUAL_WIDTH) ** 2))
+        _, across, play = solutions[best].tolist()
+        slid = felt[:, 3] - felt[:, 3].mean()
+        middle = at[best] - at[best].mean()
+        moved = float(middle @ middle) + 1e-12
+        # On walls that stand askew the tip slides along them: what is left is across the wall.
+        askew = float(middle @ slid) / moved / across
+        gain = across * (1.0 + askew**2) - 1.0
+        sigma = max(float(rms[best]), noise) / math.sqrt(moved)
         dead, lag = identify(cycles)
-        sigma *= max(rms, noise)
         return Learned(
-            float(solution[1]) - 1.0, sigma, -float(solution[2]), stamp, dead, lag, rms, noise
+            gain=gain,
+            gain_sigma=sigma,
+            width=-play,
+            stamp=float(stamps[best]),
+            dead_time=dead,
+            lag=lag,
+            unexplained=float(rms[best]),
+            askew=askew,
+            noise=noise,
         )
 
     def _climb(self, felt: Floats, cycles: Floats, found: Learned) -> str | None:
@@ -180,22 +196,25 @@ def _scatter(values: Floats) -> float:
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6.0))
 
 
-def _explained(
-    felt: Floats, cycles: Floats, stamp: float, width: float
-) -> tuple[float, Floats, float, float]:
-    """Return rms, (3,) offset, gain and play, the gain's sigma for unit noise, and the stamp."""
-    at = np.interp(felt[:, 0] - stamp, cycles[:, 0], cycles[:, 2])
-    rows = np.column_stack([np.ones(len(at)), -at, (_dragged(at, width) - at) / width])
-    solution, *_ = np.linalg.lstsq(rows, felt[:, 1], rcond=None)
-    rms = float(np.sqrt(np.mean((felt[:, 1] - rows @ solution) ** 2)))
-    middle = at - at.mean()
-    return rms, np.asarray(solution), float(1.0 / np.sqrt(middle @ middle + 1e-12)), stamp
+def _explained(at: Floats, widths: Floats, felt: Floats) -> tuple[Floats, Floats]:
+    """Return rms (C,) and offset, gain and play (C, 3) that explain what was felt (N,).
+
+    Args:
+        at: (C, N) where the end point was, for each candidate's timestamps [m].
+        widths: (C,) of each candidate's reversal [m].
+        felt: (N,) displacements across [m].
+    """
+    reversal = (_dragged(at, widths) - at) / widths[:, None]
+    rows = np.stack([np.ones_like(at), -at, reversal], axis=2)
+    gram = np.swapaxes(rows, 1, 2) @ rows
+    solutions = np.einsum("cij,cnj,n->ci", np.linalg.pinv(gram, hermitian=True), rows, felt)
+    left = felt - np.einsum("cni,ci->cn", rows, solutions)
+    return np.sqrt(np.mean(left**2, axis=1)), np.asarray(solutions)
 
 
-def _dragged(at: Floats, half: float) -> Floats:
-    """Return what is dragged along by a motion with a dead band of ``half`` to both sides."""
-    behind, out = float(at[0]), []
-    for value in at.tolist():
-        behind = min(max(behind, value - half), value + half)
-        out.append(behind)
-    return np.array(out)
+def _dragged(at: Floats, half: Floats) -> Floats:
+    """Return what motions (C, N) drag along with dead bands of ``half`` (C,) to both sides."""
+    dragged = at.copy()
+    for i in range(1, at.shape[1]):
+        dragged[:, i] = np.clip(dragged[:, i - 1], at[:, i] - half, at[:, i] + half)
+    return dragged

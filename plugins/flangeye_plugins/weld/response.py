@@ -11,6 +11,7 @@ import math
 from collections import deque
 
 import numpy as np
+from scipy.signal import lfilter
 
 from flangeye.types import Floats
 from flangeye_plugins.weld.motion import Command, ToolPose
@@ -18,6 +19,9 @@ from flangeye_plugins.weld.motion import Command, ToolPose
 DEAD_TIMES = np.arange(0.0, 0.161, 0.02)
 LAGS = np.array([1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3])
 """Among which the arm's response is sought [s]."""
+
+GRID = 5e-3
+"""Times at which commands and motion are compared [s]; dead times are multiples of it."""
 
 
 class Response:
@@ -67,23 +71,19 @@ def identify(cycles: Floats) -> tuple[float, float]:
         cycles: (K, 3) time [s], velocity commanded [m/s], where the arm was reported [m].
     """
     clock = cycles[:, 0]
-    grid = np.arange(clock[0], clock[-1], 5e-3)
+    grid = np.arange(clock[0], clock[-1], GRID)
     command, where = (np.interp(grid, clock, column) for column in cycles.T[1:])
     best, found = math.inf, (0.0, 0.0)
     for lag in LAGS:
-        followed = _lagged(command, 5e-3, float(lag))
+        followed = _lagged(command, GRID, float(lag))
         for dead in DEAD_TIMES:
-            moved = np.cumsum(np.interp(grid - dead, grid, followed)) * 5e-3
-            off = where - moved
-            spread = float(np.var(off))
+            late = np.concatenate([np.zeros(round(dead / GRID)), followed])[: len(grid)]
+            spread = float(np.var(where - np.cumsum(late) * GRID))
             if spread < best:
                 best, found = spread, (float(dead), float(lag) if lag > 1e-3 else 0.0)
     return found
 
 
 def _lagged(command: Floats, period: float, lag: float) -> Floats:
-    share, speed, followed = 1.0 - math.exp(-period / lag), 0.0, []
-    for told in command.tolist():
-        speed += share * (told - speed)
-        followed.append(speed)
-    return np.array(followed)
+    share = 1.0 - math.exp(-period / lag)
+    return np.asarray(lfilter([share], [1.0, share - 1.0], command))

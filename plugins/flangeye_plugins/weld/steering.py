@@ -8,6 +8,9 @@ import numpy as np
 
 from flangeye.types import Floats
 
+SLOWEST = 0.1
+"""Share of its speed that the tip always keeps."""
+
 
 @dataclass(frozen=True)
 class Steering:
@@ -19,6 +22,7 @@ class Steering:
         rate: Largest angular velocity [rad/s].
         regular: |n_d . n_t| above which equation (16) alone decides; zero half way below.
         share: Largest part of the tip's speed that taking back an error may use.
+        usual: Share of the rate that following alone may use; the rest takes back errors.
     """
 
     distance: float
@@ -26,6 +30,7 @@ class Steering:
     rate: float
     regular: float = 0.5
     share: float = 0.7
+    usual: float = 0.8
 
     def turn(self, velocity: Floats, tool: Floats, normal: Floats, error: float) -> float:
         """Return the angular velocity [rad/s], never beyond :attr:`rate`.
@@ -51,10 +56,19 @@ class Steering:
         """Return 1 where equation (16) decides, 0 where the tool is turned back, and between."""
         return min(max(2.0 * cosine / self.regular - 1.0, 0.0), 1.0)
 
-    def slowing(self, tool: Floats, normal: Floats) -> float:
-        """Return the share of its speed that the tip may keep, 0.1 to 1."""
+    def pace(self, speed: float, tool: Floats, normal: Floats, along: Floats) -> float:
+        """Return the speed that the tip may have: less where the tool is crooked or turns fast.
+
+        Args:
+            speed: That is asked for [m/s].
+            tool: (2,) unit vector from the torch to the tip.
+            normal: (2,) unit normal of the refined path at the torch.
+            along: (2,) unit tangent of the path at the tip.
+        """
         cosine, _ = _cos_sin(tool, normal)
-        return min(max(cosine / self.regular, 0.1), 1.0)
+        turn = speed * abs(float(along @ normal)) / (self.distance * max(cosine, 1e-3))
+        turning = self.usual * self.rate / max(turn, 1e-9)
+        return speed * min(max(min(cosine / self.regular, turning), SLOWEST), 1.0)
 
 
 def _cos_sin(tool: Floats, normal: Floats) -> tuple[float, float]:

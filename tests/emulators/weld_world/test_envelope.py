@@ -77,6 +77,24 @@ def test_heat_stays_within_the_stated_bound():
     assert (found.errors <= found.column("bound")[found.beside]).all()
 
 
+def test_a_wavy_seam_is_followed_as_far_as_it_is_felt():
+    found = try_condition(CONDITIONS["seam wavy 1 mm per 10 mm"], 0, 0.1, 16e-3)
+    assert found.column("torch_s").max() > 0.09
+    assert rms(found) < 0.2e-3
+    assert (found.errors <= found.column("bound")[found.beside]).all()
+
+
+def test_a_tip_that_is_not_where_its_file_says_is_in_the_stated_bound():
+    """In a curve the tool turns between the tip's and the torch's passing."""
+    wrong = Condition({"tool": {"tip": ["1.5 mm", "0 mm", "0 mm"], "torch": ["1.5 mm", "0 mm"]}})
+    known = wrong._replace(belief={"tip_sigma": 0.8e-3}, settings={"max_error": "4 mm"})
+    found = try_condition(known, 0, period=16e-3)
+    stated = found.column("bound")[found.beside]
+    assert found.done
+    assert found.errors.max() > 0.4e-3
+    assert (found.errors <= stated).all()
+
+
 def _reachable(value):
     seen, left = {}, [value]
     while left:
@@ -128,6 +146,8 @@ def test_worlds_are_drawn_again_as_they_were():
 @pytest.mark.slow
 def test_no_weld_is_reported_done_beyond_its_bound():
     verdicts = [judged(seed) for seed in range(2000, 2040)]
-    assert sum(v.done for v in verdicts) >= 8
-    assert not [v for v in verdicts if v.silent]
+    done = [v for v in verdicts if v.done]
+    assert len(done) >= 6
+    assert not [v for v in done if v.silent]
+    assert np.mean([v.inside for v in done]) >= 0.93
     assert f"{len(verdicts)} worlds" in summary(verdicts)[0]

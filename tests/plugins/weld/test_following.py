@@ -79,7 +79,7 @@ def test_the_end_of_the_seam_makes_no_step():
 def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start):
     true = curved()
     length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
-    blind = Following(max_error="2 mm")  # what is not felt is known less
+    blind = Following(max_error="3 mm")  # what is not felt, up to 37 mm, is known less
     done = weld(true, planning_error(true, seed=0), settings=blind, gaps=(Gap(start, length, 1),))
     assert done.controller.phase == "done"
     assert abs(done.deviation()).max() < 0.4e-3

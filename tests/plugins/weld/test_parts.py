@@ -69,6 +69,16 @@ def test_progress_neither_goes_back_nor_jumps_to_another_branch():
     assert eight.advance(eight.at(0.0).point, s, 5e-3) >= s
 
 
+def test_the_curvature_of_a_path_is_a_circle_s_and_not_its_scatter_s():
+    angle = np.linspace(0.0, np.pi / 2, 300)
+    circle = 0.05 * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
+    path = Path(circle)
+    assert path.sharpest(0.0, path.length) == pytest.approx(20.0, rel=0.02)
+    assert path.sharpest(path.length + 0.01, path.length + 0.02) == 0.0
+    scatter = straight() + 0.02e-3 * np.random.default_rng(0).standard_normal((200, 3))
+    assert Path(scatter).sharpest(0.0, 0.12) < 5.0
+
+
 # --- the refined path -----------------------------------------------------------------------------
 
 
@@ -86,7 +96,7 @@ def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was():
                 at.tangent @ place.tangent
             )
         offset = float((true.at(foot).point - place.point) @ place.normal)
-        refined.add(i * 0.01, float(s), offset)
+        refined.add(i * 0.01, float(s), offset, 0.0)
     refined.confirm(100.0)
     for s in (0.02, 0.04, 0.06, 0.08, 0.1):
         point, normal = refined.frame(s)
@@ -97,20 +107,20 @@ def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was():
 
 def test_what_is_not_confirmed_is_not_believed():
     refined = RefinedPath(Path(straight()), 0.05)
-    refined.add(1.0, 0.01, 1e-3)
+    refined.add(1.0, 0.01, 1e-3, 0.0)
     assert refined.empty
     refined.confirm(0.5)
     assert refined.empty
     refined.forget_pending()
     refined.confirm(2.0)
     assert refined.empty
-    np.testing.assert_array_equal(refined.offsets(np.array([0.01])), [0.0])
+    assert refined.offset(0.01) == 0.0
 
 
 def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one():
     refined = RefinedPath(Path(straight(5.0)), 0.05)
     for s in np.arange(0.0, 4.0, 4e-4):
-        refined.add(0.0, float(s), 1e-3)
+        refined.add(0.0, float(s), 1e-3, 0.0)
     refined.confirm(1.0)
     assert len(refined._near(0.01)) <= len(refined._near(2.0)) <= 2 * 60e-3 / 0.5e-3 + 2
     assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
@@ -227,3 +237,17 @@ def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam():
     points = np.array([[-0.01, 0, 0], [0.05, 2e-3, 7e-3], [0.2, 0, 0]])
     found = torch_deviation(points, line, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(found, [2e-3])
+
+
+def test_where_the_field_is_held_by_samples_an_error_of_the_plan_s_motion_does_no_harm():
+    plan = Path(straight(0.12))
+    refined = RefinedPath(plan, 0.05)
+    refined.noise = 10e-6
+    for s in np.arange(0.0, 0.08, 2e-4):
+        refined.add(0.0, float(s), 1e-3 * np.sin(2 * np.pi * s / 10e-3), 0.2)
+    refined.confirm(1.0)
+    assert refined.offset(0.04) == pytest.approx(1e-3 * np.sin(2 * np.pi * 4), abs=0.01e-3)
+    assert refined.slope(0.04) == pytest.approx(2 * np.pi * 0.1, rel=0.3)
+    assert np.sqrt(refined.variance(0.04)) < 0.03e-3
+    assert np.sqrt(refined.variance(0.1)) > 0.5e-3  # where nothing was felt the waves go on unseen
+    assert refined.angle(0.04, 0.0) == 0.2
