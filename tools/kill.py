@@ -144,8 +144,8 @@ class Trial:
         for pid, command in left.items():
             yield f"a process is left: {command}"
             os.kill(pid, signal.SIGKILL)
-        for path in [*_temporary(out).iterdir(), *(set(Path("/dev/shm").iterdir()) - shared)]:
-            yield f"{path} is left"
+        forgotten = _unused(set(Path("/dev/shm").iterdir()) - shared)
+        yield from (f"{path} is left" for path in [*_temporary(out).iterdir(), *forgotten])
 
     def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
         """Yield what of a log cannot be read though it was finished before."""
@@ -206,6 +206,15 @@ def _marked(out: str) -> dict[int, str]:
                 words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
                 found[int(process.name)] = words
     return found
+
+
+def _unused(paths: set[Path]) -> set[Path]:
+    """Return the paths that no living process has in its memory: the others are its own."""
+    maps = ""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            maps += (process / "maps").read_text("utf-8", "replace")
+    return {path for path in paths if str(path) not in maps}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Change the source in small ways and see which changes no fast test notices.
 
-python -m tools.mutate [SAMPLE] [--seed N] [--room NAME]: a sample over the rooms below, each change
-under the fast tests of its room, with a copy of the repository for itself. A change that no test
-fails is a survivor: its place and what was changed are printed, at the end the share that was killed.
+python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE]: a sample over the
+rooms below, each change under the fast tests of its room, in a copy of the repository. A change that
+fails no test is a survivor: its place and what was changed are printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from copy import deepcopy
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 ROOMS = {
@@ -34,32 +34,37 @@ ROOMS = {
 COMPARED = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
             ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is}  # fmt: skip
 COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
-PATIENCE = 300
+SLOWER = 5.0
+"""A change is noticed, too, by tests that take so many times as long."""
 
 
 class Mutation(NamedTuple):
-    """One change: of which file and line, to what text, and in words."""
+    """One change: of which room, file, line and node of its syntax tree, in words, and how."""
 
     room: str
     file: Path
     line: int
+    node: int
     words: str
-    text: str
+    change: Callable[[Any], Any]
+
+    def text(self) -> str:
+        """Return the changed source."""
+        tree = ast.parse((ROOT / self.file).read_text("utf-8"))
+        self.change(list(ast.walk(tree))[self.node])
+        return ast.unparse(tree)
 
 
 def mutations(room: str) -> Iterator[Mutation]:
     """Yield every change of a room's source."""
     for file in sorted((ROOT / ROOMS[room][0]).rglob("*.py")):
-        tree = ast.parse(file.read_text("utf-8"))
-        for number, node in enumerate(ast.walk(tree)):
+        for number, node in enumerate(ast.walk(ast.parse(file.read_text("utf-8")))):
+            line = getattr(node, "lineno", 0)
             for words, change in _changes(node):
-                changed = deepcopy(tree)
-                change(next(n for i, n in enumerate(ast.walk(changed)) if i == number))
-                line = getattr(node, "lineno", 0)
-                yield Mutation(room, file.relative_to(ROOT), line, words, ast.unparse(changed))
+                yield Mutation(room, file.relative_to(ROOT), line, number, words, change)
 
 
-def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
+def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
     if isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARED:
         to = COMPARED[type(node.ops[0])]
         yield (f"{ast.unparse(node)}: {to.__name__}", lambda n: n.ops.__setitem__(0, to()))
@@ -76,51 +81,77 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
         yield f"{ast.unparse(node)}: without not", lambda n: setattr(n, "op", ast.UAdd())
 
 
-def killed(mutation: Mutation, copy: Path) -> bool:
-    """Return whether the room's fast tests fail on a change."""
-    file = copy / mutation.file
-    sound = file.read_text("utf-8")
-    file.write_text(mutation.text, "utf-8")
-    options = ["-q", "-x", "-p", "no:cacheprovider", "-m", "not slow and not realtime"]
-    path = [str(copy / folder) for folder in ("pipeline", "plugins")]
-    start = f"import sys; sys.path[:0] = {path}; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
-    command = [sys.executable, "-c", start, *options, ROOMS[mutation.room][1]]
-    try:
-        return (
-            subprocess.run(command, cwd=copy, capture_output=True, timeout=PATIENCE).returncode != 0
+class Copy:
+    """A copy of the repository in which one change at a time is tried."""
+
+    def __init__(self, folder: Path) -> None:
+        self._root = folder / "copy"
+        left_out = shutil.ignore_patterns(".git", ".venv", ".hypothesis", "runs", "site")
+        shutil.copytree(ROOT, self._root, symlinks=True, ignore=left_out)
+
+    def killed(self, mutation: Mutation, patience: float) -> bool:
+        """Return whether the room's fast tests fail on a change, or do not come to an end."""
+        file = self._root / mutation.file
+        sound = file.read_text("utf-8")
+        file.write_text(mutation.text(), "utf-8")
+        tests = ROOMS[mutation.room][1]
+        named = (self._root / tests).rglob(f"test_*{mutation.file.stem}*.py")
+        try:
+            return not self.passes([*map(str, named), tests], patience)
+        finally:
+            file.write_text(sound, "utf-8")
+
+    def passes(self, tests: list[str], patience: float | None = None) -> bool:
+        """Return whether fast tests pass within ``patience`` [s]; those named first run first."""
+        path = [str(self._root / folder) for folder in ("pipeline", "plugins")]
+        start = (
+            f"import sys; sys.path[:0] = {path}; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
         )
-    except subprocess.TimeoutExpired:
-        return True
-    finally:
-        file.write_text(sound, "utf-8")
+        options = ["-q", "-x", "-p", "no:cacheprovider", "-m", "not slow and not realtime"]
+        command = [sys.executable, "-c", start, *options, *tests]
+        try:
+            return not subprocess.run(
+                command, cwd=self._root, capture_output=True, timeout=patience
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return False
 
 
 def main() -> None:
-    """Try a sample, and print who survived."""
+    """Try a sample of each room, and print who survived."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("sample", nargs="?", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--room", choices=ROOMS)
+    parser.add_argument("--room", nargs="+", choices=ROOMS, default=list(ROOMS))
+    parser.add_argument("--only", default="", help="a part of FILE:LINE: those changes alone, all")
     asked = parser.parse_args()
-    rooms = [asked.room] if asked.room else list(ROOMS)
-    chance, alive = random.Random(asked.seed), 0
-    chosen = [m for room in rooms for m in _sampled(room, asked.sample // len(rooms), chance)]
+    killed = tried = 0
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "copy"
-        shutil.copytree(
-            ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(".git", ".venv", "runs")
-        )
-        for mutation in chosen:
-            if not killed(mutation, copy):
-                alive += 1
-                print(f"alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
-    share = 1 - alive / max(len(chosen), 1)
-    print(f"{len(chosen) - alive} of {len(chosen)} killed by fast tests ({share:.0%})")
+        copy = Copy(Path(folder))
+        for room in asked.room:
+            chosen = _chosen(room, asked.sample // len(asked.room), asked.seed, asked.only)
+            if not chosen:
+                continue
+            patience = _patience(copy, room)
+            alive = [m for m in chosen if not copy.killed(m, patience)]
+            print(f"{room:10} {len(chosen) - len(alive):3} of {len(chosen):3} killed")
+            for mutation in alive:
+                print(f"  alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
+            killed, tried = killed + len(chosen) - len(alive), tried + len(chosen)
+    print(f"{killed} of {tried} killed by fast tests ({killed / max(tried, 1):.0%})")
 
 
-def _sampled(room: str, count: int, chance: random.Random) -> list[Mutation]:
-    every = list(mutations(room))
-    return chance.sample(every, min(count, len(every)))
+def _patience(copy: Copy, room: str) -> float:
+    """Return how long a room's tests may take; they have to pass as they are."""
+    began = time.monotonic()
+    if not copy.passes([ROOMS[room][1]]):
+        raise SystemExit(f"{room}: its tests fail without any change")
+    return SLOWER * (time.monotonic() - began)
+
+
+def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:
+    every = [m for m in mutations(room) if only in f"{m.file}:{m.line}:"]
+    return every if only else random.Random(f"{room} {seed}").sample(every, min(count, len(every)))
 
 
 if __name__ == "__main__":

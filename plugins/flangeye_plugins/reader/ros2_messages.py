@@ -14,6 +14,8 @@ import numpy as np
 
 from flangeye import StageError
 from flangeye.files.recording import NotThisLayout
+from flangeye.files.regular import open_regular
+from flangeye.log.records import Channel, LogFile
 from flangeye.types import Singles
 
 MISSING = "{}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
@@ -101,7 +103,7 @@ def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
 def _mcap_topics(file: Path) -> dict[str, str]:
     from mcap.reader import make_reader
 
-    with file.open("rb") as opened:
+    with open_regular(file) as opened:
         summary = make_reader(opened).get_summary()
     if summary is None or not summary.channels:
         raise StageError(f"{file}: has no summary; was the recording stopped half way?")
@@ -113,16 +115,24 @@ def _mcap_topics(file: Path) -> dict[str, str]:
 
 
 def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
-    from mcap.reader import make_reader
+    from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 
-    factory = DecoderFactory()
-    with file.open("rb") as opened:
-        for schema, channel, message in make_reader(opened).iter_messages(topics=list(topics)):
-            decode = factory.decoder_for(channel.message_encoding, schema)
-            if decode is not None:
-                call = partial(decode, message.data)
-                yield Raw(channel.topic, message.log_time * 1e-9, message.data, call)
+    def refuse(what: str) -> None:
+        raise StageError(f"{file}: damaged: {what}")
+
+    factory, decoders = DecoderFactory(), dict[Channel, Callable[[bytes], Any] | None]()
+    with open_regular(file) as opened:
+        # The library's reader expands chunks before it looks at how large they become.
+        for channel, time_ns, data, _ in LogFile(refuse).messages(opened, file.stat().st_size):
+            if channel.topic not in topics:
+                continue
+            if channel not in decoders:
+                described = channel.schema_data, channel.schema_encoding, channel.schema
+                schema = Schema(len(decoders) + 1, *described)
+                decoders[channel] = factory.decoder_for(channel.encoding, schema)
+            if (decode := decoders[channel]) is not None:
+                yield Raw(channel.topic, time_ns * 1e-9, data, partial(decode, data))
 
 
 def _db3_topics(file: Path) -> dict[str, str]:

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, Writer
 from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
 from flangeye.files.clouds import read_cloud
 from flangeye.files.recording import NotThisLayout
+from flangeye.log import records
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -16,6 +18,7 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
+from flangeye_plugins.reader.ros2_messages import messages
 from tests.plugins.reader.bags import (
     FIXED,
     START,
@@ -196,3 +199,19 @@ def test_what_is_no_bag_is_said(tmp_path):
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\0" * 40)
     with pytest.raises(StageError, match=r"x\.mcap: cannot be read as a ROS 2 bag"):
         read(tmp_path)
+
+
+def test_a_bag_that_expands_too_far_is_refused_before_it_does(tmp_path, monkeypatch):
+    file = tmp_path / "bag.mcap"
+    with file.open("wb") as out:
+        writer = Writer(out, chunk_size=1, compression=CompressionType.ZSTD)
+        writer.start()
+        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+        writer.add_message(writer.register_channel("/pose", "cdr", schema), 0, bytes(1 << 20), 0)
+        writer.finish()
+    assert file.stat().st_size < 1 << 11
+    monkeypatch.setattr(records, "MAX_CHUNK", 1 << 19)
+    with pytest.raises(
+        StageError, match=r"bag.mcap: damaged: .* a chunk says that it expands to 10"
+    ):
+        list(messages([file], ["/pose"]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from flangeye.report.certificate import (
     write_certificate,
 )
 from flangeye.report.certificate.budget import shares_of
+from flangeye.report.certificate.page import sandbox
 from flangeye.report.units import millimetres
 from flangeye.result import Result
 from tests.report.conftest import WORKSPACE, Script, scripted
@@ -149,3 +151,10 @@ def test_without_a_calibration_there_is_nothing_to_certify(tmp_path: Path) -> No
     scripted(Script(solved=False, verified=None, points=50), tmp_path / "run.mcap")
     with pytest.raises(StageError, match="gave no calibration, so there is nothing to certify"):
         write_certificate(tmp_path, None, Conditions())
+
+
+def test_the_browser_keeps_its_sandbox_but_for_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert sandbox() == []
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert sandbox() == ["--no-sandbox"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -51,13 +52,18 @@ def print_pdf(page: Path) -> Path | None:
     if browser is None:
         return None
     out = page.with_suffix(".pdf")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer"]
+    options = ["--headless", *sandbox(), "--disable-gpu", "--no-pdf-header-footer"]
     command = [browser, *options, f"--print-to-pdf={out.resolve()}", page.resolve().as_uri()]
     try:
         subprocess.run(command, check=True, capture_output=True, timeout=120)
     except (subprocess.SubprocessError, OSError) as error:
         raise StageError(f"{out}: {browser} does not print: {error}") from None
     return out
+
+
+def sandbox() -> list[str]:
+    """Return what lets Chromium start: for root it refuses its sandbox, for others it keeps it."""
+    return ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
 
 
 def render(facts: Facts, conditions: Conditions) -> str:
