@@ -54,7 +54,7 @@ def init(  # noqa: PLR0913  one for each option
     out: Annotated[Path, typer.Option(help="The recipe to write.")] = Path("recipe.yaml"),
 ) -> None:
     """Look at recordings, ask what they do not show, and write a recipe for them."""
-    from flangeye.draft import Questions, draft_recipe, look
+    from flangeye.recipe.draft import Questions, draft_recipe, look
     from flangeye.recipe.load import load_recipe
 
     if out.exists():

@@ -268,8 +268,8 @@ def regress(
     """
     from rich.console import Console
 
+    from flangeye.batch.regress import compare, read_manifests
     from flangeye.files.bundled import bundled
-    from flangeye.regress import compare, read_manifests
 
     manifests = read_manifests(folder or bundled("data") / "manifests")
     comparisons = compare(manifests, out, workers, load_plugins(), Console(stderr=True))

@@ -11,9 +11,6 @@ from typing import Any
 
 import yaml
 
-from flangeye.draft.convention import table_params
-from flangeye.draft.questions import Questions
-from flangeye.draft.sights import Sights
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import read_cloud
 from flangeye.files.recording import Archive
@@ -24,6 +21,9 @@ from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
+from flangeye.recipe.draft.convention import table_params
+from flangeye.recipe.draft.questions import Questions
+from flangeye.recipe.draft.sights import Sights
 from flangeye.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"

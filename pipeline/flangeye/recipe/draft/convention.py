@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.draft.headings import ROTATIONS, Group, Headings, headings_of, holds_matrix
-from flangeye.draft.questions import Questions
 from flangeye.errors import RecipeError
 from flangeye.files.tables import Column, TextTable, number_of
 from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.recipe.draft.headings import ROTATIONS, Group, Headings, headings_of, holds_matrix
+from flangeye.recipe.draft.questions import Questions
 from flangeye.types import Floats
 
 FARTHEST = 20.0

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Literal
 from flangeye.batch.command import run_sessions
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession, plan
+from flangeye.batch.regress.manifest import Expected, Manifest
 from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.regress.manifest import Expected, Manifest
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from flangeye.batch.regress import read_manifests
 from flangeye.cli import app
 from flangeye.files.bundled import bundled
-from flangeye.regress import read_manifests
 
 DATA = Path(__file__).parents[2] / "data"
 MANIFEST = """\
