@@ -137,7 +137,7 @@ def test_the_line_cures(tmp_path, fault):
 
     found = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
     assert [finding.name for finding in found] == [name]
-    (step,) = yaml.safe_load(found[-1].fix)
+    (step,) = yaml.safe_load(found[-1].fix.rpartition("if it is not: ")[2])
     corrected_session = recipe_with(tmp_path / "mended.yaml", step)
 
     shift, turn = apart(calibrated(corrected_session, archive), truth)

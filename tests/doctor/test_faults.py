@@ -91,10 +91,68 @@ def test_both_in_the_same_wrong_unit():
 def test_the_base_in_the_flange(kind, carried):
     session = session_of(kind, carried)
     finding = only(session.with_poses(inverted(session.poses)))
-    assert finding.what.startswith("the poses are flange_T_base")
+    assert "the poses are flange_T_base" in finding.what
+    step = "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
+    mounted = {"target": "eye-in-hand", "camera": "eye-on-base"}[carried]
+    other = f"configuration: {{name: {mounted}, place: unknown}}  # or, if it is not: "
+    assert finding.fix == (other if kind in ("marker", "point") else "") + step
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_a_mounting_named_wrongly_is_a_configuration(carried):
+    other = {"target": "camera", "camera": "target"}[carried]
+    finding = only(replace(session_of("marker", carried), carried=other))
+    mounted = {"target": "eye-on-base", "camera": "eye-in-hand"}[carried]
+    assert finding.fix.startswith(f"configuration: {{name: {mounted}, place: unknown}}")
+
+
+def test_markers_that_no_lens_sees_are_inverted():
+    session = session_of("marker", seed=4)
+    turned = session.rotations.swapaxes(-1, -2)
+    centres = -(turned @ session.centres[..., None])[..., 0]
+    finding = only(replace(session, rotations=turned, centres=centres))
+    assert finding.name == "inverted marker"
+    assert "the markers' poses are target_T_camera: as they are read, one is" in finding.what
     assert finding.fix == (
-        "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
+        "- acquire.archive: {reader: {corrected: {reader: auto, target_inverted: true}}}"
     )
+
+
+def arbitrary(rng, n=15):
+    """Return (n, 4, 4) poses that no arm was at."""
+    turns, places = rotation_exp(rng.normal(0, 1.5, (n, 3))), rng.uniform(-0.6, 0.6, (n, 3))
+    return np.array([rigid(*each) for each in zip(turns, places, strict=True)])
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_a_driver_that_detected_nothing_is_the_only_finding(carried):
+    session = session_of("marker", carried, n=15)
+    eye = np.tile(np.eye(3), (15, 1, 1))
+    poses = arbitrary(np.random.default_rng(0))
+    finding = only(replace(session, poses=poses, centres=np.zeros((15, 3)), rotations=eye))
+    assert finding.what.startswith("15 of 15 markers are at the camera itself")
+
+
+def test_a_driver_that_gave_the_same_each_time_is_the_only_finding():
+    session = session_of("marker", n=15)
+    stale = replace(
+        session,
+        centres=np.tile(session.centres[:1], (15, 1)),
+        rotations=np.tile(session.rotations[:1], (15, 1, 1)),
+    )
+    assert only(stale).name == "repeated detection"
+    assert only(session.with_poses(np.tile(session.poses[:1], (15, 1, 1)))).name == (
+        "repeated robot pose"
+    )
+
+
+@pytest.mark.parametrize("carried", ["target", "camera"])
+def test_poses_that_have_nothing_to_do_with_the_markers_are_in_no_other_unit(carried):
+    """Nor at another time, nor was the target moved: nothing foretells samples held out."""
+    for seed in range(4):
+        session = session_of("marker", carried, n=15, seed=seed)
+        found = named(session.with_poses(arbitrary(np.random.default_rng(seed))))
+        assert set(found) <= {"too little rotation"}
 
 
 @pytest.mark.parametrize(("kind", "carried"), TURNED)

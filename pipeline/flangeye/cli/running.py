@@ -86,7 +86,7 @@ def run(  # noqa: PLR0913  one for each option
         start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline))
         folder = RunFolder.create(checked.name, results)
         result = _record(checked, registry, folder, start)
-        if result.status == "refused":
+        if result.status == "refused" and checked.header.cell is None:
             _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)

@@ -215,6 +215,12 @@ class Finding:
     corrected_session: RecordedSession | None = field(default=None, repr=False)
     note: bool = False
 
+    @property
+    def hopeless(self) -> bool:
+        """Whether it is certain, of most samples, and only new recordings help."""
+        certain = self.gain == CERTAIN and bool(self.samples)
+        return certain and self.corrected_session is None and not self.note
+
 
 Findings = Iterable[Finding]
 Change = Callable[[Floats], Floats]

@@ -47,6 +47,9 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
     found, current = list(session.remarks), session
     _require_enough(session)
     offered, idle = _offered(current, bound)
+    if made_up := [f for f in offered if f.hopeless]:
+        # What else these samples seem to show is made up like them.
+        return Diagnosis(session, (*found, made_up[0]), (), _names(bound), idle)
     while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:
         found.append(max(mendable, key=lambda finding: finding.gain))
         current = found[-1].corrected_session or current
@@ -56,7 +59,11 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
         offered, _ = _offered(current, bound)
     found += [f for f in offered if f.corrected_session is None and not f.note]
     notes = tuple(f for f in offered if f.note)
-    return Diagnosis(session, tuple(found), notes, tuple(check.part.name for check in bound), idle)
+    return Diagnosis(session, tuple(found), notes, _names(bound), idle)
+
+
+def _names(checks: Sequence[BoundPart]) -> tuple[str, ...]:
+    return tuple(check.part.name for check in checks)
 
 
 def _offered(

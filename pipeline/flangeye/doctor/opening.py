@@ -18,7 +18,7 @@ from flangeye.doctor.diagnosis import Finding, Reader, RecordedSession
 from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, Recording, check_ids
-from flangeye.log.read import is_log, log_of, read_run
+from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import DEFAULT, Configuration
 from flangeye.models.robots import RobotModel
@@ -59,6 +59,7 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
         raise StageError(f"{path}: the run ended early; nothing was gathered yet")
     if recipe is None and text is not None:
         recipe = parse_recipe(text, path.name, registry)
+    _require_one_camera(path, log)
     found = {o.id: o.feature for o in log.observations()}
     calibration = [meta for meta in log.poses.values() if meta["role"] == "calibration"]
     given = {o.id: o.base_T_flange.matrix for o in log.observations()}
@@ -67,6 +68,14 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     session = _session({**given, **poses}, found, times)
     states = {meta["id"]: _state_of(meta) for meta in calibration}
     return session if recipe is None else _as_recipe(session, recipe, states)
+
+
+def _require_one_camera(path: Path, log: RunLog) -> None:
+    if any(t.FLANGE not in o.poses for o in log.observations()):
+        raise StageError(
+            f"{path}: is of a cell with several cameras; the doctor looks at one arm with "
+            "one camera and one target"
+        )
 
 
 def _state_of(meta: Mapping[str, Any]) -> State:

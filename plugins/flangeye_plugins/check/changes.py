@@ -13,6 +13,7 @@ from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import VariantFits, fit
+from flangeye_plugins.check.held_out import moved_helps
 from flangeye_plugins.check.significance import Significance, best_of, exceedance
 
 SPARE = 2
@@ -35,8 +36,9 @@ def moved(session: RecordedSession) -> Findings:
     equations = equations_of(session)
     halves = fit(equations.without(after)), fit(equations.without(~after))
     evidence = best_of(null, _together(*halves), null.parameters)
-    if evidence.probability < 1:
-        yield _moved_finding(session, evidence, int(starts[evidence.which]))
+    start = int(starts[evidence.which])
+    if evidence.probability < 1 and moved_helps(session, np.arange(len(session)) >= start):
+        yield _moved_finding(session, evidence, start)
 
 
 def _together(first: VariantFits, second: VariantFits) -> VariantFits:
@@ -85,7 +87,8 @@ def tool(session: RecordedSession) -> Findings:
     listed = [f"{value * 1e3:.2f} mm" for value in offset + 0.0]
     what = (
         f"the seen target is {length * 1e3:.1f} mm from where the arm carries it, constantly: "
-        "the poses are probably those of a tool set in the controller"
+        "the poses are probably those of a tool set in the controller, or it is mounted there, "
+        "which configuration: {place: unknown} says"
     )
     corrected_session = session.corrected(
         lambda poses: without_tool(poses, -offset),

@@ -89,6 +89,13 @@ def fit(equations: Equations) -> VariantFits:
     return _told(blocks, scales, unknowns, information)
 
 
+def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
+    """Return (K, N, B) lengths of every kind of error where the unknowns are as given [m, rad]."""
+    blocks = _blocks(equations, unknowns)
+    lengths = [np.linalg.norm(block.residuals, axis=-1) for block in blocks]
+    return np.stack(np.broadcast_arrays(*lengths), axis=-1)
+
+
 def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[Block]:
     """Return every kind of error and how the parameters move it.
 

@@ -14,6 +14,7 @@ from flangeye.maths.pose_corrections import delayed, shifted
 from flangeye.types import Floats, Mask
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
+from flangeye_plugins.check.held_out import helps
 from flangeye_plugins.check.significance import Significance, best_of
 
 SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -50,6 +51,8 @@ def order(session: RecordedSession) -> Findings:
     of = "" if session.seconds is None else f" of {_OF[arms]}"
     what = f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
     corrected_session = others[evidence.which].session.where(others[evidence.which].known)
+    if not helps(session.where(others[evidence.which].known), corrected_session):
+        return
     yield Finding(
         "shifted poses", what, corrected_session.step(), (), *evidence[1:], corrected_session
     )
@@ -113,6 +116,8 @@ def clock(session: RecordedSession) -> Findings:
     whose = "the arm was" if session.seconds is None else f"{_OF[arms]} was"
     what = f"{whose} at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
     corrected_session = others[finer.which].session.where(others[finer.which].known)
+    if not helps(session.where(others[finer.which].known), corrected_session):
+        return
     yield Finding("time offset", what, corrected_session.step(), (), *finer[1:], corrected_session)
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
 
 from flangeye import part
 from flangeye.doctor.diagnosis import Arms, Change, Finding, Findings, RecordedSession
@@ -12,7 +15,8 @@ from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
-from flangeye_plugins.check.significance import best_of
+from flangeye_plugins.check.held_out import helps
+from flangeye_plugins.check.significance import Significance, best_of
 
 QUATERNIONS = ("xyzw", "wxyz")
 COMMON = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
@@ -33,7 +37,7 @@ def convention(session: RecordedSession) -> Findings:
     tried = [(arms, *pair) for arms in session.arms for pair in _readings(session)]
     others = [_reread(session, *each) for each in tried]
     evidence = best_of(fit_of(session), fit(equations_of(*others)))
-    if evidence.probability < 1:
+    if evidence.probability < 1 and helps(session, others[evidence.which]):
         arms, read_as, written_as = tried[evidence.which]
         whose = "the" if session.seconds is None else named(arms, session)
         what = f"{whose} rotations were read as {_name(read_as)}, and fit as {_name(written_as)}"
@@ -85,14 +89,65 @@ def direction(session: RecordedSession) -> Findings:
     tried = [(arms, way) for arms in session.arms for way in _WAYS]
     others = [session.corrected(_WAYS[way][0], arms, **{way: True}) for arms, way in tried]
     evidence = best_of(fit_of(session), fit(equations_of(*others)))
-    if evidence.probability == 1:
+    corrected_session = others[evidence.which]
+    if evidence.probability == 1 or not helps(session, corrected_session):
         return
     arms, way = tried[evidence.which]
+    if way == "inverted" and _marker_rather(session):
+        yield _inverted_marker(session, evidence)
+        return
     whose = "the" if session.seconds is None else named(arms, session)
-    what = f"{whose} {_WAYS[way][1]}"
-    corrected_session = others[evidence.which]
-    yield Finding(
-        "pose direction", what, corrected_session.step(), (), *evidence[1:], corrected_session
+    what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
+    if way == "inverted" and _may_be_mounted_otherwise(session):
+        held, name = _MOUNTED_OTHERWISE[session.carried]
+        what = f"the camera is {held}, or the poses are flange_T_base: the samples fit either way"
+        fix = f"configuration: {{name: {name}, place: unknown}}  # or, if it is not: {fix}"
+    yield Finding("pose direction", what, fix, (), *evidence[1:], corrected_session)
+
+
+LENS = np.radians(35)
+"""No lens sees a target further from its axis."""
+_MOUNTED_OTHERWISE: Mapping[str, tuple[str, str]] = {
+    "target": ("in the hand", "eye-in-hand"),
+    "camera": ("beside the robot", "eye-on-base"),
+}
+"""By what the recipe says the arm carries: where the camera then is, and how to say so."""
+
+
+def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
+    """Whether camera and target, exchanged, come to the same as poses the other way round."""
+    unknown = not np.isfinite(session.places).any()
+    return session.links is None and session.seconds is None and unknown
+
+
+def _marker_rather(session: RecordedSession) -> bool:
+    """Whether targets lie where no lens sees them, and do not the other way round."""
+    if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
+        return False
+    return bool(_off_axis(session) > LENS >= _off_axis(_marker_inverted(session)))
+
+
+def _off_axis(session: RecordedSession) -> float:
+    """Return the largest angle between what was seen and the camera's axis [rad]."""
+    x, y, z = session.centres.T
+    return float(np.nanmax(np.arctan2(np.hypot(x, y), z)))
+
+
+def _marker_inverted(session: RecordedSession) -> RecordedSession:
+    turned = session.rotations.swapaxes(-1, -2)
+    centres = -(turned @ session.centres[..., None])[..., 0]
+    read = session.read_with(target_inverted=True)
+    return replace(read, rotations=turned, centres=centres)
+
+
+def _inverted_marker(session: RecordedSession, evidence: Significance) -> Finding:
+    corrected_session = _marker_inverted(session)
+    what = (
+        f"the markers' poses are target_T_camera: as they are read, one is "
+        f"{np.degrees(_off_axis(session)):.0f} deg from the camera's axis"
+    )
+    return Finding(
+        "inverted marker", what, corrected_session.step(), (), *evidence[1:], corrected_session
     )
 
 

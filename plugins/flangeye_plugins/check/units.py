@@ -15,6 +15,7 @@ from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
+from flangeye_plugins.check.held_out import helps
 from flangeye_plugins.check.significance import Significance, best_of
 
 UNITS: Mapping[str, float] = {
@@ -24,6 +25,8 @@ UNITS: Mapping[str, float] = {
 _METRES: Mapping[str, float] = {"m": 1.0, **UNITS}
 STANDING = 1e-9
 """With so small positions the target does not move: no unit, if that explains samples better."""
+AGREE = 0.05
+"""Share of the arm's distance by which arm and target differ where they agree."""
 ARMS = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
@@ -51,7 +54,9 @@ def units(session: RecordedSession) -> Findings:
     tried = list(_alternatives(session))
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
     if evidence.probability < 1 and tried[evidence.which].said:
-        yield _finding(session, tried[evidence.which], evidence)
+        found = _finding(session, tried[evidence.which], evidence)
+        if found.corrected_session is not None and helps(session, found.corrected_session):
+            yield found
     elif session.uses_poses and (both := _both(session)) is not None:
         yield both
 
@@ -151,6 +156,8 @@ def _both(session: RecordedSession) -> Finding | None:
     unit = min(UNITS, key=lambda u: _outside(distance * UNITS[u], ARMS))
     factor = UNITS[unit]
     if _outside(distance * factor, ARMS) > 0:
+        return None
+    if fit_of(session).misfit().position > AGREE * distance:
         return None
     corrected_session = replace(session, centres=session.centres * factor).corrected(
         lambda poses: scaled(poses, factor), scale=_number(factor), target_scale=_number(factor)

@@ -57,6 +57,7 @@ class CorrectedParams(Params):
         description="What positions of ready-made centres and markers are multiplied with.",
     )
     inverted: bool = Field(False, description="The poses are flange_T_base.")
+    target_inverted: bool = Field(False, description="Markers' poses are target_T_camera.")
     target_offset: tuple[Length, Length, Length] = param(
         ("0 mm", "0 mm", "0 mm"),
         description="What was seen, from the point whose poses were recorded, in its frame.",
@@ -100,6 +101,8 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         for frame, pose in recording.poses.items()
     }
     centre, target = recording.centre_in_camera, recording.camera_T_target
+    if target is not None and params.target_inverted:
+        target = inverted(target[None])[0]
     return replace(
         recording,
         poses=poses,
