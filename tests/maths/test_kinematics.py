@@ -200,3 +200,21 @@ def test_a_pose_of_an_arm_on_a_rail_is_found_within_the_rails_ends():
 def test_an_axis_needs_a_direction():
     with pytest.raises(ValueError, match="an axis needs a direction"):
         Joint(axis=(0, 0, 0))
+
+
+@pytest.mark.parametrize("name", ["franka-fr3", "kuka-iiwa14-r820"])
+def test_seven_joints_are_solved_with_one_of_them_held(name):
+    arm = Arm(load_model("robots", name))
+    assert arm.in_closed_form
+    low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+    shares = np.random.default_rng(0).uniform(0.2, 0.8, (12, arm.n))
+    counts = []
+    for pose in arm.flange(low + shares * (high - low)):
+        found = arm.inverse(pose)
+        np.testing.assert_allclose(
+            arm.flange(found), np.broadcast_to(pose, (len(found), 4, 4)), atol=2e-9
+        )
+        assert ((found >= arm.lower) & (found <= arm.upper)).all()
+        counts.append(len(found))
+    assert min(counts) >= 1
+    assert np.median(counts) >= 8  # of the continuum, a sample with several of its branches

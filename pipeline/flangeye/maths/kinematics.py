@@ -29,6 +29,12 @@ POLISH = 8
 CLOSE = 0.1
 """Farther from a pose than this [rad, m], what a closed form gives is no start towards it."""
 
+HELD = 8
+"""Angles at which a redundant joint is held, spread over its range."""
+
+TRIED = 8
+"""Poses by which the joint to hold is chosen."""
+
 LONGEST_STEP = 0.5
 """Largest change of a joint in one iteration [rad or m]; linearisation means nothing beyond."""
 
@@ -219,9 +225,11 @@ class Arm:
         """Return joint angles within the limits that reach a pose, (K, n), K may be zero.
 
         In closed form where six joints allow it (:mod:`flangeye.maths.closed_form`); an arm that
-        differs a little from such a one, as a calibrated arm does, is polished from there. Else
-        from many points of a fixed sequence, so that all branches of a six-joint arm are normally
-        found; of the continuum of a seven-joint arm it gives a sample. Nothing random is in it.
+        differs a little from such a one, as a calibrated arm does, is polished from there. Of the
+        continuum of a seven-joint arm it gives a sample: one joint is held at a row of angles,
+        which leaves six. Else, and where those give nothing, from many points of a fixed
+        sequence, so that all branches of a six-joint arm are normally found. Nothing random is
+        in it.
 
         Args:
             base_T_flange: (4, 4) pose to reach.
@@ -231,10 +239,17 @@ class Arm:
         Returns:
             Distinct solutions, those nearest to the middle of the joints' ranges first.
         """
-        if self._closed_form is None:
-            return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
-        joints = self._closed_form(base_T_flange)
-        error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2))
+        if self._closed_form is not None:
+            return self._polished(base_T_flange, self._closed_form(base_T_flange))
+        if self._held:
+            found = np.concatenate([held(base_T_flange) for held in self._held])
+            if len(solved := self._polished(base_T_flange, found)):
+                return solved
+        return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
+
+    def _polished(self, base_T_flange: Floats, joints: Floats) -> Floats:
+        """Return what closed forms gave (M, n) as solutions, iterated if they only come near."""
+        error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2), initial=0.0)
         if (error < SOLVED).any():
             return self._distinct(self._within_limits(joints[error < SOLVED]))
         return self.inverse_near(base_T_flange, joints[error < CLOSE], POLISH)
@@ -260,8 +275,8 @@ class Arm:
 
     @property
     def in_closed_form(self) -> bool:
-        """Whether poses are solved in closed form."""
-        return self._closed_form is not None
+        """Whether poses are solved in closed form, with a joint held if there are seven."""
+        return self._closed_form is not None or bool(self._held)
 
     @cached_property
     def _closed_form(self) -> ClosedForm | None:
@@ -269,6 +284,42 @@ class Arm:
             return None
         directions, points = self.axes(np.zeros(self.n))
         return closed_form(directions, points, self.flange(np.zeros(self.n)))
+
+    @cached_property
+    def _held(self) -> list[ClosedForm]:
+        """The closed forms of seven joints with one of them held, at each angle of a row."""
+        if self.n != 7 or self.slides.any():
+            return []
+        joint = max(range(self.n), key=self._solved_when_held)
+        if not self._solved_when_held(joint):
+            return []
+        low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
+        angles = low + (np.arange(HELD) + 0.5) / HELD * (high - low)
+        forms = [self._form_holding(joint, angle) for angle in angles]
+        return [form for form in forms if form is not None]
+
+    def _solved_when_held(self, joint: int) -> int:
+        """Return how many solutions of a few poses there are with a joint held amid its range."""
+        form = self._form_holding(joint, float(np.clip(self._middle[joint], -1.0, 1.0)))
+        if form is None:
+            return 0
+        solved = 0
+        for pose in self.flange(self._starting_points(TRIED)):
+            joints = form(pose)
+            error = np.abs(self.flange(joints) - pose).max(axis=(1, 2), initial=0.0)
+            solved += len(self._within_limits(joints[error < SOLVED]))
+        return solved
+
+    def _form_holding(self, joint: int, angle: float) -> ClosedForm | None:
+        """Return the closed form of the other six joints."""
+        at = np.zeros(self.n)
+        at[joint] = angle
+        others = np.delete(np.arange(self.n), joint)
+        directions, points = self.axes(at)
+        form = closed_form(directions[others], points[others], self.flange(at))
+        if form is None:
+            return None
+        return lambda pose: np.insert(form(pose), joint, angle, axis=1)
 
     def _motions(self, joints: Floats) -> Floats:
         """Return the (..., n, 4, 4) turns about z, or slides along it."""
