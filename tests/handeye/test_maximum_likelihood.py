@@ -13,7 +13,7 @@ from flangeye_plugins.solve.maximum_likelihood import (
     solve_maximum_likelihood,
 )
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
-from tests.handeye.cells import CONFIGURATIONS, ROBOT, Noise, errors, moves, session
+from tests.handeye.cells import CONFIGURATIONS, ROBOT, Noise, errors, moves, session, wandering
 
 EXACT = Noise(0.0, 0.0, 0.0, 0.0)
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
@@ -241,6 +241,52 @@ def test_noise_that_is_not_stated_is_found():
     (note,) = solve(made).notes
     beyond = float(note.removeprefix("noise beyond the features' own: ").split(" mm")[0])
     assert 0.4 < beyond < 0.65
+
+
+def resized(made, factor):
+    """The session as a camera would see it that takes all distances for longer."""
+    seen = []
+    for o in made.observations:
+        pose = o.feature.camera_T_target.matrix.copy()
+        pose[:3, 3] *= factor
+        seen.append(
+            replace(o, feature=replace(o.feature, camera_T_target=Transform(CAMERA, TARGET, pose)))
+        )
+    return replace(made, observations=seen)  # fmt: skip
+
+
+def test_a_size_that_is_unknown_is_found():
+    made = session(MARKER, np.random.default_rng(17), n=20)
+    assert "target_size: unknown finds it" in refusal(resized(made, 2.0))
+    found = solve(resized(made, 2.0), target_size="unknown")
+    (note,) = [n for n in found.notes if "times as large" in n]
+    told, _, sigma = note.split("target is ")[1].split()[:3]
+    assert abs(float(told) - 0.5) < 4 * float(sigma) < 0.01
+    error = errors(found.camera, made.truth["flange_T_camera"])
+    assert error @ np.linalg.solve(found.camera.covariance, error) < 30
+
+
+def test_a_size_that_the_motion_does_not_tell_is_refused():
+    poses = moves(np.random.default_rng(0), 12, 0.3, reach=0.0)
+    made = session(MARKER, np.random.default_rng(18), n=12, poses=poses, noise=Noise().scaled(20))
+    told = refusal(made, target_size="unknown")
+    assert told.startswith("the target's size is told to ")
+    assert told.endswith("move the arm further between poses, or say target_size: known")
+
+
+def test_a_camera_that_wanders_is_no_noise():
+    """What lasts for twenty poses widens the region, and none of it counts as many."""
+    ours, without = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        made = session(MARKER, rng, n=60, tilt=0.4)
+        walked = wandering(made, rng, turn=1e-3, shift=1e-3, wrong=0.0)
+        for errors_of, smooth in ((ours, "auto"), (without, "off")):
+            found = solve(walked, smooth_error=smooth).camera
+            error = errors(found, made.truth["flange_T_camera"])
+            errors_of.append(error @ np.linalg.solve(found.covariance, error))
+    assert any("the camera wandered during the session" in n for n in solve(walked).notes)
+    assert np.mean(ours) < 10 < np.mean(without)  # six are expected
 
 
 def test_the_former_name_solves_the_same_and_says_so():

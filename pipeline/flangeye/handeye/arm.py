@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flangeye.handeye.candidates import Model, better, rms
+from flangeye.handeye.candidates import Model, better, rms, with_nuisance
 from flangeye.handeye.likelihood import Problem, Solution, weigh
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.maths.arm_correction import follow
@@ -98,7 +98,7 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
     field = field_over(places[model.found.inliers])
     moves = effects(field, places)
     twists = np.concatenate([np.zeros_like(moves), moves], axis=1)
-    candidate = _with(model, flange.nuisance(twists, 1.0, sized=True))
+    candidate = with_nuisance(model, flange.nuisance(twists, 1.0, sized=True))
     if candidate is None:
         return model
     k, found = len(field.weights), candidate.found
@@ -132,7 +132,7 @@ def with_tool_offset(model: Model, flange: MovedFlange) -> Model:
         known = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
         if known > OBSERVABLE:
             return model.noted(_not_told_apart(known, flange.poses[:, :3, :3]))
-    candidate = _with(model, offset)
+    candidate = with_nuisance(model, offset)
     if candidate is None:
         return model
     values = candidate.found.at.nuisance[-3:]
@@ -185,16 +185,6 @@ def unknown_zeros(model: Model, flange: MovedFlange) -> Floats | None:
     return np.asarray(flange.deviation**2 * moved @ moved.T)
 
 
-def _with(model: Model, nuisance: Nuisance) -> Model | None:
-    """Return the model with more nuisances, those sized begun at the size of the residuals."""
-    problem, found = model.problem, model.found
-    joined = problem.nuisance.and_also(nuisance) if len(problem.nuisance) else nuisance
-    size = max(rms(found.linear.residuals[found.inliers][:, 3:]), 1e-7)
-    noise = replace(found.noise, size=size) if nuisance.sized.any() else found.noise
-    started = replace(model.consensus, found=replace(found, noise=noise))
-    return replace(model, consensus=started).with_problem(replace(problem, nuisance=joined))
-
-
 def _with_offsets(model: Model, flange: MovedFlange, joints: Floats, prior: float) -> Model | None:
     """Fit with offsets linearised about none, then about those found; None if it is refused."""
     if flange.kinematics is None:
@@ -222,7 +212,7 @@ def _about(
     s = replace(s, a=s.a @ move) if flange.carries_camera else replace(s, b=s.b @ move)
     remainder = moved.nuisance(arm.jacobian(joints + offsets)[:, :, 1:-1], prior)
     remainder = replace(remainder, mean=-offsets[1:-1])
-    return _with(replace(model, consensus=replace(
+    return with_nuisance(replace(model, consensus=replace(
         model.consensus, problem=replace(model.problem, measurements=s))), remainder)  # fmt: skip
 
 
@@ -231,6 +221,7 @@ def _without_sized(nuisance: Nuisance) -> Nuisance:
     return Nuisance(
         nuisance.camera[:, :, kept],
         nuisance.target[:, :, kept],
+        nuisance.seen[:, :, kept],
         nuisance.prior[kept],
         nuisance.mean[kept],
         nuisance.sized[kept],

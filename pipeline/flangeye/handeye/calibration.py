@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from flangeye.errors import CalibrationRefused
 from flangeye.handeye.arm import (
     MovedFlange,
     unknown_zeros,
@@ -15,7 +16,7 @@ from flangeye.handeye.arm import (
     with_joint_offsets,
     with_tool_offset,
 )
-from flangeye.handeye.candidates import Model, understated
+from flangeye.handeye.candidates import Model, understated, with_nuisance
 from flangeye.handeye.consensus import find_consensus
 from flangeye.handeye.degeneracy import (
     ObservabilityLimits,
@@ -33,7 +34,10 @@ from flangeye.handeye.flange_roll import roll_note
 from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.loop import ArmNoise, meaningless_turns
 from flangeye.handeye.measurements import loop_of, measurements_of
-from flangeye.handeye.target_size import require_size
+from flangeye.handeye.nuisance import nuisance_of
+from flangeye.handeye.target_size import longer_distances, require_size, told_size
+from flangeye.handeye.wander import with_wander
+from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.configuration import Configuration
@@ -45,10 +49,14 @@ from flangeye.types import (
     HandEye,
     Observation,
     Pair,
+    PoseFeature,
     ScatterNoise,
     TransformEstimate,
 )
 
+SIZES, EXACT_SIZE, LOOSEST_SIZE = 10, 1e-6, 0.1
+"""Steps to find a target's size, the share by which the last one changes it, and the largest
+standard deviation of what is taken for found."""
 TYPICAL_ARM = ArmNoise(np.radians(0.01), 0.05e-3)
 """Noise of the poses of an arm of which nothing is known: what else is found is in its ratio."""
 
@@ -69,6 +77,7 @@ class Options:
         joint_zeros: Whether the covariance includes what zeros may be off by.
         smooth_error: Whether a smooth error of the arm is looked for.
         size_limit: Share by which a marker may be of another size.
+        finds_size: Whether its size is found instead, from the arm's motion.
     """
 
     normals: bool
@@ -82,6 +91,7 @@ class Options:
     joint_zeros: bool
     smooth_error: bool
     size_limit: float
+    finds_size: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +130,21 @@ class Cell:
             self.robot.joint_accuracy if self.robot else 0.0,
         )
 
+    def resized(self, factor: float) -> Cell:
+        """Return the cell with all poses of the target so many times as far from the camera."""
+        scale = np.repeat([1.0, factor], 3)
+        observations = []
+        for o in self.observations:
+            if isinstance(o.feature, PoseFeature):
+                seen = o.feature.camera_T_target
+                pose = rigid(seen.rotation, factor * seen.translation)
+                covariance = o.feature.covariance * np.outer(scale, scale)
+                moved = replace(o.feature, camera_T_target=replace(seen, matrix=pose),
+                                covariance=covariance)  # fmt: skip
+                o = replace(o, feature=moved)
+            observations.append(o)
+        return replace(self, observations=observations)
+
 
 def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     """Return every unknown of a cell with its covariance, and what is wrong with the arm.
@@ -135,7 +160,10 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     require_turns(problem)
     model = Model(find_consensus(problem, options.limits.rotation))
     weak = unobservable(model.problem, model.found, options.limits)
-    require_size(model.problem, model.found, options.size_limit)
+    if options.finds_size and model.problem.measurements.are_poses:
+        cell, model = _with_size(cell, model, options)
+    else:
+        require_size(model.problem, model.found, options.size_limit)
     reported, model = (
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
     )
@@ -150,6 +178,29 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         tuple(others),
         _corrected(model, cell, options, weak),
         _scatter(model.found),
+    )
+
+
+def _with_size(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]:
+    """Return the cell as it is with the target's size found, and what is then agreed on."""
+    size = 1.0
+    for _ in range(SIZES):
+        told = told_size(model.problem, model.found)
+        if not 0.1 < 1 + told.share < 10 or told.sigma > LOOSEST_SIZE:
+            raise CalibrationRefused(
+                f"the target's size is told to {told.sigma:.1%} only: move the arm further between "
+                "poses, or say target_size: known"
+            )
+        size, cell = size * (1 + told.share), cell.resized(1 + told.share)
+        model = Model(find_consensus(_problem(cell, options), options.limits.rotation))
+        if abs(told.share) < EXACT_SIZE:
+            break
+    longer = longer_distances(model.problem.measurements)
+    still = np.zeros_like(longer)
+    known = with_nuisance(model, nuisance_of(still, still, np.inf, seen=longer)) or model
+    return cell, known.noted(
+        f"by the arm's own motion the target is {size:.4f} +- {size * told.sigma:.4f} times as "
+        "large as was said where it was fitted, and is taken to be"
     )
 
 
@@ -168,6 +219,11 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
     flange = cell.flange
     if flange is None or model.problem.stated:
         return model, model
+    if options.smooth_error:
+        wandering = with_wander(model, options.finds_size)
+        if wandering.problem.nuisance.sized.any():
+            return wandering, wandering
+        model = wandering
     if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
         considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
         model = with_tool_offset(model, considered)

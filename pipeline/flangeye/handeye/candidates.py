@@ -11,6 +11,7 @@ from flangeye.errors import CalibrationRefused
 from flangeye.handeye.consensus import Consensus, again
 from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.loop import COLUMNS
+from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import ArmCorrection, Floats
 
 FOLDS, LARGEST_FOLD = 5, 20
@@ -72,6 +73,16 @@ class Model:
             return replace(self, consensus=again(self.consensus, problem))
         except (CalibrationRefused, np.linalg.LinAlgError):
             return None
+
+
+def with_nuisance(model: Model, nuisance: Nuisance) -> Model | None:
+    """Return the model with more nuisances, those sized begun at the size of the residuals."""
+    problem, found = model.problem, model.found
+    joined = problem.nuisance.and_also(nuisance) if len(problem.nuisance) else nuisance
+    size = max(rms(found.linear.residuals[found.inliers][:, 3:]), 1e-7)
+    noise = replace(found.noise, size=size) if nuisance.sized.any() else found.noise
+    started = replace(model.consensus, found=replace(found, noise=noise))
+    return replace(model, consensus=started).with_problem(replace(problem, nuisance=joined))
 
 
 def better(model: Model, candidate: Model, what: str) -> Model:

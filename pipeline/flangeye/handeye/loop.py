@@ -107,7 +107,7 @@ def linearise(
     residuals = chain.residuals()
     of_camera, of_target = chain.of_camera_arm(), chain.of_arm()
     if nuisance is not None and len(nuisance):
-        moves = of_camera @ nuisance.camera + of_target @ nuisance.target
+        moves = of_camera @ nuisance.camera + of_target @ nuisance.target + nuisance.seen
         jacobian[:, :, COLUMNS:] = measurements.projectors @ moves
         residuals = residuals - jacobian[:, :, COLUMNS:] @ at.nuisance
     covariance = np.zeros((len(measurements), 6, 6))

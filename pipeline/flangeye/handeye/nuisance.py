@@ -17,6 +17,7 @@ class Nuisance:
     Attributes:
         camera: (N, 6, k) twist by each of the frame that carries the camera, in it.
         target: (N, 6, k) the same of the frame that carries the target.
+        seen: (N, 6, k) by which each turns and moves what is predicted, in ``camera``.
         prior: (k,) standard deviation known beforehand; infinite where nothing is known.
         mean: (k,) value expected beforehand.
         sized: (k,) whether the prior is itself estimated, one for all that are.
@@ -24,6 +25,7 @@ class Nuisance:
 
     camera: Floats
     target: Floats
+    seen: Floats
     prior: Floats
     mean: Floats
     sized: Mask
@@ -33,13 +35,15 @@ class Nuisance:
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Nuisance:
         """Return the effects on some of the poses."""
-        return replace(self, camera=self.camera[chosen], target=self.target[chosen])
+        effects = self.camera[chosen], self.target[chosen], self.seen[chosen]
+        return Nuisance(*effects, self.prior, self.mean, self.sized)
 
     def and_also(self, other: Nuisance) -> Nuisance:
         """Return both sets of numbers, these first."""
         return Nuisance(
             np.concatenate([self.camera, other.camera], axis=2),
             np.concatenate([self.target, other.target], axis=2),
+            np.concatenate([self.seen, other.seen], axis=2),
             np.concatenate([self.prior, other.prior]),
             np.concatenate([self.mean, other.mean]),
             np.concatenate([self.sized, other.sized]),
@@ -55,7 +59,13 @@ def no_nuisance(count: int) -> Nuisance:
     return nuisance_of(np.zeros((count, 6, 0)), np.zeros((count, 6, 0)), 1.0)
 
 
-def nuisance_of(camera: Floats, target: Floats, deviation: float, sized: bool = False) -> Nuisance:
-    """Return numbers of mean zero and one deviation, from their (N, 6, k) twists."""
-    k = camera.shape[2]
-    return Nuisance(camera, target, np.full(k, deviation), np.zeros(k), np.full(k, sized))
+def nuisance_of(
+    camera: Floats,
+    target: Floats,
+    deviation: float,
+    sized: bool = False,
+    seen: Floats | None = None,
+) -> Nuisance:
+    """Return numbers of mean zero and one deviation, from their (N, 6, k) effects."""
+    k, seen = camera.shape[2], np.zeros_like(camera) if seen is None else seen
+    return Nuisance(camera, target, seen, np.full(k, deviation), np.zeros(k), np.full(k, sized))

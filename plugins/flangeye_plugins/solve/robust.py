@@ -103,6 +103,12 @@ class RobustParams(Params):
         description="Share by which a marker may be larger or smaller than its fit was told, as "
         "the arm's motion shows it; beyond, the calibration is refused.",
     )
+    target_size: Literal["known", "unknown"] = Field(
+        "known",
+        description="Whether a marker's size was said where it was fitted, or its poses are right "
+        "but for one factor on all distances, as those of a single moving camera: then the arm's "
+        "own motion tells it.",
+    )
     required: Length | None = param(
         None,
         gt=0,
@@ -220,4 +226,5 @@ def _options(params: RobustParams) -> Options:
         joint_zeros=params.joint_zeros == "consider",
         smooth_error=params.smooth_error == "auto",
         size_limit=params.size_limit,
+        finds_size=params.target_size == "unknown",
     )
