@@ -1,14 +1,16 @@
 """Which sessions a batch has, and when a session is still the same."""
 
 import os
+import re
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flangeye.batch import plan as batch_plan
 from flangeye.batch.plan import plan
 from flangeye.batch.request import BatchError, Request
-from flangeye.batch.software import Software, check_software, software_of
+from flangeye.batch.software import Software, _code_of, check_software, software_of
 from flangeye.batch.variants import split_values
 from flangeye.errors import FlangeyeError, StageError
 
@@ -137,6 +139,28 @@ def test_files_that_the_recipe_names_count(sessions, tmp_path):
     assert sessions(overrides=("steps.3.reads=there",))[0].key != first
 
 
+def test_a_thousand_seeds_are_planned_from_one_reading_of_the_recipe(sessions, monkeypatch):
+    read, load = [], batch_plan.load_recipe
+    monkeypatch.setattr(batch_plan, "load_recipe", lambda *a: (read.append(1), load(*a))[1])
+    found = sessions(grid=("steps.0.count=5,6",), repeat=1000)
+    assert len(read) == 3 and len({s.key for s in found}) == 2000
+    assert found[7].key == sessions(overrides=("seed=10", "steps.0.count=5"))[0].key
+
+
+def test_code_that_changed_under_one_version_is_other_software(tmp_path):
+    package = tmp_path / "package"
+    package.mkdir()
+    module = package / "__init__.py"
+    module.write_text("")
+    (package / "part.py").write_text("A = 1")
+    first = _code_of(str(module))
+    _code_of.cache_clear()
+    assert _code_of(str(module)) == first
+    (package / "part.py").write_text("A = 2")
+    _code_of.cache_clear()
+    assert _code_of(str(module)) != first
+
+
 @given(st.lists(st.text("ab1. {}[]", min_size=1).filter(str.strip), min_size=1))
 def test_splitting_undoes_joining(values):
     balanced = [v.strip() for v in values if _balanced(v)]
@@ -160,12 +184,12 @@ def test_commas_inside_brackets_and_quotes_belong_to_the_value():
 
 def test_workers_must_have_the_same_software(registry):
     here = software_of(registry)
-    assert "toy_batch 1.0" in here.plugins
+    assert any(re.fullmatch(r"toy_batch 1.0 \(code \w{8}\)", each) for each in here.plugins)
     check_software(here, here, "host")
     for other, told in (
         (
             Software("9", here.plugins),
-            f"flangeye {here.flangeye}, the batch was started with flang",
+            f"flangeye {re.escape(here.flangeye)}, the batch was started with flang",
         ),
         (Software(here.flangeye, (*here.plugins, "zzz 1")), "plugins, the batch was started with"),
         (Software(here.flangeye, ("aaa 1", *here.plugins[1:])), "the batch was started with aaa 1"),

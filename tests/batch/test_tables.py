@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -112,6 +113,15 @@ def test_variants_are_summed_up_when_repeated(entries):
     assert '<h2 id="variants">' not in render(table_of(entries[:2]))
     row = re.search(r"<tr><td>0.2 mm</td><td>6</td>(.*?)</tr>", page, re.S).group(1)
     assert re.findall(r">([^<>]*)</td>", row) == ["2", "1", "1", "0.200", "0.400", ""]
+
+
+def test_a_page_of_very_many_sessions_shows_the_worst():
+    many = [(session(i), replace(outcome(), holdout_rms_m=1e-6 * i)) for i in range(1200)]
+    many[5] = (session(5), SessionOutcome("crashed", "no"))
+    page = render(table_of(many))
+    assert "1000 of 1200: those without a calibration" in page
+    assert "toy_000000000005" in page and "toy_000000001199" in page
+    assert "toy_000000000006<" not in page and len(page) < 6e6
 
 
 def test_nothing_accepted_still_makes_a_page():

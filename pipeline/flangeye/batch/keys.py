@@ -47,15 +47,22 @@ class Fingerprints:
         return [f"{path} {self.of(path)}" for path in sorted(paths)]
 
 
-def session_key(
-    recipe: Recipe, archive: str | None, software: Software, prints: Fingerprints
-) -> str:
-    """Return the hash of a recipe, the files it names, its input and what computes."""
-    # The resolved recipe has only the names of the models that the header's files describe.
+def common_key(recipe: Recipe, software: Software, prints: Fingerprints) -> str:
+    """Return the hash of what sessions that differ in seed and archive alone have in common.
+
+    It is of the recipe, the models and files that it names, and what computes.
+    """
+    data = recipe.data()
+    data.pop("seed")
+    # The data have only the names of the models that the header's files describe.
     models = [value for kind, value in recipe.context.items() if kind not in (t.Box, t.Seed)]
-    files = prints.of_recipe(recipe)
+    return sha256(json.dumps([data, repr(models), prints.of_recipe(recipe), software]))
+
+
+def session_key(common: str, seed: int, archive: str | None, prints: Fingerprints) -> str:
+    """Return the hash of all that decides a session's result; ``common`` from above."""
     given = [archive, prints.of_archive(archive)] if archive else []
-    return sha256(json.dumps([recipe.resolved(), repr(models), files, given, software]))
+    return sha256(json.dumps([common, seed, *given]))
 
 
 def _fingerprint(path: Path) -> str:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 _HERE = Path(__file__).parent
 _REPORT = Path(run_report.__file__).parent
 
+MOST = 1000
+"""Sessions in the page's table, and about as many in its plots; the files have all."""
+
 _HEADINGS: Mapping[str, str] = {
     "session": "Session",
     "archive": "Archive",
@@ -79,13 +82,13 @@ def render(table: Table) -> str:
 
     table = _with_short_archives(table)
     columns = _columns(table)
-    drawings = drawings_of(table)
+    drawings = drawings_of(replace(table, rows=table.rows[:: 1 + len(table.rows) // MOST]))
     return _environment().get_template("summary.html.j2").render(
         title=table.rows[0]["recipe"] if table.rows else "nothing",
         counts=[(s, n) for s, n in _counts(table.rows).items() if n],
         total=len(table.rows),
         headings=[(name, _HEADINGS.get(name, name)) for name in columns],
-        rows=[[_cell(row, name) for name in columns] for row in table.rows],
+        rows=[[_cell(row, name) for name in columns] for row in _worst(table.rows)],
         groups=_groups(table),
         varied=_varied(table),
         drawings=drawings,
@@ -93,6 +96,17 @@ def render(table: Table) -> str:
         plotly_js=get_plotlyjs() if drawings else "",
         version=VERSION,
     )  # fmt: skip
+
+
+def _worst(rows: Sequence[Row]) -> Sequence[Row]:
+    """Return as many rows as a browser bears: without a calibration first, then the worst."""
+    if len(rows) <= MOST:
+        return rows
+
+    def goodness(row: Row) -> tuple[bool, float]:
+        return row["status"] in ACCEPTED, -(row["holdout_rms_m"] or 0.0)
+
+    return sorted(rows, key=goodness)[:MOST]
 
 
 def _with_short_archives(table: Table) -> Table:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from flangeye import types as t
-from flangeye.batch.keys import Fingerprints, session_key
+from flangeye.batch.keys import Fingerprints, common_key, session_key
 from flangeye.batch.request import SEED, BatchError, Request
 from flangeye.batch.software import Software
 from flangeye.batch.variants import variants
@@ -52,19 +52,39 @@ def plan(request: Request, registry: Registry, software: Software) -> list[Batch
     base = load_recipe(path, registry, request.overrides)
     archives = _archives(base, request.archives)
     prints = Fingerprints()
-    sessions = []
-    for varied in variants(request, base.header.seed):
-        overrides = (*request.overrides, *(f"{k}={v}" for k, v in varied.items()))
-        recipe = _variant(path, registry, overrides) if varied else base
+    sessions: list[BatchSession] = []
+    known, common = base, common_key(base, software, prints)
+    for varied, recipe, seed in _recipes(request, base, path, registry):
+        overrides = (*request.overrides, *_written(varied))
+        shown = {k: v for k, v in varied.items() if k != SEED}
+        if recipe is not known:
+            known, common = recipe, common_key(recipe, software, prints)
         for archive in archives:
-            key = session_key(recipe, archive, software, prints)
+            key = session_key(common, seed, archive, prints)
             name = _session_id(recipe.name, archive, key)
-            shown = {k: v for k, v in varied.items() if k != SEED}
-            sessions.append(
-                BatchSession(name, key, path, archive, overrides, shown, recipe.header.seed)
-            )
+            sessions.append(BatchSession(name, key, path, archive, overrides, shown, seed))
     _check_distinct(sessions)
     return sessions
+
+
+def _recipes(
+    request: Request, base: Recipe, path: Path, registry: Registry
+) -> Iterator[tuple[dict[str, str], Recipe, int]]:
+    """Yield every variant with its recipe and seed.
+
+    Seeds that are counted up share one recipe: a hundred thousand would take minutes to read.
+    """
+    counted = request.repeat is not None
+    recipe, read = base, dict[str, str]()
+    for varied in variants(request, base.header.seed):
+        rest = {k: v for k, v in varied.items() if not (counted and k == SEED)}
+        if rest != read:
+            recipe, read = _variant(path, registry, (*request.overrides, *_written(rest))), rest
+        yield varied, recipe, int(varied[SEED]) if counted else recipe.header.seed
+
+
+def _written(varied: Mapping[str, str]) -> list[str]:
+    return [f"{path}={value}" for path, value in varied.items()]
 
 
 def _archives(base: Recipe, given: Sequence[str]) -> list[str | None]:
@@ -98,5 +118,4 @@ def _check_distinct(sessions: Sequence[BatchSession]) -> None:
 
 
 def _told(session: BatchSession) -> str:
-    words = [f"{path}={value}" for path, value in session.varied.items()]
-    return " ".join([str(session.archive or session.recipe.name), *words])
+    return " ".join([str(session.archive or session.recipe.name), *_written(session.varied)])

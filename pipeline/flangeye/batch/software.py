@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
+import flangeye
 from flangeye.errors import StageError
 from flangeye.files.bundled import VERSION
 from flangeye.plugin.registry import Registry
@@ -13,8 +17,8 @@ class Software(NamedTuple):
     """Versions that decide a result.
 
     Attributes:
-        flangeye: Version of the project.
-        plugins: ``name version`` of every plugin that could be loaded, sorted.
+        flangeye: Version of the project, and a hash of its code.
+        plugins: The same with its name for every plugin that could be loaded, sorted.
     """
 
     flangeye: str
@@ -23,8 +27,25 @@ class Software(NamedTuple):
 
 def software_of(registry: Registry) -> Software:
     """Return the versions in this process."""
-    plugins = sorted(f"{name} {version}" for name, version in registry.versions().items())
-    return Software(VERSION, tuple(plugins))
+    modules = dict(registry.hooks.list_name_plugin())
+    plugins = [
+        f"{name} {version} (code {_code_of(getattr(modules[name], '__file__', None))})"
+        for name, version in sorted(registry.versions().items())
+    ]
+    return Software(f"{VERSION} (code {_code_of(flangeye.__file__)})", tuple(plugins))
+
+
+@cache
+def _code_of(module: str | None) -> str:
+    """Return a hash of a package's Python files, or of a module's: a version may stay as it is."""
+    if module is None:
+        return "unknown"
+    file = Path(module)
+    files = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+    digest = hashlib.sha256()
+    for each in files:
+        digest.update(f"{each.relative_to(file.parent)}\0".encode() + each.read_bytes())
+    return digest.hexdigest()[:8]
 
 
 def check_software(expected: Software, here: Software, host: str) -> None:

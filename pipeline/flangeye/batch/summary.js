@@ -19,6 +19,13 @@
     body.append(...rows);
   }
 
+  for (const input of document.querySelectorAll("input[data-filters]"))
+    input.addEventListener("input", () => {
+      const words = input.value.toLowerCase().split(/\s+/);
+      for (const row of document.getElementById(input.dataset.filters).tBodies[0].rows)
+        row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+    });
+
   for (const table of document.querySelectorAll("table.sortable"))
     [...table.tHead.rows[0].cells].forEach((heading, column) => {
       const button = document.createElement("button");

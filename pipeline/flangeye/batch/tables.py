@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ def _row(session: BatchSession, outcome: SessionOutcome) -> Row:
         "archive": session.archive,
         **session.varied,
         "seed": session.seed,
-        **asdict(outcome),
+        **vars(outcome),
     }
 
 

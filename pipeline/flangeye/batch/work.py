@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from flangeye.batch.keys import Fingerprints, session_key
+from flangeye.batch.keys import Fingerprints, common_key, session_key
 from flangeye.batch.outcome import (
     FINISHED,
     SessionOutcome,
@@ -127,6 +127,8 @@ def _check_worker(job: Job, registry: Registry) -> None:
 
 
 def _check_unchanged(job: Job, session: BatchSession, recipe: Recipe) -> None:
-    if session_key(recipe, session.archive, job.software, Fingerprints()) != session.key:
+    prints = Fingerprints()
+    common = common_key(recipe, job.software, prints)
+    if session_key(common, recipe.header.seed, session.archive, prints) != session.key:
         changed = " or ".join(str(path) for path in (session.recipe, session.archive) if path)
         raise StageError(f"{changed}: has changed since the batch was started; start it again")

@@ -53,6 +53,10 @@ class Recipe:
 
     @cached_property
     def _resolved(self) -> str:
+        return yaml.safe_dump(self.data(), sort_keys=False, allow_unicode=True, width=100)
+
+    def data(self) -> dict[str, Any]:
+        """Return the same as plain data."""
         data = self.header.model_dump(mode="json", exclude_none=True)
         data["steps"] = [
             {step.stage.name: step.params.model_dump(mode="json", exclude_none=True)}
@@ -60,7 +64,7 @@ class Recipe:
             else step.stage.name
             for step in self.steps
         ]
-        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        return data
 
 
 def recipe_names() -> dict[str, Path]:
