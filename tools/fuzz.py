@@ -3,8 +3,8 @@
 Each target runs in a process of its own, in a folder with canaries: a Python module of a library's
 name and a program. What counts as a find: any exception but a FlangeyeError, a signal, more than
 20 s or 2 GB for one input, a canary that ran. Finds are kept in tests/fuzz/seeds/TARGET/, where the
-fast tests read them again. With --coverage, atheris guides the search instead (pip install atheris;
-it has wheels for some versions of Python only).
+fast tests read them again. With --coverage, atheris guides the search instead, for so long for each
+target (pip install 'flangeye[fuzz]').
 """
 
 from __future__ import annotations
@@ -21,6 +21,12 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
+
+if "--coverage" in sys.argv:
+    import atheris
+
+    # For good, and before anything of ours is imported, in each child too.
+    atheris.instrument_imports(include=["flangeye", "flangeye_plugins"]).__enter__()
 
 from flangeye.files.children import keep_current_folder_out
 from tests.fuzz.damage import spoilt
@@ -65,12 +71,14 @@ def _in_child(name: str, cases: int, asked: argparse.Namespace) -> tuple[int, in
     counts = spawn.Array("q", 3)
     done = 0
     while done < cases:  # a process that dies has one find, and the next goes on behind it
-        work = _covered if asked.coverage else _fuzzed
-        child = spawn.Process(
-            target=work, args=(name, done, cases, asked.seed, counts, asked.coverage)
-        )
-        child.start()
-        child.join()
+        with tempfile.TemporaryDirectory() as folder:
+            amount = asked.coverage or range(done, cases)
+            work = _covered if asked.coverage else _fuzzed
+            child = spawn.Process(
+                target=work, args=(name, Path(folder), amount, asked.seed, counts)
+            )
+            child.start()
+            child.join()
         if child.exitcode == 0:
             break
         counts[2] += 1
@@ -79,14 +87,13 @@ def _in_child(name: str, cases: int, asked: argparse.Namespace) -> tuple[int, in
     return counts[0], counts[1], counts[2]
 
 
-def _fuzzed(name: str, first: int, cases: int, seed: int, counts, seconds: int) -> None:
+def _fuzzed(name: str, folder: Path, cases: range, seed: int, counts) -> None:
     target = TARGETS[name]
-    with tempfile.TemporaryDirectory() as made:
-        folder = _with_canaries(Path(made))
-        sound = target.seeds(folder)
-        for number in range(first, cases):
-            chance = random.Random(f"{seed} {name} {number}")
-            _once(name, target, folder, spoilt(chance.choice(sound), chance), counts)
+    _lay_canaries(folder)
+    sound = target.seeds(folder)
+    for number in cases:
+        chance = random.Random(f"{seed} {name} {number}")
+        _once(name, target, folder, spoilt(chance.choice(sound), chance), counts)
 
 
 def _once(name: str, target: Target, folder: Path, raw: bytes, counts) -> None:
@@ -117,35 +124,26 @@ def _hung(*_: object) -> None:
     raise TimeoutError(f"more than {HANG} s")
 
 
-def _with_canaries(folder: Path) -> Path:
+def _lay_canaries(folder: Path) -> None:
+    sys.stderr = os.fdopen(os.dup(2), "w")  # for finds; image libraries write to what was there
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     for module in ("yaml", "struct", "zstandard"):
         (folder / f"{module}.py").write_text(f"open({str(folder / 'PWNED')!r}, 'w')\n")
     program = folder / "evil.sh"
     program.write_text(f"#!/bin/sh\ntouch {folder / 'PWNED'}\n")
     program.chmod(0o755)
     os.chdir(folder)
-    return folder
 
 
-def _covered(name: str, first: int, cases: int, seed: int, counts, seconds: int) -> None:
+def _covered(name: str, folder: Path, seconds: int, seed: int, counts) -> None:
     """Let atheris look for inputs that reach new code."""
-    import atheris
-
-    with atheris.instrument_imports(include=["flangeye", "flangeye_plugins"]):
-        import flangeye_plugins  # noqa: F401
-
-    target, folder = TARGETS[name], _with_canaries(Path(tempfile.mkdtemp()))
-    corpus = folder / "corpus"
+    target, corpus = TARGETS[name], folder / "corpus"
+    _lay_canaries(folder)
     corpus.mkdir()
     for number, raw in enumerate(target.seeds(folder)):
         (corpus / str(number)).write_bytes(raw)
-    words = [
-        sys.argv[0],
-        str(corpus),
-        f"-max_total_time={seconds}",
-        f"-timeout={HANG}",
-        f"-seed={seed + 1}",
-    ]
+    limits = [f"-max_total_time={seconds}", f"-timeout={HANG}", f"-seed={seed + 1}"]
+    words = ["fuzz", str(corpus), *limits, "-verbosity=0"]
     atheris.Setup(words, lambda raw: _once(name, target, folder, raw, counts))
     atheris.Fuzz()
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from platform import machine, python_version, system
 
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements.lock"
-HEAD = "# Every package of `make demo` and `make test`, with hashes: python -m tools.supply lock\n"
+HEAD = """\
+# Every package of `make demo` and `make test`, with the hash of the file that pip chooses on
+# {machine}, Python {python}: python -m tools.supply lock
+"""
 
 
 def lock() -> None:
@@ -23,7 +28,10 @@ def lock() -> None:
         subprocess.run([sys.executable, "-m", "pip", *command, f"{ROOT}[dev]"], check=True)
         found = json.loads(report.read_text("utf-8"))["install"]
     lines = [_pinned(item) for item in found if "archive_info" in item["download_info"]]
-    LOCK.write_text(HEAD + "".join(sorted(lines, key=str.lower)), encoding="utf-8")
+    head = HEAD.format(
+        machine=f"{system()} {machine()}", python=python_version().rpartition(".")[0]
+    )
+    LOCK.write_text(head + "".join(sorted(lines, key=str.lower)), encoding="utf-8")
     print(f"{LOCK.name}: {len(lines)} packages")
 
 
@@ -58,23 +66,21 @@ def licences() -> None:
 
 
 def weaknesses() -> None:
-    """Ask pip-audit; where it is missing or reaches no database, say so."""
-    command = [
-        sys.executable,
-        "-m",
-        "pip_audit",
-        "--require-hashes",
-        "--disable-pip",
-        "-r",
-        str(LOCK),
-    ]
-    told = subprocess.run(command, capture_output=True, text=True)
-    print(told.stdout or told.stderr.strip().splitlines()[-1])
-    if told.returncode and not told.stdout:
-        print(
-            "pip-audit is missing (pip install pip-audit) or reaches no database: nothing is known"
-        )
-    sys.exit(told.returncode)
+    """Let pip-audit look every package up, and say of how many anything is known."""
+    tool = shutil.which("pip-audit")
+    if tool is None:
+        sys.exit("pip-audit is not in PATH: pipx install pip-audit")
+    options = ["--require-hashes", "--disable-pip", "--format=json", "--progress-spinner=off"]
+    told = subprocess.run([tool, *options, "-r", str(LOCK)], capture_output=True, text=True)
+    if not told.stdout:
+        sys.exit(f"nothing is known: {told.stderr.strip().splitlines()[-1]}")
+    every = json.loads(told.stdout)["dependencies"]
+    known = [each for each in every if "skip_reason" not in each]
+    weak = [(each, weakness["id"]) for each in known for weakness in each["vulns"]]
+    print(f"{len(known)} of {len(every)} packages are in the database that pip-audit reaches")
+    for each, name in weak:
+        print(f"{each['name']} {each['version']}: {name}")
+    sys.exit(bool(weak) or len(known) < len(every))
 
 
 def sbom() -> None:

@@ -4,8 +4,10 @@ import random
 import resource
 
 import pytest
+from hypothesis import HealthCheck, given, settings
 
 from tests.fuzz.damage import NASTY, spoilt
+from tests.fuzz.strategies import STRATEGIES
 from tests.fuzz.targets import SEEDS, TARGETS, survives
 
 CASES = 140
@@ -32,6 +34,19 @@ def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name, tmp_path):
         path = tmp_path / f"{number}{target.suffix}"
         path.write_bytes(raw)
         assert survives(target, path) or number >= len(sound) or name in ("poses",), raw[:80]
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_made_input_is_read_or_refused(name, tmp_path):
+    target, path = TARGETS[name], tmp_path / f"made{TARGETS[name].suffix}"
+
+    @settings(deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(STRATEGIES[name])
+    def reads(raw):
+        path.write_bytes(raw)
+        survives(target, path)
+
+    reads()
 
 
 FOUND = sorted(SEEDS.glob("*/*")) if SEEDS.is_dir() else []

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from flangeye import StageError
 from flangeye.maths.geometry import rotation_exp
@@ -22,7 +23,13 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye_plugins.solve.svd import SvdParams, solve_svd
-from flangeye_plugins.verify.holdout import HoldoutParams, deal, verify_holdout
+from flangeye_plugins.verify.holdout import (
+    HeldOut,
+    HoldoutParams,
+    _beyond_gate,
+    deal,
+    verify_holdout,
+)
 
 TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])
 MM = 1e-3
@@ -222,3 +229,14 @@ def _holds(n: int, seed: int) -> bool:
     corners = box.grid(2)
     wrong = calibration.base_T_camera.transform.apply((corners - TRUTH[1]) @ TRUTH[0]) - corners
     return bool(np.linalg.norm(wrong, axis=1).max() <= predicted)
+
+
+@pytest.mark.parametrize("probability", [0.95, 0.99])
+def test_a_pose_is_an_outlier_beyond_the_quantile_of_three_degrees_of_freedom(
+    probability: float,
+) -> None:
+    gate = np.sqrt(chi2.ppf(probability, 3)) * MM
+    errors = np.zeros((9, 3))
+    errors[:2, 0] = gate * 0.999, gate * 1.001  # the others lie where they should: nothing is added
+    held = HeldOut(errors, np.tile(np.eye(3) * MM**2, (9, 1, 1)), np.full(9, np.nan))
+    assert _beyond_gate(held, probability).tolist() == [False, True] + [False] * 7

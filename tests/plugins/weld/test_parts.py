@@ -13,7 +13,7 @@ from flangeye.models.model import read_model
 from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Contact as Tip3D
 from flangeye_emulators.weld_world.groove import Groove, Section, Tip
-from flangeye_plugins.weld.contact import Contact
+from flangeye_plugins.weld.contact import DWELL, LOST, REGAINED, SMOOTHING, Contact
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Command, ToolPose, Track, turned
 from flangeye_plugins.weld.path import Path
@@ -136,6 +136,42 @@ def fed(contact, values, start=0.0, wanted=2e-3):
         contact.update(start + i * 0.03, value, wanted)
         states.append(contact.state)
     return states
+
+
+def test_contact_filters_by_its_time_constant():
+    contact = Contact()
+    contact.update(1.0, 1e-3, 2e-3)
+    assert contact.deflection == 1e-3
+    for step in (0.01, 0.05, 0.2):
+        before = contact.deflection
+        contact.update(contact._time + step, 3e-3, 2e-3)
+        left = np.exp(-step / SMOOTHING)
+        assert contact.deflection == pytest.approx(3e-3 + left * (before - 3e-3), rel=1e-12)
+
+
+def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels():
+    contact = Contact()
+    times = iter(np.arange(0.0, 60.0, 0.01))
+
+    def until_changed(value):
+        """Return how long a constant deflection takes to change the state, at most two seconds."""
+        contact.deflection, began = value, None
+        for time in times:
+            began, before = time if began is None else began, contact.state
+            contact.update(time, value, 2e-3)
+            if contact.state != before:
+                assert contact.since == time
+                return time - began
+            if time - began > 2.0:
+                return None
+
+    assert until_changed(REGAINED * 2e-3 * 0.999) is None
+    assert until_changed(REGAINED * 2e-3 * 1.001) == pytest.approx(DWELL, abs=0.011)
+    assert contact.state == "held"
+    assert until_changed(LOST * 2e-3 * 1.001) is None
+    assert until_changed(LOST * 2e-3 * 0.999) == pytest.approx(DWELL, abs=0.011)
+    assert contact.state == "lost"
+    assert contact.doubted(3e-3, 2e-3)
 
 
 def test_contact_has_hysteresis_in_size_and_in_time():
