@@ -13,6 +13,7 @@ from flangeye.batch.request import BatchError, Request
 from flangeye.batch.software import Software, _code_of, check_software, software_of
 from flangeye.batch.variants import split_values
 from flangeye.errors import FlangeyeError, StageError
+from flangeye.plugin.registry import load_registry
 
 SOFTWARE = Software("1", ("toy 1.0",))
 
@@ -33,6 +34,13 @@ def test_grid_times_seeds(sessions):
     ]  # fmt: skip
     assert len({s.id for s in found}) == 12
     assert found[0].overrides == ("steps.2.inlier=0.2 mm", "steps.0.count=5", "seed=3")
+
+
+def test_a_grid_compares_solvers():
+    request = Request("ur5_phoxi-m_sample", grid=("steps.3=solve.svd,solve.robust",))
+    found = plan(request, load_registry(), SOFTWARE)
+    assert [s.varied for s in found] == [{"steps.3": "solve.svd"}, {"steps.3": "solve.robust"}]
+    assert len({s.key for s in found}) == 2
 
 
 def test_archives_times_values(sessions, archive_recipe, archives):
