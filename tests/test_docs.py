@@ -99,7 +99,7 @@ WALKS = ROOT / "docs" / "how-to" / "add-a-plugin.md"
 )
 def test_a_walk_is_short_and_its_plugin_is_accepted(title, text):
     assert len(text.splitlines()) <= 40
-    given = {}
+    given: dict[str, object] = {}
     exec(compile(text, title, "exec"), given)
     assert [name for name in given if isinstance(given[name], Plugin)]
 

@@ -61,9 +61,9 @@ def flangeye(monkeypatch, tmp_path, capsys):
 
     def call(*words):
         monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        code: str | int | None = 0
         try:
             cli.main()
-            code = 0
         except SystemExit as exit_:
             code = exit_.code
         said = capsys.readouterr()

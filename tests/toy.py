@@ -25,6 +25,7 @@ from flangeye.types import (
     PointCloud,
     PoseError,
     Rejected,
+    Role,
     Seam,
     Seed,
     Solver,
@@ -39,7 +40,7 @@ from flangeye.types import (
     WorkpieceScan,
     by_frame,
 )  # fmt: skip
-from flangeye.units import Length
+from flangeye.units import Length, param
 
 BASE_T_CAMERA = Transform(BASE, CAMERA, rigid(rotation_from_rpy(3.0, 0.1, -1.5), [0.6, 0, 1]))
 CROSS = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
@@ -48,7 +49,7 @@ acquired: list[str] = []
 
 class AcquireParams(Params):
     count: int = Field(6, ge=0, description="How many captures.")
-    noise: Length = Field("0 mm", ge=0, description="Standard deviation of a centre.")
+    noise: Length = param("0 mm", ge=0, description="Standard deviation of a centre.")
     bad: int = Field(0, description="How many captures show nothing.")
     verification: int = Field(0, description="How many are kept from the solver.")
 
@@ -65,7 +66,7 @@ def acquire(seed: Seed, params: AcquireParams) -> Captures:
             pose = rigid(rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)), rng.uniform(-0.2, 0.2, 3))
             centre = BASE_T_CAMERA.inverse().apply(pose[:3, 3]) + rng.normal(0, params.noise, 3)
             xyz = np.full((4, 3), np.nan) if i < params.bad else centre + CROSS
-            role = "verification" if i < params.verification else "calibration"
+            role: Role = "verification" if i < params.verification else "calibration"
             flange = Transform(BASE, FLANGE, pose)
             yield Capture(f"{i:03d}", PointCloud(CAMERA, xyz), by_frame(flange), None, i, role)
 
@@ -74,7 +75,7 @@ def acquire(seed: Seed, params: AcquireParams) -> Captures:
     )
 
     def look(_bodies: object) -> PointCloud:
-        return PointCloud(CAMERA, np.float32(CROSS))
+        return PointCloud(CAMERA, CROSS)
 
     return Captures(captures(), source, params.count, look)
 
@@ -89,7 +90,7 @@ def segment(capture: Capture) -> FlangeCloud | Rejected:
 
 
 class FitParams(Params):
-    inlier: Length = Field(
+    inlier: Length = param(
         "0.3 mm", gt=0, description="Largest distance of a rim point from the circle."
     )
 
@@ -109,7 +110,7 @@ def toy_cost(error: PoseError) -> float:
 
 
 class ScaledParams(Params):
-    radius: Length = Field("300 mm", description="Work radius.")
+    radius: Length = param("300 mm", description="Work radius.")
 
 
 @part("cost.scaled")
@@ -120,7 +121,7 @@ def scaled_cost(error: PoseError, params: ScaledParams) -> float:
 
 class SolveParams(Params):
     at_most: int = Field(100, description="Stop pulling after so many.")
-    cost: Annotated[BoundPart, Choose("cost")] = Field({"toy": {}}, description="What to minimise.")
+    cost: Annotated[BoundPart, Choose("cost")] = param({"toy": {}}, description="What to minimise.")
 
 
 @stage("solve.toy")
@@ -145,7 +146,7 @@ def refine(calibration: HandEye) -> HandEye:
 
 
 class VerifyParams(Params):
-    max_rms: Length = Field("1 mm", gt=0, description="Largest root mean square residual.")
+    max_rms: Length = param("1 mm", gt=0, description="Largest root mean square residual.")
 
 
 @stage("verify.toy")

@@ -126,6 +126,7 @@ def _blamed(watched: Watched, first: int) -> str:
         CORNERS,
         TEST,
     ).since
+    assert since is not None  # asked only after an alarm
     before = Information.of_covariance(watched.prior).plus(
         told.summed(max(since - TEST.reference, 0), since)
     )

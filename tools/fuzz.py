@@ -82,8 +82,10 @@ def _in_child(name: str, cases: int, asked: argparse.Namespace) -> tuple[int, in
         if child.exitcode == 0:
             break
         counts[2] += 1
-        print(f"{name}: the process ended with {child.exitcode} at input {sum(counts)}", flush=True)
-        done = sum(counts)
+        print(
+            f"{name}: the process ended with {child.exitcode} at input {sum(counts[:])}", flush=True
+        )
+        done = sum(counts[:])
     return counts[0], counts[1], counts[2]
 
 

@@ -171,18 +171,21 @@ class Trial:
             return
         self._gone_on += 1
         again = self._start(command, out, stderr=subprocess.PIPE)
-        if again.wait() not in (0, 1):
-            yield f"{' '.join(command)}: {again.stderr.read().decode().strip()}"
+        _, told = again.communicate()
+        if again.returncode not in (0, 1):
+            yield f"{' '.join(command)}: {told.decode().strip()}"
 
-    def _start(self, command: tuple[str, ...], out: Path, **streams: int) -> subprocess.Popen:
+    def _start(
+        self, command: tuple[str, ...], out: Path, stderr: int = subprocess.DEVNULL
+    ) -> subprocess.Popen[bytes]:
         """Start a command; what it starts has the folder's name in its environment."""
         _temporary(out).mkdir(exist_ok=True)
         environment = {**os.environ, MARK: str(out), "TMPDIR": str(_temporary(out))}
-        options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, **streams}
         words = command if "--out" in command else (*command, "--out", str(out))
         return subprocess.Popen(
             python_command("-m", "flangeye.cli", *words),
-            env=environment, start_new_session=True, stdin=subprocess.DEVNULL, **options,
+            env=environment, start_new_session=True, stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=stderr,
         )  # fmt: skip
 
 

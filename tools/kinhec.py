@@ -90,7 +90,7 @@ def page(tracks, lines, refusals):
     yield "| track | flangeye | refused | best reference | which |\n|---|---|---|---|---|"
     for track, found in tracks.items():
         medians = {k: np.nanmedian([t[k] for _, t in found]) for k in found[0][1]}
-        best = min(medians, key=medians.get)
+        best = min(medians, key=medians.__getitem__)
         ours = [o for o, _ in found if np.isfinite(o)]
         told = f"{np.median(ours):.2f}" if ours else "—"
         refused = f"{len(found) - len(ours)} of {len(found)}"

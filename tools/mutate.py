@@ -69,14 +69,15 @@ def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
         to = COMPARED[type(node.ops[0])]
         yield (f"{ast.unparse(node)}: {to.__name__}", lambda n: n.ops.__setitem__(0, to()))
     elif isinstance(node, ast.BinOp) and type(node.op) in COMPUTED:
-        to = COMPUTED[type(node.op)]
-        yield f"{ast.unparse(node)}: {to.__name__}", lambda n: setattr(n, "op", to())
+        computed = COMPUTED[type(node.op)]
+        yield f"{ast.unparse(node)}: {computed.__name__}", lambda n: setattr(n, "op", computed())
     elif isinstance(node, ast.BoolOp):
-        to = ast.Or if isinstance(node.op, ast.And) else ast.And
-        yield f"{ast.unparse(node)}: {to.__name__}", lambda n: setattr(n, "op", to())
+        other = ast.Or if isinstance(node.op, ast.And) else ast.And
+        yield f"{ast.unparse(node)}: {other.__name__}", lambda n: setattr(n, "op", other())
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        more = node.value + 1 if isinstance(node.value, int) else node.value * 2 + 1e-3
-        yield f"{node.value} -> {more}", lambda n: setattr(n, "value", more)
+        number: Any = node.value
+        more = number + 1 if isinstance(number, int) else number * 2 + 1e-3
+        yield f"{number} -> {more}", lambda n: setattr(n, "value", more)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
         yield f"{ast.unparse(node)}: without not", lambda n: setattr(n, "op", ast.UAdd())
 

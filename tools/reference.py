@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 
+import click
 import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -32,6 +33,7 @@ def pages() -> dict[str, str]:
 
 def _commands() -> str:
     group = get_command(app)
+    assert isinstance(group, click.Group)
     lines = ["# Commands", "", "`flangeye COMMAND --help` says the same.", ""]
     for name, command in sorted(group.commands.items()):
         if command.hidden:

@@ -52,10 +52,10 @@ def licence_of(name: str) -> str:
         facts = distribution(name).metadata
     except PackageNotFoundError:
         return ""
-    classified = [
-        c.rpartition(" :: ")[2] for c in facts.get_all("Classifier") or () if "License" in c
-    ]
-    told = facts.get("License-Expression") or "; ".join(classified) or facts.get("License") or ""
+    classifiers = facts.get_all("Classifier") or ()
+    classified = "; ".join(c.rpartition(" :: ")[2] for c in classifiers if "License" in c)
+    expression, free = (facts.get_all(key) or [""] for key in ("License-Expression", "License"))
+    told = expression[0] or classified or free[0]
     return told.splitlines()[0][:80] if told else ""
 
 
@@ -87,15 +87,16 @@ def sbom() -> None:
     """Write a CycloneDX 1.6 list of components."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     own = {"type": "library", "name": project["name"], "version": project["version"]}
+    components = [_component(line) for line in LOCK.read_text("utf-8").splitlines() if "==" in line]
     document = {
         "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1,
         "metadata": {"component": own},
-        "components": [_component(line) for line in LOCK.read_text("utf-8").splitlines() if "==" in line],
+        "components": components,
     }  # fmt: skip
     out = ROOT / "dist" / "sbom.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-    print(f"{out.relative_to(ROOT)}: {len(document['components'])} components")
+    print(f"{out.relative_to(ROOT)}: {len(components)} components")
 
 
 def _component(line: str) -> dict:

@@ -27,7 +27,7 @@ def table(
     out: Annotated[Path | None, typer.Option(help="Write it here too, as CSV.")] = None,
 ) -> None:
     """Print the table."""
-    rows = [COLUMNS]
+    rows: list[tuple[str, ...]] = [COLUMNS]
     print("| " + " | ".join(COLUMNS) + " |\n" + "| --- " * len(COLUMNS) + "|")
     for name, condition in CONDITIONS.items():
         if only in name:

@@ -70,9 +70,10 @@ def batch(recipe, registry):
     """Run a batch of the toy recipe in this process; return it and what was said meanwhile."""
 
     def call(name=recipe, **wanted):
-        console = Console(file=io.StringIO(), width=200)
+        said = io.StringIO()
+        console = Console(file=said, width=200)
         done = run_batch(Request(str(name), **{"report": False, **wanted}), registry, console)
-        return done, console.file.getvalue()
+        return done, said.getvalue()
 
     return call
 
@@ -84,9 +85,9 @@ def flangeye(monkeypatch, capsys):
 
     def call(*words):
         monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        code: str | int | None = 0
         try:
             cli.main()
-            code = 0
         except SystemExit as exit_:
             code = exit_.code
         said = capsys.readouterr()

@@ -14,6 +14,7 @@ from flangeye.batch.software import Software, _code_of, check_software, software
 from flangeye.batch.variants import split_values
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
 
 SOFTWARE = Software("1", ("toy 1.0",))
 
@@ -148,8 +149,13 @@ def test_files_that_the_recipe_names_count(sessions, tmp_path):
 
 
 def test_a_thousand_seeds_are_planned_from_one_reading_of_the_recipe(sessions, monkeypatch):
-    read, load = [], batch_plan.load_recipe
-    monkeypatch.setattr(batch_plan, "load_recipe", lambda *a: (read.append(1), load(*a))[1])
+    read = []
+
+    def noted(*given):
+        read.append(given)
+        return load_recipe(*given)
+
+    monkeypatch.setattr(batch_plan, "load_recipe", noted)
     found = sessions(grid=("steps.0.count=5,6",), repeat=1000)
     assert len(read) == 3 and len({s.key for s in found}) == 2000
     assert found[7].key == sessions(overrides=("seed=10", "steps.0.count=5"))[0].key

@@ -1,6 +1,8 @@
 """What a worker makes of one session."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,22 +11,31 @@ from flangeye.batch.plan import plan
 from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
 from flangeye.batch.work import STARTS, WORKER_DIED, Job, _registry, run_session
+from flangeye.plugin.registry import Registry
+
+
+class Worker:
+    """Runs the one session of a request here; keeps job, session and its folder."""
+
+    def __init__(self, recipe: Path, registry: Registry, out: Path) -> None:
+        self.recipe, self.registry, self.out = recipe, registry, out
+
+    def __call__(
+        self, report: bool = False, name: Path | None = None, **wanted: Any
+    ) -> SessionOutcome:
+        software = software_of(self.registry)
+        self.job = Job(self.out, report, software)
+        (self.out / STARTS).mkdir(parents=True, exist_ok=True)
+        request = Request(str(name or self.recipe), **wanted)
+        (self.session,) = plan(request, self.registry, software)
+        self.folder = self.out / self.session.id
+        return run_session(self.job, self.session)
 
 
 @pytest.fixture
 def work(recipe, registry, tmp_path):
-    """Run the one session of a request here; also leaves job and session on the function."""
     _registry.cache_clear()
-
-    def call(report=False, name=recipe, **wanted):
-        software = software_of(registry)
-        call.job = Job(tmp_path / "out", report, software)
-        (call.job.out / STARTS).mkdir(parents=True, exist_ok=True)
-        (call.session,) = plan(Request(str(name), **wanted), registry, software)
-        call.folder = call.job.out / call.session.id
-        return run_session(call.job, call.session)
-
-    yield call
+    yield Worker(recipe, registry, tmp_path / "out")
     _registry.cache_clear()
 
 
@@ -126,7 +137,7 @@ def test_a_worker_without_the_shared_folder(work):
     work()
     elsewhere = Job(work.job.out / "elsewhere", report=False, software=work.job.software)
     outcome = run_session(elsewhere, work.session)
-    assert outcome.status == "failed"
+    assert outcome.status == "failed" and outcome.reason
     assert "elsewhere: not there on worker " in outcome.reason
     assert outcome.reason.endswith("must be on a file system that all workers share")
 

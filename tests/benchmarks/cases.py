@@ -47,12 +47,19 @@ def recipe() -> Recipe:
     return load_recipe(find_recipe("ur5_phoxi-m_simulated"), load_registry())
 
 
+class Seen(NamedTuple):
+    """One full scan and its flange."""
+
+    capture: t.Capture
+    flange: t.FlangeCloud
+
+
 @cache
-def stages() -> dict[str, t.Capture | t.FlangeCloud]:
-    """Return one full scan and its flange."""
+def stages() -> Seen:
+    """Return what the benchmarks work on."""
     capture = next(iter(_acquire()))
-    flange = segment_flange(capture, **_asked(segment_flange))
-    return {"capture": capture, "flange": flange}
+    assert isinstance(capture, t.Capture)
+    return Seen(capture, segment_flange(capture, **_asked(segment_flange)))
 
 
 def _acquire() -> t.Captures:
@@ -76,7 +83,9 @@ def acquire() -> tuple[Work, Work]:
     captures = iter(_acquire())
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(o3d.t.geometry.TriangleMesh.create_sphere(0.3))
-    rays = scene.create_rays_pinhole(47, [0, 0, 0], [0, 0, -1], [0, 1, 0], 2064, 1544)
+    ends = ([0, 0, 0], [0, 0, -1], [0, 1, 0])
+    centre, eye, up = (o3d.core.Tensor.from_numpy(np.array(end, np.float32)) for end in ends)
+    rays = scene.create_rays_pinhole(47, centre, eye, up, 2064, 1544)
     return (
         Work(lambda: next(captures), "2064 x 1544 pixels", 2064 * 1544),
         Work(lambda: scene.cast_rays(rays, nthreads=1), "as many rays cast at a sphere by open3d"),
@@ -84,13 +93,13 @@ def acquire() -> tuple[Work, Work]:
 
 
 def _pass_over_depths() -> Work:
-    xyz = stages()["capture"].cloud.xyz
+    xyz = stages().capture.cloud.xyz
     return Work(lambda: np.isfinite(xyz[..., 2]), "one isfinite over its depths")
 
 
 def segment() -> tuple[Work, Work]:
     """The flange out of a full scan."""
-    capture = stages()["capture"]
+    capture = stages().capture
     return (
         Work(
             lambda: segment_flange(capture, **_asked(segment_flange)),
@@ -104,7 +113,7 @@ def segment_unorganised() -> tuple[Work, Work]:
     """The same without the scanner's image."""
     from dataclasses import replace
 
-    capture = stages()["capture"]
+    capture = stages().capture
     loose = replace(capture, cloud=t.PointCloud(t.CAMERA, capture.cloud.points()))
     return (
         Work(
@@ -117,7 +126,7 @@ def segment_unorganised() -> tuple[Work, Work]:
 
 def fit() -> tuple[Work, Work]:
     """fit.rim beside the paper's 10,000 draws as fit.ransac_circle does them."""
-    flange = stages()["flange"]
+    flange = stages().flange
     return (
         Work(lambda: fit_rim(flange, **_asked(fit_rim)), "flange", len(flange.cloud.xyz)),
         Work(lambda: fit_ransac_circle(flange, **_asked(fit_ransac_circle)), "fit.ransac_circle"),
@@ -126,7 +135,7 @@ def fit() -> tuple[Work, Work]:
 
 def ransac() -> tuple[Work, Work]:
     """The paper's fit beside a loop that draws one circle at a time, 1 % of its draws timed."""
-    flange = stages()["flange"]
+    flange = stages().flange
     points = flange.cloud.points().astype(float)
     rng = np.random.default_rng(0)
 
@@ -214,7 +223,7 @@ def robust_poses() -> tuple[Work, Work]:
 
 def read() -> tuple[Work, Work]:
     """A binary PCD of a full scan beside numpy's reading of its bytes."""
-    cloud = stages()["capture"].cloud
+    cloud = stages().capture.cloud
     path = Path(tempfile.mkdtemp()) / "scan.pcd"
     write_cloud(path, cloud)
     return (
@@ -227,7 +236,7 @@ def record() -> tuple[Work, Work]:
     """A full scan into the log beside compressing its bytes."""
     from flangeye.log.record import Recorder
 
-    capture, folder = stages()["capture"], Path(tempfile.mkdtemp())
+    capture, folder = stages().capture, Path(tempfile.mkdtemp())
     recorder = Recorder(folder / "run.mcap", {}, full_clouds=True)
 
     def compressed() -> None:
@@ -268,6 +277,7 @@ def finger() -> tuple[Work, Work]:
 
 def cycle() -> tuple[Work, Work]:
     """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
+    from flangeye_plugins.weld.belief import Belief
     from flangeye_plugins.weld.follower import Follower
     from flangeye_plugins.weld.motion import ToolPose, Touch
     from flangeye_plugins.weld.path import Path as Plan
@@ -275,7 +285,7 @@ def cycle() -> tuple[Work, Work]:
 
     x = np.linspace(0.0, 2.0, 2000)
     plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))
-    follower, clock = Follower(plan, 40e-3, Following()), itertools.count()
+    follower, clock = Follower(plan, Belief(40e-3), Following()), itertools.count()
 
     def turn() -> None:
         time = next(clock) * 2e-3

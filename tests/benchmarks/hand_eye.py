@@ -14,6 +14,7 @@ own, for OpenCV 5 has no hand-eye functions:
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def converged(count: int) -> int:
 
 def main(words: list[str]) -> None:
     if words[:1] == ["--write"]:
-        held = {}
+        held: dict[str, Any] = {}
         for case in CASES:
             made = sessions(case, 60)
             held[f"{case}/carried"], held[f"{case}/seen"] = map(

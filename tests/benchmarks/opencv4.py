@@ -2,9 +2,12 @@
 
 import json
 import sys
+from typing import Any
 
 import cv2
 import numpy as np
+
+CV: Any = cv2  # the stubs of OpenCV 5 do not know its functions of OpenCV 4
 
 AX_XB = {
     "tsai_lenz": "TSAI",
@@ -22,13 +25,13 @@ def solve(name, carried, seen):
     out = np.eye(4)
     if name in AX_XB:
         method = getattr(cv2, f"CALIB_HAND_EYE_{AX_XB[name]}")
-        out[:3, :3], shift = cv2.calibrateHandEye(*map(list, parts), method=method)
+        out[:3, :3], shift = CV.calibrateHandEye(*map(list, parts), method=method)
         out[:3, 3] = shift.ravel()
         return out
     # Their world is the target, their camera ours: world2cam, base2gripper.
     inverse = np.linalg.inv(carried)
     method = getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{AX_ZB[name]}")
-    _, _, rotation, shift = cv2.calibrateRobotWorldHandEye(
+    _, _, rotation, shift = CV.calibrateRobotWorldHandEye(
         list(seen[:, :3, :3]), list(seen[:, :3, 3]), list(inverse[:, :3, :3]),
         list(inverse[:, :3, 3]), method=method,
     )  # fmt: skip
@@ -38,7 +41,7 @@ def solve(name, carried, seen):
 
 def main(path):
     held = np.load(path)
-    figures = {"opencv": cv2.__version__}
+    figures: dict[str, Any] = {"opencv": cv2.__version__}
     for case in sorted({key.split("/")[0] for key in held}):
         carried, seen, truth = (held[f"{case}/{part}"] for part in ("carried", "seen", "truth"))
         figures[case] = {}

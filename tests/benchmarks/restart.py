@@ -28,11 +28,10 @@ OUTCOME = SessionOutcome(
 def main(count: int) -> None:
     registry = load_registry()
     with tempfile.TemporaryDirectory() as folder:
-        request = Request(
-            "ur5_phoxi-m_simulated", repeat=count, out=Path(folder) / "batch", report=False
-        )
+        out = Path(folder) / "batch"
+        request = Request("ur5_phoxi-m_simulated", repeat=count, out=out, report=False)
         for i, session in enumerate(plan(request, registry, software_of(registry))):
-            path = request.out / session.id
+            path = out / session.id
             path.mkdir(parents=True)
             mark_finished(path, session.key, replace(OUTCOME, holdout_rms_m=1e-4 + 1e-9 * i))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -43,8 +42,8 @@ def main(count: int) -> None:
             f"{count} finished sessions: {time.process_time() - cpu:.1f} s of the processor, "
             f"{time.perf_counter() - clock:.1f} s of the clock, "
             f"{(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024:.0f} MB more; "
-            f"summary.html {(request.out / 'summary.html').stat().st_size / 1e6:.1f} MB, "
-            f"sessions.parquet {(request.out / 'sessions.parquet').stat().st_size / 1e6:.1f} MB"
+            f"summary.html {(out / 'summary.html').stat().st_size / 1e6:.1f} MB, "
+            f"sessions.parquet {(out / 'sessions.parquet').stat().st_size / 1e6:.1f} MB"
         )
 
 

@@ -27,7 +27,7 @@ BEGIN, END = "<!-- begin python -m tests.benchmarks.side_by_side -->\n", "<!-- e
 
 def ours() -> object:
     """segment.flange and fit.rim on the whole scan."""
-    flange = segment_flange(stages()["capture"], **_asked(segment_flange))
+    flange = segment_flange(stages().capture, **_asked(segment_flange))
     return fit_rim(flange, **_asked(fit_rim))
 
 
@@ -35,7 +35,7 @@ def with_open3d() -> object:
     """Thin to two millimetres, remove outliers, take planes off, cluster, draw circles."""
     import open3d as o3d
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(stages()["capture"].cloud.points()))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(stages().capture.cloud.points()))
     cloud, _ = cloud.voxel_down_sample(2e-3).remove_statistical_outlier(20, 2.0)
     for _ in range(2):
         _, inliers = cloud.segment_plane(1e-3, 3, 1000)
@@ -48,7 +48,7 @@ def with_open3d() -> object:
 
 def authors_loop() -> object:
     """The circle alone, one draw at a time over the flange's points; a hundredth is timed."""
-    return draws(stages()["flange"].cloud.points().astype(float), DRAWS // 100)
+    return draws(stages().flange.cloud.points().astype(float), DRAWS // 100)
 
 
 def draws(points: np.ndarray, count: int) -> tuple[int, np.ndarray | None]:

@@ -16,9 +16,9 @@ def flangeye(monkeypatch, toy_registry, tmp_path, capsys):
 
     def call(*words):
         monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        code: str | int | None = 0
         try:
             cli.main()
-            code = 0
         except SystemExit as exit_:
             code = exit_.code
         for plugin in list(toy_registry.hooks.get_plugins()):

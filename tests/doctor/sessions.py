@@ -43,15 +43,15 @@ def clean(rng, n=20, kind="flange", carried="target", noise=0.1e-3, turn=0.3, bo
 def _carriers(rng, carried, poses, drawn):
     """Return what carries the camera and the target, and what else is reported of the arms."""
     eye = np.tile(np.eye(4), (len(poses), 1, 1))
-    others = np.array([drawn() for _ in poses]) if carried in ("arm-1", "arm-2", "both") else None
+    if carried in ("target", "camera"):
+        return (eye, poses, {}) if carried == "target" else (poses, eye, {})
+    others = np.array([drawn() for _ in poses])
     if carried == "both":
         base = rigid(rotation_exp(np.array([0.0, 0.1, 2.0])), np.array([1.2, 0.3, 0.0]))
         return poses, base @ others, {"seconds": others}
     if carried == "arm-1":
         return others, poses, {"links": others}
-    if carried == "arm-2":
-        return others, eye, {"links": others}
-    return (eye, poses, {}) if carried == "target" else (poses, eye, {})
+    return others, eye, {"links": others}
 
 
 def in_motion(rng, n=40, **changes):

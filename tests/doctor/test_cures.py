@@ -1,6 +1,7 @@
 """The line that a finding gives, put into the recipe, cures: the calibration is as if nothing was."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from tests.doctor.sessions import clean
 REGISTRY = load_registry()
 N = 24
 
-RECIPE = {
+RECIPE: dict[str, Any] = {
     "title": "Samples",
     "robot": {"model": "ur5e"},
     "configuration": {"name": "eye-on-base", "place": "unknown"},

@@ -3,6 +3,7 @@
 import time
 import tracemalloc
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ POINTS = np.array([[0.1, -0.2, 0.4], [np.nan, np.nan, np.nan], [1e-3, 2.5, 0.7]]
 
 def compress(data: bytes) -> bytes:
     """LZF, greedy, with a table of where each three bytes were last seen."""
-    out, literals, seen, at = bytearray(), bytearray(), {}, 0
+    out, literals, at = bytearray(), bytearray(), 0
+    seen: dict[bytes, int] = {}
 
     def flush():
         for i in range(0, len(literals), 32):
@@ -75,11 +77,12 @@ def with_extras(xyz: np.ndarray, extras: bool) -> np.ndarray:
 
 
 def pcd(record: np.ndarray, encoding: str, shape=None) -> bytes:
-    kinds = [record.dtype[name] for name in record.dtype.names]
+    names = record.dtype.names or ()
+    kinds = [record.dtype[name] for name in names]
     width, height = (len(record), 1) if shape is None else (shape[1], shape[0])
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
-        f"FIELDS {' '.join(record.dtype.names)}\nSIZE {' '.join(str(k.itemsize) for k in kinds)}\n"
+        f"FIELDS {' '.join(names)}\nSIZE {' '.join(str(k.itemsize) for k in kinds)}\n"
         f"TYPE {' '.join(k.kind.upper() for k in kinds)}\nCOUNT {' '.join('1' for _ in kinds)}\n"
         f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(record)}\n"
         f"DATA {encoding}\n"
@@ -88,7 +91,7 @@ def pcd(record: np.ndarray, encoding: str, shape=None) -> bytes:
         return header + text_of(record)
     if encoding == "binary":
         return header + record.tobytes()
-    columns = b"".join(record[name].tobytes() for name in record.dtype.names)
+    columns = b"".join(record[name].tobytes() for name in names)
     packed = compress(columns)
     sizes = len(packed).to_bytes(4, "little") + len(columns).to_bytes(4, "little")
     return header + sizes + packed
@@ -96,7 +99,7 @@ def pcd(record: np.ndarray, encoding: str, shape=None) -> bytes:
 
 def ply(record: np.ndarray, encoding: str, others: bool) -> bytes:
     names = {"f4": "float", "f8": "double", "u2": "ushort", "u4": "uint"}
-    kinds = [(name, names[record.dtype[name].str[1:]]) for name in record.dtype.names]
+    kinds = [(name, names[record.dtype[name].str[1:]]) for name in record.dtype.names or ()]
     before = "element marker 2\nproperty short a\nproperty double b\n" if others else ""
     after = "element face 1\nproperty list uchar int vertex_index\n" if others else ""
     header = (
@@ -108,7 +111,7 @@ def ply(record: np.ndarray, encoding: str, others: bool) -> bytes:
     if encoding == "ascii":
         body = text_of(record)
         return header + (b"1 2\n3 4\n" + body + b"3 0 1 2\n" if others else body)
-    order = "<" if "little" in encoding else ">"
+    order: Literal["<", ">"] = "<" if "little" in encoding else ">"
     marker = np.zeros(2, [("a", f"{order}i2"), ("b", f"{order}f8")]).tobytes()
     body = record.astype(record.dtype.newbyteorder(order)).tobytes()
     return header + (marker + body + b"\x03\x00" if others else body)
@@ -412,7 +415,7 @@ def test_published_clouds_are_read_as_open3d_reads_them(ancorasir):
         "calib_toolbox/data/2019-06-14-sample/01_tool_valid.pcd",
     ):
         ours = read_cloud(ancorasir / name).points()
-        theirs = io.read_point_cloud(str(ancorasir / name), remove_nan_points=True)
+        theirs = io.read_point_cloud(ancorasir / name, remove_nan_points=True)
         np.testing.assert_allclose(ours, np.asarray(theirs.points), rtol=1e-6)
 
 

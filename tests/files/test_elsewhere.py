@@ -3,6 +3,8 @@
 import json
 import shutil
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -64,9 +66,17 @@ def archive(tmp_path):
     return folder
 
 
+@contextmanager
+def folder_at(where: str) -> Iterator[Path]:
+    """The archive's path, which only an archive that nobody named has not."""
+    with archive_at(where) as root:
+        assert root is not None
+        yield root
+
+
 def test_scans_are_fetched_one_at_a_time_and_let_go(bucket, archive):
     bucket.put(f"{archive}/", "cell/monday/", recursive=True)
-    with archive_at("s3://cell/monday") as root:
+    with folder_at("s3://cell/monday") as root:
         assert (root / "poses.csv").read_text() == "cloud\n"
         for i in range(2):
             scan = root / "scans" / f"{i}.pcd"
@@ -80,7 +90,7 @@ def test_scans_are_fetched_one_at_a_time_and_let_go(bucket, archive):
 def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(bucket, archive):
     shutil.copy(archive / "scans" / "0.pcd", archive / "scans" / "2.pcd")
     bucket.put(f"{archive}/", "cell/monday/", recursive=True)
-    with archive_at("s3://cell/monday") as root:
+    with folder_at("s3://cell/monday") as root:
         digests = [digest_elsewhere(root / "scans" / f"{i}.pcd") for i in range(3)]
     assert digests[0] == digests[2] != digests[1]
     before = print_of("s3://cell/monday")
@@ -93,7 +103,7 @@ def test_an_archive_in_a_zip_file(archive, tmp_path):
     with zipfile.ZipFile(tmp_path / "monday.zip", "w") as packed:
         for file in archive.rglob("*.*"):
             packed.write(file, file.relative_to(archive))
-    with archive_at(f"zip://::{tmp_path}/monday.zip") as root:
+    with folder_at(f"zip://::{tmp_path}/monday.zip") as root:
         assert read_cloud(root / "scans" / "1.pcd").xyz[0, 0, 0] == 1.5
 
 
@@ -102,6 +112,7 @@ def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket):
         pytest.raises(StageError, match="s3://cell/out/run.mcap"),
         results_at("s3://cell/out") as out,
     ):
+        assert out is not None
         out.mkdir()
         (out / "run.mcap").write_bytes(b"log")
         raise StageError(f"{out / 'run.mcap'}: torn")
@@ -150,7 +161,7 @@ def test_a_name_that_leads_out_is_refused(tmp_path):
 
 def test_a_path_is_a_path(tmp_path):
     assert not is_url("C:\\data") and not is_url("a/b") and is_url("s3://a")
-    with archive_at(str(tmp_path)) as path, at_hand(path):
+    with folder_at(str(tmp_path)) as path, at_hand(path):
         assert path == tmp_path
     with archive_at(None) as nothing, results_at(None) as none:
         assert nothing is None and none is None

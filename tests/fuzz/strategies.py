@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 import yaml
@@ -51,7 +52,7 @@ def _ply(count: int, faces: int, kind: str, body: bytes) -> bytes:
     return f"{head}{more}end_header\n".encode() + body
 
 
-def _table(rows: list[list[object]]) -> bytes:
+def _table(rows: Sequence[Sequence[object]]) -> bytes:
     lines = ["cloud,x_m,y_m,z_m,qx,qy,qz,qw", *(",".join(map(str, row)) for row in rows)]
     return "\n".join(lines).encode("utf-8", "replace")
 

@@ -192,7 +192,7 @@ def _rewritten(folder):
     topics = ["/source", "/capture", "/capture/cloud", "/step/1.segment.toy", "/step/2.fit.toy",
               "/step/3.solve.toy", "/step/4.verify.toy", "/capture/finished", "/log", "/rejection",
               "result.json", "recipe.yaml", "recipe.resolved.yaml"]  # fmt: skip
-    held = {}
+    held: dict[str, bytes] = {}
     rewritten(sound_log(folder / "sound"), folder / "copy.mcap",
               lambda name, data: (name, held.setdefault(name, data)))  # fmt: skip
     return [t.encode() + b"\n" + held[t] for t in topics if t in held]

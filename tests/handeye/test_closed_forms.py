@@ -196,7 +196,7 @@ def test_axb_ycz_converges_from_a_random_start():
         first = [o.base_T_flange.rotation for o in made.observations]
         seen = [o.feature.camera_T_target.rotation for o in made.observations]
         second = [o.poses["flange2"].rotation for o in made.observations]
-        given = tuple(np.array(m) for m in (first, seen, second))
+        given = np.array(first), np.array(seen), np.array(second)
         (x, _, _), _ = alternate(given, random_rotations(rng))
         true = made.truth["flange_T_camera"][:3, :3]
         good += np.linalg.norm(rotation_log(x @ true.T)) < np.radians(1.0)

@@ -208,7 +208,7 @@ def test_a_place_is_written_as_a_pose(registry):
         "{name: eye-in-hand, place: {position: [0 mm, 0 mm, 12 mm], rpy: [0 deg, 0 deg, 90 deg]}}"
     )
     place = recipe(registry, written).context[Configuration].place
-    assert np.allclose(place, [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0.012], [0, 0, 0, 1]])
+    assert np.allclose(place, [[0.0, -1, 0, 0], [1.0, 0, 0, 0], [0, 0, 1, 0.012], [0.0, 0, 0, 1]])
 
 
 def observation(*others, joints=None):
@@ -224,7 +224,8 @@ def test_the_loop_closes_for_two_arms():
     )
     configuration = Configuration("two-arms", FLANGE, FLANGE2, None)
     names = dict(zip(configuration.unknowns, (x, y, z), strict=True))
-    transforms = {n: Transform(*n.split("_T_"), m) for n, m in names.items()}
+    ends = {name: name.split("_T_") for name in names}
+    transforms = {n: Transform(ends[n][0], ends[n][1], m) for n, m in names.items()}
     first = observation()
     target = first.base_T_flange.matrix @ x @ first.feature.camera_T_target.matrix
     second = Transform(BASE2, FLANGE2, np.linalg.inv(y) @ target @ np.linalg.inv(z))

@@ -276,7 +276,7 @@ def test_a_size_that_the_motion_does_not_tell_is_refused():
 
 def test_a_camera_that_wanders_is_no_noise():
     """What lasts for twenty poses widens the region, and none of it counts as many."""
-    ours, without = [], []
+    ours, without = list[float](), list[float]()
     for seed in range(4):
         rng = np.random.default_rng(seed)
         made = session(MARKER, rng, n=60, tilt=0.4)

@@ -1,6 +1,7 @@
 """What other viewers are given: circles as points, the flanges in base, and a layout."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def messages(toy_registry, tmp_path):
     toy_registry.hooks.register(recorder)
     Runner(parse_recipe(TOY_RECIPE, "toy", toy_registry), toy_registry, t.ArchivePath()).run()
     toy_registry.hooks.unregister(recorder)
-    found = {}
+    found: dict[str, list[Any]] = {}
     with (tmp_path / "run.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         for _, channel, raw, message in reader.iter_decoded_messages(topics=list(CLOUDS)):

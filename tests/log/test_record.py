@@ -52,7 +52,7 @@ def test_what_is_written_is_read(tmp_path):
     assert [(r.id, r.stage, r.reason) for r in log.rejections] == [("b", "fit.toy", "too dark")]
     (capture,) = log.captures()
     assert np.array_equal(capture.cloud.xyz, CAPTURE.cloud.xyz)
-    assert np.array_equal(capture.joints, CAPTURE.joints)
+    assert np.array_equal(np.asarray(capture.joints), np.asarray(CAPTURE.joints))
     (entry,) = log.entries
     assert (entry.step, entry.stage, entry.kind, entry.capture) == (
         "2.fit.toy", "fit.toy", "fit", "a",

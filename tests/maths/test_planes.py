@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.planes import SIGMA_OF_MAD, Plane, fit_plane, robust_plane, robust_planes
+from flangeye.maths.planes import Plane, fit_plane, robust_plane, robust_planes
+from flangeye.maths.statistics import SIGMA_OF_MAD
 
 
 def patch(rng, count, noise=1e-4):

@@ -45,7 +45,7 @@ def farthest(arm, of, start):
 
     bounds = list(zip(arm.lower, arm.upper, strict=True))
     starts = np.random.default_rng(0).uniform(-1.5, 1.5, (8, arm.n))
-    found = [minimize(near, np.clip(s, *zip(*bounds, strict=True)), bounds=bounds) for s in starts]
+    found = [minimize(near, np.clip(s, arm.lower, arm.upper), bounds=bounds) for s in starts]
     return -1e3 * min(f.fun for f in found)
 
 

@@ -3,11 +3,12 @@
 import os
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from flangeye.devices import DeviceError
+from flangeye.devices import DeviceError, RobotState
 from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
 from flangeye.motion.arm import watched
@@ -30,7 +31,7 @@ def way_to(arm, **turns):
 
 
 def test_it_drives_there_and_has_settled():
-    robot, told = StandIn(), []
+    robot, told = StandIn(), list[RobotState]()
     with watched(driver_of(robot), MODEL, LIMITS, told.append) as arm:
         goal = turned(arm.state.joints, j1=0.3)
         arm.go(way_to(arm, j1=0.3))
@@ -104,19 +105,25 @@ def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
     assert robot.commands().count("move") == 1  # a safety fault is not outlived
 
 
-def test_an_arm_that_does_not_set_off_is_noticed():
+def test_an_arm_that_does_not_set_off_is_noticed(monkeypatch):
     robot = StandIn()
-    robot.arm.step = lambda: None
+    monkeypatch.setattr(robot.arm, "step", lambda: None)
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
         with pytest.raises(DeviceError, match="has not set off 1 s after it was told to"):
             arm.wait()
 
 
+class GoesHalfWay(StandIn):
+    """Takes an order for half of the way."""
+
+    def move_joints(self, joints, speed, acceleration):
+        here = self.arm.stance.joints
+        super().move_joints(here + 0.5 * (joints - here), speed, acceleration)
+
+
 def test_an_arm_that_never_arrives_is_noticed():
-    robot = StandIn()
-    move = StandIn.move_joints
-    robot.move_joints = lambda q, v, a: move(robot, robot.arm.stance.joints + 0.5 * (q - robot.arm.stance.joints), v, a)  # fmt: skip
+    robot = GoesHalfWay()
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.3))
         with pytest.raises(DeviceError, match="the arm is not there after"):
@@ -191,12 +198,12 @@ class Wire:
 
 
 @pytest.mark.parametrize("key", ["alarm", "keyboard"])
-def test_the_operator_stops_it_within_one_cycle(key):
+def test_the_operator_stops_it_within_one_cycle(monkeypatch, key):
     reading, writing = os.pipe()
     robot = StandIn()
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
-    wire = Wire(robot, [(0, ("go", way)), (2000, ("close", None))])
+    wire: Any = Wire(robot, [(0, ("go", way)), (2000, ("close", None))])
     guard = Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS, **{key: reading}))
     wait = robot.wait_cycle
 
@@ -205,7 +212,7 @@ def test_the_operator_stops_it_within_one_cycle(key):
         if robot.cycles == 300:
             os.write(writing, b"x " if key == "keyboard" else b"\x02")
 
-    robot.wait_cycle = pressed
+    monkeypatch.setattr(robot, "wait_cycle", pressed)
     guard.run()
     stopped = [cycle for name, cycle in robot.asked if name == "stop"]
     assert stopped[0] == 300
@@ -236,7 +243,7 @@ def test_a_program_that_dies_stops_the_arm():
     robot = StandIn()
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
-    wire = Wire(robot, [(0, ("go", way)), (200, None)])
+    wire: Any = Wire(robot, [(0, ("go", way)), (200, None)])
     guard_module.guard(wire, Charge(lambda: robot, MODEL, LIMITS))
     assert robot.closed
     assert ("stop", 200) in robot.asked

@@ -1,6 +1,7 @@
 """From the tables of batches to CSV files and pictures, on batches made up here."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,7 +140,9 @@ def test_heldout_compares_methods_on_the_same_poses(batch, tmp_path):
     ]
     errors = {"0": 3e-4, "1": 4e-4, "2": 5e-4, "3": 8e-2}
     for method in heldout.HELD_OUT_METHODS:
-        sessions = [({"archive": f"/a/{name}"}, heldout.STAGE, {}) for name in heldout.RECORDINGS]
+        sessions: list[Any] = [
+            ({"archive": f"/a/{name}"}, heldout.STAGE, {}) for name in heldout.RECORDINGS
+        ]
         root = batch(f"heldout_{method}", *sessions, errors=errors, extra={"observations": poses})
     heldout.heldout(root, tmp_path / "published", tmp_path)
     rows = read_csv(tmp_path / "heldout.csv")

@@ -2,11 +2,12 @@ import importlib
 import subprocess
 import sys
 import types as python_types
+from collections.abc import Callable
 from typing import Protocol
 
 import pytest
 
-from flangeye import stage
+from flangeye import hookimpl, stage
 from flangeye import types as t
 from flangeye.plugin.registry import DuplicatePluginError, PluginNotFoundError, load_registry
 from flangeye.plugin.stage import PARTS, part
@@ -15,7 +16,7 @@ from tests import toy
 
 def module_offering(*stages):
     module = python_types.ModuleType("vendor")
-    module.flangeye_stages = toy.hookimpl(lambda: stages)
+    vars(module)["flangeye_stages"] = hookimpl(lambda: stages)
     return module
 
 
@@ -40,7 +41,7 @@ def test_a_broken_plugin_is_named_only_when_something_is_missing(toy_registry):
 
 def test_a_misspelt_hook_is_a_broken_plugin(monkeypatch, toy_registry):
     module = python_types.ModuleType("vendor")
-    module.flangeye_stagez = toy.hookimpl(lambda: ())
+    vars(module)["flangeye_stagez"] = hookimpl(lambda: ())
     with pytest.raises(Exception, match="unknown hook 'flangeye_stagez'"):
         toy_registry.register("acme", module)
 
@@ -52,15 +53,18 @@ def test_the_built_ins_come_through_the_same_door():
 
 
 def test_a_signature_is_checked_when_it_is_declared():
-    def no_docstring(capture: t.Capture) -> t.FlangeCloud: ...
+    def no_docstring(capture: t.Capture) -> t.FlangeCloud:
+        raise NotImplementedError
 
     def wrong_result(capture: t.Capture) -> t.HandEye:
         """Give the wrong thing."""
+        raise NotImplementedError
 
     def wrong_input(cloud: t.FlangeCloud) -> t.FlangeCloud:
         """Take the wrong thing."""
+        raise NotImplementedError
 
-    for name, function, message in [
+    refused: list[tuple[str, Callable[..., object], str]] = [
         ("segment.a", no_docstring, "'segment.a' has no docstring; its first line is what people "
          "read"),
         ("segment.b", wrong_result, "stage 'segment.b' returns HandEye, but a 'segment' stage "
@@ -68,7 +72,8 @@ def test_a_signature_is_checked_when_it_is_declared():
         ("segment.c", wrong_input, "stage 'segment.c': a 'segment' stage takes a Capture"),
         ("paint.d", wrong_result, "stage 'paint.d': no kind 'paint'; kinds: acquire, segment, fit, "
          "solve, refine, verify, export, scan, seam, weld"),
-    ]:  # fmt: skip
+    ]  # fmt: skip
+    for name, function, message in refused:
         with pytest.raises(TypeError) as error:
             stage(name)(function)
         assert str(error.value) == message
@@ -124,7 +129,8 @@ def test_a_former_name_still_works_and_is_said():
 
 def offering(**places):
     module = python_types.ModuleType("acme")
-    module.flangeye_stages = toy.hookimpl(lambda: {f"solve.{n}": at for n, at in places.items()})
+    named = {f"solve.{n}": at for n, at in places.items()}
+    vars(module)["flangeye_stages"] = hookimpl(lambda: named)
     return module
 
 

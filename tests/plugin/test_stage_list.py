@@ -5,6 +5,7 @@ import sys
 from importlib.metadata import EntryPoint
 
 import pytest
+from platformdirs import user_cache_path
 
 from flangeye.plugin import registry
 from flangeye.plugin import stage_list as listing
@@ -79,9 +80,7 @@ def test_a_plugin_that_could_not_be_loaded_is_tried_again(installed):
 def test_a_damaged_memory_is_made_anew(installed, content):
     _, loads, _ = installed
     text = listing.list_stages()
-    listing.user_cache_path("flangeye").joinpath("stages.json").write_bytes(
-        content.encode("latin-1")
-    )
+    user_cache_path("flangeye").joinpath("stages.json").write_bytes(content.encode("latin-1"))
     assert listing.list_stages() == text
     assert len(loads) == 2
     listing.list_stages()
@@ -90,7 +89,7 @@ def test_a_damaged_memory_is_made_anew(installed, content):
 
 def test_where_nothing_can_be_written_the_list_is_made_each_time(installed):
     _, loads, _ = installed
-    listing.user_cache_path("flangeye").write_text("a file where the folder should be")
+    user_cache_path("flangeye").write_text("a file where the folder should be")
     assert "fit.toy" in listing.list_stages()
     assert "fit.toy" in listing.list_stages()
     assert len(loads) == 2

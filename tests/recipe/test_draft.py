@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -201,7 +202,7 @@ def sample(folder):
 
 
 def arrays(folder):
-    piles = {name: np.tile(np.eye(4), (5, 1, 1)) for name in ("robot", "seen")}
+    piles: dict[str, Any] = {name: np.tile(np.eye(4), (5, 1, 1)) for name in ("robot", "seen")}
     np.savez(folder / "poses.npz", **piles)
 
 

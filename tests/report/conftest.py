@@ -26,7 +26,7 @@ RIM, BORE = 0.0305, 0.0164
 TRUTH = t.Transform(
     t.BASE, t.CAMERA, rigid(rotation_from_rpy(np.pi - 0.2, 0.1, 0.5), np.array([0.5, -0.1, 1.1]))
 )
-WORKSPACE = t.Box([0.45, 0.0, 0.4], [0.3, 0.3, 0.2])
+WORKSPACE = t.Box(np.array([0.45, 0.0, 0.4]), np.array([0.3, 0.3, 0.2]))
 RECIPE = """title: A test
 workspace: {centre: [450 mm, 0 mm, 400 mm], size: [300 mm, 300 mm, 200 mm]}
 seed: 7
@@ -101,7 +101,7 @@ def _captures(script: Script, recorder: Recorder) -> tuple[list[t.Observation], 
 def _log_observation(
     script: Script, recorder: Recorder, found: t.Observation, cloud: t.PointCloud
 ) -> None:
-    given = {"capture": found.id, "seconds": 0.02}
+    given: dict[str, Any] = {"capture": found.id, "seconds": 0.02}
     if not script.clouds:
         recorder.flangeye_stage_finished(step="0.acquire.archive", value=found, **given)
         return

@@ -1,6 +1,7 @@
 """The page of configurations other than the default: drawn in frames that fit them."""
 
 import base64
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def logged(path, carrier=t.FLANGE, solved=True, hidden=()):
         seen = t.Transform(t.CAMERA, t.TARGET, invert(pose @ EYE) @ TARGET)
         feature = t.PoseFeature(seen, 1e-8 * np.eye(6), {}, CORNERS)
         recorder.flangeye_captured(step="0.acquire.x", capture=capture, seconds=0.1)
-        given = {"capture": f"{i}", "seconds": 0.1}
+        given: dict[str, Any] = {"capture": f"{i}", "seconds": 0.1}
         if i in hidden:
             why = "4 corners found, at least 6 are needed"
             recorder.flangeye_capture_rejected(t.Rejection(f"{i}", "fit.x", why))

@@ -2,6 +2,7 @@
 
 import io
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from flangeye import types as t
 from flangeye.cli.terminal import print_result
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
+from flangeye.report.facts import Facts
 from flangeye.report.page import render
 from flangeye.report.seam import seam_view
 from flangeye.result import seam_result
@@ -27,6 +29,7 @@ SEAM = t.Seam(
     figures={"seen": 0.97},
     cloud=t.PointCloud(t.BASE, np.float32(LINE + [0.0, 0.01, 0.01])),
 )
+assert SEAM.cloud is not None
 SCAN = t.WorkpieceScan(SEAM.cloud, "a scan", (), {"groove": LINE})
 TUBE = 1e-4 * np.sqrt(5.9915)
 
@@ -42,7 +45,7 @@ def log(tmp_path):
 
 
 def test_the_report_shows_cloud_seam_tube_and_truth(log):
-    view = seam_view(SimpleNamespace(log=log, result=SimpleNamespace(seam=None)))
+    view = seam_view(Facts(log, cast(r.Result, SimpleNamespace(seam=None)), ""))
     assert [trace["name"] for trace in view.space["data"]] == [
         "scan", "tube, 95 % × 25", "planned seam", "towards the torch", "start", "true seam",
     ]  # fmt: skip
@@ -73,9 +76,9 @@ def test_the_terminal_tells_the_seam():
         provenance=r.Provenance(versions={}, plugins={}, recipe="", recipe_hash="", input_hash="",
                                 seed=0, notes=[]),
     )  # fmt: skip
-    console = Console(file=io.StringIO(), width=120)
-    print_result(console, result)
-    assert console.file.getvalue().splitlines()[3:] == [
+    out = io.StringIO()
+    print_result(Console(file=out, width=120), result)
+    assert out.getvalue().splitlines()[3:] == [
         "seam: CAD plate on a scan",
         "  from (500.0, 0.1, 270.0) to (700.0, 0.1, 270.0) mm in base, 200.000 mm along",
         "  tube               95 % within 0.245 mm of the plan",

@@ -2,6 +2,8 @@
 
 import base64
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ import pytest
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
+from flangeye.report.facts import Facts
 from flangeye.report.page import render
 from flangeye.report.weld import off_line, weld_drawing
+from flangeye.result import Result
 
 TIME = np.linspace(0.0, 40.0, 401)
 LINE = np.column_stack([np.linspace(0.5, 0.7, 201), np.zeros(201), np.full(201, 0.27)])
@@ -36,12 +40,9 @@ SCAN = t.WorkpieceScan(
 )
 
 
-class Facts:
-    """Of a log alone."""
-
-    def __init__(self, log):
-        self.log = log
-        self.result = type("Result", (), {"weld": None})
+def facts(log):
+    """Facts of a log alone."""
+    return Facts(log, cast(Result, SimpleNamespace(weld=None)), "")
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def traces(figure):
 
 
 def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
-    drawn = traces(weld_drawing(Facts(logged(WELD))).paths)
+    drawn = traces(weld_drawing(facts(logged(WELD))).paths)
     assert list(drawn) == ["planned", "felt (refined)", "robot", "tip", "torch"]
     x, y = drawn["torch"]
     np.testing.assert_allclose([x[0], x[-1]], [-40.0, 160.0], atol=1e-3)
@@ -77,17 +78,17 @@ def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
 
 
 def test_the_deviation_is_the_torch_s_beside_the_seam(logged):
-    drawn = traces(weld_drawing(Facts(logged(WELD))).deviation)
+    drawn = traces(weld_drawing(facts(logged(WELD))).deviation)
     x, y = drawn["from the seam as felt"]
     assert x.min() >= 0.0
     np.testing.assert_allclose(y, 0.2, atol=1e-3)
     np.testing.assert_allclose(drawn["from the true seam"][1], 0.1, atol=1e-3)
-    alone = traces(weld_drawing(Facts(logged(WELD, scan=None))).deviation)
+    alone = traces(weld_drawing(facts(logged(WELD, scan=None))).deviation)
     assert list(alone) == ["from the seam as felt"]
 
 
 def test_the_phases_are_bands_over_the_deflection(logged):
-    layout = weld_drawing(Facts(logged(WELD))).contact["layout"]
+    layout = weld_drawing(facts(logged(WELD))).contact["layout"]
     assert [note["text"] for note in layout["annotations"]] == ["seeking", "bridging", "ending"]
     seeking, bridging, ending = [(band["x0"], band["x1"]) for band in layout["shapes"]]
     assert seeking == pytest.approx((0.0, 5.0))
@@ -96,7 +97,7 @@ def test_the_phases_are_bands_over_the_deflection(logged):
 
 
 def test_speeds_and_the_loop_are_told_in_people_s_units(logged):
-    drawing = weld_drawing(Facts(logged(WELD)))
+    drawing = weld_drawing(facts(logged(WELD)))
     speeds = traces(drawing.speeds)
     np.testing.assert_allclose(speeds["robot [mm/s]"][1], 5.0, rtol=1e-5)
     np.testing.assert_allclose(speeds["turning [deg/s]"][1], 5.73, rtol=1e-3)
@@ -114,13 +115,13 @@ def test_the_page_says_why_a_weld_was_stopped(logged):
 
 def test_a_weld_that_felt_nothing_is_still_drawn(logged):
     nothing = replace(WELD, refined=np.zeros((0, 3)), mode="vision", loop={})
-    drawing = weld_drawing(Facts(logged(nothing)))
+    drawing = weld_drawing(facts(logged(nothing)))
     assert list(traces(drawing.deviation)) == ["from the true seam"]
     assert [name for name, _ in drawing.loop] == ["images read", "with the tag"]
 
 
 def test_a_run_without_a_weld(logged):
-    assert weld_drawing(Facts(logged(None))) is None
+    assert weld_drawing(facts(logged(None))) is None
 
 
 def test_a_line_goes_on_beyond_its_ends():

@@ -38,9 +38,7 @@ def estimate(shift=0.0, unobservable=()):
 
 
 def calibration(**changes):
-    circle = CircleFeature(
-        np.array([0, 0, 0.7]), None, {}, SIGMA**2 * np.eye(3), None, 1.0, np.zeros(3)
-    )
+    circle = CircleFeature(np.array([0, 0, 0.7]), None, {}, SIGMA**2 * np.eye(3), None, 1.0)
     flange = Transform("base", "flange", np.eye(4))
     pair = Pair(Observation("0", circle, by_frame(flange)), np.zeros(3))
     return HandEye(estimate(), (pair,), "solve.robust", **changes)
@@ -67,9 +65,9 @@ def document(calibration, figures=None):
 
 
 def told(result):
-    console = Console(file=io.StringIO(), width=200)
-    print_result(console, result)
-    return console.file.getvalue()
+    out = io.StringIO()
+    print_result(Console(file=out, width=200), result)
+    return out.getvalue()
 
 
 FIGURES = {
@@ -89,7 +87,7 @@ def test_the_pose_is_that_of_the_arm_as_reported():
 
 
 def test_where_on_the_flange_the_circle_is_belongs_to_both():
-    tool = ArmCorrection([1e-3, 0, 0])
+    tool = ArmCorrection(np.array([1e-3, 0, 0]))
     assert calibration(correction=tool).as_corrected() is None
     assert calibration(correction=tool).as_reported().correction.tool_offset[0] == 1e-3
 

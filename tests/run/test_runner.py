@@ -22,7 +22,7 @@ from tests.conftest import TOY_RECIPE, replaced
 @pytest.fixture
 def execute(toy_registry, tmp_path):
     """Run recipe text with a log; return the result and the log."""
-    runs = []
+    runs: list[Recorder] = []
 
     def run(text, at=None, log=None):
         recipe = parse_recipe(text, "toy", toy_registry)
@@ -76,7 +76,7 @@ def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(execute):
 
 
 def test_captures_are_not_kept(execute):
-    alive, most = weakref.WeakSet(), []
+    alive, most = weakref.WeakSet[t.Capture](), list[int]()
     plain = toy.segment.function
 
     def watched(capture):
@@ -112,7 +112,9 @@ def test_views_that_an_acquire_step_adds_reach_the_verification(execute, monkeyp
     monkeypatch.setitem(toy.acquire.needs, "views", t.Views | None)
 
     def with_a_view(seed, views, params):
-        flange = t.FlangeCloud(t.PointCloud(t.CAMERA, toy.CROSS), np.zeros(3), [0, 0, -1.0])
+        flange = t.FlangeCloud(
+            t.PointCloud(t.CAMERA, toy.CROSS), np.zeros(3), np.array([0, 0, -1.0])
+        )
         pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
         views.append(t.VerificationView("published", flange, pose))
         return plain(seed, params)

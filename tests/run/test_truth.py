@@ -53,7 +53,7 @@ def truths_in(arguments):
 @pytest.fixture
 def spied(monkeypatch):
     """Walk the arguments of every step when it is called, and when it has been."""
-    found, called = [], []
+    found, called = list[tuple[str, object]](), list[str]()
     arguments_of = Runner._arguments
 
     def spy(self, step, given):

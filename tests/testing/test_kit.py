@@ -9,9 +9,11 @@ import pytest
 
 from flangeye import StageError
 from flangeye import types as t
+from flangeye.devices import Scan, SensorFrame
 from flangeye.files.recording import Recording
 from flangeye.testing import KITS
 from flangeye.types import CAMERA, FLANGE, PointCloud
+from flangeye_emulators.robot.simulated import SimulatedRobot
 from flangeye_plugins.cost.costs import cost_translation
 from flangeye_plugins.fit.rim import fit_rim
 from tests.testing import bad
@@ -57,7 +59,7 @@ def answering(state):
     """A state() that changes the sample of the arm in simulated time."""
 
     def method(self):
-        return state(self, bad.SimulatedRobot.state(self))
+        return state(self, SimulatedRobot.state(self))
 
     return method
 
@@ -74,7 +76,7 @@ def zeros_cloud(self):
 
 def at_time(started, ended):
     def expose(self):
-        return lambda: bad.Scan(self.cloud(), started(), ended())
+        return lambda: Scan(self.cloud(), started(), ended())
 
     return expose
 
@@ -626,7 +628,7 @@ CASES = [
         "sensor",
         "test_its_camera_is_calibrated",
         bad.sensor(
-            frame=lambda self: bad.SensorFrame(t.Image(np.zeros((8, 8), np.uint8), np.eye(3)), 1)
+            frame=lambda self: SensorFrame(t.Image(np.zeros((8, 8), np.uint8), np.eye(3)), 1)
         ),
         "not in this image's pixels",
         {},

@@ -221,7 +221,7 @@ def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
     desk.page_gone("another page")
     assert not desk.run.stopped
     desk.page_gone("page")
-    assert desk.run.stopped == "the page was closed"
+    assert [desk.run.stopped] == ["the page was closed"]
     deadline = time.monotonic() + 30
     while desk.run.code is None and time.monotonic() < deadline:
         time.sleep(0.05)

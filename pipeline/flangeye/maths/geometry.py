@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flangeye.types import Floats
 
@@ -12,18 +13,18 @@ NEAR_HALF_A_TURN = -0.9
 """Cosine below which a rotation's axis is read off its quaternion."""
 
 
-def hat(v: Floats) -> Floats:
+def hat(vectors: ArrayLike) -> Floats:
     """Return the (..., 3, 3) cross-product matrices of (..., 3) vectors: ``hat(a) @ b = a x b``."""
-    v = np.asarray(v, dtype=np.float64)
+    v = np.asarray(vectors, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
 
 
-def rotation_exp(phi: Floats) -> Floats:
+def rotation_exp(vectors: ArrayLike) -> Floats:
     """Return the rotations of rotation vectors, (..., 3) [rad] -> (..., 3, 3) (Rodrigues)."""
-    phi = np.asarray(phi, dtype=np.float64)
+    phi = np.asarray(vectors, dtype=np.float64)
     if phi.ndim == 1:  # an arm's pose, hundreds of times a second: floats are five times faster
         return _rotation_exp_of_one(*phi.tolist())
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
@@ -141,7 +142,7 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
     return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
 
 
-def rigid(rotation: Floats, translation: Floats) -> Floats:
+def rigid(rotation: ArrayLike, translation: ArrayLike) -> Floats:
     """Return the (4, 4) matrix of a (3, 3) rotation and a (3,) translation [m]."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation, translation

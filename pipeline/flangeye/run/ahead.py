@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -55,7 +55,7 @@ def cores() -> int:
 
 def worked_ahead(
     items: Iterator[T], work: Callable[[T], R], workers: int
-) -> Iterator[tuple[T, Callable[[], R]]]:
+) -> Generator[tuple[T, Callable[[], R]]]:
     """Yield each item in order with what gives its result, or raises what the work raised.
 
     Items are pulled in this thread and worked on in others, as many as there are workers and one

@@ -45,4 +45,29 @@ KITS = {
 }
 """Kind of stage or part -> its class."""
 
-__all__ = ["KITS", "Conformance", *(kit.__name__ for kit in KITS.values())]
+# Spelt out: a type checker takes nothing else for public.
+__all__ = [
+    "KITS",
+    "AcquireConformance",
+    "CheckConformance",
+    "Conformance",
+    "CostConformance",
+    "ErrorConformance",
+    "ExportConformance",
+    "FitConformance",
+    "GuideConformance",
+    "PlanConformance",
+    "ReaderConformance",
+    "RefineConformance",
+    "ReplayConformance",
+    "RobotConformance",
+    "ScanConformance",
+    "ScannerConformance",
+    "SeamConformance",
+    "SegmentConformance",
+    "SensorConformance",
+    "SolveConformance",
+    "VerifyConformance",
+    "ViewConformance",
+    "WeldConformance",
+]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic_core import core_schema
 
 
@@ -24,12 +24,13 @@ class PointCloud:
     frame: str
     xyz: NDArray[np.float32]
 
-    def __post_init__(self) -> None:
-        xyz = np.asarray(self.xyz, dtype=np.float32)
+    def __init__(self, frame: str, xyz: ArrayLike) -> None:
+        xyz = np.asarray(xyz, dtype=np.float32)
         if xyz.ndim not in (2, 3) or xyz.shape[-1] != 3:
             raise ValueError(f"a cloud is (N, 3) or (H, W, 3), not {xyz.shape}")
         view = xyz.view()
         view.setflags(write=False)
+        object.__setattr__(self, "frame", frame)
         object.__setattr__(self, "xyz", view)
 
     @property

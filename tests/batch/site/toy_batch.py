@@ -10,14 +10,14 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, RecipePath, StageError, hookimpl, stage
 from flangeye.types import ArchivePath, Captures, HandEye, Observations, Seed
-from flangeye.units import Duration
+from flangeye.units import Duration, param
 from tests import toy
 
 
 class WorkParams(Params):
     what: Literal["work", "refuse", "fail", "raise", "exit", "die", "die once"] = "work"
-    wait: Duration = Field("0 s", description="Time that passes without work.")
-    burn: Duration = Field("0 s", description="Time of the processor that is used.")
+    wait: Duration = param("0 s", description="Time that passes without work.")
+    burn: Duration = param("0 s", description="Time of the processor that is used.")
     once: str = Field("", description="File left behind by 'die once'.")
     reads: RecipePath | None = Field(None, description="A file that decides the result.")
 

@@ -7,8 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from flangeye.cli import app
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration

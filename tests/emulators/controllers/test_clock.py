@@ -52,7 +52,7 @@ def test_a_clock_that_never_ticked_has_no_figures():
 @pytest.mark.parametrize("delays", [[0.0] * 5, [0.03, 0.02, 0.01, 0.0, 0.02]])
 def test_a_delay_line_keeps_the_order(delays):
     async def push():
-        arrived = []
+        arrived: list[bytes] = []
         line = DelayLine(arrived.append)
         for i, delay in enumerate(delays):
             line.push(bytes([i]), delay)

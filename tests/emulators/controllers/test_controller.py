@@ -102,7 +102,7 @@ def test_an_emergency_stop_takes_the_power(desk):
     assert answer(desk.box, "safetystatus") == "Safetystatus: ROBOT_EMERGENCY_STOP"
     assert answer(desk.box, "robotmode") == "Robotmode: POWER_OFF"
     answer(desk.box, "power on")
-    assert desk.box.robot_mode is RobotMode.POWER_OFF
+    assert answer(desk.box, "robotmode") == "Robotmode: POWER_OFF"
     answer(desk.box, "restart safety")
     answer(desk.box, "power on")
     assert desk.box.robot_mode is RobotMode.IDLE

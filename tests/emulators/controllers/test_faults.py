@@ -46,8 +46,12 @@ def test_what_cannot_go_wrong_is_said(text, message):
 
 
 def test_faults_wait_for_their_time():
-    happened = []
-    kinds = {name: Kind(lambda s, name=name: happened.append((name, s))) for name in "abc"}
+    happened: list[tuple[str, float | None]] = []
+
+    def kind(name: str) -> Kind:
+        return Kind(lambda seconds: happened.append((name, seconds)))
+
+    kinds = {name: kind(name) for name in "abc"}
     schedule = Schedule(kinds)
     schedule.add(Fault("a", None, 0.0), now=1.0)
     schedule.add(Fault("b", 0.5, 2.0), now=1.0)

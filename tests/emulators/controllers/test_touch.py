@@ -43,7 +43,7 @@ def test_a_surface_that_makes_no_sense_is_refused(wrong):
 @pytest.mark.parametrize("stiffness", [2e3, 20e3, 200e3])
 def test_force_mode_finds_the_surface_and_holds_the_force(over_floor, stiffness):
     desk = over_floor
-    desk.arm.surfaces[:] = [Surface(desk.arm.surfaces[0].point, [0, 0, 1], stiffness)]
+    desk.arm.surfaces[:] = [Surface(desk.arm.surfaces[0].point, np.array([0, 0, 1]), stiffness)]
     start = desk.pose()
     press(desk, -15.0, seconds=4.0)
     forces = np.array([felt[2] for *_, felt in desk.trace])

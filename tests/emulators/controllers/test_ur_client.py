@@ -191,7 +191,7 @@ def test_a_servo_follows(cell, how):
 
 def test_touch(cell):
     floor = cell.pose()[2] - 0.02
-    cell.control.set_surfaces(Surface([0, 0, floor], [0, 0, 1]))
+    cell.control.set_surfaces(Surface(np.array([0, 0, floor]), np.array([0, 0, 1])))
     assert cell.robot.zeroFtSensor()
     assert cell.robot.moveUntilContact([0, 0, -0.04, 0, 0, 0])
     assert cell.pose()[2] == pytest.approx(floor, abs=3e-4)

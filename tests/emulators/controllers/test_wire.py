@@ -190,7 +190,9 @@ def test_the_control_channel_refuses_with_a_reason(process):
 def test_surfaces_can_be_changed(process):
     process.control.put(HOME)
     height = process.control.truth().base_T_flange[2, 3]
-    process.control.set_surfaces(Surface([0, 0, height + 1e-3], [0, 0, 1], 10e3))
+    process.control.set_surfaces(
+        Surface(np.array([0, 0, height + 1e-3]), np.array([0, 0, 1]), 10e3)
+    )
     time.sleep(0.02)
     assert process.control.state()["force"][2] == pytest.approx(10.0)
     process.control.set_surfaces()

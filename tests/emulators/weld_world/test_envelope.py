@@ -10,6 +10,7 @@ from flangeye_emulators.weld_world import trial as trials
 from flangeye_emulators.weld_world.bench import try_condition
 from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
 from flangeye_emulators.weld_world.worlds import drawn, judged
+from flangeye_plugins.weld.follower import Follower
 from tools.weld_worlds import summary
 
 SHORT = 0.07
@@ -31,6 +32,7 @@ def test_a_finger_that_is_not_as_calibrated_is_measured_before_the_weld(name):
 def test_delays_of_arm_and_images_are_measured_and_made_up_for():
     name = "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms"
     found = try_condition(CONDITIONS[name], 0)
+    assert isinstance(found.controller, Follower)
     assert found.controller.learned.dead_time == pytest.approx(0.06, abs=0.021)
     assert found.controller.learned.lag == pytest.approx(0.1, abs=0.051)
     assert rms(found) < 0.15e-3

@@ -94,13 +94,13 @@ def test_the_finger_shows_less_and_later_than_it_feels():
 
 def test_images_are_late_lost_and_wrongly_stamped():
     truth = params(ClockTruth, rate=100, latency="50 ms", jitter="0 ms", stamp="20 ms", dropped=0)
-    shutter = Shutter(truth, RNG(0))
+    shutter: Shutter[str] = Shutter(truth, RNG(0))
     assert shutter.due(0.0)
     assert not shutter.due(0.005)
     shutter.expose(1.0, 0.0, "image")
     assert shutter.arrived(1.04) is None
     assert shutter.arrived(1.06) == (1.02, "image")
-    lossy = Shutter(params(ClockTruth, dropped=0.5), RNG(0))
+    lossy: Shutter[int] = Shutter(params(ClockTruth, dropped=0.5), RNG(0))
     for i in range(200):
         lossy.expose(float(i), 0.0, i)
     assert 70 < sum(lossy.arrived(1e9) is not None for _ in range(200)) < 130

@@ -12,7 +12,8 @@ from flangeye.models.loading import load_model
 from flangeye.models.targets import plate_of, wrist_circle_of
 from flangeye.plugin.stage import KINDS
 from flangeye.types import CAMERA
-from flangeye_emulators.acquire.simulated import CameraPose, SimulatedParams, acquire_simulated
+from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
+from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.plan.grid import GridParams, grid
 
 SMALL = {"counts": (2, 2, 1)}

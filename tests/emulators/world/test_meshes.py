@@ -54,6 +54,7 @@ def test_the_chamfers_fall_at_45_degrees():
     radius = np.hypot(vertices[:, 0], vertices[:, 1])
     bottom = vertices[np.isclose(radius, shape.outer, atol=1e-9), 2]
     assert bottom.max() == pytest.approx(shape.rim - shape.outer)
+    assert shape.bore is not None
     inner = np.isclose(radius, shape.bore - shape.details.bore_chamfer, atol=1e-9)
     assert vertices[inner, 2].max() == pytest.approx(-shape.details.bore_chamfer)
 

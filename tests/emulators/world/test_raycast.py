@@ -61,6 +61,7 @@ def test_a_plane_is_flat_to_single_precision():
     local = (points - camera_T_flange[:3, 3]) @ camera_T_flange[:3, :3]
     radius = np.hypot(local[:, 0], local[:, 1])
     shape = flange()
+    assert shape.bore is not None
     face = (radius > shape.bore + 1e-5) & (radius < shape.rim - 1e-5) & (local[:, 2] > -5e-5)
     assert face.sum() > 15000
     # All but the pixels that just touch a countersink.
@@ -69,7 +70,12 @@ def test_a_plane_is_flat_to_single_precision():
 
 def test_the_cell_has_a_second_disc_of_a_similar_size():
     robot_flange = flange()
-    cell = Cell(None, robot_flange, np.array([0.6, 0, 0.3]), np.array([0.3, 0.3, 0.2]))
+    cell = Cell(
+        load_model("robots", "ur5"),
+        robot_flange,
+        np.array([0.6, 0, 0.3]),
+        np.array([0.3, 0.3, 0.2]),
+    )
     table, wall, ring, post = cell.around()
     assert table.mesh.vertices[:, 2].max() == 0
     assert wall.mesh.vertices[:, 0].min() > 0.6 + 0.15

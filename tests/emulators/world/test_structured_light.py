@@ -40,6 +40,7 @@ def test_without_noise_the_face_is_a_plane_and_the_rim_a_circle():
     pose = facing(0.2)
     points = in_flange(scan(zoomed(quiet()), flange_scene(pose), noise=0.0), pose)
     radius, shape = np.hypot(points[:, 0], points[:, 1]), flange()
+    assert shape.bore is not None
     face = (radius < shape.rim) & (radius > shape.bore) & (points[:, 2] > -2e-5)
     assert np.quantile(np.abs(points[face, 2]), 0.99) < 5e-7
     angle = np.arctan2(points[face, 1], points[face, 0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye import StageError
-from flangeye.files.clouds import write_cloud
+from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.log.record import Recorder
 from flangeye.types import ArchivePath, Capture, PointCloud, Source, Transform
 from flangeye_plugins.acquire import archive as module
@@ -50,7 +50,7 @@ def same(one: Capture, other: Capture) -> bool:
         (one.id, one.role, one.time_ns) == (other.id, other.role, other.time_ns)
         and np.array_equal(one.cloud.xyz, other.cloud.xyz)
         and np.allclose(one.base_T_flange.matrix, other.base_T_flange.matrix, atol=1e-14)
-        and np.array_equal(one.joints, other.joints)
+        and np.array_equal(np.asarray(one.joints), np.asarray(other.joints))
     )
 
 
@@ -67,8 +67,12 @@ def test_captures_come_back_as_they_were_verification_first(acquire, captures):
 
 def test_clouds_are_read_one_at_a_time(acquire, monkeypatch):
     read = []
-    original = module.read_cloud
-    monkeypatch.setattr(module, "read_cloud", lambda *a: read.append(a[0]) or original(*a))
+
+    def noted(path, *unit):
+        read.append(path)
+        return read_cloud(path, *unit)
+
+    monkeypatch.setattr(module, "read_cloud", noted)
     stream = iter(acquire())
     assert len(read) == 1, "one cloud, for its unit"
     next(stream)
@@ -152,7 +156,7 @@ def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(ac
     images = {capture.id: capture.image for capture in stream}
     assert {name for name, image in images.items() if image} == {"two", "three"}
     assert np.allclose(
-        images["two"].camera_matrix, [[FOCAL, 0, 9.5], [0, FOCAL, 7], [0, 0, 1]], atol=1e-3
+        images["two"].camera_matrix, [[FOCAL, 0, 9.5], [0, FOCAL, 7], [0.0, 0, 1]], atol=1e-3
     )
     assert images["three"].pixels[0, 0] == len("three")
     assert (

@@ -10,6 +10,7 @@ import types
 import warnings
 from math import cos, pi, sin
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -74,7 +75,7 @@ def ros_message(values):
         translation=STORE.types["geometry_msgs/msg/Vector3"](*values[:3]),
         rotation=STORE.types["geometry_msgs/msg/Quaternion"](*values[3:]),
     )
-    again = STORE.deserialize_cdr(STORE.serialize_cdr(msg, msg.__msgtype__), msg.__msgtype__)
+    again: Any = STORE.deserialize_cdr(STORE.serialize_cdr(msg, msg.__msgtype__), msg.__msgtype__)
     move, turn = again.translation, again.rotation
     mat = robomath.quaternion_2_pose([turn.w, turn.x, turn.y, turn.z])
     return at((move.x, move.y, move.z), of_robodk(mat))
@@ -98,15 +99,19 @@ def read_command(text):
 
 def read_launch(text):
     """Run the launch file with stand-ins for ROS's two packages."""
-    nodes = []
+    nodes: list[Any] = []
+
+    def node(**told):
+        nodes.append(told)
+        return told
+
     launch, launch_ros = types.ModuleType("launch"), types.ModuleType("launch_ros.actions")
-    launch.LaunchDescription = list
-    launch_ros.Node = lambda **told: nodes.append(told) or told
+    vars(launch)["LaunchDescription"], vars(launch_ros)["Node"] = list, node
     names = {"launch": launch, "launch_ros": launch, "launch_ros.actions": launch_ros}
     before = {name: sys.modules.get(name) for name in names}
     sys.modules.update(names)
     try:
-        space = {}
+        space: dict[str, Any] = {}
         exec(compile(text, "launch", "exec"), space)
         assert len(space["generate_launch_description"]()) == 1
     finally:
@@ -144,8 +149,14 @@ def read_opencv(text):
     return storage.getNode(name).mat()
 
 
+def found_in(text: str, pattern: str) -> re.Match[str]:
+    found = re.search(pattern, text)
+    assert found is not None, text
+    return found
+
+
 def numbers_after(pattern, text):
-    return [float(x) for x in re.findall(NUMBER, re.search(pattern, text)[0])]
+    return [float(x) for x in re.findall(NUMBER, found_in(text, pattern)[0])]
 
 
 def read_ur(text):
@@ -160,7 +171,7 @@ def read_kuka(text):
 
 def read_abb(text):
     """The RAPID value, whose brackets are Python's; q1 is the real part."""
-    line = re.search(r"PERS wobjdata camera:=(.*);", text)[1]
+    line = found_in(text, r"PERS wobjdata camera:=(.*);")[1]
     held, programmed, unit, user, obj = eval(line, {"TRUE": True, "FALSE": False})
     assert (programmed, unit, obj) == (True, "", [[0, 0, 0], [1, 0, 0, 0]])
     assert held in (True, False)
@@ -170,7 +181,7 @@ def read_abb(text):
 
 
 def labelled(text, labels):
-    return [float(re.search(rf"(?m)^{label}: ({NUMBER})$", text)[1]) for label in labels]
+    return [float(found_in(text, rf"(?m)^{label}: ({NUMBER})$")[1]) for label in labels]
 
 
 def read_fanuc(text):
@@ -269,6 +280,7 @@ def poses(draw):
 
 def written(name, pose, **params):
     stage = BY_NAME[name]
+    assert stage.params is not None
     return stage(pose=pose, params=stage.params(**params))
 
 

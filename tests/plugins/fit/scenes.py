@@ -32,8 +32,9 @@ def face(
     x, y = x + rng.uniform(0, pitch, x.size), y + rng.uniform(0, pitch, y.size)
     radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
     keep = (radius < model.rim) & (radius > (model.bore or 0)) & (angle <= arc)
-    openings = [*((a, model.hole) for a in model.holes), (model.pin, model.pin_hole)]
-    for turn, size in openings if model.pin is not None else []:
+    pin = model.pin
+    openings = [*((a, model.hole) for a in model.holes), (pin, model.pin_hole)] if pin else []
+    for turn, size in openings:
         at = model.pitch * np.array([np.cos(turn), np.sin(turn)])
         keep &= np.hypot(x - at[0], y - at[1]) > size
     flat = np.stack([x[keep], y[keep], rng.normal(0, noise, keep.sum())], axis=1)

@@ -1,7 +1,7 @@
 import numpy as np
 
 from flangeye.types import CircleFeature, Seed
-from flangeye_plugins.fit.ransac import fit_ransac_circle
+from flangeye_plugins.fit.ransac import RansacCircleParams, fit_ransac_circle
 from tests.plugins.fit.scenes import CENTRE, face, flange, placed
 
 UR5 = flange()
@@ -10,7 +10,7 @@ UR5 = flange()
 def fitted(cloud, seed=0, **params):
     asked = {n: {"Flange": UR5, "Seed": Seed(seed)}.get(getattr(need, "__name__", ""))
              for n, need in fit_ransac_circle.needs.items() if n != "cloud"}  # fmt: skip
-    return fit_ransac_circle(cloud, **asked, params=fit_ransac_circle.params(**params))
+    return fit_ransac_circle(cloud, **asked, params=RansacCircleParams(**params))
 
 
 def test_the_papers_fit_is_good_to_half_a_millimetre():

@@ -50,6 +50,7 @@ def test_stray_points_do_not_move_it():
 
 
 def test_the_radius_may_differ_from_the_nominal():
+    assert UR5.bore is not None
     worn = UR5.model_copy(update={"rim": UR5.rim - 0.5e-3, "bore": UR5.bore + 0.5e-3})
     circle = fitted(placed(face(worn)))
     across, _ = in_face(circle.centre - CENTRE)

@@ -44,7 +44,7 @@ def test_the_same_seed_gives_the_same_poses():
 
 
 def test_a_pose_that_told_nothing_is_made_up_for():
-    lost = set()
+    lost: set[int] = set()
     place = site(lost=lambda: lost)
     plan = next_best(place, np.random.default_rng(0), NextBestParams(count=6))
     poses = []

@@ -40,7 +40,7 @@ POSES = np.array(
         for _ in "12345"
     ]
 )
-CLOUDS = RNG.normal(0, 0.1, (5, 6, 7, 3)).astype(np.float32) + np.float32([0, 0, 1])
+CLOUDS = RNG.normal(0, 0.1, (5, 6, 7, 3)).astype(np.float32) + np.array([0, 0, 1], np.float32)
 
 
 def read(path, **params):
@@ -159,8 +159,8 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag):
     registry = load_registry()
     recipe = parse_recipe(RECIPE, "bag", registry)
     results = [Runner(recipe, registry, ArchivePath(path)).run() for path in (SAMPLE, bag(told))]
-    matrices = [result.transforms["base_T_camera"].matrix for result in results]
-    assert np.allclose(*matrices, rtol=0, atol=1e-9)
+    one, other = (result.transforms["base_T_camera"].matrix for result in results)
+    assert np.allclose(one, other, rtol=0, atol=1e-9)
     assert "reader: ros2_bag, chosen by" in results[1].provenance.notes[1]
 
 

@@ -104,7 +104,7 @@ def compensate(calibration, views=None, error=error_exact, **changes):
 def test_it_is_a_refining_stage():
     assert refine_compensate.kind == "refine"
     assert set(refine_compensate.gives) <= set(KINDS["refine"].gives)
-    assert issubclass(refine_compensate.params, Params)
+    assert refine_compensate.params and issubclass(refine_compensate.params, Params)
 
 
 small = st.tuples(*[st.floats(-0.02, 0.02)] * 3)

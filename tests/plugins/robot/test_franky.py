@@ -31,9 +31,8 @@ def settle(robot, longest=20_000):
 
 
 def robot_on(connection, **params):
-    params = FrankyParams(host="172.16.0.2", **params)
     robot = FrankyRobot("franka-panda at 172.16.0.2", franky, connection)
-    return opened(robot, PANDA, params)
+    return opened(robot, PANDA, FrankyParams(host="172.16.0.2", **params))
 
 
 @pytest.fixture

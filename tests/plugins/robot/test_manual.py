@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from flangeye.devices import DeviceError, MovedByHand, Robot
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.maths.pose_formats import CONVENTIONS, AngleUnit
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
 from flangeye_emulators.controllers.start import starting_joints
@@ -45,8 +45,8 @@ class Person:
         os.close(self._typing)
 
     def robot(self, convention="ur", model=UR5E, **params):
-        params = ManualParams(convention=convention, **params)
-        return ManualRobot(model, params, OperatorConsole(self.heard, self.said))
+        console = OperatorConsole(self.heard, self.said)
+        return ManualRobot(model, ManualParams(convention=convention, **params), console)
 
     def last(self):
         return self.said.getvalue().strip().split("\n")[-1]
@@ -185,7 +185,7 @@ def test_metres_for_millimetres_are_named(convention, asked):
 @pytest.mark.parametrize("convention", ["kuka", "fanuc", "ur"])
 def test_radians_for_degrees_are_named(convention):
     words = CONVENTIONS[convention]
-    other = "rad" if words.angle == "deg" else "deg"
+    other: AngleUnit = "rad" if words.angle == "deg" else "deg"
     numbers = words.in_units("mm", other).numbers(TILTED)
     assert doubted(numbers, convention).endswith(
         f": are the angles in {other}, not in {words.angle}?"

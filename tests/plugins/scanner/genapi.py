@@ -86,7 +86,7 @@ def node_map(description):
 
     memory = {address: content for address, content in description.registers.values()}
 
-    class Port(genapi.AbstractPort):
+    class Port(genapi.AbstractPort):  # type: ignore[misc]  # genicam has no types
         def read(self, address, length):
             return memory[address][:length]
 

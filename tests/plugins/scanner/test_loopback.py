@@ -33,7 +33,9 @@ def shown():
     base_T_camera = CameraPose().base_T_camera
     reach = Reach(UR5E, PHOXI, base_T_camera, UR5E.flange.wrist / 2)
     middle = middle_of_view(PHOXI, base_T_camera)
-    return reach.joints(rigid(reach.facing(middle), middle))
+    facing = reach.facing(middle)
+    assert facing is not None
+    return reach.joints(rigid(facing, middle))
 
 
 @pytest.fixture(scope="module")

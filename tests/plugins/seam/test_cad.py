@@ -135,7 +135,7 @@ def test_a_part_that_could_lie_either_way_is_refused(tmp_path, seed):
 
 def test_a_seam_outside_the_workspace_is_refused():
     scan, _ = scanned("v-straight")
-    told = refused(scan, workspace=Box([0.6, 0.0, 0.3], [0.15, 0.3, 0.2]))
+    told = refused(scan, workspace=Box(np.array([0.6, 0.0, 0.3]), np.array([0.15, 0.3, 0.2])))
     assert told.startswith("seam.cad: the seam leaves the workspace by ")
     assert " mm along x, at (" in told
 

@@ -23,8 +23,8 @@ def planned(scan, workspace=None, hand=None, **given):
 def grooved(roots, half_angle=40, depth=10 * MM, spacing=0.7 * MM, noise=0.05 * MM, seed=0):
     """Return a scan of a plate of 200 x 160 mm with straight grooves at y, in closed form."""
     rng = np.random.default_rng(seed)
-    x, y = np.meshgrid(np.arange(-0.1, 0.1, spacing), np.arange(-0.08, 0.08, spacing))
-    x, y = x.ravel(), y.ravel()
+    ticks = np.arange(-0.1, 0.1, spacing), np.arange(-0.08, 0.08, spacing)
+    x, y = (grid.ravel() for grid in np.meshgrid(*ticks))
     away = (
         np.abs(y[:, None] - np.asarray(roots)).min(axis=1) if len(roots) else np.full(len(y), 1.0)
     )
@@ -116,7 +116,7 @@ def test_a_rough_groove_is_refused():
 
 def test_a_seam_outside_the_workspace_is_refused():
     with pytest.raises(CalibrationRefused, match="seam.groove: the seam leaves the workspace by"):
-        planned(grooved([0.01])[0], Box([0.6, 0.0, 0.3], [0.1, 0.3, 0.2]))
+        planned(grooved([0.01])[0], Box(np.array([0.6, 0.0, 0.3]), np.array([0.1, 0.3, 0.2])))
 
 
 def test_too_small_a_scan_is_refused():

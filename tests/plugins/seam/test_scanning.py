@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from flangeye import StageError
-from flangeye.devices import Scan, ScannerDriver
+from flangeye.devices import Scan, Scanner, ScannerDriver
 from flangeye.files.clouds import write_cloud
 from flangeye.types import CAMERA, PointCloud, Seed
 from flangeye_emulators.scan.simulated import SimulatedScanParams, scan_simulated
@@ -57,15 +57,19 @@ def test_a_scan_that_is_not_there_is_named(tmp_path):
         scan_file(FileScanParams(path=tmp_path, unit="m"))
 
 
-class Still:
+class Still(Scanner):
     """A scanner with one scan."""
 
-    name, facts = "still scanner", {}
+    def __init__(self) -> None:
+        self.name, self.facts, self.closed = "still scanner", {}, False
 
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
+        self.close()
+
+    def close(self):
         self.closed = True
 
     def expose(self):

@@ -55,6 +55,7 @@ class Scene:
     def flange(self, model: Flange, centre=CENTRE, normal=None) -> "Scene":
         """Add a flange's face, the wrist behind it, and the floor of the bore."""
         normal = towards_scanner(centre) if normal is None else normal
+        assert model.pin is not None
         places = [(angle, model.hole) for angle in model.holes] + [(model.pin, model.pin_hole)]
         holes = [(model.pitch * np.cos(a), model.pitch * np.sin(a), size) for a, size in places]
         behind = centre - model.details.thickness * normal

@@ -17,6 +17,10 @@ UR5 = flange_of(load_model("robots", "ur5").flange, load_standard("50-4-M6"))
 UR10 = flange_of(load_model("robots", "ur10e").flange, load_standard("50-4-M6"))
 
 
+assert UR5.bore is not None
+BORE = UR5.bore
+
+
 def found(xyz, flange=UR5, **params) -> FlangeCloud:
     cloud = segment_flange(capture(xyz), flange, SegmentParams(**params))
     assert isinstance(cloud, FlangeCloud), cloud
@@ -62,14 +66,14 @@ def test_the_order_of_loose_points_does_not_matter():
 def test_full_resolution_is_kept_on_the_disc_only():
     xyz = Scene(columns=1200, rows=900, pitch=0.35e-3).table().flange(UR5).scan()
     cloud = found(xyz)
-    area = np.pi * (UR5.rim**2 - UR5.bore**2) * np.cos(0.3)
+    area = np.pi * (UR5.rim**2 - BORE**2) * np.cos(0.3)
     assert len(cloud.cloud.xyz) > 0.8 * area / 0.35e-3**2
     assert np.linalg.norm(cloud.cloud.xyz - cloud.centre, axis=1).max() < UR5.outer + 4e-3
 
 
 @pytest.mark.parametrize(
     ("inner", "outer"),
-    [(0.0, 31.5), (16.0, 40.0), (8.0, 31.0), (UR5.bore * 1e3, UR5.rim * 1e3)],
+    [(0.0, 31.5), (16.0, 40.0), (8.0, 31.0), (BORE * 1e3, UR5.rim * 1e3)],
     ids=["blind", "large", "narrow bore", "without holes"],
 )
 def test_another_disc_is_not_taken_for_it(inner, outer):

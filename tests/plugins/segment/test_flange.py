@@ -124,9 +124,9 @@ def test_only_the_window_about_the_disc_is_read_and_nothing_is_missed(cell):
         view = coarse_view(capture.cloud.xyz, flange.rim / 15)
         cloud = found(capture, flange)
         near = np.linalg.norm(view.xyz - cloud.centre, axis=-1)
-        cell_at = np.unravel_index(np.nanargmin(near), near.shape)
+        row, column = map(int, np.unravel_index(np.nanargmin(near), near.shape))
         reach = flange.outer + 2e-3
-        window = view.about(cell_at, cloud.centre, reach, capture.cloud.xyz)
+        window = view.about((row, column), cloud.centre, reach, capture.cloud.xyz)
         whole = capture.cloud.xyz.reshape(-1, 3)
         assert len(window) < 0.5 * len(whole)
         assert np.array_equal(

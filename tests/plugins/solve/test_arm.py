@@ -24,6 +24,7 @@ from flangeye.types import (
     ArmCorrection,
     CircleFeature,
     FlangeCloud,
+    Floats,
     HandEye,
     Observation,
     Observations,
@@ -58,8 +59,8 @@ def simulate(
     robot: RobotModel,
     n: int,
     *,
-    offsets: Sequence[float] = (0.0,) * 6,
-    tool: Sequence[float] = (0.0,) * 3,
+    offsets: Sequence[float] | Floats = (0.0,) * 6,
+    tool: Sequence[float] | Floats = (0.0,) * 3,
     tilt: float = 0.3,
     with_joints: bool = False,
     seed: int = 0,
@@ -195,7 +196,7 @@ def test_the_correction_moves_the_reported_pose(ur5: RobotModel) -> None:
     near = HOME + 0.2
     corrected = corrected_flange(reported, None, ArmCorrection(np.zeros(3), offsets, near), arm)
     np.testing.assert_allclose(corrected, arm.flange(HOME + offsets), atol=1e-9)
-    tool = corrected_flange(reported, None, ArmCorrection([0, 0, 1 * MM]), None)
+    tool = corrected_flange(reported, None, ArmCorrection(np.array([0, 0, 1 * MM])), None)
     np.testing.assert_allclose(tool[:3, 3], reported[:3, 3] + 1 * MM * reported[:3, 2])
 
 

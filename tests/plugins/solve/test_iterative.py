@@ -62,7 +62,7 @@ def parameters(**given: object) -> IterativeParams:
     return IterativeParams.model_validate({**chosen, **given})
 
 
-def run(observations: Observations | list[Observation], params: IterativeParams):  # type: ignore[no-untyped-def]
+def run(observations: Observations | list[Observation], params: IterativeParams):
     if not isinstance(observations, Observations):
         observations = Observations(observations, Source("test"))
     return solve_iterative(observations, Views(), None, params)
@@ -189,7 +189,7 @@ def test_a_larger_pool_is_a_better_answer() -> None:
     assert rms(10) < rms(4)
 
 
-def worst_at_work(calibration) -> float:  # type: ignore[no-untyped-def]
+def worst_at_work(calibration) -> float:
     corners = np.array([0.4, -0.5, 0.2]) + 0.1 * np.array([[1, 1, 1], [-1, -1, -1], [1, -1, 0]])
     mapped = calibration.base_T_camera.transform.apply(TRUTH.inverse().apply(corners))
     return float(np.linalg.norm(mapped - corners, axis=1).max())

@@ -34,7 +34,7 @@ def observe(centres: np.ndarray, tcps: np.ndarray) -> Observations:
     for i, (centre, tcp) in enumerate(zip(centres, tcps, strict=True)):
         pose[:3, 3] = tcp
         circle = CircleFeature(
-            centre, [0, 0, -1], {}, np.eye(3) * 1e-10, np.diag([1e-8, 1e-8, 0]), 1.0
+            centre, np.array([0, 0, -1]), {}, np.eye(3) * 1e-10, np.diag([1e-8, 1e-8, 0]), 1.0
         )
         items.append(
             Observation(f"{i:02d}", circle, by_frame(Transform(BASE, FLANGE, pose.copy())))
@@ -189,7 +189,7 @@ def coverage(n: int, runs: int) -> float:
     return inside / runs
 
 
-def holds(estimate) -> bool:  # type: ignore[no-untyped-def]
+def holds(estimate) -> bool:
     """Whether the estimate's 95 % region holds the TRUTH."""
     found = estimate.transform
     skew = TRUTH[0] @ found.rotation.T

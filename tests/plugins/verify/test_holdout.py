@@ -221,7 +221,7 @@ def test_the_predicted_error_holds_in_93_to_97_percent(n: int) -> None:
 
 def _holds(n: int, seed: int) -> bool:
     """Whether the true error in every corner of the workspace is below the prediction."""
-    box = Box([0.4, -0.5, 0.2], [0.4, 0.4, 0.3])
+    box = Box(np.array([0.4, -0.5, 0.2]), np.array([0.4, 0.4, 0.3]))
     calibration = svd(simulate(n, seed=1000 * n + seed))
     predicted = verify_holdout(calibration, svd, HoldoutParams(folds=2), box).figures[
         "predicted_worst_p95"

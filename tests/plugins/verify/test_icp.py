@@ -251,7 +251,7 @@ def test_the_published_flange_roll_is_found(ancorasir: Path) -> None:
     quaternion = np.array([-0.085809201, -0.389310586, 0.914859337, 0.064081527])
     position = np.array([0.27704067625331485, -0.573055166920657, 0.26205388882758757])
     pose = Transform(BASE, FLANGE, rigid(rotation_from_quaternion(quaternion), position))
-    flange_cloud = FlangeCloud(PointCloud(CAMERA, seen), seen.mean(0), [0, 0, -1])
+    flange_cloud = FlangeCloud(PointCloud(CAMERA, seen), seen.mean(0), np.array([0, 0, -1]))
     published = Transform(BASE, CAMERA, np.load(folder / "H.npy"))
     cad = CadCloud.model_validate(
         {"file": str(ancorasir / "flange_ground_truth" / "flange_aubo_cropped.pcd"), "unit": "m",

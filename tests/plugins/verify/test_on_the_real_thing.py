@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,7 +82,7 @@ def test_touch_finds_a_shift_of_the_matrix() -> None:
 
 
 def test_stitch_finds_a_turn_of_the_matrix_and_draws_it() -> None:
-    pictures = {}
+    pictures: dict[str, Any] = {}
     right, wrong = (
         verify_stitch(calibration(turn=a), views(), StitchParams(), journal=pictures.__setitem__)
         for a in [(0, 0, 0), (0.05, 0, 0)]

@@ -16,6 +16,7 @@ DISTANCE = 40e-3
 SECTION = Section(np.pi / 6, 8e-3)
 PERIOD = 8e-3
 FRAME = 1 / 30
+COLUMNS = ("time", "torch_s", "torch", "tip_s", "tip", "robot", "turn", "advance")
 
 
 def straight(length=0.12):
@@ -109,8 +110,8 @@ class World:
             self.position = self.position + command.velocity * self.period
             self.angle += command.turn * self.period
             time += self.period
-        columns = np.array(rows).T
-        done = Weld(self.controller, *columns, phases)
+        columns = dict(zip(COLUMNS, np.array(rows).T, strict=True))
+        done = Weld(self.controller, phase=phases, **columns)
         done.length = self.root.length
         return done
 

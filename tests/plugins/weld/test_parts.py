@@ -143,8 +143,9 @@ def test_contact_filters_by_its_time_constant():
     contact.update(1.0, 1e-3, 2e-3)
     assert contact.deflection == 1e-3
     for step in (0.01, 0.05, 0.2):
-        before = contact.deflection
-        contact.update(contact._time + step, 3e-3, 2e-3)
+        before, since = contact.deflection, contact._time
+        assert before is not None and since is not None
+        contact.update(since + step, 3e-3, 2e-3)
         left = np.exp(-step / SMOOTHING)
         assert contact.deflection == pytest.approx(3e-3 + left * (before - 3e-3), rel=1e-12)
 
@@ -170,7 +171,7 @@ def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels():
     assert contact.state == "held"
     assert until_changed(LOST * 2e-3 * 1.001) is None
     assert until_changed(LOST * 2e-3 * 0.999) == pytest.approx(DWELL, abs=0.011)
-    assert contact.state == "lost"
+    assert [contact.state] == ["lost"]
     assert contact.doubted(3e-3, 2e-3)
 
 

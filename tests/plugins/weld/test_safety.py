@@ -86,7 +86,7 @@ def test_a_way_that_would_drag_the_finger_through_the_work_is_refused():
 
 def test_an_arm_that_a_person_moves_cannot_weld():
     arm = Arm()
-    arm.by_hand = True
+    vars(arm)["by_hand"] = True
     with pytest.raises(DeviceError, match="is moved by hand; a weld needs an arm that drives"):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm))
 
@@ -147,7 +147,7 @@ def test_ctrl_c_stops_the_arm_and_the_log_is_kept():
     def interrupted(state):
         raise KeyboardInterrupt
 
-    arm, journal = Arm(interrupted, after=15.0), []
+    arm, journal = Arm(interrupted, after=15.0), list[tuple[str, object]]()
     with pytest.raises(KeyboardInterrupt):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm), journal=journal)
     assert arm.stopped

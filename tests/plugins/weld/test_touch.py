@@ -127,7 +127,8 @@ def readings(eye, force=None):
 
 
 def test_the_calibration_finds_rest_gain_noise_and_stiffness():
-    found = calibrate(*readings(Eye(), np.array([1000.0, 1000.0, 2000.0])), "a test")
+    rest, held = readings(Eye(), np.array([1000.0, 1000.0, 2000.0]))
+    found = calibrate(rest, held, "a test")
     np.testing.assert_allclose(found.rest[:2], COMPLIANCE.rest[:2], atol=20e-6)
     all_of_it = np.array(found.gain) @ COMPLIANCE.camera_R_tool @ np.diag(COMPLIANCE.share)
     np.testing.assert_allclose(all_of_it, np.eye(3), atol=0.02)
@@ -136,7 +137,8 @@ def test_the_calibration_finds_rest_gain_noise_and_stiffness():
 
 
 def test_without_force_no_stiffness():
-    found = calibrate(*readings(Eye()), "a test")
+    rest, held = readings(Eye())
+    found = calibrate(rest, held, "a test")
     assert found.lateral is None and found.axial is None
 
 
