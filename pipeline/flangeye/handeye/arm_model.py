@@ -124,12 +124,26 @@ def residuals(arm: Arm, session: ArmSession, fit: ArmFit) -> Floats:
     return np.asarray(mapped - expected(arm, session, fit.parameters))
 
 
-def _step(arm: Arm, session: ArmSession, fit: ArmFit, prior: Floats) -> ArmFit:
-    left = residuals(arm, session, fit)
+def covariance_at_work(arm: Arm, session: ArmSession, fit: ArmFit) -> Floats:
+    """Return (6, 6) of the pose as the session's poses see it, with the parameters that go with it.
+
+    The pose alone is known worse: zeros take back what it is off by. What is left of both at the
+    poses is a rigid motion and little else; this is the covariance of that.
+    """
+    stacked = _jacobian(arm, session, fit).reshape(3 * len(session.poses), -1)
+    together = np.linalg.pinv(stacked[:, :6]) @ stacked
+    return np.asarray(together @ fit.covariance @ together.T)
+
+
+def _jacobian(arm: Arm, session: ArmSession, fit: ArmFit) -> Floats:
+    """Return (N, 3, 6 + 4n) of the residuals by the pose about ``about``, and the parameters."""
     moved = session.centres @ fit.base_T_camera[:3, :3].T + fit.base_T_camera[:3, 3] - fit.about
-    still = np.broadcast_to(np.eye(3), (len(left), 3, 3))
-    moves = -sensitivity(arm, session, fit.parameters)
-    jacobian = np.concatenate([-hat(moved), still, moves], axis=2)
+    still = np.broadcast_to(np.eye(3), (len(moved), 3, 3))
+    return np.concatenate([-hat(moved), still, -sensitivity(arm, session, fit.parameters)], axis=2)
+
+
+def _step(arm: Arm, session: ArmSession, fit: ArmFit, prior: Floats) -> ArmFit:
+    left, jacobian = residuals(arm, session, fit), _jacobian(arm, session, fit)
     # Scaled by the prior, all unknowns are of one size, and what shall stay has no column.
     scale = np.concatenate([np.ones(6), prior.ravel()])
     scaled = jacobian * scale

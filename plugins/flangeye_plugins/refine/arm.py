@@ -14,6 +14,7 @@ from flangeye.handeye.arm_model import (
     ArmFit,
     ArmSession,
     combinations,
+    covariance_at_work,
     deviations,
     fit_arm,
     identified,
@@ -107,7 +108,7 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
         left = f"the arm's parameters left out, for they do not help ({compared})"
         return replace(before, notes=(*notes, left))
     kept = f"the arm's parameters are corrected ({compared})"
-    return replace(before, notes=(*notes, kept), corrected=_corrected(before, found))
+    return replace(before, notes=(*notes, kept), corrected=_corrected(before, found, arm))
 
 
 def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
@@ -179,8 +180,9 @@ def _start(calibration: HandEye) -> Floats:
     return calibration.base_T_camera.transform.matrix
 
 
-def _corrected(calibration: HandEye, found: _Found) -> CorrectedArm:
+def _corrected(calibration: HandEye, found: _Found, arm: Arm) -> CorrectedArm:
     fit = found.fit
+    covariance = covariance_at_work(arm, found.session.where(found.used), fit)
     before = calibration.correction or ArmCorrection(np.zeros(3))
     correction = replace(
         before,
@@ -189,7 +191,7 @@ def _corrected(calibration: HandEye, found: _Found) -> CorrectedArm:
         joints=found.session.joints[0],
     )
     transform = replace(calibration.base_T_camera.transform, matrix=fit.base_T_camera)
-    camera = TransformEstimate(transform, _symmetric(fit.covariance[:6, :6]), fit.about)
+    camera = TransformEstimate(transform, _symmetric(covariance), fit.about)
     return CorrectedArm(camera, correction)
 
 
