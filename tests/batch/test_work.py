@@ -1,6 +1,7 @@
 """What a worker makes of one session."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,22 @@ def test_no_archive(work, archive_recipe, archives):
     assert outcome.status == "failed"
     assert outcome.reason == f"{archives[2]}: no such archive"
     assert not work.folder.exists()
+
+
+def test_an_archive_by_url(work, archive_recipe, tmp_path):
+    def packed(text):
+        with zipfile.ZipFile(tmp_path / "packed.zip", "w") as file:
+            file.writestr("one.txt", text)
+
+    url = f"zip://one.txt::{tmp_path}/packed.zip"
+    packed("7")
+    outcome = work(name=archive_recipe, archives=(url,))
+    assert outcome.status == "verified"
+    key = work.session.key
+    packed("8")
+    other = work(name=archive_recipe, archives=(url,))
+    assert other.status == "verified" and other.true_rms_m != outcome.true_rms_m
+    assert work.session.key != key
 
 
 def test_a_finished_session_is_taken_over(work):

@@ -107,6 +107,12 @@ def test_an_archive_in_a_zip_file(archive, tmp_path):
         assert read_cloud(root / "scans" / "1.pcd").xyz[0, 0, 0] == 1.5
 
 
+def test_an_archive_that_is_one_file(bucket, tmp_path):
+    bucket.pipe("cell/run.mcap", b"a log")
+    with archive_at("s3://cell/run.mcap") as path:
+        assert path.name == "run.mcap" and path.read_bytes() == b"a log"
+
+
 def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket):
     with (
         pytest.raises(StageError, match="s3://cell/out/run.mcap"),

@@ -44,7 +44,8 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
         yield None if place is None else Path(place)
         return
     with TemporaryDirectory(prefix="flangeye-") as folder:
-        root = Path(folder).resolve() / (PurePosixPath(place).name or "archive")
+        within = place.partition("::")[0].partition("://")[2]
+        root = Path(folder).resolve() / (PurePosixPath(within).name or "archive")
         _STANDING_IN[root] = stand_in = _StandIn(place, root)
         try:
             stand_in.lay_out()
@@ -140,7 +141,7 @@ class _StandIn:
         self._names: dict[Path, str] = {}
 
     def listed(self) -> dict[str, Mapping[str, Any]]:
-        """Return name below the URL -> what the store says of the file."""
+        """Return name below the URL -> what the store says of the file; "" if it is one itself."""
         with _reaching(self.url):
             found = self._system.find(self._there, detail=True)
         if not found:
@@ -150,10 +151,10 @@ class _StandIn:
     def lay_out(self) -> None:
         """Make every file's name, and fetch the small ones."""
         for name, about in self.listed().items():
-            path = self._root / name
+            path = self._root / name if name else self._root
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
-            self._names[path] = f"{self._there.rstrip('/')}/{name}".lstrip("/")
+            self._names[path] = about["name"]
             if path.suffix.lower() in LATER and (about.get("size") or 0) > SMALL:
                 self.later[path] = about
             else:
@@ -161,11 +162,11 @@ class _StandIn:
 
     def fetch(self, path: Path) -> None:
         """Bring a file here."""
-        with _reaching(f"{self.url.rstrip('/')}/{path.relative_to(self._root)}"):
+        with _reaching(told(str(path))):
             self._system.get_file(self._names[path], str(path))
 
     def _name_of(self, path: str) -> str:
-        name = path.removeprefix(self._there.rstrip("/")).lstrip("/") or PurePosixPath(path).name
+        name = path.removeprefix(self._there.rstrip("/")).lstrip("/")
         if ".." in PurePosixPath(name).parts:
             raise StageError(f"{self.url}: holds a file called '{name}', which leads out of it")
         return name
@@ -197,7 +198,10 @@ def _system(url: str) -> tuple[Any, str]:
         import fsspec
 
         with _reaching(url):
-            system, path = fsspec.url_to_fs(url)
+            # What it listed before may have changed since: it is asked again.
+            fresh = {"skip_instance_cache": True} if url.startswith("zip:") else {}
+            system, path = fsspec.url_to_fs(url, **fresh)
+            system.invalidate_cache()
     except ImportError as error:
         raise StageError(
             f"{url}: {error.name or 'fsspec'} is not installed; install with: "
