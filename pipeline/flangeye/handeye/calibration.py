@@ -18,12 +18,6 @@ from flangeye.handeye.arm import (
 )
 from flangeye.handeye.candidates import Model, understated, with_nuisance
 from flangeye.handeye.consensus import find_consensus
-from flangeye.handeye.degeneracy import (
-    ObservabilityLimits,
-    require_enough,
-    require_turns,
-    unobservable,
-)
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
@@ -35,6 +29,12 @@ from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.loop import ArmNoise, meaningless_turns
 from flangeye.handeye.measurements import loop_of, measurements_of
 from flangeye.handeye.nuisance import nuisance_of
+from flangeye.handeye.observability import (
+    ObservabilityLimits,
+    require_enough,
+    require_turns,
+    unobservable,
+)
 from flangeye.handeye.target_size import longer_distances, require_size, told_size
 from flangeye.handeye.wander import with_wander
 from flangeye.maths.geometry import rigid

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,39 +15,31 @@ from flangeye.handeye.measurements import measured
 from flangeye.maths.geometry import rigid
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
-from flangeye.types import Floats, HandEye, Observation, Pair, Transform, TransformEstimate
+from flangeye.types import HandEye, Observation, Pair, Transform, TransformEstimate
 
 NOWHERE = np.zeros((6, 0))
 
 
-@dataclass(frozen=True)
-class CellLimits:
-    """How well every unknown of a cell has to be known: largest standard deviations [rad, m]."""
-
-    rotation: float
-    translation: float
-
-
 def calibrate_cell(
-    observations: Sequence[Observation], cell: Cell, limits: CellLimits, method: str
+    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float], method: str
 ) -> HandEye:
     """Return every unknown of a cell with its covariance; the first camera's pose comes first.
 
     What moves is measured with noise; its size is found from the residuals, and sightings beyond
-    that are set aside.
+    that are set aside. ``limits`` are the largest standard deviations of a rotation [rad] and of a
+    translation [m].
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    found = solve_cell(observations, cell)
+    found = solve_cell(observations, cell, limits)
     _require_agreement(found, len(observations))
     transforms = {
         cell.name_of(name): Transform.named(cell.name_of(name), found.places[name])
         for name in cell.unknown_frames
     }
-    _require_known(found, cell, limits)
     camera, *others = (
         _estimate(transform, found, observations) for transform in transforms.values()
     )
@@ -56,7 +47,9 @@ def calibrate_cell(
     return HandEye(camera, pairs, method, _notes(observations, found), others=tuple(others))
 
 
-def solve_cell(observations: Sequence[Observation], cell: Cell) -> Solved:
+def solve_cell(
+    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float]
+) -> Solved:
     """Return the places of a cell's unknown frames, as its graph has them.
 
     Raises:
@@ -67,7 +60,7 @@ def solve_cell(observations: Sequence[Observation], cell: Cell) -> Solved:
         raise StageError("no sighting to solve with: every capture was set aside, for its reason")
     noise = {name: TYPICAL_ARM.covariance for name in cell.movers}
     sightings = [_sighting(i, o) for i, o in enumerate(observations)]
-    return solve_graph(cell.graph(observations), sightings, noise)
+    return solve_graph(cell.graph(observations), sightings, noise, limits)
 
 
 def _sighting(i: int, observation: Observation) -> Sighting:
@@ -83,26 +76,6 @@ def _require_agreement(found: Solved, count: int) -> None:
             f"only {agree} of {count} sightings agree with one another: check that each belongs to "
             "the poses beside it, and that the cell stands as the recipe says"
         )
-
-
-def _require_known(found: Solved, cell: Cell, limits: CellLimits) -> None:
-    for name in cell.unknown_frames:
-        turn, shift = _largest(found.covariances[name])
-        if turn > limits.rotation or shift > limits.translation:
-            raise CalibrationRefused(
-                f"{cell.name_of(name)} is known to {np.degrees(turn):.2g} deg and "
-                f"{shift * 1e3:.2g} mm only (limits {np.degrees(limits.rotation):g} deg, "
-                f"{limits.translation * 1e3:g} mm): let what carries it, or what it sees, turn "
-                "further about two axes"
-            )
-
-
-def _largest(covariance: Floats) -> tuple[float, float]:
-    """Return the largest standard deviations of rotation and translation [rad, m]."""
-    turn, shift = (
-        np.linalg.eigvalsh(block)[-1] for block in (covariance[:3, :3], covariance[3:, 3:])
-    )
-    return float(np.sqrt(turn)), float(np.sqrt(shift))
 
 
 def _estimate(

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
+from flangeye.handeye.observability import weak_moves
 from flangeye.maths.frame_graph import Frame, chain, composed, root_of
 from flangeye.maths.geometry import (
     hat,
@@ -37,8 +38,8 @@ AGREE = 1e-3
 """Two starts whose costs differ by this share ended in one valley, which then is the answer."""
 SOLVED = 1e-10
 """A step as small as this ends a descent [rad, m]."""
-UNKNOWN = 1e-9
-"""Directions of less information than this share of the most are not told."""
+LIMITS = float(np.radians(2)), 20e-3
+"""Largest standard deviations of an unknown's rotation [rad] and translation [m]."""
 ROUNDS = 4
 """Of finding the movers' noise, and what it makes of the sightings."""
 GATE = 0.9995
@@ -118,6 +119,7 @@ def solve_graph(
     frames: Mapping[str, Frame],
     sightings: Sequence[Sighting],
     noise: Mapping[str, Floats] | None = None,
+    limits: tuple[float, float] = LIMITS,
 ) -> Solved:
     """Find every frame whose place is unknown.
 
@@ -128,6 +130,7 @@ def solve_graph(
             origin and a shift, alike in all directions. Its ratios are believed; its size is found
             from the residuals, and what then lies beyond is set aside. Without it the sightings'
             own covariances are all there is, and all count.
+        limits: Largest standard deviations of an unknown's rotation [rad] and translation [m].
 
     Raises:
         StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
@@ -139,20 +142,24 @@ def solve_graph(
     places = _best(graph, own)
     every = np.ones(len(sightings), bool)
     if noise is None:
-        return _solved(graph, _descend(graph, places, own), own, every, 1.0)
+        return _solved(graph, _descend(graph, places, own), (own, every, 1.0), limits)
     for _ in range(ROUNDS):
         carried = graph.carried(places, noise)
         size, kept, whiteners = _weighed(graph, graph.residuals(places), carried)
         places = _descend(graph, places, whiteners * kept[:, None, None])
-    return _solved(graph, places, whiteners, kept, size)
+    return _solved(graph, places, (whiteners, kept, size), limits)
 
 
 def _solved(
-    graph: _Graph, places: Mapping[str, Floats], whiteners: Floats, kept: Mask, size: float
+    graph: _Graph,
+    places: Mapping[str, Floats],
+    weighed: tuple[Floats, Mask, float],
+    limits: tuple[float, float],
 ) -> Solved:
+    whiteners, kept, size = weighed
     residuals, jacobian = graph.linearised(places)
     information = information_of(whiteners[kept] @ jacobian[kept])
-    _refuse_unknown(information, list(places))
+    _refuse_unknown(information, list(places), limits)
     freedom = float(graph.freedoms[kept].sum()) - len(information)
     wider = covariance_inflation(max(freedom, 1.0), 6)
     joint = np.asarray(np.linalg.inv(information) * wider, dtype=np.float64)
@@ -384,17 +391,19 @@ def _moved(places: Mapping[str, Floats], step: Floats) -> dict[str, Floats]:
     return out
 
 
-def _refuse_unknown(information: Floats, unknown: Sequence[str]) -> None:
-    """Refuse when some motion of the unknowns changes no sighting; name what it moves most."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if values[0] > UNKNOWN * values[-1]:
+def _refuse_unknown(
+    information: Floats, unknown: Sequence[str], limits: tuple[float, float]
+) -> None:
+    """Refuse when a common move of the unknowns hardly changes the sightings; name what moves."""
+    scale = np.tile(np.repeat(limits, 3), len(unknown))
+    weak = weak_moves(information, scale)
+    if not weak:
         return
-    moved = np.abs(vectors[:, 0].reshape(-1, 6))
-    named = [name for name, row in zip(unknown, moved, strict=True) if row.max() > 0.1]
-    turns = moved[:, :3].max() > moved[:, 3:].max()
+    share = np.abs((weak.moves[:, 0] / scale).reshape(-1, 6))
+    named = [name for name, row in zip(unknown, share, strict=True) if row.max() > 0.1]
+    turns = share[:, :3].max() > share[:, 3:].max()
     raise CalibrationRefused(
         f"the sightings do not tell where {' and '.join(named)} {'are' if len(named) > 1 else 'is'}"
-        f": a common {'turn' if turns else 'shift'} changes none of them; move the arms about more "
+        f": a common {'turn' if turns else 'shift'} hardly changes them; move the arms about more "
         "axes, or let a camera see what ties them"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flangeye import Params, stage
-from flangeye.handeye.cell import CellLimits, calibrate_cell
+from flangeye.handeye.cell import calibrate_cell
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CELL
 from flangeye.types import HandEye, Observations
@@ -34,5 +34,5 @@ def solve_cell(observations: Observations, cell: Cell, params: CellParams) -> Ha
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    limits = CellLimits(params.rotation_limit, params.translation_limit)
+    limits = params.rotation_limit, params.translation_limit
     return calibrate_cell(list(observations), cell, limits, "solve.cell")

@@ -10,12 +10,6 @@ import numpy as np
 from flangeye import CalibrationRefused, Params, StageError
 from flangeye.handeye.closed.motions import Motions, motions_of, place_of
 from flangeye.handeye.components import Noise
-from flangeye.handeye.degeneracy import (
-    ObservabilityLimits,
-    require_enough,
-    require_turns,
-    unobservable,
-)
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
@@ -27,6 +21,12 @@ from flangeye.handeye.estimates import (
 from flangeye.handeye.likelihood import Problem, weigh, with_noise
 from flangeye.handeye.loop import Unknowns, meaningless_turns
 from flangeye.handeye.measurements import Loop, Measurements, loop_of, measurements_of
+from flangeye.handeye.observability import (
+    ObservabilityLimits,
+    require_enough,
+    require_turns,
+    unobservable,
+)
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation

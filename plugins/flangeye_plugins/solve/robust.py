@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flangeye import FlangeyeError, Params, stage
 from flangeye.handeye.calibration import Cell, Options, calibrate
-from flangeye.handeye.degeneracy import ObservabilityLimits
 from flangeye.handeye.loop import ArmNoise
+from flangeye.handeye.observability import ObservabilityLimits
 from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel

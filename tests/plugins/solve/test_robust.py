@@ -1,6 +1,7 @@
 """solve.robust: efficiency, outliers, normals, calibrated covariance, what it refuses."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -286,12 +287,29 @@ def test_scans_that_belong_to_other_poses_are_refused() -> None:
     assert str(refused.value).endswith("check that each scan belongs to its robot pose")
 
 
+def test_an_unknown_tip_is_not_answered_with_more_spread() -> None:
+    observations = simulate(20, 0)
+    camera_T_base = solve(observations).camera.transform.inverse()
+    tip = np.array([0.06, 0.05, 0.12])
+    seen = [camera_T_base.apply(o.base_T_flange.apply(tip)) for o in observations]
+    at_tip = [
+        replace(o, feature=replace(o.circle, centre=centre))
+        for o, centre in zip(observations, seen, strict=True)
+    ]
+    with pytest.raises(CalibrationRefused) as refused:
+        solve(at_tip)
+    assert "configuration: {place: unknown} finds it" in str(refused.value)
+    assert "spread" not in str(refused.value)
+
+
 def test_without_a_majority_there_is_no_answer() -> None:
     with pytest.raises(CalibrationRefused) as refused:
         solve(simulate(20, 2, wrong=13))
     assert str(refused.value).startswith("rotation about base (")
-    assert "of noise per axis: spread the poses further, and check that each scan" in str(
-        refused.value
+    assert str(refused.value).endswith(
+        "of noise per axis: no scanner or arm is so noisy: check that each scan belongs to its "
+        "robot pose, and that the target is where the recipe has it (configuration: {place: "
+        "unknown} finds it)"
     )
 
 
