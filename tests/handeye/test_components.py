@@ -94,6 +94,10 @@ def test_noises_are_close_to_a_thousandth(name):
     assert not Noise(**{**base, name: base[name] * 1.0012}).is_close(noise)
 
 
+def test_without_more_said_nothing_is_scaled():
+    assert Noise(0.0, 0.0) == Noise(0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
+
+
 def test_a_nuisances_size_is_compared_by_its_variance():
     noise = Noise(0.0, 0.0, size=0.5)
     assert noise.is_close(Noise(0.0, 0.0, size=0.5 * 1.00049))
