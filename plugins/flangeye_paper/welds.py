@@ -37,11 +37,16 @@ class SeenWeld:
     report: WeldReport
     truth: Floats
 
+    @property
+    def torch(self) -> Floats:
+        """(K, 3) where the torch really was, in base [m]; as believed in logs that do not say."""
+        return self.report.true_torch if len(self.report.true_torch) else self.report.torch
+
     def deviation(self, part: tuple[float, float] = (0.0, np.inf)) -> Floats:
         """Return the torch's distances from the true seam, on a part of it by arc length [m]."""
         along = _arc_length(self.truth)
         inside = (along >= part[0]) & (along <= part[1])
-        return torch_deviation(self.report.torch, self.truth[inside], self.report.opening)
+        return torch_deviation(self.torch, self.truth[inside], self.report.opening)
 
     @property
     def regained(self) -> bool:
@@ -52,7 +57,7 @@ class SeenWeld:
     @property
     def recovery(self) -> float:
         """How far the tip went until the torch was near the seam for good [m]."""
-        _, off = self._seen(self.report.torch)
+        _, off = self._seen(self.torch)
         tip, _ = self._seen(self.report.robot)
         away = np.flatnonzero(np.abs(off) > NEAR)
         return float(tip[away[-1]] - tip[0]) if len(away) else 0.0
@@ -64,7 +69,7 @@ class SeenWeld:
         leaving = along > _arc_length(self.truth)[-1] - LEAVING
         time = self.report.time[leaving]
         both = time + STEP <= time[-1]
-        paths = (self.report.torch, self.report.tip, self.report.robot)
+        paths = (self.torch, self.report.tip, self.report.robot)
         laterals = [self._seen(path)[1][leaving] for path in paths]
         steps = [np.abs(np.interp(time + STEP, time, off) - off)[both] for off in laterals]
         return float(np.max(steps, initial=0.0))

@@ -79,12 +79,12 @@ def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
 
 def test_the_deviation_is_the_torch_s_beside_the_seam(logged):
     drawn = traces(weld_drawing(facts(logged(WELD))).deviation)
-    x, y = drawn["from the seam as felt"]
+    x, y = drawn["believed, from the seam as felt"]
     assert x.min() >= 0.0
     np.testing.assert_allclose(y, 0.2, atol=1e-3)
-    np.testing.assert_allclose(drawn["from the true seam"][1], 0.1, atol=1e-3)
+    np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.1, atol=1e-3)
     alone = traces(weld_drawing(facts(logged(WELD, scan=None))).deviation)
-    assert list(alone) == ["from the seam as felt"]
+    assert list(alone) == ["believed, from the seam as felt"]
 
 
 def test_the_phases_are_bands_over_the_deflection(logged):
@@ -116,7 +116,7 @@ def test_the_page_says_why_a_weld_was_stopped(logged):
 def test_a_weld_that_felt_nothing_is_still_drawn(logged):
     nothing = replace(WELD, refined=np.zeros((0, 3)), mode="vision", loop={})
     drawing = weld_drawing(facts(logged(nothing)))
-    assert list(traces(drawing.deviation)) == ["from the true seam"]
+    assert list(traces(drawing.deviation)) == ["true, from the true seam"]
     assert [name for name, _ in drawing.loop] == ["images read", "with the tag"]
 
 
@@ -129,3 +129,16 @@ def test_a_line_goes_on_beyond_its_ends():
     along, across = off_line(corner, np.array([[-0.5, 0.1], [0.5, -0.2], [0.9, 0.5], [1.1, 1.5]]))
     np.testing.assert_allclose(along, [-0.5, 0.5, 1.5, 2.5])
     np.testing.assert_allclose(across, [0.1, -0.2, 0.1, -0.1])
+
+
+def test_believed_and_true_torch_are_shown_with_the_band(logged):
+    band = np.full(len(WELD.torch), 0.3e-3)
+    drawn = traces(
+        weld_drawing(
+            facts(logged(replace(WELD, band=band, true_torch=path(0.46, 1.4e-3))))
+        ).deviation
+    )
+    np.testing.assert_allclose(drawn["believed, from the seam as felt"][1], 0.2, atol=1e-3)
+    np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.3, atol=1e-3)
+    np.testing.assert_allclose(drawn["95 % band"][1], 0.3, atol=1e-3)
+    np.testing.assert_allclose(drawn["95 % band, right"][1], -0.3, atol=1e-3)

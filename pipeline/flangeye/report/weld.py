@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye.report.facts import Facts
 from flangeye.report.plot import CIRCLE, HELD_OUT, TRUTH, UNUSED, USED, Figure, Trace, packed
@@ -51,6 +52,10 @@ def weld_drawing(facts: Facts) -> WeldDrawing | None:
         weld, _summary(facts, weld), _paths(seen), _offsets(seen), _deviation(seen, _truth(facts)),
         _contact(weld), _speeds(weld), tuple(_loop(weld)),
     )  # fmt: skip
+
+
+LARGEST_BAND = 5e-3
+"""A band that is wider is drawn so wide: it says that nothing is known [m]."""
 
 
 class _View:
@@ -153,20 +158,32 @@ def _offsets(view: _View) -> Figure:
 
 
 def _deviation(view: _View, truth: Floats | None) -> Figure:
-    torch = view.flat(view.weld.torch)
+    """Show the torch as believed, with its 95 % band, and as it truly was, where that is known."""
+    weld = view.weld
+    true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
-    for name, line, colour in (
-        ("from the seam as felt", view.weld.refined, CIRCLE),
-        ("from the true seam", truth, TRUTH),
+    for name, line, torch, colour in (
+        ("believed, from the seam as felt", weld.refined, weld.torch, CIRCLE),
+        ("true, from the true seam", truth, true_torch, TRUTH),
     ):
-        if line is None or len(line) < 2:
-            continue
-        seam = view.flat(line)
-        length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
-        along, across = off_line(seam, torch)
-        beside = (along >= 0.0) & (along <= length)
-        traces.append(_line(along[beside] * 1e3, across[beside] * 1e3, name, colour))
+        if line is not None and len(line) > 1:
+            along, across, _ = _beside(view, line, torch)
+            traces.append(_line(along * 1e3, across * 1e3, name, colour))
+    if len(weld.refined) > 1 and len(weld.band) == len(weld.torch):
+        along, _, beside = _beside(view, weld.refined, weld.torch)
+        for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
+            edge = sign * np.minimum(weld.band[beside], LARGEST_BAND) * 1e3
+            traces.append(_line(along * 1e3, edge, name, UNUSED, dash="dot"))
     return {"data": traces, "layout": _layout("along the seam [mm]", "torch to the left [mm]")}
+
+
+def _beside(view: _View, line: Floats, torch: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return where a torch (N, 3) is along a seam and to its left [m], and the (N,) beside it."""
+    seam = view.flat(line)
+    length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
+    along, across = off_line(seam, view.flat(torch))
+    beside = (along >= 0.0) & (along <= length)
+    return along[beside], across[beside], beside
 
 
 def _contact(weld: WeldReport) -> Figure:

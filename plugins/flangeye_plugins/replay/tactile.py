@@ -14,14 +14,10 @@ from flangeye.models.finger import Finger
 from flangeye.plugin.stage import part
 from flangeye.run.replay import ReplayedStep
 from flangeye_plugins.sensor.recorded import piece_of
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import Reader
+from flangeye_plugins.weld.going_on import controller_from
 from flangeye_plugins.weld.motion import ToolPose
-from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.settings import Following
-from flangeye_plugins.weld.tactile import controller_of
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
 SAME = 1e-9
@@ -49,11 +45,8 @@ class Again:
 
     def __init__(self, start: Mapping[str, Any]) -> None:
         """Set up controller and finger as they were."""
-        settings = Following.model_validate(start["settings"])
         self._finger = Finger.model_validate(start["finger"])
-        plan = Path(np.array(start["points"]))
-        belief = Belief(**{**start["belief"], "noise": tuple(start["belief"]["noise"])})
-        self._controller: Controller = controller_of(plan, belief, settings, start["mode"])
+        self._controller = controller_from(start)
         self._reader = Reader(self._finger)
         self._pixels: Any = None
         self._feelings: dict[int, TipDisplacement | None] = {}

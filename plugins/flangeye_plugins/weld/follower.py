@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,6 +46,12 @@ FIRM = 0.7
 WAITING = 0.2
 """Share of its speed that it keeps all the same: a wall that has ended is found out by going on."""
 
+COMPARED = 15
+"""Measurements that tell whether the seam has moved since the weld was stopped."""
+
+MOVED = 0.2e-3
+"""A seam that has moved by more is another one [m]."""
+
 SWERVE = 0.3e-3
 """So far the arm may swerve from a curve while it does not know of it [m]."""
 
@@ -53,6 +60,19 @@ SWERVE_AHEAD = 10e-3
 
 LATE_SHARE = 0.05
 """Weight of one image in the mean of their delays."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a stopped weld leaves to who goes on with it.
+
+    Attributes:
+        samples: (K, 4) what was felt; see :meth:`RefinedPath.samples`.
+        torch: Arc length of the torch's progress [m].
+    """
+
+    samples: Floats
+    torch: float
 
 
 class Follower:
@@ -74,7 +94,14 @@ class Follower:
         lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
     """
 
-    def __init__(self, plan: Path, belief: Belief, settings: Following, touch: bool = True) -> None:
+    def __init__(
+        self,
+        plan: Path,
+        belief: Belief,
+        settings: Following,
+        touch: bool = True,
+        before: Kept | None = None,
+    ) -> None:
         """Prepare to follow ``plan``.
 
         Args:
@@ -82,6 +109,7 @@ class Follower:
             belief: What is known of tool, finger and joint.
             settings: Gains and limits.
             touch: Follow by touch; otherwise the plan alone, for comparison.
+            before: What an earlier weld has left that is gone on with.
         """
         self.mode = "tactile" if touch else "vision"
         self.phase: Phase = "seeking" if touch else "following"
@@ -89,6 +117,10 @@ class Follower:
         self.tip, self.torch = settings.inset, settings.inset - belief.distance
         self.wanted = 0.0
         self.refined = RefinedPath(plan, belief.distance + settings.ending)
+        self._before = before
+        if before is not None:
+            self.refined.recall(before.samples)
+        self._moved: list[float] = []
         self.contact = Contact()
         self._plan, self._settings, self._touching = plan, settings, touch
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
@@ -109,6 +141,10 @@ class Follower:
         self._response = Response()
         self._elapsed = self._began = 0.0
         self._newest: tuple[ToolPose, Touch] | None = None
+
+    def kept(self) -> Kept | None:
+        """Return what is left to who goes on; None before the torch was on the seam."""
+        return None if self.lit is None else Kept(self.refined.samples(), self.torch)
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""
@@ -157,12 +193,14 @@ class Follower:
             return
         self.sigma = float(np.sqrt(self._variance(slant, angle)))
         self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
-        if not 0.0 <= self.torch <= self._plan.length:
+        if self.phase == "seeking" or not 0.0 <= self.torch <= self._plan.length:
             return
         if self.bound <= self._settings.max_error:
             self.lit = self.torch if self.lit is None else self.lit
         elif self.lit is not None or self.torch > LEAD_IN * self._belief.distance:
             self._stop(self._too_uncertain())
+        if self._before is not None and self.lit is None and self.torch > self._before.torch:
+            self._stop("the torch was not on the seam again where it had stopped; raise 'overlap'")
 
     def _variance(self, slant: float, angle: float) -> float:
         """Return the variance of the torch's place across the seam [m^2]."""
@@ -246,9 +284,24 @@ class Follower:
             settled = time - self.contact.since > BELIEF
             if settled and s < self._plan.length - self._settings.ending / 2:
                 self._felt = self._smoothed(felt)
+                self._compare(s, felt.offset)
                 self.refined.add(time, s, felt.offset, angle)
                 self._watch(s, felt)
             self.refined.confirm(time - BELIEF)
+
+    def _compare(self, s: float, offset: float) -> None:
+        """Stop where the seam is not where it was felt before the weld was stopped."""
+        if self._before is None or len(self._moved) == COMPARED:
+            return
+        if s > self._before.samples[-1, 0]:
+            return
+        self._moved.append(offset - self.refined.offset(s))
+        by = float(np.median(self._moved))
+        if len(self._moved) == COMPARED and abs(by) > MOVED:
+            self._stop(
+                f"the seam has moved by {abs(by) * 1e3:.2f} mm since the weld was stopped; weld "
+                "the rest as a seam of its own"
+            )
 
     def _watch(self, s: float, felt: Felt) -> None:
         """Stop where the tip does not sit in the groove any more."""

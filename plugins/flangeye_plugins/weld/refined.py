@@ -157,6 +157,20 @@ class RefinedPath:
         """Drop what is not yet believed: contact is lost, and it may be wrong already."""
         self._pending.clear()
 
+    def samples(self) -> Floats:
+        """Return what is believed: rows (K, 4) of arc length, offset, tool's angle and count."""
+        filled = np.flatnonzero(self._count)
+        count = self._count[filled]
+        means = (self._along[filled] / count, self._sum[filled] / count)
+        return np.column_stack([*means, self._angle[filled], count])
+
+    def recall(self, samples: Floats) -> None:
+        """Believe samples (K, 4) of an earlier weld of this plan; see :meth:`samples`."""
+        for s, offset, angle, count in samples.tolist():
+            for _ in range(int(count)):
+                self.add(-math.inf, s, offset, angle)
+        self.confirm(0.0)
+
     def offset(self, s: float) -> float:
         """Return the seam's offset from the plan at one arc length."""
         return self._offsets(s, (0.0,))[0]

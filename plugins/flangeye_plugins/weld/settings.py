@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from flangeye.files.paths import RecipePath
 from flangeye.models.finger import FingerPath
 from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
@@ -123,6 +124,13 @@ class WeldTactileParams(Following):
     )
     approach_joint_speed: AngularSpeed = param(
         "20 deg/s", gt=0, description="Speed of the joints on the way there."
+    )
+    resume: RecipePath | None = Field(
+        None,
+        description="The run.mcap of a weld that was stopped: goes on with what was felt.",
+    )
+    overlap: Length = param(
+        "30 mm", gt=0, description="How far before the stop the torch begins again, to go on."
     )
     start_angle: Angle = param(
         "0 deg", ge=-np.pi, le=np.pi, description="Angle of the tool to the seam at the start."

@@ -18,10 +18,8 @@ from flangeye.recipe.header import LimitsSection
 from flangeye.types import Floats, Journal, Seam, Seed, VerifiedHandEye, WeldReport
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
-from flangeye_plugins.weld.as_printed import AsPrinted
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.bounds import Bounds
-from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.execution import Cell, follow
 from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import (
@@ -31,12 +29,13 @@ from flangeye_plugins.weld.finger_camera import (
     SteppedReader,
     ThreadedReader,
 )
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.follower import Kept
 from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.going_on import controller_of, kept_of, set_back
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
-from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.weld_log import WeldLog
 
 
@@ -70,11 +69,14 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     checks.check_finger(finger, params)
     checks.check_seam(seam, plan, finger, params)
     checks.check_speeds(finger, params, allowed)
+    kept = None if params.resume is None else kept_of(params.resume, points)
+    if kept is not None:
+        params = set_back(params, plan, finger.torch, kept)
     passage = SeamReach(Task(model, allowed, finger, tool, plan, params))
     simulated = driver.simulated
     belief = belief_of(finger, seam.half_angle, params)
     checks.check_belief(belief, params)
-    controller = controller_of(plan, belief, params, params.mode)
+    controller = controller_of(plan, belief, params, params.mode, kept)
     checks.check_controller(controller, driver)
     if not (motion.allowed or simulated):
         raise NothingMoved(_plan_text(plan, params))
@@ -84,7 +86,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
         weld_log = opened.enter_context(WeldLog(journal, not simulated, params.log_images))
-        weld_log.note("start", start_of(points, plane, finger, belief, params))
+        weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
         keyboard = opened.enter_context(nullcontext() if simulated else keys())
         drive = Executor(robot, latest, model, allowed, keyboard)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
@@ -93,13 +95,6 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         reason = follow(cell, controller, weld_log, longest)
         truth = sensor.true_torch() if isinstance(sensor, KnowsTorch) else None
     return report_of(seam, plane, plan, finger, controller, weld_log, reason, truth)
-
-
-def controller_of(plan: Path, belief: Belief, settings: Following, mode: Mode) -> Controller:
-    """Return the controller of the mode that was asked for."""
-    if mode == "as_printed":
-        return AsPrinted(plan, belief.distance, settings)
-    return Follower(plan, belief, settings, touch=mode == "tactile")
 
 
 def _eyes(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:
@@ -115,7 +110,12 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
 
 
 def start_of(
-    points: Floats, plane: WorkPlane, finger: Finger, belief: Belief, params: WeldTactileParams
+    points: Floats,
+    plane: WorkPlane,
+    finger: Finger,
+    belief: Belief,
+    params: WeldTactileParams,
+    kept: Kept | None,
 ) -> dict[str, Any]:
     """Return all that the decisions of a weld follow from, besides what was measured."""
     return {
@@ -124,5 +124,6 @@ def start_of(
         "finger": finger.model_dump(mode="json"),
         "belief": asdict(belief),
         "mode": params.mode,
+        "kept": None if kept is None else {"samples": kept.samples.tolist(), "torch": kept.torch},
         "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
     }

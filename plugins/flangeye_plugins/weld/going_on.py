@@ -1,0 +1,144 @@
+"""Going on with a weld that was stopped: what was felt is kept, the torch goes back and overlaps.
+
+What was felt is in the log: the controller is stepped through the logged poses and displacements as
+far as the log goes, so nothing has to be saved when a weld is stopped, not even by kill -9.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.log.read import Note, read_notes
+from flangeye.types import Floats
+from flangeye_plugins.weld.as_printed import AsPrinted
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.follower import Follower, Kept
+from flangeye_plugins.weld.motion import ToolPose, Touch
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+
+SAME_PLAN = 1e-6
+"""Plans that differ by less are the same [m]."""
+
+PRESSING = 5e-3
+"""So far before the tip lets go of the wall it is set down at the latest [m]."""
+
+
+def controller_of(
+    plan: Path, belief: Belief, settings: Following, mode: Mode, kept: Kept | None = None
+) -> Controller:
+    """Return the controller of the mode that was asked for."""
+    if mode == "as_printed":
+        return AsPrinted(plan, belief.distance, settings)
+    return Follower(plan, belief, settings, mode == "tactile", kept)
+
+
+def controller_from(start: Mapping[str, Any]) -> Controller:
+    """Return the controller of a logged weld, as it was at its start."""
+    belief = Belief(**{**start["belief"], "noise": tuple(start["belief"]["noise"])})
+    settings = Following.model_validate(start["settings"])
+    kept = start.get("kept")
+    return controller_of(
+        Path(np.array(start["points"])), belief, settings, start["mode"],
+        None if kept is None else Kept(np.array(kept["samples"]), kept["torch"]),
+    )  # fmt: skip
+
+
+def kept_of(log: FilePath, points: Floats) -> Kept | None:
+    """Return what a stopped weld has left; None where its torch had not been on the seam.
+
+    Args:
+        log: The weld's.
+        points: (N, 3) of the plan, in the plane of the work [m].
+
+    Raises:
+        StageError: The log holds no weld by touch, or one that has ended or had another plan.
+    """
+    again: _Again | None = None
+    for note in read_notes(log):
+        if note.name == "start":
+            _require_same(log, points, np.array(note.value["points"]))
+            again = _Again(controller_from(note.value))
+        elif again is not None:
+            again.take(note)
+    if again is None or not isinstance(again.controller, Follower):
+        raise StageError(f"{log}: holds no weld by touch to go on with")
+    if again.controller.phase == "done":
+        raise StageError(f"{log}: this weld came to its end; there is nothing to go on with")
+    return again.controller.kept()
+
+
+class _Again:
+    """Steps a controller through the journal of its weld."""
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller = controller
+        self._felt: dict[int, Touch] = {}
+        self._number = -1
+
+    def take(self, note: Note) -> None:
+        if note.name == "sight":
+            self._number = note.value["number"]
+        elif note.name == "feeling":
+            felt = note.value
+            self._felt[self._number] = Touch(felt["time_ns"] * 1e-9, np.array(felt["displacement"]))
+        elif note.name == "cycles":
+            cycles = note.value
+            for i, time in enumerate(cycles["time"]):
+                pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
+                self.controller.step(pose, [self._felt[n] for n in cycles["touches"][i]])
+
+
+def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
+    if points.shape == before.shape and np.abs(points - before).max() < SAME_PLAN:
+        return
+    raise StageError(
+        f"{log}: was of another plan; go on with the seam that it had: "
+        f"--from {log} --at weld.tactile"
+    )
+
+
+def set_back(
+    params: WeldTactileParams, plan: Path, distance: float, kept: Kept
+) -> WeldTactileParams:
+    """Return the parameters with which the tip is set down so that the torch overlaps.
+
+    Raises:
+        StageError: The tip would be beyond where it can press.
+    """
+    release = params.speed * params.deflection / params.release
+    last = plan.length - params.ending - release - PRESSING
+    tip = _ahead(plan, max(kept.torch - params.overlap, params.inset - distance), distance)
+    tip = min(tip, last)
+    if tip < params.inset:
+        raise StageError(
+            "weld.tactile: the seam is too short to go on with from where the tip can press"
+        )
+    place = plan.at(tip)
+    torch = plan.at(_behind(plan, tip, distance)).point
+    heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
+    angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
+    return params.model_copy(update={"inset": tip, "start_angle": angle})
+
+
+def _ahead(plan: Path, torch: float, distance: float) -> float:
+    """Return where the tip is with the torch at an arc length and both on the plan."""
+    point = plan.at(torch).point
+    tip = torch + distance
+    while float(np.hypot(*(plan.at(tip).point - point))) < distance:
+        tip += 0.5e-3
+    return tip
+
+
+def _behind(plan: Path, tip: float, distance: float) -> float:
+    point = plan.at(tip).point
+    torch = tip - distance
+    while float(np.hypot(*(plan.at(torch).point - point))) < distance:
+        torch -= 0.5e-3
+    return torch

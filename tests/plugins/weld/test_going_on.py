@@ -1,0 +1,79 @@
+"""A weld that was stopped is gone on with: what was felt is kept, the torch overlaps."""
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.maths.seam_geometry import torch_deviation
+from flangeye.plugin.registry import load_registry
+from flangeye.plugin.stage import BoundPart
+from flangeye.run.replay import replay_steps
+from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
+from flangeye_plugins.weld.follower import Kept
+from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.going_on import kept_of, set_back
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.settings import WeldTactileParams
+from tests.plugins.weld.bench import curved
+from tests.plugins.weld.cell import planned, run, true_line
+from tests.plugins.weld.test_replay import logged
+
+END = 0.13
+SEAM = planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=END)
+PLAN = WorkPlane(SEAM.points_in_base, SEAM.openings_in_base).points(SEAM.points_in_base)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    hidden = {"hidden": ("24 s", "60 s")}
+    report, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
+    assert report.reason == "no tag was seen for 500 ms"
+    return report, logged(journal, tmp_path_factory.mktemp("stopped") / "run.mcap")
+
+
+def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped, tmp_path):
+    before, log = stopped
+    report, journal = run(SEAM, seed=4, speed="10 mm/s", resume=log)
+    assert report.completed
+    assert report.along[0] == pytest.approx(before.along[-1] - 30e-3, abs=2e-3)
+    welding = report.along > before.along[-1]
+    assert torch_deviation(
+        report.torch[welding], true_line("v-straight", END), report.opening
+    ).max() < 0.4e-3  # fmt: skip
+    ((_, redone),) = replay_steps(logged(journal, tmp_path / "run.mcap"), load_registry())
+    assert redone.same
+
+
+def test_a_seam_that_has_moved_meanwhile_is_noticed(stopped):
+    moved = {"position": ("600 mm", "0.6 mm", "250 mm")}
+    report, _ = run(SEAM, sensor=moved, seed=4, speed="10 mm/s", resume=stopped[1])
+    assert "the seam has moved by 0." in report.reason
+
+
+def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(stopped, tmp_path):
+    torn = tmp_path / "run.mcap"
+    torn.write_bytes(stopped[1].read_bytes()[:-200_000])
+    whole, part = kept_of(stopped[1], PLAN), kept_of(torn, PLAN)
+    assert 0.0 < part.torch < whole.torch
+    assert len(part.samples) < len(whole.samples)
+
+
+def test_what_cannot_be_gone_on_with_is_refused(stopped, tmp_path):
+    with pytest.raises(StageError, match="was of another plan"):
+        kept_of(stopped[1], PLAN + 1e-3)
+    with pytest.raises(StageError, match="holds no weld by touch"):
+        kept_of(logged([], tmp_path / "empty.mcap"), PLAN)
+
+
+def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path):
+    hidden = {"hidden": ("12 s", "60 s")}
+    _, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
+    assert kept_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
+
+
+def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it():
+    plan = Path(curved(0.15))
+    params = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
+    params = set_back(params, plan, 0.04, Kept(np.zeros((0, 4)), 0.06))
+    tip, torch = plan.at(params.inset).point, plan.at(0.03).point
+    assert np.linalg.norm(tip - torch) == pytest.approx(0.04, abs=0.6e-3)
