@@ -14,8 +14,8 @@ from flangeye.errors import FlangeyeError
 from flangeye.log.read import RunLog
 from flangeye.report.units import millimetres
 from flangeye.result import Result
-from flangeye_ui.desk import Desk
 from flangeye_ui.layout import command_line, page
+from flangeye_ui.project import Project
 from flangeye_ui.run_page import FLANGE, SCAN
 from flangeye_ui.scene import draw_cloud
 
@@ -29,23 +29,23 @@ COLUMNS = [
 POINTS = 5_000
 
 
-def add(desk: Desk) -> None:
+def add(project: Project) -> None:
     """Add the page, and serve the folder's own reports to it."""
     for name in ("runs", "batches"):
-        (desk.folder / name).mkdir(exist_ok=True)
-        app.add_static_files(f"/{name}", desk.folder / name)
+        (project.folder / name).mkdir(exist_ok=True)
+        app.add_static_files(f"/{name}", project.folder / name)
 
     @ui.page("/archive")
     def archive() -> None:
         with page("Archive"):
-            rows = [row_of(run) for run in desk.runs()]
+            rows = [row_of(run) for run in project.runs()]
             if not rows:
                 ui.label("There is no run in this folder yet.")
                 return
             ui.table(columns=COLUMNS, rows=rows, row_key="run").classes("w-full").props("dense")
-            _reports(desk)
-            Scrubber(desk)
-            command_line(desk.command("show", f"runs/{rows[0]['run']}/run.mcap"))
+            _reports(project)
+            Scrubber(project)
+            command_line(project.command("show", f"runs/{rows[0]['run']}/run.mcap"))
 
 
 def row_of(run: Path) -> dict[str, Any]:
@@ -69,21 +69,21 @@ def row_of(run: Path) -> dict[str, Any]:
     }
 
 
-def _reports(desk: Desk) -> None:
-    pages = [*desk.folder.glob("runs/*/report.html"), *desk.folder.glob("batches/*/*.html")]
+def _reports(project: Project) -> None:
+    pages = [*project.folder.glob("runs/*/report.html"), *project.folder.glob("batches/*/*.html")]
     with ui.row().classes("gap-4"):
         for path in sorted(pages):
-            where = path.relative_to(desk.folder)
+            where = path.relative_to(project.folder)
             ui.link(str(where), f"/{where}", new_tab=True)
 
 
 class Scrubber:
     """A log, capture by capture."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, project: Project) -> None:
+        self._project = project
         self._log: RunLog | None = None
-        runs = [r.name for r in desk.runs()]
+        runs = [r.name for r in project.runs()]
         ui.label("Look at a log").classes("text-h6")
         ui.select(
             runs, value=runs[0], label="Run", on_change=lambda e: self._open(e.value)
@@ -99,7 +99,7 @@ class Scrubber:
     async def _open(self, run: str) -> None:
         self._log, self._told.text = None, "reading …"
         try:
-            facts = await asyncio.to_thread(self._desk.read, self._desk.folder / "runs" / run)
+            facts = await asyncio.to_thread(self._project.read, self._project.folder / "runs" / run)
             self._log = facts.log
         except FlangeyeError as error:
             self._told.text = str(error)

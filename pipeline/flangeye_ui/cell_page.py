@@ -10,42 +10,42 @@ from nicegui import ui
 from flangeye.files.bundled import bundled
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.load import find_recipe, recipe_names
-from flangeye_ui.desk import Desk, Mistake, at
 from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.project import Mistake, Project, at
 
 CONFIGURATIONS = ["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"]
 
 
-def add(desk: Desk) -> None:
+def add(project: Project) -> None:
     """Add the page."""
 
     @ui.page("/")
     def cell() -> None:
         with page("Cell"), ui.row().classes("w-full gap-6 items-start"):
-            Form(desk)
+            Form(project)
 
 
 class Form:
     """The form and the recipe: two views of one file."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, project: Project) -> None:
+        self._project = project
         with ui.column().classes("col-12 col-md-5 gap-2"):
             self._start_from()
             self.fields()
         with ui.column().classes("col-12 col-md gap-2"):
             ui.label("Recipe").classes("text-h6")
-            self._yaml = ui.textarea(value=desk.text, on_change=self._typed)
+            self._yaml = ui.textarea(value=project.text, on_change=self._typed)
             self._yaml.classes("w-full").props(
                 'outlined autogrow input-class="font-mono" aria-label="Recipe in YAML"'
             )
             self.verdict()
-            command_line(desk.command("check", desk.recipe_path.name))
+            command_line(project.command("check", project.recipe_path.name))
 
     @ui.refreshable_method
     def verdict(self) -> None:
         """Say whether the recipe can run, and everything that is wrong with it."""
-        _, mistakes = self._desk.check()
+        _, mistakes = self._project.check()
         if not mistakes:
             ui.label("The recipe is sound.").classes("text-positive").props('role="status"')
         for each in mistakes:
@@ -54,11 +54,11 @@ class Form:
     @ui.refreshable_method
     def fields(self) -> None:
         """Show the header and every step, with what is wrong at each field."""
-        data, (_, mistakes) = self._desk.data(), self._desk.check()
+        data, (_, mistakes) = self._project.data(), self._project.check()
         self._header(data, mistakes)
         for index, entry in enumerate(data.get("steps") or []):
             self._step(index, entry, mistakes)
-        stages = sorted(self._desk.registry.stages)
+        stages = sorted(self._project.registry.stages)
         ui.select(stages, label="Add a step", with_input=True, on_change=self._add).classes(
             "w-full"
         )
@@ -97,7 +97,7 @@ class Form:
     def _step(self, index: int, entry: Any, mistakes: list[Mistake]) -> None:
         name = next(iter(entry)) if isinstance(entry, dict) else str(entry)
         given = (entry[name] if isinstance(entry, dict) else None) or {}
-        stage = self._desk.registry.stages.get(name)
+        stage = self._project.registry.stages.get(name)
         with ui.expansion(f"{index}. {name}").classes("w-full").props("dense"):
             if stage:
                 ui.label(stage.summary).classes("text-caption")
@@ -123,7 +123,7 @@ class Form:
             mistake(text)
 
     def _set(self, path: list[Any], value: Any) -> None:
-        data = self._desk.data()
+        data = self._project.data()
         if path[0] == "steps":
             _put_step(data["steps"], path, _plain(value))
         elif len(path) == 1:
@@ -135,22 +135,22 @@ class Form:
         )
 
     def _add(self, event: Any) -> None:
-        data = self._desk.data()
+        data = self._project.data()
         data["steps"] = [*(data.get("steps") or []), event.value]
         self._write(data)
 
     def _remove(self, index: int) -> None:
-        data = self._desk.data()
+        data = self._project.data()
         del data["steps"][index]
         self._write(data)
 
     def _write(self, data: dict[str, Any]) -> None:
-        self._desk.edit(data)
-        self._yaml.value = self._desk.text
+        self._project.edit(data)
+        self._yaml.value = self._project.text
         self.fields.refresh()
 
     def _typed(self, event: Any) -> None:
-        self._desk.text = event.value
+        self._project.text = event.value
         self.verdict.refresh()
         self.fields.refresh()
 

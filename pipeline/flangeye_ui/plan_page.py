@@ -17,8 +17,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
 from flangeye.types import Floats
-from flangeye_ui.desk import Desk
 from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum
 
 ROW = re.compile(r"^(\d{4})\s+(\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(\d+) deg\s+(.*)$")
@@ -48,25 +48,25 @@ class Stop:
         return self.way.startswith("barred")
 
 
-def add(desk: Desk) -> None:
+def add(project: Project) -> None:
     """Add the page."""
 
     @ui.page("/plan")
     def plan() -> None:
         with page("Plan"):
             ui.label("Nothing moves on this page.")
-            recipe, mistakes = desk.check()
+            recipe, mistakes = project.check()
             if recipe is None:
                 mistake(f"The recipe has {len(mistakes)} mistakes; see the page Cell.")
                 return
-            Planner(desk, recipe)
+            Planner(project, recipe)
 
 
 class Planner:
     """The drawing and the plan beside it."""
 
-    def __init__(self, desk: Desk, recipe: Recipe) -> None:
-        self._desk, self._recipe = desk, recipe
+    def __init__(self, project: Project, recipe: Recipe) -> None:
+        self._project, self._recipe = project, recipe
         with ui.row().classes("w-full gap-4"):
             with ui.column().classes("col-12 col-md-7"):
                 self._scene = ui.scene(width=640, height=460, background_color="#eef1f5").classes(
@@ -77,7 +77,7 @@ class Planner:
                 self._guess()
                 ui.button("Check every pose and way", on_click=self._plan)
                 self._told = ui.column().classes("w-full")
-        command_line(desk.command("run", desk.recipe_path.name))
+        command_line(project.command("run", project.recipe_path.name))
 
     def _draw(self) -> None:
         robot, scanner = (self._recipe.context.get(m) for m in (RobotModel, ScannerModel))
@@ -107,7 +107,7 @@ class Planner:
 
     def _guess(self) -> None:
         """Let the person say where the scanner stands, by number or by dragging its ball."""
-        data = self._desk.data()
+        data = self._project.data()
         view = (_first(data) or {}).get("view") or {}
         position = (view.get("guess") or {}).get("position") if isinstance(view, dict) else None
         if not position:
@@ -124,12 +124,12 @@ class Planner:
         ).classes("text-caption")
 
     def _place(self, position: list[str]) -> None:
-        data = self._desk.data()
+        data = self._project.data()
         first = _first(data) or {}
         guess = {**(first["view"]["guess"]), "position": position}
         name = next(iter(data["steps"][0]))
         data["steps"][0] = {name: {**first, "view": {"guess": guess}}}
-        self._desk.edit(data)
+        self._project.edit(data)
         ui.navigate.reload()
 
     async def _plan(self) -> None:
@@ -140,7 +140,7 @@ class Planner:
         if self._recipe.steps[0].stage.name != "acquire.live":
             text = "this recipe drives no arm: its poses are those of its recordings or simulation"
         else:
-            text = await asyncio.to_thread(_planned, self._desk)
+            text = await asyncio.to_thread(_planned, self._project)
         self._told.clear()
         with self._told:
             self._show(text)
@@ -165,11 +165,11 @@ def stops_of(text: str) -> list[Stop]:
     return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[7]) for r in rows]
 
 
-def _planned(desk: Desk) -> str:
-    command = [sys.executable, "-P", "-m", "flangeye.cli", "run", desk.recipe_path.name]
+def _planned(project: Project) -> str:
+    command = [sys.executable, "-P", "-m", "flangeye.cli", "run", project.recipe_path.name]
     try:
         done = subprocess.run(
-            command, cwd=desk.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+            command, cwd=project.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
             timeout=300,
         )  # fmt: skip
     except subprocess.TimeoutExpired:

@@ -7,9 +7,9 @@ from typing import Any
 
 from nicegui import Client, ui
 
-from flangeye_ui.desk import Desk
 from flangeye_ui.layout import command_line, confirmed, mistake, page
 from flangeye_ui.process import RunProcess
+from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_cloud
 
 EVERY = 0.25
@@ -20,21 +20,21 @@ SCAN, FLANGE = (0.12, 0.14, 0.18), (0.02, 0.20, 0.75)
 BEAT = "setInterval(() => emitEvent('beat'), 500)"
 
 
-def add(desk: Desk) -> None:
+def add(project: Project) -> None:
     """Add the page."""
 
     @ui.page("/run")
     def run(client: Client) -> None:
         with page("Run"):
-            Panel(desk, client)
+            Panel(project, client)
 
 
 class Panel:
     """What is seen of the run, and the buttons that start and stop it."""
 
-    def __init__(self, desk: Desk, client: Client) -> None:
-        self._desk, self._me, self._heard, self._shown = desk, client.id, time.monotonic(), -1
-        recipe, mistakes = desk.check()
+    def __init__(self, project: Project, client: Client) -> None:
+        self._project, self._me, self._heard, self._shown = project, client.id, time.monotonic(), -1
+        recipe, mistakes = project.check()
         self._said: list[Any] = []
         self._live = bool(recipe) and recipe.steps[0].stage.name == "acquire.live"  # type: ignore[union-attr]
         if mistakes:
@@ -57,13 +57,13 @@ class Panel:
                 self._scene.classes("w-full").move_camera(0.1, -0.3, 0.1, 0, 0, 0.75, 0, -1, 0)
                 self._leave_out()
         move = ["--move"] if self._live else []
-        command_line(desk.command("run", desk.recipe_path.name, *move))
+        command_line(project.command("run", project.recipe_path.name, *move))
         self._watch(client)
 
     def _watch(self, client: Client) -> None:
         """Look at the run, and at whether this page still lives."""
         ui.on("beat", self._beat)
-        client.on_disconnect(lambda: self._desk.page_gone(self._me))
+        client.on_disconnect(lambda: self._project.page_gone(self._me))
         ui.timer(0.1, lambda: ui.run_javascript(BEAT), once=True)
         ui.timer(EVERY, self._look)
 
@@ -75,20 +75,20 @@ class Panel:
             self._stop()
 
     def _stop(self) -> None:
-        if self._desk.run:
-            self._desk.run.stop("stopped on this page")
+        if self._project.run:
+            self._project.run.stop("stopped on this page")
 
     async def _begin(self) -> None:
         if self._running:
             ui.notify("a run is under way; stop it first", type="warning")
         elif await self._agreed():
-            self._desk.start(self._live, self._me)
+            self._project.start(self._live, self._me)
             self._shown = -1
 
     async def _resume(self) -> None:
-        runs = self._desk.runs()
+        runs = self._project.runs()
         if runs and not self._running and await self._agreed():
-            self._desk.resume(runs[0], self._live, self._me)
+            self._project.resume(runs[0], self._live, self._me)
 
     async def _agreed(self) -> bool:
         """Ask, where an arm would move."""
@@ -98,15 +98,15 @@ class Panel:
 
     @property
     def _running(self) -> bool:
-        return bool(self._desk.run) and self._desk.run.code is None  # type: ignore[union-attr]
+        return bool(self._project.run) and self._project.run.code is None  # type: ignore[union-attr]
 
     def _look(self) -> None:
-        run = self._desk.run
+        run = self._project.run
         if self._running and time.monotonic() - self._heard > SILENCE:
-            self._desk.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
+            self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
         self._go_on.set_visibility(bool(run and run.code not in (None, 0)))
         self._state.text = (
-            "Nothing runs." if run is None else told(run, self._desk.owner == self._me)
+            "Nothing runs." if run is None else told(run, self._project.owner == self._me)
         )
         if run is not None:
             self._show(run)
@@ -140,7 +140,7 @@ class Panel:
 
     def _leave_out(self) -> None:
         """Let a pose of an archive be left out, as the recipe's line has it."""
-        data = self._desk.data()
+        data = self._project.data()
         steps = data.get("steps") or [{}]
         name = next(iter(steps[0])) if isinstance(steps[0], dict) else steps[0]
         if name not in ("acquire.archive", "acquire.centres"):
@@ -151,7 +151,7 @@ class Panel:
             given = dict((steps[0][name] if isinstance(steps[0], dict) else None) or {})
             given["leave_out"] = [*given.get("leave_out", []), box.value]
             steps[0] = {name: given}
-            self._desk.edit(data)
+            self._project.edit(data)
             ui.notify(f"{box.value} is in leave_out; start again")
 
         ui.button("Leave it out", on_click=leave_out).props("outline")

@@ -15,7 +15,7 @@ from nicegui import app, ui
 from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
 from flangeye_ui import archive_page, cell_page, plan_page, run_page, verdict_page
-from flangeye_ui.desk import Desk
+from flangeye_ui.project import Project
 
 COOKIE = "flangeye_token"
 DENIED = b"wrong or missing token: open the address that 'flangeye ui' printed\n"
@@ -38,11 +38,11 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
         raise StageError(f"{folder}: is not a folder")
     require_free(host, port)
     token = secrets.token_urlsafe(16)
-    desk = Desk(folder.resolve(), registry)
+    project = Project(folder.resolve(), registry)
     for each in (cell_page, plan_page, run_page, verdict_page, archive_page):
-        each.add(desk)
+        each.add(project)
     app.add_middleware(Token, token=token)
-    app.on_shutdown(lambda: desk.run.stop("the page's server ended") if desk.run else None)
+    app.on_shutdown(lambda: project.run.stop("the page's server ended") if project.run else None)
     address = f"http://{host}:{port}/?token={token}"
     print(f"open {address}", flush=True)  # noqa: T201  the person needs it
     if browser and not webbrowser.open(address):

@@ -16,19 +16,19 @@ from flangeye.errors import FlangeyeError
 from flangeye.recipe.overrides import apply_override
 from flangeye.report.facts import Facts
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
-from flangeye_ui.desk import Desk
 from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.project import Project
 
 TONES = {"verified": "text-positive", "unverified": "text-warning"}
 
 
-def add(desk: Desk) -> None:
+def add(project: Project) -> None:
     """Add the page."""
 
     @ui.page("/verdict")
     def verdict(run: str = "") -> None:
         with page("Verdict"):
-            runs = desk.runs()
+            runs = project.runs()
             chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
             if chosen is None:
                 ui.label("There is no run yet; start one on the page Run.")
@@ -38,22 +38,22 @@ def add(desk: Desk) -> None:
                 on_change=lambda e: ui.navigate.to(f"/verdict?run={e.value}"),
             ).classes("w-full")  # fmt: skip
             place = ui.column().classes("w-full gap-3")
-            ui.timer(0.05, lambda: _load(desk, chosen, place), once=True)
+            ui.timer(0.05, lambda: _load(project, chosen, place), once=True)
 
 
-async def _load(desk: Desk, run: Path, place: ui.column) -> None:
+async def _load(project: Project, run: Path, place: ui.column) -> None:
     """Read the log aside, so that the page answers meanwhile, and show it."""
     with place:
         spinner = ui.spinner()
         try:
-            facts = await asyncio.to_thread(desk.read, run)
-            _show(desk, run, facts)
+            facts = await asyncio.to_thread(project.read, run)
+            _show(project, run, facts)
         except FlangeyeError as error:
             mistake(str(error))
         spinner.delete()
 
 
-def _show(desk: Desk, run: Path, facts: Facts) -> None:
+def _show(project: Project, run: Path, facts: Facts) -> None:
     found = verdict_of(facts)
     tone = TONES.get(found.kind, "text-negative")
     ui.label(f"{found.label}: {found.sentence}").classes(f"text-h6 {tone}").props('role="status"')
@@ -69,17 +69,17 @@ def _show(desk: Desk, run: Path, facts: Facts) -> None:
         text = transform_text(name, estimate)
         ui.label(f"{text.name} {text.meaning}")
         ui.code(text.matrix, language="text").classes("w-full overflow-x-auto")
-    Doctor(desk, run)
+    Doctor(project, run)
     if facts.result.transforms:
-        _exports(desk, run)
-    command_line(desk.command("certificate", str(run.relative_to(desk.folder))))
+        _exports(project, run)
+    command_line(project.command("certificate", str(run.relative_to(project.folder))))
 
 
 class Doctor:
     """The doctor's findings, with a button that writes the line it gives into the recipe."""
 
-    def __init__(self, desk: Desk, run: Path) -> None:
-        self._desk, self._run = desk, run
+    def __init__(self, project: Project, run: Path) -> None:
+        self._project, self._run = project, run
         ui.button("Ask the doctor", on_click=self._ask).props("outline")
         self._told = ui.column().classes("w-full gap-1")
 
@@ -98,7 +98,7 @@ class Doctor:
                 ui.button("Write this line", on_click=lambda _, fix=fix: self._apply(fix))
 
     def _findings(self) -> Iterator[tuple[str, str]]:
-        registry = self._desk.registry
+        registry = self._project.registry
         try:
             session = open_session(self._run / "run.mcap", registry)
             checks = [part for part in registry.parts.values() if part.kind == "check"]
@@ -113,13 +113,13 @@ class Doctor:
             line: Any = yaml.safe_load(fix)
         except yaml.YAMLError:
             line = None
-        data = self._desk.data()
+        data = self._project.data()
         if not isinstance(line, dict) or not data.get("steps"):
             ui.notify("this is for a person to do, not a line of the recipe", type="warning")
             return
         for name, value in line.items():
             _write(data, str(name), value)
-        self._desk.edit(data)
+        self._project.edit(data)
         ui.notify("written; look at the page Cell")
 
 
@@ -137,10 +137,10 @@ def _write(data: dict[str, Any], name: str, value: Any) -> None:
     )
 
 
-def _exports(desk: Desk, run: Path) -> None:
+def _exports(project: Project, run: Path) -> None:
     """Show the calibration in every program's words, a tab each."""
-    names = sorted(n.removeprefix("export.") for n in desk.registry.stages if n[:7] == "export.")
-    where = run.relative_to(desk.folder)
+    names = sorted(n.removeprefix("export.") for n in project.registry.stages if n[:7] == "export.")
+    where = run.relative_to(project.folder)
     ui.label("Export").classes("text-h6")
 
     place = ui.column().classes("w-full gap-1")
@@ -150,8 +150,8 @@ def _exports(desk: Desk, run: Path) -> None:
 
     async def show(name: str) -> None:
         words = ["export", str(where), "--to", name]
-        code.content = await asyncio.to_thread(_exported, desk.folder, words)
-        line.text = desk.command(*words)
+        code.content = await asyncio.to_thread(_exported, project.folder, words)
+        line.text = project.command(*words)
 
     async def chosen(event: ValueChangeEventArguments[Any]) -> None:
         await show(str(event.value))
@@ -168,7 +168,7 @@ def _exports(desk: Desk, run: Path) -> None:
         async def save() -> None:
             if tabs.value:
                 words = ["export", str(where), "--to", str(tabs.value)]
-                ui.notify(await asyncio.to_thread(_command, desk.folder, words))
+                ui.notify(await asyncio.to_thread(_command, project.folder, words))
 
         ui.button("Write the file", on_click=save)
     place.move(target_index=-1)

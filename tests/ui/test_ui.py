@@ -22,8 +22,8 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from flangeye.errors import StageError
 from flangeye.recipe.load import find_recipe
-from flangeye_ui.desk import _mistake
 from flangeye_ui.plan_page import stops_of
+from flangeye_ui.project import _mistake
 from flangeye_ui.server import require_free
 from tests.ui.conftest import Served, ended, serve
 
@@ -209,23 +209,23 @@ def test_a_folder_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
     from flangeye.plugin.registry import load_registry
-    from flangeye_ui.desk import Desk
+    from flangeye_ui.project import Project
 
-    desk = Desk(tmp_path, load_registry())
-    desk.text = SMALL.replace("0.25", "1.0")
-    desk.start(move=False, owner="page")
-    assert desk.run is not None and desk.run.code is None
-    desk.page_gone("page")
-    assert not desk.run.stopped  # nothing moves, so nothing is stopped
-    desk.run.moves = True
-    desk.page_gone("another page")
-    assert not desk.run.stopped
-    desk.page_gone("page")
-    assert [desk.run.stopped] == ["the page was closed"]
+    project = Project(tmp_path, load_registry())
+    project.text = SMALL.replace("0.25", "1.0")
+    project.start(move=False, owner="page")
+    assert project.run is not None and project.run.code is None
+    project.page_gone("page")
+    assert not project.run.stopped  # nothing moves, so nothing is stopped
+    project.run.moves = True
+    project.page_gone("another page")
+    assert not project.run.stopped
+    project.page_gone("page")
+    assert [project.run.stopped] == ["the page was closed"]
     deadline = time.monotonic() + 30
-    while desk.run.code is None and time.monotonic() < deadline:
+    while project.run.code is None and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert desk.run.code not in (None, 0)
+    assert project.run.code not in (None, 0)
 
 
 def test_a_recipes_mistake_stands_at_its_field() -> None:

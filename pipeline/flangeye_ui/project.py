@@ -44,7 +44,7 @@ class Mistake:
     text: str
 
 
-class Desk:
+class Project:
     """The state behind the pages; one a server, so that two pages show the same.
 
     Attributes:
