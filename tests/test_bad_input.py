@@ -4,6 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +33,7 @@ def pose(i, x=None):
 
 
 @pytest.fixture
-def archive(tmp_path):
+def archive(tmp_path: Path) -> Path:
     """A folder of five clouds and their poses."""
     folder = tmp_path / "archive"
     folder.mkdir()
@@ -44,7 +47,7 @@ def archive(tmp_path):
 
 
 @pytest.fixture
-def run(tmp_path):
+def run(tmp_path: Path) -> Callable[..., Any]:
     def call(archive, *words):
         told = subprocess.run(
             [sys.executable, "-m", "flangeye.cli", "run", "recipe.yaml", "--archive", str(archive),
@@ -111,7 +114,9 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_one_line_that_names_the_place(name, archive, run, tmp_path):
+def test_one_line_that_names_the_place(
+    name: str, archive: Path, run: Callable[..., Any], tmp_path: Path
+) -> None:
     spoil, words, mentions = CASES[name]
     spoil(archive)
     line = refusal(run(archive, *words), tmp_path)
@@ -119,7 +124,7 @@ def test_one_line_that_names_the_place(name, archive, run, tmp_path):
     assert len(line) < 400
 
 
-def test_a_disk_that_is_full(tmp_path, ancorasir):
+def test_a_disk_that_is_full(tmp_path: Path, ancorasir: Path) -> None:
     """The file size limit of the process stands in for a full disk."""
     script = (
         "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "

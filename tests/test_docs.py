@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def quoted(path):
 
 
 @pytest.mark.parametrize("document", ["plugins/README.md"])
-def test_quoted_files_are_the_files(document):
+def test_quoted_files_are_the_files(document: str) -> None:
     quotes = QUOTE.findall((ROOT / document).read_text())
     assert quotes
     for path, text in quotes:
@@ -34,13 +35,13 @@ def test_quoted_files_are_the_files(document):
 
 
 @pytest.mark.parametrize("document", sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("*/README.md")))
-def test_links_lead_somewhere(document):
+def test_links_lead_somewhere(document: Any) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
         if "://" not in target:
             assert (document.parent / target).exists(), f"{document.name} links to {target}"
 
 
-def test_the_gallery_shows_the_recipes():
+def test_the_gallery_shows_the_recipes() -> None:
     for path in (gallery.README, gallery.FRONT):
         page = path.read_text()
         assert gallery.renewed(page) == page, "python -m tools.gallery renews it"
@@ -69,7 +70,7 @@ def _runnable():
 
 
 @pytest.mark.parametrize("page", list(_runnable()))
-def test_commands_of_a_page_run(page, tmp_path, monkeypatch):
+def test_commands_of_a_page_run(page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files with a title are written, then every command is run, in the order of the page."""
     shared = ROOT.parent / "shared"
     work = tmp_path / "work"
@@ -97,14 +98,14 @@ WALKS = ROOT / "docs" / "how-to" / "add-a-plugin.md"
 @pytest.mark.parametrize(
     ("title", "text"), [(t, x) for language, t, x in blocks(WALKS) if language == "python"]
 )
-def test_a_walk_is_short_and_its_plugin_is_accepted(title, text):
+def test_a_walk_is_short_and_its_plugin_is_accepted(title: Any, text: Any) -> None:
     assert len(text.splitlines()) <= 40
     given: dict[str, object] = {}
     exec(compile(text, title, "exec"), given)
     assert [name for name in given if isinstance(given[name], Plugin)]
 
 
-def test_the_rail_of_the_walk_is_an_arm(tmp_path):
+def test_the_rail_of_the_walk_is_an_arm(tmp_path: Path) -> None:
     ((title, text),) = [(t, x) for language, t, x in blocks(WALKS) if language == "yaml"]
     (tmp_path / title).write_text(text)
     robot = read_model(tmp_path / title, RobotModel)

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ from flangeye.log.read import read_run
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.workpiece import load_workpiece, read_mesh
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import load_recipe
 from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
@@ -55,7 +58,9 @@ steps:
 
 
 @pytest.fixture
-def flangeye(monkeypatch, tmp_path, capsys):
+def flangeye(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Any]:
     """Call the command line in an empty folder; return the exit code and what it wrote."""
     monkeypatch.chdir(tmp_path)
 
@@ -88,7 +93,9 @@ def evil(folder, name, to="PWNED"):
 
 
 @pytest.mark.parametrize("program", ["./evil.sh", "{folder}/evil.sh", "../{name}/evil.sh"])
-def test_a_recipe_runs_no_program(flangeye, tmp_path, program):
+def test_a_recipe_runs_no_program(
+    flangeye: Callable[..., Any], tmp_path: Path, program: str
+) -> None:
     evil(tmp_path, "evil.sh")
     path = program.format(folder=tmp_path, name=tmp_path.name)
     driver = f"{{model: phoxi-m, driver: {{azure_kinect: {{python: {path}}}}}}}"
@@ -98,7 +105,9 @@ def test_a_recipe_runs_no_program(flangeye, tmp_path, program):
     assert not (tmp_path / "PWNED").exists()
 
 
-def test_a_program_of_the_current_folder_is_not_found_by_its_name(tmp_path, monkeypatch):
+def test_a_program_of_the_current_folder_is_not_found_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     evil(tmp_path, "evil.sh")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
@@ -107,7 +116,7 @@ def test_a_program_of_the_current_folder_is_not_found_by_its_name(tmp_path, monk
     assert not (tmp_path / "PWNED").exists()
 
 
-def test_a_recipe_loads_no_library(flangeye, tmp_path):
+def test_a_recipe_loads_no_library(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     (tmp_path / "evil.cti").write_bytes(b"\x7fELF")
     for producer in ("./evil.cti", tmp_path / "evil.cti"):
         driver = f"{{model: phoxi-m, driver: {{genicam: {{producer: {producer}}}}}}}"
@@ -115,7 +124,7 @@ def test_a_recipe_loads_no_library(flangeye, tmp_path):
         assert "scanner.driver.genicam.producer" in one_line(flangeye("check", "r.yaml"))
 
 
-def test_a_device_of_the_finger_is_a_camera_and_no_pipeline_of_programs():
+def test_a_device_of_the_finger_is_a_camera_and_no_pipeline_of_programs() -> None:
     from pydantic import ValidationError
 
     from flangeye_plugins.sensor.opencv import OpenCVParams
@@ -132,7 +141,9 @@ def poisoned(folder, *names):
         (folder / f"{name}.py").write_text(f"open({str(folder / 'PWNED')!r}, 'w').close()\n")
 
 
-def test_a_child_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
+def test_a_child_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     poisoned(tmp_path, "yaml", "struct", "numpy", "flangeye")
     subprocess.run(python_command("-c", "import yaml, struct, numpy"), check=True)
@@ -144,7 +155,7 @@ def test_a_child_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "PWNED").exists()
 
 
-def test_every_child_is_started_so(monkeypatch):
+def test_every_child_is_started_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """What starts this Python in the source does it through the one function."""
     root = Path(cli.__file__).parents[3]
     for package in ("pipeline/flangeye", "plugins/flangeye_plugins", "plugins/flangeye_emulators"):
@@ -153,7 +164,9 @@ def test_every_child_is_started_so(monkeypatch):
                 assert "sys.executable" not in file.read_text("utf-8"), file
 
 
-def test_a_plugin_of_the_current_folder_is_not_loaded(tmp_path, monkeypatch):
+def test_a_plugin_of_the_current_folder_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from flangeye.plugin.installed import installed_plugins
 
     info = tmp_path / "evil-1.dist-info"
@@ -167,7 +180,9 @@ def test_a_plugin_of_the_current_folder_is_not_loaded(tmp_path, monkeypatch):
     assert "builtin" in {plugin.name for plugin in installed_plugins()}
 
 
-def test_a_model_is_a_regular_file_of_reasonable_size(tmp_path, flangeye):
+def test_a_model_is_a_regular_file_of_reasonable_size(
+    tmp_path: Path, flangeye: Callable[..., Any]
+) -> None:
     (tmp_path / "zero.yaml").symlink_to("/dev/zero")
     os.mkfifo(tmp_path / "pipe.yaml")
     (tmp_path / "big.yaml").write_bytes(b"#" * 2_000_000)
@@ -190,12 +205,12 @@ def test_a_model_is_a_regular_file_of_reasonable_size(tmp_path, flangeye):
         assert why in flangeye("check", "r.yaml")[2]
 
 
-def test_a_link_to_a_regular_file_is_followed(tmp_path):
+def test_a_link_to_a_regular_file_is_followed(tmp_path: Path) -> None:
     (tmp_path / "ur5.yaml").symlink_to(bundled("data") / "robots" / "ur5.yaml")
     assert read_model(tmp_path / "ur5.yaml", RobotModel).model == "ur5"
 
 
-def test_opening_never_waits(tmp_path):
+def test_opening_never_waits(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path("/dev/null"), tmp_path):
         with pytest.raises(StageError, match="a file is needed"):
@@ -228,7 +243,7 @@ end_header
 """
 
 
-def test_a_malformed_mesh_is_refused_and_ends_no_process(tmp_path):
+def test_a_malformed_mesh_is_refused_and_ends_no_process(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(200, 3)).astype("<f4").tobytes()
     face = b"\x03" + np.array([0, 1, 10**9], "<i4").tobytes()
@@ -245,7 +260,7 @@ def test_a_malformed_mesh_is_refused_and_ends_no_process(tmp_path):
         load_workpiece(tmp_path / "part.yaml")
 
 
-def test_a_corner_that_is_no_vertex_is_refused(tmp_path):
+def test_a_corner_that_is_no_vertex_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(WHOLE % 2)
     vertices, triangles = read_mesh(tmp_path / "a.ply")
     assert vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
@@ -264,11 +279,13 @@ def test_a_corner_that_is_no_vertex_is_refused(tmp_path):
         (f"seed={'9' * 5000}", "--set seed:1: an integer of 5000 digits; at most 18 are read"),
     ],
 )
-def test_an_override_that_leads_nowhere(flangeye, override, said):
+def test_an_override_that_leads_nowhere(
+    flangeye: Callable[..., Any], override: str, said: str
+) -> None:
     assert said in one_line(flangeye("check", "ur5e_phoxi-m_loopback", "--set", override))
 
 
-def test_numbers_out_of_any_range(flangeye, tmp_path):
+def test_numbers_out_of_any_range(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     text = "title: t\nrobot: {{model: ur5}}\nscanner: {{model: phoxi-m}}\nseed: {}\nsteps:\n"
     steps = "  - acquire.simulated\n  - segment.flange\n  - fit.rim\n  - solve.robust\n"
     last = "  - verify.holdout: {{max_rms: {}}}\n"
@@ -282,7 +299,7 @@ def test_numbers_out_of_any_range(flangeye, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory):
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A whole log of the toy stages."""
     folder = tmp_path_factory.mktemp("sound")
     (folder / "toy.yaml").write_text(TOY_RECIPE)
@@ -293,13 +310,17 @@ def sound(tmp_path_factory):
     return made.log
 
 
-def test_a_sound_log_has_no_damage(sound, tmp_path, flangeye):
+def test_a_sound_log_has_no_damage(
+    sound: Any, tmp_path: Path, flangeye: Callable[..., Any]
+) -> None:
     assert read_run(sound).damage == []
     copy = rewritten(sound, tmp_path / "copy.mcap", lambda name, data: (name, data))
     assert flangeye("show", copy)[0] == 0
 
 
-def test_one_changed_digit_of_the_result_is_found(sound, tmp_path, flangeye):
+def test_one_changed_digit_of_the_result_is_found(
+    sound: Any, tmp_path: Path, flangeye: Callable[..., Any]
+) -> None:
     raw = bytearray(sound.read_bytes())
     at = bytes(raw).rindex(b'"matrix"') + 30
     while not chr(raw[at]).isdigit():
@@ -315,7 +336,9 @@ def test_one_changed_digit_of_the_result_is_found(sound, tmp_path, flangeye):
     assert "Traceback" not in err
 
 
-def test_a_result_rewritten_with_valid_checksums_is_found_by_its_hash(sound, tmp_path):
+def test_a_result_rewritten_with_valid_checksums_is_found_by_its_hash(
+    sound: Any, tmp_path: Path
+) -> None:
     log = sound.read_bytes()
     path = tmp_path / "run.mcap"
     text = read_run(sound).attachments["result.json"]
@@ -332,7 +355,9 @@ def test_a_result_rewritten_with_valid_checksums_is_found_by_its_hash(sound, tmp
 
 
 @pytest.mark.parametrize("at", range(0, 100, 7))
-def test_one_changed_byte_anywhere_is_named_and_the_rest_is_read(sound, tmp_path, at):
+def test_one_changed_byte_anywhere_is_named_and_the_rest_is_read(
+    sound: Any, tmp_path: Path, at: int
+) -> None:
     raw = bytearray(sound.read_bytes())
     summary = int.from_bytes(raw[-28:-20], "little")  # of the footer: where the index begins
     raw[8 + (summary - 22) * at // 100] ^= 0x55
@@ -359,8 +384,15 @@ def test_one_changed_byte_anywhere_is_named_and_the_rest_is_read(sound, tmp_path
     ],
 )
 def test_foreign_content_is_named_with_topic_and_number(
-    sound, tmp_path, flangeye, toy_registry, monkeypatch, name, change, said
-):
+    sound: Any,
+    tmp_path: Path,
+    flangeye: Callable[..., Any],
+    toy_registry: Registry,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    change: Any,
+    said: str,
+) -> None:
     monkeypatch.setattr("flangeye.plugin.registry.load_registry", lambda: toy_registry)
     rewritten(sound, tmp_path / f"{name}.mcap", change)
     (tmp_path / "toy.yaml").write_text(TOY_RECIPE)
@@ -381,7 +413,9 @@ def test_foreign_content_is_named_with_topic_and_number(
         assert "Traceback" not in err
 
 
-def test_what_others_wrote_reaches_the_terminal_as_text(sound, tmp_path, flangeye):
+def test_what_others_wrote_reaches_the_terminal_as_text(
+    sound: Any, tmp_path: Path, flangeye: Callable[..., Any]
+) -> None:
     for name, change, plain in [
         ("markup", only("/step/2.fit.toy", name="/step/2.fit.[/red]rim"), "2.fit.[/red]rim"),
         ("link", only("/step/2.fit.toy", name="/step/2.fit.[link=http://x]r"), "[link=http://x]r"),
@@ -406,7 +440,7 @@ def _titled(title):
     return change
 
 
-def test_a_bomb_is_not_expanded(tmp_path, flangeye):
+def test_a_bomb_is_not_expanded(tmp_path: Path, flangeye: Callable[..., Any]) -> None:
     path = bomb(tmp_path / "bomb.mcap", 3 << 28)
     assert path.stat().st_size < 100_000
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -415,13 +449,17 @@ def test_a_bomb_is_not_expanded(tmp_path, flangeye):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
 
 
-def test_many_small_bombs_are_not_expanded_either(tmp_path, monkeypatch):
+def test_many_small_bombs_are_not_expanded_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(records, "SLACK", 1000)
     log = read_run(bomb(tmp_path / "bomb.mcap", 1_000_000))
     assert "the log expands to more than 100 times its size" in log.damage[0]
 
 
-def test_a_log_killed_before_its_first_message_says_so(sound, tmp_path, flangeye):
+def test_a_log_killed_before_its_first_message_says_so(
+    sound: Any, tmp_path: Path, flangeye: Callable[..., Any]
+) -> None:
     whole = sound.read_bytes()
     for length in (0, 5, 8, 30, 200):
         (tmp_path / "early.mcap").write_bytes(whole[:length])
@@ -433,7 +471,7 @@ def test_a_log_killed_before_its_first_message_says_so(sound, tmp_path, flangeye
     assert "other.mcap: is not an MCAP file" in one_line(flangeye("show", "other.mcap"))
 
 
-def test_a_fifo_is_no_log(tmp_path, flangeye):
+def test_a_fifo_is_no_log(tmp_path: Path, flangeye: Callable[..., Any]) -> None:
     os.mkfifo(tmp_path / "f.mcap")
     for words in (("show", "f.mcap"), ("watch", "f.mcap"), ("doctor", "f.mcap"),
                   ("report", "f.mcap"), ("replay", "f.mcap")):  # fmt: skip
@@ -443,8 +481,11 @@ def test_a_fifo_is_no_log(tmp_path, flangeye):
 
 
 def test_a_folder_in_which_anything_was_recorded_is_kept(
-    tmp_path, flangeye, toy_registry, monkeypatch
-):
+    tmp_path: Path,
+    flangeye: Callable[..., Any],
+    toy_registry: Registry,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("flangeye.plugin.registry.load_registry", lambda: toy_registry)
 
     monkeypatch.setattr(Runner, "_segment", lambda self, capture: self._reject(
@@ -457,7 +498,9 @@ def test_a_folder_in_which_anything_was_recorded_is_kept(
     assert "flangeye run toy --from kept/run.mcap --at segment.toy --set PATH=VALUE" in err
 
 
-def test_results_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_results_are_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target = tmp_path / "deep" / "result.json"
     write_whole(target, "first")
     monkeypatch.setattr(os, "fsync", lambda number: (_ for _ in ()).throw(OSError(28, "full")))
@@ -468,7 +511,7 @@ def test_results_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("words", [("recipes",), ("stages",), ("schema",), ("--help",)])
-def test_a_full_disk_and_a_reader_that_leaves(words, tmp_path):
+def test_a_full_disk_and_a_reader_that_leaves(words: tuple[Any, ...], tmp_path: Path) -> None:
     command = python_command("-m", "flangeye.cli", *words)
     with Path("/dev/full").open("w") as full:
         told = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
@@ -477,7 +520,9 @@ def test_a_full_disk_and_a_reader_that_leaves(words, tmp_path):
     assert "standard output: cannot be read or written: No space left on device" in told.stderr
 
 
-def test_a_reader_that_leaves_is_no_mistake_and_an_ascii_terminal_none_either(tmp_path):
+def test_a_reader_that_leaves_is_no_mistake_and_an_ascii_terminal_none_either(
+    tmp_path: Path,
+) -> None:
     program = " ".join(python_command("-m", "flangeye.cli"))
     told = subprocess.run(
         ["bash", "-c", f"set -o pipefail; {program} recipes | head -1 >/dev/null; {program} recipes >&-"],
@@ -495,7 +540,9 @@ def test_a_reader_that_leaves_is_no_mistake_and_an_ascii_terminal_none_either(tm
     assert r"no stage '\xfcmlaut'" in told.stderr
 
 
-def test_a_file_that_cannot_be_written_is_said(flangeye, tmp_path):
+def test_a_file_that_cannot_be_written_is_said(
+    flangeye: Callable[..., Any], tmp_path: Path
+) -> None:
     assert "/dev/full: cannot be written: No space" in one_line(
         flangeye("schema", "--out", "/dev/full")
     )
@@ -509,14 +556,18 @@ def test_a_file_that_cannot_be_written_is_said(flangeye, tmp_path):
         (("--floor", "1e99999999999999999999 mm"), "is out of any range"),
     ],
 )
-def test_a_controller_with_options_that_cannot_be(flangeye, words, said):
+def test_a_controller_with_options_that_cannot_be(
+    flangeye: Callable[..., Any], words: tuple[Any, ...], said: str
+) -> None:
     code, _, err = flangeye("loopback", "ur5e", "--host", "127.0.77.9", *words)
     assert code == 2
     assert said in err
     assert "Traceback" not in err
 
 
-def test_a_deeply_nested_cache_is_made_again(monkeypatch, tmp_path):
+def test_a_deeply_nested_cache_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from flangeye.plugin import stage_list
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -525,7 +576,7 @@ def test_a_deeply_nested_cache_is_made_again(monkeypatch, tmp_path):
     assert stage_list._recall("anything") is None
 
 
-def test_an_image_larger_than_any_camera_is_refused(tmp_path):
+def test_an_image_larger_than_any_camera_is_refused(tmp_path: Path) -> None:
     from flangeye_plugins.acquire.camera import read_image
 
     head = struct.pack(">IIBBBBB", 200_000, 200_000, 8, 0, 0, 0, 0)
@@ -535,7 +586,7 @@ def test_an_image_larger_than_any_camera_is_refused(tmp_path):
         read_image(tmp_path / "huge.png")
 
 
-def test_a_shape_of_truth_values_is_no_shape(tmp_path):
+def test_a_shape_of_truth_values_is_no_shape(tmp_path: Path) -> None:
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (True, 3), }".ljust(117) + b"\n"
     raw = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(24)
     (tmp_path / "shape.npy").write_bytes(raw)
@@ -543,7 +594,7 @@ def test_a_shape_of_truth_values_is_no_shape(tmp_path):
         read_cloud(tmp_path / "shape.npy")
 
 
-def test_an_npz_bomb_is_not_expanded(tmp_path):
+def test_an_npz_bomb_is_not_expanded(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(
@@ -559,7 +610,7 @@ def test_an_npz_bomb_is_not_expanded(tmp_path):
         read_npz(tmp_path / "big.npz", "arr_0", (None, 4, 4))
 
 
-def test_numbers_of_400_digits_in_a_pose_file(tmp_path, flangeye):
+def test_numbers_of_400_digits_in_a_pose_file(tmp_path: Path, flangeye: Callable[..., Any]) -> None:
     row = ", ".join(["1" * 400, *"000010000100001"])
     (tmp_path / "a.yaml").write_text(
         f"- effector_wrt_world: [{row}]\n  object_wrt_sensor: [{', '.join('1000010000100001')}]\n"

@@ -1,6 +1,9 @@
 """Everything a recipe can make a process open or start is in one list in the documentation."""
 
 import re
+from pathlib import Path
+
+import pytest
 
 from tests.openings import ROOT, openings
 
@@ -12,14 +15,14 @@ def listed():
     return {(file, word) for file, words in rows for word in re.findall(r"`([^`]+)`", words)}
 
 
-def test_the_list_has_all_that_opens_loads_or_starts_something_and_nothing_else():
+def test_the_list_has_all_that_opens_loads_or_starts_something_and_nothing_else() -> None:
     found = openings()
     missing, gone = sorted(found - listed()), sorted(listed() - found)
     assert not missing, f"say in {PAGE.name} what these open, and who names it: {missing}"
     assert not gone, f"{PAGE.name} lists what the source does not have: {gone}"
 
 
-def test_the_search_sees_each_way(tmp_path, monkeypatch):
+def test_the_search_sees_each_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tests.openings as search
 
     source = tmp_path / "pipeline" / "flangeye" / "new.py"

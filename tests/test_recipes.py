@@ -3,7 +3,9 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from statistics import median
+from typing import Any
 
 import pytest
 
@@ -34,7 +36,7 @@ def flangeye(*words, cwd):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_recipe_checks_and_resolves(name):
+def test_a_recipe_checks_and_resolves(name: Any) -> None:
     registry = load_registry()
     recipe = load_recipe(recipe_names()[name], registry)
     assert recipe.header.title
@@ -55,7 +57,9 @@ CALIBRATIONS = [name for name in NAMES if "/" not in name]
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in CALIBRATIONS])
-def test_a_recipe_runs_to_a_verified_calibration(name, tmp_path, request):
+def test_a_recipe_runs_to_a_verified_calibration(
+    name: Any, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     words = ["run", name, "--out", "run"]
     if name.endswith("_archive"):
         recordings = request.getfixturevalue("ancorasir")
@@ -108,7 +112,7 @@ COARSER = {
         for name in CONFIGURATIONS
     ],
 )
-def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
+def test_every_configuration_runs_to_a_verified_calibration(name: Any, tmp_path: Path) -> None:
     registry = load_registry()
     checked = load_recipe(recipe_names()[name], registry, COARSER[first_step(name)])
     folder = RunFolder.create(name, tmp_path / "run")
@@ -125,7 +129,7 @@ def test_every_configuration_runs_to_a_verified_calibration(name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_the_table_says_what_came_of_a_configuration(name, tmp_path):
+def test_the_table_says_what_came_of_a_configuration(name: Any, tmp_path: Path) -> None:
     told, got = outcomes()[name], outcome(name, run(name, tmp_path))
     assert (got["captures"], got["used"]) == (told["captures"], told["used"])
     for figure in ("held_out_mm", "predicted_mm", "true_mm"):
@@ -144,7 +148,9 @@ def rms(values):
     return (sum(value * value for value in values) / len(values)) ** 0.5
 
 
-def test_the_published_aubo_clouds_reach_the_target_with_every_pose(ancorasir, tmp_path):
+def test_the_published_aubo_clouds_reach_the_target_with_every_pose(
+    ancorasir: Path, tmp_path: Path
+) -> None:
     result = archived("aubo-i5_phoxi-s_svd_archive", ancorasir, tmp_path)
     residuals = [pose["residual"] for pose in result["observations"]]
     assert len(residuals) == 30
@@ -153,7 +159,9 @@ def test_the_published_aubo_clouds_reach_the_target_with_every_pose(ancorasir, t
     assert result["holdout"]["rms"] <= 0.44e-3
 
 
-def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(ancorasir, tmp_path):
+def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(
+    ancorasir: Path, tmp_path: Path
+) -> None:
     result = archived("aubo-i5_phoxi-s_archive", ancorasir, tmp_path)
     poses = result["observations"]
     assert len(poses) == 30
@@ -164,14 +172,14 @@ def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(an
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_editors_accept_a_recipe_that_runs(name):
+def test_editors_accept_a_recipe_that_runs(name: Any) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     schema = recipe_schema(load_registry())
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(read_yaml(recipe_names()[name]).data, schema)
 
 
-def test_editors_mark_a_recipe_that_does_not():
+def test_editors_mark_a_recipe_that_does_not() -> None:
     jsonschema = pytest.importorskip("jsonschema")
     schema = recipe_schema(load_registry())
     recipe = {"title": "T", "steps": [{"fit.rim": {"inlir": "0.2 mm"}}]}

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,7 +20,7 @@ from flangeye.units import format_quantity, parse_quantity
         ("2 N/mm", "stiffness", 2000.0),
     ],
 )
-def test_a_quantity_becomes_si(text, kind, si):
+def test_a_quantity_becomes_si(text: str, kind: str, si: Any) -> None:
     assert parse_quantity(text, kind) == si
 
 
@@ -49,12 +51,12 @@ def test_a_quantity_becomes_si(text, kind, si):
         ),
     ],
 )
-def test_a_quantity_that_is_none_says_what_is_allowed(value, message):
+def test_a_quantity_that_is_none_says_what_is_allowed(value: Any, message: str) -> None:
     with pytest.raises(ValueError) as error:
         parse_quantity(value, "length")
     assert str(error.value) == message
 
 
 @given(st.floats(-1e6, 1e6), st.sampled_from(["length", "angle", "duration", "speed", "force"]))
-def test_formatting_reads_back_to_the_same_float(si, kind):
+def test_formatting_reads_back_to_the_same_float(si: float, kind: Any) -> None:
     assert parse_quantity(format_quantity(si, kind), kind) == si

@@ -4,7 +4,9 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,7 +18,7 @@ def pip(*words):
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory):
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A folder holding our wheel and the vendor's, installed without the checkout."""
     wheels, target = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
     for project in (ROOT, ROOT / "tests" / "vendor_example"):
@@ -26,7 +28,7 @@ def installed(tmp_path_factory):
 
 
 @pytest.fixture
-def flangeye(installed, tmp_path):
+def flangeye(installed: Any, tmp_path: Path) -> Callable[..., Any]:
     """Run the installed command in an empty folder."""
 
     def call(*words):
@@ -39,7 +41,7 @@ def flangeye(installed, tmp_path):
     return call
 
 
-def test_the_wheel_carries_recipes_and_data(installed, flangeye):
+def test_the_wheel_carries_recipes_and_data(installed: Any, flangeye: Callable[..., Any]) -> None:
     assert (installed / "flangeye" / "_shipped" / "recipes").is_dir()
     assert (installed / "flangeye" / "py.typed").exists()
     told = flangeye("recipes")
@@ -47,14 +49,14 @@ def test_the_wheel_carries_recipes_and_data(installed, flangeye):
     assert flangeye("check", "ur5_phoxi-m_simulated").stdout.startswith(str(installed))
 
 
-def test_the_wheel_runs_in_an_empty_folder(flangeye, tmp_path):
+def test_the_wheel_runs_in_an_empty_folder(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     small = ["--set", "steps.0.resolution=0.25"]
     told = flangeye("run", "ur5_phoxi-m_simulated", *small, "--out", "run")
     assert told.returncode == 0, told.stderr
     assert json.loads((tmp_path / "run" / "result.json").read_text())["status"] == "verified"
 
 
-def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
+def test_a_vendors_plugin_is_found_and_runs(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     assert (
         "acme 1.0.0: cost.acme_largest_axis, fit.acme_hull, scanner.acme"
         in flangeye("plugins").stdout
@@ -78,7 +80,7 @@ def test_a_vendors_plugin_is_found_and_runs(flangeye, tmp_path):
     assert result["status"] == "unverified"
 
 
-def test_a_cost_of_ones_own_is_minimised(flangeye, tmp_path):
+def test_a_cost_of_ones_own_is_minimised(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     recipe = tmp_path / "cost.yaml"
     recipe.write_text(
         "title: A cost of one's own\n"
@@ -93,7 +95,7 @@ def test_a_cost_of_ones_own_is_minimised(flangeye, tmp_path):
     assert len(result["observations"]) < 75  # the cost was small enough before all were pulled
 
 
-def test_a_vendors_own_tests_pass(installed, tmp_path):
+def test_a_vendors_own_tests_pass(installed: Any, tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     told = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:dash",
@@ -103,7 +105,9 @@ def test_a_vendors_own_tests_pass(installed, tmp_path):
     assert told.returncode == 0, told.stdout
 
 
-def test_a_new_plugin_can_be_written_from_the_wheel(flangeye, tmp_path):
+def test_a_new_plugin_can_be_written_from_the_wheel(
+    flangeye: Callable[..., Any], tmp_path: Path
+) -> None:
     told = flangeye("new-plugin", "acme", "--kind", "fit")
     assert told.returncode == 0, told.stderr
     assert (tmp_path / "flangeye-acme" / "src" / "flangeye_acme" / "fit.py").is_file()

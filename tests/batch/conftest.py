@@ -3,7 +3,9 @@
 import io
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -28,7 +30,7 @@ ARCHIVE_RECIPE = RECIPE.replace("acquire.toy: {count: 6, noise: 0.1 mm}", "acqui
 
 
 @pytest.fixture(autouse=True)
-def toys(monkeypatch, tmp_path):
+def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Put the toy plugin on the path of this process and of those it starts."""
     paths = [str(SITE), str(ROOT)]
     for path in reversed(paths):
@@ -38,26 +40,26 @@ def toys(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def registry(toys):
+def registry(toys: None) -> Any:
     return load_registry()
 
 
 @pytest.fixture
-def recipe(tmp_path):
+def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "toy.yaml"
     path.write_text(RECIPE)
     return path
 
 
 @pytest.fixture
-def archive_recipe(tmp_path):
+def archive_recipe(tmp_path: Path) -> Path:
     path = tmp_path / "replay.yaml"
     path.write_text(ARCHIVE_RECIPE)
     return path
 
 
 @pytest.fixture
-def archives(tmp_path):
+def archives(tmp_path: Path) -> Any:
     """Two archives that can be read, and one that is not there."""
     paths = [tmp_path / name for name in ("one.txt", "two.txt", "<b>none.txt")]
     for number, path in enumerate(paths[:2]):
@@ -66,7 +68,7 @@ def archives(tmp_path):
 
 
 @pytest.fixture
-def batch(recipe, registry):
+def batch(recipe: Path, registry: Any) -> Callable[..., Any]:
     """Run a batch of the toy recipe in this process; return it and what was said meanwhile."""
 
     def call(name=recipe, **wanted):
@@ -79,7 +81,9 @@ def batch(recipe, registry):
 
 
 @pytest.fixture
-def flangeye(monkeypatch, capsys):
+def flangeye(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Any]:
     """Call the command line; return code, out, err."""
     from flangeye import cli
 

@@ -1,8 +1,10 @@
 """Archives that cannot be used: one line and exit code 2 in run, a row with the reason in batch."""
 
 import csv
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,7 +96,7 @@ CASES = {
 
 
 @pytest.fixture
-def bad(tmp_path):
+def bad(tmp_path: Path) -> Callable[..., Any]:
     """Make one spoilt archive after the other, and a recipe to run on them."""
     (tmp_path / "bad.yaml").write_text(RECIPE)
 
@@ -113,7 +115,9 @@ def bad(tmp_path):
 
 
 @pytest.mark.parametrize("spoil", CASES, ids=lambda spoil: spoil.__name__)
-def test_run_says_one_line(spoil, bad, flangeye, tmp_path):
+def test_run_says_one_line(
+    spoil: Any, bad: Callable[..., Any], flangeye: Callable[..., Any], tmp_path: Path
+) -> None:
     folder = bad(spoil)
     code, _, err = flangeye("run", "bad.yaml", "--archive", folder)
     assert code == 2
@@ -122,7 +126,9 @@ def test_run_says_one_line(spoil, bad, flangeye, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_batch_has_a_row_with_the_reason_for_each(bad, flangeye):
+def test_batch_has_a_row_with_the_reason_for_each(
+    bad: Callable[..., Any], flangeye: Callable[..., Any]
+) -> None:
     folders = [bad(spoil) for spoil in CASES]
     code, out, _ = flangeye("batch", "bad.yaml", *folders, "--workers", "1", "--out", "out")
     assert code == 1

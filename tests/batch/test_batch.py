@@ -9,8 +9,10 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,7 +32,9 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
-def test_every_end_is_a_row_and_costs_only_itself(batch, tmp_path):
+def test_every_end_is_a_row_and_costs_only_itself(
+    batch: Callable[..., Any], tmp_path: Path
+) -> None:
     """A worker that is killed, too; and the second start goes on where the first ended."""
     grid = ("steps.3.what=die,work,refuse,fail,die once",)
     done, said = batch(grid=grid, overrides=("steps.3.once=once",), workers=2)
@@ -52,7 +56,9 @@ def test_every_end_is_a_row_and_costs_only_itself(batch, tmp_path):
     assert (third.known, len(rows(third.out))) == (2, 2)
 
 
-def test_archives_on_the_command_line(flangeye, archive_recipe, archives, tmp_path):
+def test_archives_on_the_command_line(
+    flangeye: Callable[..., Any], archive_recipe: Path, archives: Any, tmp_path: Path
+) -> None:
     code, out, err = flangeye("batch", archive_recipe, *archives, "--workers", "1", "--out", "out")
     assert code == 1
     assert out.startswith("3 sessions: 2 verified, 1 failed\n  held-out error ")
@@ -85,7 +91,14 @@ def test_archives_on_the_command_line(flangeye, archive_recipe, archives, tmp_pa
         (["--out", "toy.yaml/out"], "error: toy.yaml/out: cannot be made: Not a directory"),
     ],
 )  # fmt: skip
-def test_what_cannot_start_leaves_nothing(flangeye, recipe, tmp_path, monkeypatch, words, line):
+def test_what_cannot_start_leaves_nothing(
+    flangeye: Callable[..., Any],
+    recipe: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[Any],
+    line: str,
+) -> None:
     assert cluster.CONNECT_SECONDS == 5
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     code, _, err = flangeye("batch", recipe, *words)
@@ -94,7 +107,9 @@ def test_what_cannot_start_leaves_nothing(flangeye, recipe, tmp_path, monkeypatc
     assert [path.name for path in tmp_path.iterdir()] == ["toy.yaml"]
 
 
-def test_without_the_extra_it_says_what_to_install(flangeye, recipe, monkeypatch):
+def test_without_the_extra_it_says_what_to_install(
+    flangeye: Callable[..., Any], recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(cluster, "find_spec", lambda n: None if n == "pyarrow" else find(n))
     code, _, err = flangeye("batch", recipe)
@@ -105,7 +120,7 @@ def test_without_the_extra_it_says_what_to_install(flangeye, recipe, monkeypatch
     )
 
 
-def test_the_command_line_does_not_import_dask():
+def test_the_command_line_does_not_import_dask() -> None:
     code = (
         "import sys; from flangeye import batch, cli; "
         "print([m for m in ('dask', 'distributed', 'pyarrow', 'plotly') if m in sys.modules])"
@@ -114,7 +129,9 @@ def test_the_command_line_does_not_import_dask():
     assert told.stdout == "[]\n"
 
 
-def test_a_port_that_is_no_scheduler(batch, monkeypatch):
+def test_a_port_that_is_no_scheduler(
+    batch: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
@@ -140,7 +157,7 @@ def running(command, **options):
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_ctrl_c_keeps_what_came_so_far(recipe, tmp_path):
+def test_ctrl_c_keeps_what_came_so_far(recipe: Path, tmp_path: Path) -> None:
     """Sent to the whole group, as a terminal does: the workers must not answer it."""
     command = [
         sys.executable, "-m", "flangeye.cli", "batch", str(recipe), "--repeat", "100",
@@ -173,7 +190,7 @@ print("Submitted batch job 1")
 
 
 @pytest.fixture
-def slurm(tmp_path, monkeypatch):
+def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Run the documented script with a stand-in for SLURM; give the scheduler's address."""
     if importlib.util.find_spec("dask_jobqueue") is None:
         pytest.skip("dask-jobqueue is not installed")
@@ -194,7 +211,9 @@ def slurm(tmp_path, monkeypatch):
     assert process.returncode == 0
 
 
-def test_the_slurm_script_and_a_batch_on_it(slurm, batch, tmp_path):
+def test_the_slurm_script_and_a_batch_on_it(
+    slurm: Any, batch: Callable[..., Any], tmp_path: Path
+) -> None:
     done, _ = batch(scheduler=slurm, grid=("steps.3.what=work,die",))
     assert [row["status"] for row in rows(done.out)] == ["verified", "crashed"]
     job = (tmp_path / "job.sh").read_text()
@@ -203,7 +222,9 @@ def test_the_slurm_script_and_a_batch_on_it(slurm, batch, tmp_path):
     assert re.search(r"dask_worker tcp://\S+ .*--nthreads 1 .*--nworkers 2 ", job)
 
 
-def test_two_workers_are_at_work_nearly_all_the_time(recipe, registry, tmp_path):
+def test_two_workers_are_at_work_nearly_all_the_time(
+    recipe: Path, registry: Any, tmp_path: Path
+) -> None:
     """Measured against the sessions' own time, so that a busy machine does not fail it."""
     software = software_of(registry)
     wanted = Request(str(recipe), repeat=26, overrides=("steps.3.wait=100 ms",))
@@ -222,7 +243,7 @@ def test_two_workers_are_at_work_nearly_all_the_time(recipe, registry, tmp_path)
 
 
 @pytest.mark.slow
-def test_500_sessions_keep_memory_flat(recipe, registry, tmp_path):
+def test_500_sessions_keep_memory_flat(recipe: Path, registry: Any, tmp_path: Path) -> None:
     import psutil
 
     software = software_of(registry)
@@ -243,7 +264,7 @@ def test_500_sessions_keep_memory_flat(recipe, registry, tmp_path):
         assert late - early < 10e6
 
 
-def test_files_for_tls_go_together_and_exist(batch, tmp_path):
+def test_files_for_tls_go_together_and_exist(batch: Callable[..., Any], tmp_path: Path) -> None:
     from flangeye.batch.request import Tls
 
     missing = Tls(tmp_path / "ca.pem", tmp_path / "cert.pem", tmp_path / "key.pem")
@@ -255,7 +276,7 @@ def test_files_for_tls_go_together_and_exist(batch, tmp_path):
         batch(tls=missing)
 
 
-def test_nobody_without_its_key_speaks_to_the_local_cluster():
+def test_nobody_without_its_key_speaks_to_the_local_cluster() -> None:
     from distributed import Client
 
     from flangeye.batch.cluster import local_client

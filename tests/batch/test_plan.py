@@ -2,6 +2,9 @@
 
 import os
 import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -20,14 +23,14 @@ SOFTWARE = Software("1", ("toy 1.0",))
 
 
 @pytest.fixture
-def sessions(recipe, registry):
+def sessions(recipe: Path, registry: Any) -> Callable[..., Any]:
     def call(name=recipe, software=SOFTWARE, **wanted):
         return plan(Request(str(name), **wanted), registry, software)
 
     return call
 
 
-def test_grid_times_seeds(sessions):
+def test_grid_times_seeds(sessions: Callable[..., Any]) -> None:
     found = sessions(grid=("steps.2.inlier=0.2 mm,0.3 mm", "steps.0.count=5,6,7"), repeat=2)
     assert [(*s.varied.values(), s.seed) for s in found] == [
         (inlier, count, seed)
@@ -37,14 +40,16 @@ def test_grid_times_seeds(sessions):
     assert found[0].overrides == ("steps.2.inlier=0.2 mm", "steps.0.count=5", "seed=3")
 
 
-def test_a_grid_compares_solvers():
+def test_a_grid_compares_solvers() -> None:
     request = Request("ur5_phoxi-m_sample", grid=("steps.3=solve.svd,solve.robust",))
     found = plan(request, load_registry(), SOFTWARE)
     assert [s.varied for s in found] == [{"steps.3": "solve.svd"}, {"steps.3": "solve.robust"}]
     assert len({s.key for s in found}) == 2
 
 
-def test_archives_times_values(sessions, archive_recipe, archives):
+def test_archives_times_values(
+    sessions: Callable[..., Any], archive_recipe: Path, archives: Any
+) -> None:
     found = sessions(
         archive_recipe, archives=tuple(map(str, archives)), grid=("steps.4.max_rms=1 mm,2 mm",)
     )
@@ -53,7 +58,7 @@ def test_archives_times_values(sessions, archive_recipe, archives):
     assert found[0].id.startswith("replay_one.txt_")
 
 
-def test_a_recipe_alone_is_one_session(sessions):
+def test_a_recipe_alone_is_one_session(sessions: Callable[..., Any]) -> None:
     (session,) = sessions()
     assert (session.varied, session.seed, session.archive) == ({}, 3, None)
 
@@ -85,14 +90,18 @@ def test_a_recipe_alone_is_one_session(sessions):
          "toy.yaml steps.2.inlier=0.0002 m"),
     ],
 )  # fmt: skip
-def test_what_cannot_start_is_one_line(sessions, wanted, message):
+def test_what_cannot_start_is_one_line(
+    sessions: Callable[..., Any], wanted: dict[str, Any], message: str
+) -> None:
     with pytest.raises(FlangeyeError) as caught:
         sessions(**wanted)
     assert str(caught.value) == message
     assert caught.value.exit_code == 2
 
 
-def test_an_archive_for_a_recipe_that_simulates(sessions, archives):
+def test_an_archive_for_a_recipe_that_simulates(
+    sessions: Callable[..., Any], archives: Any
+) -> None:
     with pytest.raises(BatchError) as caught:
         sessions(archives=(str(archives[0]),))
     assert str(caught.value) == (
@@ -100,12 +109,16 @@ def test_an_archive_for_a_recipe_that_simulates(sessions, archives):
     )
 
 
-def test_the_same_archive_twice(sessions, archive_recipe, archives):
+def test_the_same_archive_twice(
+    sessions: Callable[..., Any], archive_recipe: Path, archives: Any
+) -> None:
     with pytest.raises(BatchError, match="asked for twice: /.*one.txt and /.*one.txt"):
         sessions(archive_recipe, archives=(str(archives[0]),) * 2)
 
 
-def test_a_key_holds_all_that_decides_the_result(sessions, recipe, archive_recipe, archives):
+def test_a_key_holds_all_that_decides_the_result(
+    sessions: Callable[..., Any], recipe: Path, archive_recipe: Path, archives: Any
+) -> None:
     def key(name=archive_recipe, archive=archives[0], **more):
         return sessions(name, archives=(str(archive),), **more)[0].key
 
@@ -122,7 +135,9 @@ def test_a_key_holds_all_that_decides_the_result(sessions, recipe, archive_recip
     assert key() != first
 
 
-def test_large_files_are_known_by_size_and_time(sessions, archive_recipe, tmp_path):
+def test_large_files_are_known_by_size_and_time(
+    sessions: Callable[..., Any], archive_recipe: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     large, small = folder / "large.bin", folder / "small.txt"
@@ -142,13 +157,15 @@ def test_large_files_are_known_by_size_and_time(sessions, archive_recipe, tmp_pa
     assert key() != second
 
 
-def test_files_that_the_recipe_names_count(sessions, tmp_path):
+def test_files_that_the_recipe_names_count(sessions: Callable[..., Any], tmp_path: Path) -> None:
     first = sessions(overrides=("steps.3.reads=there",))[0].key
     (tmp_path / "there").write_text("now")
     assert sessions(overrides=("steps.3.reads=there",))[0].key != first
 
 
-def test_a_thousand_seeds_are_planned_from_one_reading_of_the_recipe(sessions, monkeypatch):
+def test_a_thousand_seeds_are_planned_from_one_reading_of_the_recipe(
+    sessions: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = []
 
     def noted(*given):
@@ -161,7 +178,7 @@ def test_a_thousand_seeds_are_planned_from_one_reading_of_the_recipe(sessions, m
     assert found[7].key == sessions(overrides=("seed=10", "steps.0.count=5"))[0].key
 
 
-def test_code_that_changed_under_one_version_is_other_software(tmp_path):
+def test_code_that_changed_under_one_version_is_other_software(tmp_path: Path) -> None:
     package = tmp_path / "package"
     package.mkdir()
     module = package / "__init__.py"
@@ -176,7 +193,7 @@ def test_code_that_changed_under_one_version_is_other_software(tmp_path):
 
 
 @given(st.lists(st.text("ab1. {}[]", min_size=1).filter(str.strip), min_size=1))
-def test_splitting_undoes_joining(values):
+def test_splitting_undoes_joining(values: Any) -> None:
     balanced = [v.strip() for v in values if _balanced(v)]
     assert split_values(",".join(balanced)) == (balanced or [""])
 
@@ -190,13 +207,13 @@ def _balanced(text):
     return depth == 0
 
 
-def test_commas_inside_brackets_and_quotes_belong_to_the_value():
+def test_commas_inside_brackets_and_quotes_belong_to_the_value() -> None:
     assert split_values("{a: {x: 1, y: 2}}, [1, 2] ,'c,d',\"e,'f\"") == [
         "{a: {x: 1, y: 2}}", "[1, 2]", "'c,d'", "\"e,'f\"",
     ]  # fmt: skip
 
 
-def test_workers_must_have_the_same_software(registry):
+def test_workers_must_have_the_same_software(registry: Any) -> None:
     here = software_of(registry)
     assert any(re.fullmatch(r"toy_batch 1.0 \(code \w{8}\)", each) for each in here.plugins)
     check_software(here, here, "host")

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -33,7 +34,7 @@ READER = (
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Points of a camera that is the base, with 1 mm of noise: any calibration is the identity."""
     monkeypatch.chdir(tmp_path)
     rows = [(0.1 * k, 0.1 * (k % 3), 0.1 * (k % 2), 0.2 * k, 0.1, 0.1 * k) for k in range(9)]
@@ -58,7 +59,7 @@ def regress():
     return CliRunner().invoke(app, ["regress", "known", "--workers", "1"])
 
 
-def test_each_manifest_is_compared_and_a_second_start_runs_nothing(folder):
+def test_each_manifest_is_compared_and_a_second_start_runs_nothing(folder: Path) -> None:
     manifest(folder)
     manifest(folder, "absent", recording="../nowhere")
     manifest(folder, "closer", expected="{closure: 0.1 mm, tolerance: 0.01 mm}")
@@ -94,27 +95,27 @@ def test_each_manifest_is_compared_and_a_second_start_runs_nothing(folder):
          "known/mine.yaml: expected.closure and expected.tolerance go together"),
     ],
 )  # fmt: skip
-def test_a_wrong_manifest_is_bad_input(folder, given, line):
+def test_a_wrong_manifest_is_bad_input(folder: Path, given: dict[str, Any], line: str) -> None:
     manifest(folder, **({"more": ""} | given))
     error = regress().exception
     assert str(error).startswith(line)
     assert error.exit_code == 2
 
 
-def test_a_folder_without_manifests_says_what_one_is(folder):
+def test_a_folder_without_manifests_says_what_one_is(folder: Path) -> None:
     assert str(regress().exception) == (
         "known: holds no manifests; one is a .yaml file with title, recording, recipe, expected, "
         "source and licence"
     )
 
 
-def test_every_shipped_manifest_names_a_recipe_a_source_and_a_licence():
+def test_every_shipped_manifest_names_a_recipe_a_source_and_a_licence() -> None:
     manifests = read_manifests(bundled("data") / "manifests")
     assert {file.stem for file in manifests} >= {"ur5_phoxi-m_sample", "ancorasir_aubo"}
 
 
 @pytest.mark.slow
-def test_the_shipped_manifests_are_as_expected(ancorasir, tmp_path):
+def test_the_shipped_manifests_are_as_expected(ancorasir: Path, tmp_path: Path) -> None:
     shutil.copytree(DATA / "manifests", tmp_path / "data" / "manifests")
     done = CliRunner().invoke(app, ["regress", "--out", str(tmp_path / "runs")])
     assert done.exit_code == 0, done.output

@@ -15,7 +15,9 @@ def trivial(job, session):
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 60])
-def test_every_session_is_told_once_and_few_are_held(monkeypatch, count):
+def test_every_session_is_told_once_and_few_are_held(
+    monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
     from distributed import Client
 
     monkeypatch.setattr(cluster, "run_session", trivial)

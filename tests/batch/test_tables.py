@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -31,7 +32,7 @@ def outcome(rms=3e-4, **more):
 
 
 @pytest.fixture
-def entries():
+def entries() -> Any:
     return [
         (session(0, **{"steps.0.noise": "0.1 mm", "steps.0.count": "5"}), outcome(1e-4)),
         (session(1, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}), outcome(2e-4)),
@@ -40,7 +41,7 @@ def entries():
     ]  # fmt: skip
 
 
-def test_csv_and_parquet_hold_the_same(entries, tmp_path):
+def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
     write_tables(table_of(entries), tmp_path)
     with (tmp_path / "sessions.csv").open(newline="") as file:
         read = list(csv.DictReader(file))
@@ -58,7 +59,7 @@ def test_csv_and_parquet_hold_the_same(entries, tmp_path):
     assert table.schema.field("archive").type == pa.string()
 
 
-def test_columns(entries):
+def test_columns(entries: Any) -> None:
     assert table_of(entries).columns == (
         "session", "recipe", "archive", "steps.0.noise", "steps.0.count", "seed", "status",
         "reason", "used", "captures", "holdout_rms_m", "holdout_median_m", "holdout_p95_m",
@@ -67,7 +68,7 @@ def test_columns(entries):
     )  # fmt: skip
 
 
-def test_quantities_stand_on_an_axis_by_their_number(entries):
+def test_quantities_stand_on_an_axis_by_their_number(entries: Any) -> None:
     drawings = dict(drawings_of(table_of(entries)))
     assert set(drawings) == {"Held-out error, rms", "Predicted error, 95 %", "Time"}
     figure = drawings["Held-out error, rms"]
@@ -79,7 +80,7 @@ def test_quantities_stand_on_an_axis_by_their_number(entries):
     assert first != second
 
 
-def test_names_stand_side_by_side_and_medians_join_repetitions():
+def test_names_stand_side_by_side_and_medians_join_repetitions() -> None:
     entries = [
         (session(i, **{"steps.3.cost": cost}), outcome(rms * 1e-3))
         for i, (cost, rms) in enumerate([("a", 1), ("a", 2), ("a", 4), ("b", 3), ("b", 5)])
@@ -90,7 +91,7 @@ def test_names_stand_side_by_side_and_medians_join_repetitions():
     assert (medians["x"], medians["y"]) == (["a", "b"], [2.0, 4.0])
 
 
-def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries):
+def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries: Any) -> None:
     page = render(table_of(entries))
     assert EVIL not in page
     assert "bad, &lt;script&gt;alert(1)&lt;/script&gt;" in page
@@ -100,14 +101,14 @@ def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries):
     assert "default-src 'none'" in page
 
 
-def test_archives_are_told_apart_by_what_differs():
+def test_archives_are_told_apart_by_what_differs() -> None:
     paths = ["/data/a/poses", "/data/b/poses", f"/data/{EVIL}"]
     page = render(table_of([(session(i, path), outcome()) for i, path in enumerate(paths)]))
     assert '<td class="">a/poses</td>' in page
     assert EVIL not in page
 
 
-def test_variants_are_summed_up_when_repeated(entries):
+def test_variants_are_summed_up_when_repeated(entries: Any) -> None:
     page = render(table_of(entries))
     assert '<h2 id="variants">' in page
     assert '<h2 id="variants">' not in render(table_of(entries[:2]))
@@ -115,7 +116,7 @@ def test_variants_are_summed_up_when_repeated(entries):
     assert re.findall(r">([^<>]*)</td>", row) == ["2", "1", "1", "0.200", "0.400", ""]
 
 
-def test_a_page_of_very_many_sessions_shows_the_worst():
+def test_a_page_of_very_many_sessions_shows_the_worst() -> None:
     many = [(session(i), replace(outcome(), holdout_rms_m=1e-6 * i)) for i in range(1200)]
     many[5] = (session(5), SessionOutcome("crashed", "no"))
     page = render(table_of(many))
@@ -124,14 +125,14 @@ def test_a_page_of_very_many_sessions_shows_the_worst():
     assert "toy_000000000006<" not in page and len(page) < 6e6
 
 
-def test_nothing_accepted_still_makes_a_page():
+def test_nothing_accepted_still_makes_a_page() -> None:
     entries = [(session(0), SessionOutcome("crashed", "no"))]
     page = render(table_of(entries))
     assert "1 sessions" not in page
     assert "1 session of toy" in page
 
 
-def test_the_table_sorts_in_a_browser(entries, tmp_path):
+def test_the_table_sorts_in_a_browser(entries: Any, tmp_path: Path) -> None:
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("no chromium on this machine: apt-get install chromium")
@@ -159,5 +160,5 @@ def test_the_table_sorts_in_a_browser(entries, tmp_path):
     assert orders == [["0", "1", "2"], ["1", "0", "2"]]  # what has no figure stays last
 
 
-def test_figures_are_plain_json(entries):
+def test_figures_are_plain_json(entries: Any) -> None:
     json.dumps([figure for _, figure in drawings_of(table_of(entries))], allow_nan=False)

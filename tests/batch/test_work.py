@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ class Worker:
 
 
 @pytest.fixture
-def work(recipe, registry, tmp_path):
+def work(recipe: Path, registry: Any, tmp_path: Path) -> Iterator[Worker]:
     _registry.cache_clear()
     yield Worker(recipe, registry, tmp_path / "out")
     _registry.cache_clear()
@@ -44,7 +45,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_session_leaves_what_run_leaves(work):
+def test_a_session_leaves_what_run_leaves(work: Any) -> None:
     outcome = work(report=True)
     assert outcome.status == "verified"
     assert (outcome.used, outcome.captures, outcome.reason) == (6, 6, None)
@@ -72,21 +73,21 @@ def test_a_session_leaves_what_run_leaves(work):
         ("exit", "crashed", "SystemExit: 3"),
     ],
 )  # fmt: skip
-def test_what_goes_wrong_is_the_outcome(work, what, status, reason):
+def test_what_goes_wrong_is_the_outcome(work: Worker, what: str, status: str, reason: str) -> None:
     outcome = work(overrides=(f"steps.3.what={what}",))
     assert (outcome.status, outcome.reason) == (status, reason)
     assert (work.folder / MARKER).exists() == (status == "refused")
     assert list((work.job.out / STARTS).iterdir()) == []
 
 
-def test_no_archive(work, archive_recipe, archives):
+def test_no_archive(work: Worker, archive_recipe: Path, archives: Any) -> None:
     outcome = work(name=archive_recipe, archives=(str(archives[2]),))
     assert outcome.status == "failed"
     assert outcome.reason == f"{archives[2]}: no such archive"
     assert not work.folder.exists()
 
 
-def test_an_archive_by_url(work, archive_recipe, tmp_path):
+def test_an_archive_by_url(work: Worker, archive_recipe: Path, tmp_path: Path) -> None:
     def packed(text):
         with zipfile.ZipFile(tmp_path / "packed.zip", "w") as file:
             file.writestr("one.txt", text)
@@ -102,7 +103,7 @@ def test_an_archive_by_url(work, archive_recipe, tmp_path):
     assert work.session.key != key
 
 
-def test_a_finished_session_is_taken_over(work):
+def test_a_finished_session_is_taken_over(work: Worker) -> None:
     first = work()
     before = (work.folder / "run.mcap").stat().st_mtime_ns
     assert work() == first
@@ -110,7 +111,7 @@ def test_a_finished_session_is_taken_over(work):
     assert work(report=True).report is not None  # it was run again for that
 
 
-def test_an_unfinished_session_is_run_again(work):
+def test_an_unfinished_session_is_run_again(work: Worker) -> None:
     first = work()
     (work.folder / MARKER).unlink()
     (work.folder / "result.json").write_text("half")
@@ -120,14 +121,14 @@ def test_an_unfinished_session_is_run_again(work):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"key": "other"}', "\x00", '{"key": null}'])
-def test_a_marker_that_is_not_ours_counts_for_nothing(work, text):
+def test_a_marker_that_is_not_ours_counts_for_nothing(work: Worker, text: str) -> None:
     work()
     assert finished_outcome(work.folder, work.session.key, report=False)
     (work.folder / MARKER).write_text(text)
     assert finished_outcome(work.folder, work.session.key, report=False) is None
 
 
-def test_a_session_that_killed_its_worker_twice_is_not_started_again(work):
+def test_a_session_that_killed_its_worker_twice_is_not_started_again(work: Worker) -> None:
     work()
     (work.folder / MARKER).unlink()
     (work.job.out / STARTS / work.session.id).write_bytes(b"..")
@@ -138,7 +139,7 @@ def test_a_session_that_killed_its_worker_twice_is_not_started_again(work):
     )
 
 
-def test_a_recipe_that_changed_meanwhile(work, recipe):
+def test_a_recipe_that_changed_meanwhile(work: Worker, recipe: Path) -> None:
     work()
     (work.folder / MARKER).unlink()
     recipe.write_text(recipe.read_text().replace("2 mm", "3 mm"))
@@ -150,7 +151,7 @@ def test_a_recipe_that_changed_meanwhile(work, recipe):
     )
 
 
-def test_a_worker_without_the_shared_folder(work):
+def test_a_worker_without_the_shared_folder(work: Worker) -> None:
     work()
     elsewhere = Job(work.job.out / "elsewhere", report=False, software=work.job.software)
     outcome = run_session(elsewhere, work.session)
@@ -159,7 +160,7 @@ def test_a_worker_without_the_shared_folder(work):
     assert outcome.reason.endswith("must be on a file system that all workers share")
 
 
-def test_a_folder_that_cannot_be_written(work):
+def test_a_folder_that_cannot_be_written(work: Worker) -> None:
     work()
     (work.folder / MARKER).unlink()
     (work.folder / MARKER).with_suffix(".json.part").mkdir()

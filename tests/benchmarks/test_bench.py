@@ -17,10 +17,10 @@ from tests.benchmarks.cases import CASES, GOALS
         (1.5, 1.0, "+50%: slower than it was"),
     ],
 )
-def test_a_ratio_is_held_against_the_kept_one(ratio, kept, words):
+def test_a_ratio_is_held_against_the_kept_one(ratio: float, kept: float | None, words: str) -> None:
     assert told(ratio, kept) == words
 
 
-def test_goals_and_kept_figures_are_of_cases_there_are():
+def test_goals_and_kept_figures_are_of_cases_there_are() -> None:
     assert set(GOALS) <= set(CASES)
     assert set(json.loads(KEPT.read_text())) <= set(CASES)

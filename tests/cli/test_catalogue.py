@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -20,7 +22,7 @@ def flangeye(*words, typed=""):
     return done.output
 
 
-def test_the_lists_name_every_model():
+def test_the_lists_name_every_model() -> None:
     for command, kind in (("robots", "robots"), ("scanners", "scanners")):
         listed = [line.split()[0] for line in flangeye(command).splitlines()]
         assert listed == model_names(kind)
@@ -33,7 +35,7 @@ RECIPE = "title: T\nrobot: mine.yaml\nscanner: acme.yaml\nsteps: [acquire.archiv
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_new_files_pass_check(asked, tmp_path, monkeypatch):
+def test_new_files_pass_check(asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     joints = ["d: 89.159 mm, alpha: 90 deg", "a: -425 mm", "a: -392.25 mm",
               "d: 109.15 mm, alpha: 90 deg", "d: 94.65 mm, alpha: -90 deg", "d: 82.3 mm"]  # fmt: skip
@@ -50,7 +52,7 @@ def test_new_files_pass_check(asked, tmp_path, monkeypatch):
     load_recipe(tmp_path / "r.yaml", load_registry())
 
 
-def test_a_whole_scanner_can_be_simulated(tmp_path):
+def test_a_whole_scanner_can_be_simulated(tmp_path: Path) -> None:
     out = tmp_path / "acme.yaml"
     flangeye("new-scanner", "acme", "--near", "300 mm", "--far", "900 mm", "--principle",
              "structured light", "--pixels", 1280, 1024, "--field", "40 deg", "32 deg",
@@ -72,7 +74,9 @@ def test_a_whole_scanner_can_be_simulated(tmp_path):
         (["new-robot", "mine", "--urdf", "nowhere.urdf"], "error: nowhere.urdf: "),
     ],
 )  # fmt: skip
-def test_a_wrong_value_is_one_line_and_leaves_no_file(words, line, tmp_path):
+def test_a_wrong_value_is_one_line_and_leaves_no_file(
+    words: list[Any], line: str, tmp_path: Path
+) -> None:
     told = subprocess.run(
         [sys.executable, "-m", "flangeye.cli", *words], cwd=tmp_path, capture_output=True, text=True
     )
@@ -82,10 +86,10 @@ def test_a_wrong_value_is_one_line_and_leaves_no_file(words, line, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_kind_lists_its_stages():
+def test_a_kind_lists_its_stages() -> None:
     assert "solve.svd" in flangeye("stages", "solve")
     assert "reader.table" in flangeye("stages", "reader")
 
 
-def test_the_shell_completes_recipes():
+def test_the_shell_completes_recipes() -> None:
     assert complete_recipe("ur5_phoxi-m_sa") == ["ur5_phoxi-m_sample"]

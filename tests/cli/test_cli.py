@@ -5,6 +5,9 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -16,7 +19,9 @@ from tests import toy
 from tests.conftest import replaced
 
 
-def test_a_run_leaves_its_folder_and_says_the_result(flangeye, toy_recipe, tmp_path):
+def test_a_run_leaves_its_folder_and_says_the_result(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     code, out, err = flangeye("run", toy_recipe, "--out", "here")
     assert code == 0, err
     assert sorted(p.name for p in (tmp_path / "here").iterdir()) == [
@@ -30,7 +35,9 @@ def test_a_run_leaves_its_folder_and_says_the_result(flangeye, toy_recipe, tmp_p
     assert calibration["base_T_camera"]["matrix"] == result["transforms"]["base_T_camera"]["matrix"]
 
 
-def test_by_default_the_folder_is_named_by_time_and_recipe(flangeye, toy_recipe, tmp_path):
+def test_by_default_the_folder_is_named_by_time_and_recipe(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     assert flangeye("run", toy_recipe)[0] == 0
     assert flangeye("run", toy_recipe)[0] == 0
     folders = [p.name for p in (tmp_path / "runs").iterdir()]
@@ -38,7 +45,9 @@ def test_by_default_the_folder_is_named_by_time_and_recipe(flangeye, toy_recipe,
     assert all("_toy" in name for name in folders)
 
 
-def test_the_resolved_recipe_runs_to_the_same_result(flangeye, toy_recipe, tmp_path):
+def test_the_resolved_recipe_runs_to_the_same_result(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     flangeye("run", toy_recipe, "--out", "a")
     flangeye("run", tmp_path / "a" / "recipe.resolved.yaml", "--out", "b")
     first, second = (json.loads((tmp_path / x / "result.json").read_text()) for x in "ab")
@@ -46,7 +55,9 @@ def test_the_resolved_recipe_runs_to_the_same_result(flangeye, toy_recipe, tmp_p
     assert first["provenance"]["recipe_hash"] == second["provenance"]["recipe_hash"]
 
 
-def test_refused_is_exit_code_one_with_the_reason(flangeye, toy_recipe, tmp_path):
+def test_refused_is_exit_code_one_with_the_reason(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
     assert code == 1
     assert "refused: verify.toy: " in out
@@ -75,7 +86,9 @@ def test_refused_is_exit_code_one_with_the_reason(flangeye, toy_recipe, tmp_path
         (["stages", "solve.toi"], "error: no stage 'solve.toi'; did you mean solve.toy?"),
     ],
 )  # fmt: skip
-def test_bad_input_is_one_line_and_exit_code_two(flangeye, toy_recipe, tmp_path, words, line):
+def test_bad_input_is_one_line_and_exit_code_two(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path, words: list[Any], line: str
+) -> None:
     before = sorted(p.name for p in tmp_path.iterdir())
     code, out, err = flangeye(*words)
     assert code == 2
@@ -85,7 +98,9 @@ def test_bad_input_is_one_line_and_exit_code_two(flangeye, toy_recipe, tmp_path,
     assert kept == before
 
 
-def test_from_a_log_without_the_scans(flangeye, toy_recipe, tmp_path):
+def test_from_a_log_without_the_scans(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     flangeye("run", toy_recipe, "--out", "a")
     code, _, err = flangeye(
         "run", toy_recipe, "--from", "a/run.mcap", "--at", "solve.toy", "--out", "b"
@@ -95,7 +110,9 @@ def test_from_a_log_without_the_scans(flangeye, toy_recipe, tmp_path):
     assert first["transforms"] == second["transforms"]
 
 
-def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path):
+def test_show_and_report_work_from_the_log_alone(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     flangeye("run", toy_recipe, "--set", "steps.0.bad=1", "--out", "a")
     code, out, _ = flangeye("show", "a/run.mcap")
     assert code == 0
@@ -115,7 +132,9 @@ def test_show_and_report_work_from_the_log_alone(flangeye, toy_recipe, tmp_path)
         ["new-plugin", "mine", "--kind", "fit", "--into", "nowhere/file"],
     ],
 )
-def test_a_place_that_cannot_be_written_is_one_line(flangeye, toy_recipe, tmp_path, words):
+def test_a_place_that_cannot_be_written_is_one_line(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path, words: list[Any]
+) -> None:
     assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
     (tmp_path / "nowhere").write_text("a file where a folder should be")
     code, _, err = flangeye(*words)
@@ -124,11 +143,13 @@ def test_a_place_that_cannot_be_written_is_one_line(flangeye, toy_recipe, tmp_pa
     assert " cannot be " in err and err.endswith(": Not a directory\n")
 
 
-def test_version(flangeye):
+def test_version(flangeye: Callable[..., Any]) -> None:
     assert flangeye("--version") == (0, f"flangeye {__version__}\n", "")
 
 
-def test_check_stages_plugins_schema(flangeye, toy_recipe, tmp_path):
+def test_check_stages_plugins_schema(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     assert flangeye("check", toy_recipe)[1] == (
         f"{toy_recipe}: ok, 5 steps\n"
         "eye-on-base: [base_T_camera] · camera_T_target = base_T_flange · flange_T_target; "
@@ -150,14 +171,16 @@ def test_check_stages_plugins_schema(flangeye, toy_recipe, tmp_path):
     assert json.loads(flangeye("schema", "--result")[1])["title"] == "Result"
 
 
-def test_a_folder_is_kept_once_something_was_gathered(flangeye, toy_recipe, tmp_path):
+def test_a_folder_is_kept_once_something_was_gathered(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     code, _, err = flangeye("run", toy_recipe, "--set", "steps.0.count=2", "--out", "kept")
     assert code == 2
     assert err.splitlines()[1] == "what was gathered is in kept/run.mcap"
     assert flangeye("show", "kept/run.mcap")[0] == 0
 
 
-def test_help_and_stages_answer_at_once():
+def test_help_and_stages_answer_at_once() -> None:
     """Ratios against imports in the same run, so that a slow machine does not fail it."""
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}
 
@@ -174,7 +197,7 @@ def test_help_and_stages_answer_at_once():
     assert best("-m", "flangeye.cli", "stages") < 0.5 * heavy
 
 
-def test_light_commands_import_nothing_heavy():
+def test_light_commands_import_nothing_heavy() -> None:
     code = (
         "import sys; from flangeye import cli; from flangeye.plugin.registry import load_registry; "
         "load_registry(); print([m for m in ('open3d', 'scipy', 'cv2', 'plotly') if m in sys.modules])"
@@ -183,7 +206,9 @@ def test_light_commands_import_nothing_heavy():
     assert told.stdout == "[]\n"
 
 
-def test_ctrl_c_keeps_what_was_gathered(flangeye, toy_recipe, monkeypatch):
+def test_ctrl_c_keeps_what_was_gathered(
+    flangeye: Callable[..., Any], toy_recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = toy.segment.function
 
     def stopped_at_the_fourth(capture):
@@ -217,14 +242,22 @@ def test_ctrl_c_keeps_what_was_gathered(flangeye, toy_recipe, monkeypatch):
         (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_gone_on_with_is_said(flangeye, toy_recipe, tmp_path, words, line):
+def test_what_cannot_be_gone_on_with_is_said(
+    flangeye: Callable[..., Any],
+    toy_recipe: Path,
+    tmp_path: Path,
+    words: tuple[Any, ...],
+    line: str,
+) -> None:
     assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
     log = (tmp_path / "done" / "run.mcap").read_bytes()
     (tmp_path / "torn.mcap").write_bytes(log[: len(log) // 2])
     assert flangeye("run", *words)[::2] == (2, f"{line}\n")
 
 
-def test_a_plan_that_was_not_allowed_to_move_is_no_mistake(flangeye, toy_recipe, tmp_path):
+def test_a_plan_that_was_not_allowed_to_move_is_no_mistake(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     def acquire(seed, params):
         raise NothingMoved("stop 1: here\nnothing moved")
 
@@ -234,7 +267,9 @@ def test_a_plan_that_was_not_allowed_to_move_is_no_mistake(flangeye, toy_recipe,
     assert not (tmp_path / "here").exists()
 
 
-def test_a_source_may_reject_its_own_captures(flangeye, toy_recipe, tmp_path):
+def test_a_source_may_reject_its_own_captures(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     plain = toy.acquire.function
     made = []
 
@@ -257,13 +292,17 @@ def test_a_source_may_reject_its_own_captures(flangeye, toy_recipe, tmp_path):
     assert outcomes["000"].id == "000"
 
 
-def test_a_refusal_says_what_to_do(flangeye, toy_recipe, tmp_path):
+def test_a_refusal_says_what_to_do(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     code, out, _ = flangeye("run", toy_recipe, "--set", "steps.4.max_rms=1 um", "--out", "x")
     assert code == 1
     assert "what to do: flangeye doctor x/run.mcap" in out
 
 
-def test_solvers_are_compared_by_exchanging_a_step(flangeye, toy_recipe):
+def test_solvers_are_compared_by_exchanging_a_step(
+    flangeye: Callable[..., Any], toy_recipe: Path
+) -> None:
     code, _, err = flangeye("check", toy_recipe, "--set", "steps.3=solve.toi")
     assert (code, err) == (
         2,
@@ -272,7 +311,9 @@ def test_solvers_are_compared_by_exchanging_a_step(flangeye, toy_recipe):
     assert flangeye("check", toy_recipe, "--set", "verify.toy.max_rms=1 mm")[0] == 0
 
 
-def test_notes_of_the_solver_stand_under_the_verdict(flangeye, toy_recipe, tmp_path):
+def test_notes_of_the_solver_stand_under_the_verdict(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     text = toy_recipe.read_text().replace("  - solve.toy", "  - solve.toy\n  - refine.toy")
     toy_recipe.write_text(text)
     _, out, _ = flangeye("run", toy_recipe, "--out", "here")
@@ -283,7 +324,9 @@ def test_notes_of_the_solver_stand_under_the_verdict(flangeye, toy_recipe, tmp_p
     assert page.index("<li>refined</li>") < page.index('class="headlines"')
 
 
-def test_a_runs_folder_is_as_good_as_its_log(flangeye, toy_recipe, tmp_path):
+def test_a_runs_folder_is_as_good_as_its_log(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     flangeye("run", toy_recipe, "--out", "here")
     assert flangeye("show", "here")[1] == flangeye("show", "here/run.mcap")[1]
     (tmp_path / "here" / "report.html").unlink()
@@ -293,7 +336,9 @@ def test_a_runs_folder_is_as_good_as_its_log(flangeye, toy_recipe, tmp_path):
     assert flangeye("doctor", "here") == flangeye("doctor", "here/run.mcap")
 
 
-def test_a_refused_run_writes_no_calibration(flangeye, toy_recipe, tmp_path):
+def test_a_refused_run_writes_no_calibration(
+    flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
+) -> None:
     toy_recipe.write_text(toy_recipe.read_text().replace("2 mm", "0.001 mm"))
     code, out, _ = flangeye("run", toy_recipe, "--out", "here")
     assert code == 1

@@ -1,6 +1,8 @@
 """``flangeye export`` and export steps: what is written where, and what is refused."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ REFUSED = TOY_RECIPE.replace("max_rms: 2 mm", "max_rms: 0.001 mm")
 
 
 @pytest.fixture
-def exporting(flangeye, toy_registry, tmp_path):
+def exporting(flangeye: Any, toy_registry: Any, tmp_path: Path) -> Any:
     """Run a recipe into ``here`` with exports on offer; return the command line."""
     for stage in (export_kuka, export_matrix, export_zivid):
         toy_registry.stages[stage.name] = stage
@@ -27,7 +29,7 @@ def exporting(flangeye, toy_registry, tmp_path):
     return flangeye
 
 
-def test_an_export_is_written_into_the_runs_folder(exporting, tmp_path):
+def test_an_export_is_written_into_the_runs_folder(exporting: Any, tmp_path: Path) -> None:
     assert exporting.ran(TOY_RECIPE)[0] == 0
     code, out, err = exporting("export", "here", "--to", "matrix", "--set", "length=mm")
     assert (code, out, err) == (0, "here/exports/camera.txt: numpy.loadtxt reads it\n", "")
@@ -38,7 +40,7 @@ def test_an_export_is_written_into_the_runs_folder(exporting, tmp_path):
     assert np.allclose(found[:3, 3], 1e3 * wanted[:3, 3], atol=1e-8)
 
 
-def test_an_export_is_printed_or_written_elsewhere(exporting, tmp_path):
+def test_an_export_is_printed_or_written_elsewhere(exporting: Any, tmp_path: Path) -> None:
     exporting.ran(TOY_RECIPE)
     log = "here/run.mcap"
     code, out, _ = exporting("export", log, "--to", "kuka", "--set", "number=7", "--out", "-")
@@ -49,7 +51,7 @@ def test_an_export_is_printed_or_written_elsewhere(exporting, tmp_path):
     assert "BASE_DATA[1]={X " in (tmp_path / "else" / "b.dat").read_text()
 
 
-def test_a_refused_calibration_is_not_exported(exporting, tmp_path):
+def test_a_refused_calibration_is_not_exported(exporting: Any, tmp_path: Path) -> None:
     assert exporting.ran(REFUSED + "  - export.zivid\n")[0] == 1
     assert not (tmp_path / "here" / "exports").exists()
     code, out, err = exporting("export", "here", "--to", "zivid")
@@ -59,20 +61,20 @@ def test_a_refused_calibration_is_not_exported(exporting, tmp_path):
     assert not (tmp_path / "here" / "exports").exists()
 
 
-def test_a_refused_calibration_says_so_in_the_file(exporting, tmp_path):
+def test_a_refused_calibration_says_so_in_the_file(exporting: Any, tmp_path: Path) -> None:
     exporting.ran(REFUSED)
     assert exporting("export", "here", "--to", "zivid", "--anyway")[0] == 0
     text = (tmp_path / "here" / "exports" / "camera.zivid.yaml").read_text()
     assert "# REFUSED, DO NOT USE: verify.toy: " in text
 
 
-def test_a_calibration_nobody_judged_says_so_in_the_file(exporting, tmp_path):
+def test_a_calibration_nobody_judged_says_so_in_the_file(exporting: Any, tmp_path: Path) -> None:
     exporting.ran(TOY_RECIPE.replace("  - verify.toy: {max_rms: 2 mm}\n", "  - export.matrix\n"))
     text = (tmp_path / "here" / "exports" / "camera.txt").read_text()
     assert "# NOT VERIFIED: nothing has judged this calibration\n" in text
 
 
-def test_a_recipe_exports_wherever_the_step_stands(exporting, tmp_path):
+def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Path) -> None:
     steps = "  - export.kuka: {name: eye}\n  - export.matrix\n"
     before = TOY_RECIPE.replace("  - verify.toy", steps + "  - verify.toy")
     assert exporting.ran(before)[0] == 0
@@ -108,7 +110,9 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting, tmp_path):
         ),
     ],
 )
-def test_what_cannot_be_exported_is_one_line(exporting, text, told, message):
+def test_what_cannot_be_exported_is_one_line(
+    exporting: Any, text: Any, told: tuple[Any, ...], message: str
+) -> None:
     code, _, err = exporting.ran(text)
     if told:
         code, _, err = exporting("export", "here", *told)

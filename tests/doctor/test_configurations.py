@@ -36,7 +36,7 @@ def with_arms(session, change, arms="both"):
 
 @pytest.mark.parametrize("carried", FURTHER)
 @pytest.mark.parametrize("kind", ["flange", "centres", "marker"])
-def test_a_clean_session_gives_nothing(carried, kind):
+def test_a_clean_session_gives_nothing(carried: str, kind: str) -> None:
     diagnosis = examine(session_of(carried, kind), CHECKS)
     assert diagnosis.findings == ()
     assert diagnosis.notes == ()
@@ -44,7 +44,7 @@ def test_a_clean_session_gives_nothing(carried, kind):
 
 @pytest.mark.parametrize("carried", FURTHER)
 @pytest.mark.parametrize("kind", ["flange", "marker"])
-def test_one_gross_outlier(carried, kind):
+def test_one_gross_outlier(carried: str, kind: str) -> None:
     session = session_of(carried, kind)
     centres = np.array(session.centres)
     centres[7] += [0.0, 0.02, 0.01]
@@ -53,7 +53,7 @@ def test_one_gross_outlier(carried, kind):
 
 
 @pytest.mark.parametrize("carried", FURTHER)
-def test_a_target_that_moved_half_way(carried):
+def test_a_target_that_moved_half_way(carried: str) -> None:
     session = session_of(carried, "marker")
     late = np.arange(20) >= 10
     moved = session.centres + np.where(late[:, None], [0.01, 0.0, 0.004], 0.0)
@@ -63,7 +63,7 @@ def test_a_target_that_moved_half_way(carried):
 
 @pytest.mark.parametrize("carried", FURTHER)
 @pytest.mark.parametrize("by", [1, -1])
-def test_poses_shifted_against_the_scans(carried, by):
+def test_poses_shifted_against_the_scans(carried: str, by: int) -> None:
     session = session_of(carried)
     _, known = shifted(session.poses, by)
     links = None if session.links is None else shifted(session.links, by)[0]
@@ -72,14 +72,14 @@ def test_poses_shifted_against_the_scans(carried, by):
 
 
 @pytest.mark.parametrize("carried", REPORTED)
-def test_the_base_in_the_flange(carried):
+def test_the_base_in_the_flange(carried: str) -> None:
     finding = only(with_arms(session_of(carried), inverted))
     assert "corrected: {reader: auto, inverted: true}" in finding.fix
 
 
 @pytest.mark.parametrize("carried", REPORTED)
 @pytest.mark.parametrize("factor", [1e3, pytest.param(1 / 25.4e-3, marks=pytest.mark.slow)])
-def test_positions_in_another_unit(carried, factor):
+def test_positions_in_another_unit(carried: str, factor: float) -> None:
     session = with_arms(session_of(carried, "marker"), lambda poses: scaled(poses, factor))
     finding = only(session)
     assert finding.name == "unit"
@@ -87,14 +87,14 @@ def test_positions_in_another_unit(carried, factor):
 
 
 @pytest.mark.parametrize("carried", ["arm-1", "arm-2"])
-def test_the_targets_unit_before_a_camera_on_a_link(carried):
+def test_the_targets_unit_before_a_camera_on_a_link(carried: str) -> None:
     session = session_of(carried)
     finding = only(replace(session, centres=session.centres * 1e3))
     assert finding.what.startswith("the target's positions were read in m and are in mm")
 
 
 @pytest.mark.parametrize("carried", REPORTED)
-def test_rotations_read_in_another_convention(carried):
+def test_rotations_read_in_another_convention(carried: str) -> None:
     session = session_of(carried, "marker", turn=0.4)
     finding = only(with_arms(session, lambda poses: reread(poses, "ZYX", "xyz")))
     assert finding.name == "pose convention"
@@ -102,13 +102,13 @@ def test_rotations_read_in_another_convention(carried):
 
 
 @pytest.mark.parametrize("arms", [pytest.param("first", marks=pytest.mark.slow), "second"])
-def test_a_mistake_of_one_of_two_arms(arms):
+def test_a_mistake_of_one_of_two_arms(arms: str) -> None:
     finding = only(with_arms(session_of("both", "marker"), inverted, arms))
     assert finding.what.startswith(f"the {arms} arm's poses are flange_T_base")
     assert f"{{reader: auto, arms: {arms}, inverted: true}}" in finding.fix
 
 
-def test_a_tool_on_the_second_arm():
+def test_a_tool_on_the_second_arm() -> None:
     session = session_of("both")
     offset = np.array([0.0, 0.01, 0.05])
     wrong = with_arms(session, lambda poses: without_tool(poses, -offset), "second")
@@ -119,7 +119,7 @@ def test_a_tool_on_the_second_arm():
 
 
 @pytest.mark.parametrize("carried", REPORTED)
-def test_identity_matrices(carried):
+def test_identity_matrices(carried: str) -> None:
     session = session_of(carried)
 
     def change(poses):
@@ -131,7 +131,7 @@ def test_identity_matrices(carried):
     assert (finding.name, finding.samples) == ("identity matrices", ("003", "008"))
 
 
-def test_an_arm_that_rests_while_the_other_moves_is_no_stale_pose():
+def test_an_arm_that_rests_while_the_other_moves_is_no_stale_pose() -> None:
     session = session_of("both", "marker", n=24)
     poses = np.array(session.poses)
     poses[12:] = poses[11]
@@ -148,7 +148,7 @@ def test_an_arm_that_rests_while_the_other_moves_is_no_stale_pose():
     assert examine(resting, CHECKS).findings == ()
 
 
-def test_what_cannot_show_is_said_with_the_reason():
+def test_what_cannot_show_is_said_with_the_reason() -> None:
     idle = examine(session_of("arm-2"), CHECKS).idle
     assert idle == {
         "check.direction": "the camera's link is where the joint angles say",

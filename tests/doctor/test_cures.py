@@ -1,6 +1,7 @@
 """The line that a finding gives, put into the recipe, cures: the calibration is as if nothing was."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,7 @@ QUICK = ("metres as millimetres", "vectors as ZYX", "the base in the flange", "a
 @pytest.mark.parametrize(
     "fault", [pytest.param(f, marks=() if f in QUICK else pytest.mark.slow) for f in FAULTS]
 )
-def test_the_line_cures(tmp_path, fault):
+def test_the_line_cures(tmp_path: Path, fault: Any) -> None:
     name, plant = FAULTS[fault]
     session = clean(np.random.default_rng(5), N, "marker", turn=0.4)
     recipe = recipe_with(tmp_path / "recipe.yaml", RECIPE["steps"][0])

@@ -1,6 +1,7 @@
 """Every mistake, planted in sessions with known truth, is named; clean sessions give nothing."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def changed(session, rows, pose):
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
-def test_a_clean_session_gives_nothing(kind, carried):
+def test_a_clean_session_gives_nothing(kind: Any, carried: Any) -> None:
     diagnosis = examine(session_of(kind, carried), CHECKS)
     assert diagnosis.findings == ()
     assert diagnosis.notes == ()
@@ -60,7 +61,9 @@ def test_a_clean_session_gives_nothing(kind, carried):
     ("factor", "said", "meant"),
     [(1e3, "m", "mm"), (1e-3, "mm", "m"), (1 / 25.4e-3, "m", "inches"), (25.4, "inches", "mm")],
 )
-def test_robot_positions_in_another_unit(kind, carried, factor, said, meant):
+def test_robot_positions_in_another_unit(
+    kind: str, carried: str, factor: float, said: str, meant: str
+) -> None:
     session = session_of(kind, carried)
     finding = only(session.with_poses(scaled(session.poses, factor)))
     if factor == 25.4:  # as read in inches, meant in mm, or the same factor of other units
@@ -72,14 +75,16 @@ def test_robot_positions_in_another_unit(kind, carried, factor, said, meant):
 
 @pytest.mark.parametrize(("kind", "carried"), SOME)
 @pytest.mark.parametrize(("factor", "meant"), [(1e3, "mm"), (1 / 25.4e-3, "inches")])
-def test_target_positions_in_another_unit(kind, carried, factor, meant):
+def test_target_positions_in_another_unit(
+    kind: str, carried: str, factor: float, meant: str
+) -> None:
     session = session_of(kind, carried)
     finding = only(replace(session, centres=session.centres * factor))
     assert f"the target's positions were read in m and are in {meant}" in finding.what
     assert finding.after.position < 0.3e-3
 
 
-def test_both_in_the_same_wrong_unit():
+def test_both_in_the_same_wrong_unit() -> None:
     session = session_of("centres")
     both = replace(session, poses=scaled(session.poses, 1e3), centres=session.centres * 1e3)
     finding = only(both)
@@ -88,7 +93,7 @@ def test_both_in_the_same_wrong_unit():
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
-def test_the_base_in_the_flange(kind, carried):
+def test_the_base_in_the_flange(kind: Any, carried: Any) -> None:
     session = session_of(kind, carried)
     finding = only(session.with_poses(inverted(session.poses)))
     assert "the poses are flange_T_base" in finding.what
@@ -99,14 +104,14 @@ def test_the_base_in_the_flange(kind, carried):
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])
-def test_a_mounting_named_wrongly_is_a_configuration(carried):
+def test_a_mounting_named_wrongly_is_a_configuration(carried: str) -> None:
     other = {"target": "camera", "camera": "target"}[carried]
     finding = only(replace(session_of("marker", carried), carried=other))
     mounted = {"target": "eye-on-base", "camera": "eye-in-hand"}[carried]
     assert finding.fix.startswith(f"configuration: {{name: {mounted}, place: unknown}}")
 
 
-def test_markers_that_no_lens_sees_are_inverted():
+def test_markers_that_no_lens_sees_are_inverted() -> None:
     session = session_of("marker", seed=4)
     turned = session.rotations.swapaxes(-1, -2)
     centres = -(turned @ session.centres[..., None])[..., 0]
@@ -125,7 +130,7 @@ def arbitrary(rng, n=15):
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])
-def test_a_driver_that_detected_nothing_is_the_only_finding(carried):
+def test_a_driver_that_detected_nothing_is_the_only_finding(carried: str) -> None:
     session = session_of("marker", carried, n=15)
     eye = np.tile(np.eye(3), (15, 1, 1))
     poses = arbitrary(np.random.default_rng(0))
@@ -133,7 +138,7 @@ def test_a_driver_that_detected_nothing_is_the_only_finding(carried):
     assert finding.what.startswith("15 of 15 markers are at the camera itself")
 
 
-def test_a_driver_that_gave_the_same_each_time_is_the_only_finding():
+def test_a_driver_that_gave_the_same_each_time_is_the_only_finding() -> None:
     session = session_of("marker", n=15)
     stale = replace(
         session,
@@ -147,7 +152,7 @@ def test_a_driver_that_gave_the_same_each_time_is_the_only_finding():
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])
-def test_poses_that_have_nothing_to_do_with_the_markers_are_in_no_other_unit(carried):
+def test_poses_that_have_nothing_to_do_with_the_markers_are_in_no_other_unit(carried: str) -> None:
     """Nor at another time, nor was the target moved: nothing foretells samples held out."""
     for seed in range(4):
         session = session_of("marker", carried, n=15, seed=seed)
@@ -156,7 +161,7 @@ def test_poses_that_have_nothing_to_do_with_the_markers_are_in_no_other_unit(car
 
 
 @pytest.mark.parametrize(("kind", "carried"), TURNED)
-def test_transposed_rotations(kind, carried):
+def test_transposed_rotations(kind: str, carried: str) -> None:
     session = session_of(kind, carried)
     assert "transposed: true" in only(session.with_poses(transposed(session.poses))).fix
 
@@ -167,7 +172,9 @@ def test_transposed_rotations(kind, carried):
     [("xyzw", "wxyz"), ("wxyz", "xyzw"), ("xyz", "ZYX"), ("ZYX", "xyz"), ("vector", "xyz"),
      ("ZYX", "vector"), ("XYZ", "ZYX"), ("ZYX", "ZYZ")],
 )  # fmt: skip
-def test_rotations_read_in_another_convention(kind, carried, read_as, written_as):
+def test_rotations_read_in_another_convention(
+    kind: str, carried: str, read_as: str, written_as: str
+) -> None:
     session = session_of(kind, carried, turn=0.4)
     finding = only(session.with_poses(reread(session.poses, written_as, read_as)))
     assert finding.name == "pose convention"
@@ -175,7 +182,7 @@ def test_rotations_read_in_another_convention(kind, carried, read_as, written_as
     assert np.allclose(finding.corrected_session.poses, session.poses, atol=1e-6)
 
 
-def test_a_stated_convention_is_the_one_that_is_corrected():
+def test_a_stated_convention_is_the_one_that_is_corrected() -> None:
     session = replace(session_of(turn=0.4), reader={"poses": {"rotation": "ZYX"}})
     finding = only(session.with_poses(reread(session.poses, "xyz", "ZYX")))
     assert "read_as: ZYX, written_as: xyz" in finding.fix
@@ -183,14 +190,14 @@ def test_a_stated_convention_is_the_one_that_is_corrected():
 
 @pytest.mark.parametrize(("kind", "carried"), SOME)
 @pytest.mark.parametrize("by", [1, -1, 2])
-def test_poses_shifted_against_the_scans(kind, carried, by):
+def test_poses_shifted_against_the_scans(kind: str, carried: str, by: int) -> None:
     session = session_of(kind, carried)
     poses, known = shifted(session.poses, by)
     finding = only(session.with_poses(poses).where(known))
     assert f"shift: {-by}" in finding.fix
 
 
-def test_poses_shifted_from_one_scan_on():
+def test_poses_shifted_from_one_scan_on() -> None:
     session = session_of()
     poses, known = shifted(session.poses, 1, 12)
     finding = only(session.with_poses(poses).where(known))
@@ -200,7 +207,7 @@ def test_poses_shifted_from_one_scan_on():
 
 
 @pytest.mark.parametrize("delay", [0.03, -0.08, 0.15])
-def test_a_time_offset_between_the_streams(delay):
+def test_a_time_offset_between_the_streams(delay: float) -> None:
     session = in_motion(np.random.default_rng(2))
     poses, known = delayed(session.poses, session.times, delay)
     finding = only(session.with_poses(poses).where(known))
@@ -211,7 +218,7 @@ def test_a_time_offset_between_the_streams(delay):
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
-def test_one_gross_outlier(kind, carried):
+def test_one_gross_outlier(kind: Any, carried: Any) -> None:
     session = changed(session_of(kind, carried), [7], rigid(np.eye(3), np.array([0.01, 0, 0.02])))
     finding = only(session)
     assert finding.name == "outlier"
@@ -220,7 +227,7 @@ def test_one_gross_outlier(kind, carried):
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
-def test_identity_matrices_of_the_robots_driver(kind, carried):
+def test_identity_matrices_of_the_robots_driver(kind: Any, carried: Any) -> None:
     session = session_of(kind, carried)
     poses = np.array(session.poses)
     poses[[3, 8]] = np.eye(4)
@@ -229,7 +236,7 @@ def test_identity_matrices_of_the_robots_driver(kind, carried):
     assert finding.samples == ("003", "008")
 
 
-def test_identity_matrices_of_a_markers_driver():
+def test_identity_matrices_of_a_markers_driver() -> None:
     session = session_of("marker")
     centres, rotations = np.array(session.centres), np.array(session.rotations)
     centres[[2, 4]], rotations[[2, 4]] = 0.0, np.eye(3)
@@ -237,14 +244,14 @@ def test_identity_matrices_of_a_markers_driver():
     assert finding.what.startswith("2 of 20 markers are at the camera itself")
 
 
-def test_nothing_but_identities():
+def test_nothing_but_identities() -> None:
     session = session_of("centres")
     finding = examine(session.with_poses(np.tile(np.eye(4), (20, 1, 1))), CHECKS).findings[0]
     assert finding.name == "identity matrices"
     assert finding.fix == "record again: too little is left"
 
 
-def test_a_pose_that_is_stale():
+def test_a_pose_that_is_stale() -> None:
     session = session_of()
     poses = np.array(session.poses)
     poses[9] = poses[8]
@@ -253,7 +260,7 @@ def test_a_pose_that_is_stale():
     assert finding.samples == ("009",)
 
 
-def test_a_detection_that_is_stale():
+def test_a_detection_that_is_stale() -> None:
     session = session_of("marker")
     centres, rotations = np.array(session.centres), np.array(session.rotations)
     centres[5], rotations[5] = centres[4], rotations[4]
@@ -262,7 +269,7 @@ def test_a_detection_that_is_stale():
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)
-def test_a_target_that_moved_half_way(kind, carried):
+def test_a_target_that_moved_half_way(kind: Any, carried: Any) -> None:
     move = rigid(rotation_exp(np.array([0, 0.01, 0])), np.array([0.004, 0, 0]))
     finding = only(changed(session_of(kind, carried), np.arange(20) >= 11, move))
     assert finding.name == "moved target"
@@ -270,7 +277,7 @@ def test_a_target_that_moved_half_way(kind, carried):
 
 
 @pytest.mark.parametrize("kind", ["flange", "centres"])
-def test_the_poses_of_a_tool(kind):
+def test_the_poses_of_a_tool(kind: str) -> None:
     session = session_of(kind)
     offset = np.array([0.002, -0.003, 0.001])
     finding = only(session.with_poses(without_tool(session.poses, -offset)))
@@ -280,7 +287,7 @@ def test_the_poses_of_a_tool(kind):
 
 @pytest.mark.parametrize("carried", ["target", "camera"])
 @pytest.mark.parametrize("axis", [(np.pi, 0, 0), (0, 0, np.pi), (0, 0, np.pi / 2)])
-def test_targets_that_were_seen_turned_over(carried, axis):
+def test_targets_that_were_seen_turned_over(carried: str, axis: tuple[Any, ...]) -> None:
     session = session_of("marker", carried)
     rotations = np.array(session.rotations)
     rotations[[2, 5, 9]] = rotations[[2, 5, 9]] @ rotation_exp(np.array(axis))
@@ -290,7 +297,7 @@ def test_targets_that_were_seen_turned_over(carried, axis):
 
 
 @pytest.mark.parametrize("factor", [1.03, 0.9])
-def test_a_marker_that_was_printed_in_another_size(factor):
+def test_a_marker_that_was_printed_in_another_size(factor: float) -> None:
     session = session_of("marker")
     finding = only(replace(session, centres=session.centres * factor))
     assert finding.name == "target size"
@@ -299,11 +306,11 @@ def test_a_marker_that_was_printed_in_another_size(factor):
 
 @pytest.mark.parametrize("kind", ["marker", "point"])
 @pytest.mark.parametrize("carried", ["target", "camera"])
-def test_too_little_rotation(kind, carried):
+def test_too_little_rotation(kind: str, carried: str) -> None:
     assert named(session_of(kind, carried, turn=1e-4)) == ["too little rotation"]
 
 
-def test_rotation_about_one_axis_only():
+def test_rotation_about_one_axis_only() -> None:
     rng = np.random.default_rng(3)
     session = session_of("marker")
     turns = np.array([rotation_exp(np.array([0, 0, a])) for a in rng.normal(0, 0.5, 20)])
@@ -324,20 +331,20 @@ def test_rotation_about_one_axis_only():
     assert [note.name for note in diagnosis.notes] == ["too little rotation"]
 
 
-def test_places_on_a_line():
+def test_places_on_a_line() -> None:
     session = session_of("centres", box=(0.3, 0.0, 0.0))
     finding = only(session)
     assert finding.name == "too little motion"
     assert finding.fix.startswith("record again")
 
 
-def test_no_rotation_is_only_worth_a_note_where_the_flange_itself_is_seen():
+def test_no_rotation_is_only_worth_a_note_where_the_flange_itself_is_seen() -> None:
     diagnosis = examine(session_of("centres", turn=1e-4), CHECKS)
     assert diagnosis.findings == ()
     assert [note.name for note in diagnosis.notes] == ["little rotation"]
 
 
-def test_two_mistakes_are_both_named_and_one_line_mends_both():
+def test_two_mistakes_are_both_named_and_one_line_mends_both() -> None:
     session = changed(session_of(), [4], rigid(np.eye(3), np.array([0.0, 0.0, 0.05])))
     findings = examine(session.with_poses(scaled(session.poses, 1e3)), CHECKS).findings
     assert [f.name for f in findings] == ["unit", "outlier"]
@@ -362,18 +369,18 @@ def random_session(seed):
 
 
 @pytest.mark.slow
-def test_no_false_alarm_in_two_hundred_clean_sessions():
+def test_no_false_alarm_in_two_hundred_clean_sessions() -> None:
     assert {seed: names for seed in range(200) if (names := named(random_session(seed)))} == {}
 
 
-def test_too_few_samples_are_refused():
+def test_too_few_samples_are_refused() -> None:
     with pytest.raises(
         Exception, match="3 of 3 samples have a target in them; at least 4 are needed"
     ):
         examine(session_of(n=3), CHECKS)
 
 
-def test_a_check_never_changes_the_session():
+def test_a_check_never_changes_the_session() -> None:
     session = session_of()
     before = {name: np.array(getattr(session, name)) for name in ("poses", "centres", "normals")}
     examine(session, CHECKS)

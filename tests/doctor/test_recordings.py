@@ -3,6 +3,9 @@
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +31,7 @@ def named(session):
 
 
 @pytest.fixture(params=["aubo", "ur5", "franka"])
-def recorded(request, ancorasir) -> RecordedSession:
+def recorded(request: pytest.FixtureRequest, ancorasir: Path) -> RecordedSession:
     """A recording without its known outliers."""
     session = open_session(ancorasir / "data" / request.param, REGISTRY)
     wrong = np.array([name in OUTLIERS[request.param] for name in session.ids])
@@ -36,46 +39,48 @@ def recorded(request, ancorasir) -> RecordedSession:
 
 
 @pytest.mark.parametrize("name", OUTLIERS)
-def test_the_false_segmentations_that_were_published_and_nothing_else(ancorasir, name):
+def test_the_false_segmentations_that_were_published_and_nothing_else(
+    ancorasir: Path, name: str
+) -> None:
     found = examine(open_session(ancorasir / "data" / name, REGISTRY), CHECKS).findings
     assert {f.name for f in found} <= {"outlier"}
     assert {sample for f in found for sample in f.samples} == OUTLIERS[name]
 
 
-def test_the_kinects_circle_is_behind_the_flange(ancorasir):
+def test_the_kinects_circle_is_behind_the_flange(ancorasir: Path) -> None:
     """It was fitted to the wrist: without a recipe that says so, that is an offset to be named."""
     (finding,) = examine(open_session(ancorasir / "Kinect_Result", REGISTRY), CHECKS).findings
     assert finding.name == "tool offset"
 
 
-def test_a_recipe_that_names_the_wrist_explains_it(ancorasir):
+def test_a_recipe_that_names_the_wrist_explains_it(ancorasir: Path) -> None:
     recipe = load_recipe(recipe_names()["ur10e_azure-kinect_archive"], REGISTRY)
     diagnosis = examine(open_session(ancorasir, REGISTRY, recipe), CHECKS)
     assert diagnosis.findings == ()
     assert [note.name for note in diagnosis.notes] == ["little rotation"]
 
 
-def test_a_recording_without_its_outliers_is_clean(recorded):
+def test_a_recording_without_its_outliers_is_clean(recorded: RecordedSession) -> None:
     assert named(recorded) == []
 
 
 @pytest.mark.parametrize("factor", [1e3, 1 / 25.4e-3])
-def test_recorded_poses_in_another_unit(recorded, factor):
+def test_recorded_poses_in_another_unit(recorded: RecordedSession, factor: float) -> None:
     assert named(recorded.with_poses(scaled(recorded.poses, factor))) == ["unit"]
 
 
-def test_recorded_poses_the_other_way_round(recorded):
+def test_recorded_poses_the_other_way_round(recorded: RecordedSession) -> None:
     assert named(recorded.with_poses(inverted(recorded.poses))) == ["pose direction"]
 
 
 @pytest.mark.parametrize("by", [1, -1])
-def test_recorded_poses_shifted(recorded, by):
+def test_recorded_poses_shifted(recorded: RecordedSession, by: int) -> None:
     session = recorded.where(recorded.seen)
     poses, known = shifted(session.poses, by)
     assert named(session.with_poses(poses).where(known)) == ["shifted poses"]
 
 
-def test_a_recorded_outlier(recorded):
+def test_a_recorded_outlier(recorded: RecordedSession) -> None:
     session = recorded.where(recorded.seen)
     centres = np.array(session.centres)
     centres[5] += [0.0, 0.05, 0.0]
@@ -83,13 +88,13 @@ def test_a_recorded_outlier(recorded):
     assert [(f.name, f.samples) for f in found] == [("outlier", (session.ids[5],))]
 
 
-def test_recorded_poses_replaced_by_identities(recorded):
+def test_recorded_poses_replaced_by_identities(recorded: RecordedSession) -> None:
     poses = np.array(recorded.poses)
     poses[[2, 7]] = np.eye(4)
     assert named(recorded.with_poses(poses)) == ["identity matrices"]
 
 
-def test_a_camera_that_was_moved_half_way(recorded):
+def test_a_camera_that_was_moved_half_way(recorded: RecordedSession) -> None:
     session = recorded.where(recorded.seen)
     centres = np.array(session.centres)
     centres[len(centres) // 2 :] += [0.01, 0.0, 0.004]
@@ -97,7 +102,7 @@ def test_a_camera_that_was_moved_half_way(recorded):
     assert named(moved) == ["moved target"]
 
 
-def test_the_poses_of_a_tool_on_an_arm_that_turned(ancorasir):
+def test_the_poses_of_a_tool_on_an_arm_that_turned(ancorasir: Path) -> None:
     session = open_session(ancorasir / "data" / "ur5", REGISTRY)
     session = session.without(np.array([name in OUTLIERS["ur5"] for name in session.ids]))
     offset = np.array([0.0, 0.02, 0.12])
@@ -106,7 +111,7 @@ def test_the_poses_of_a_tool_on_an_arm_that_turned(ancorasir):
     assert finding.after.position < 1e-3 < 5e-3 < finding.before.position
 
 
-def test_clouds_in_another_unit_than_the_recipe_states():
+def test_clouds_in_another_unit_than_the_recipe_states() -> None:
     path = recipe_names()["ur5_phoxi-m_sample"]
     recipe = load_recipe(path, REGISTRY, ["steps.0.unit=mm"])
     archive = recipe.steps[0].params.path
@@ -116,7 +121,7 @@ def test_clouds_in_another_unit_than_the_recipe_states():
     assert "unit: auto" in finding.fix
 
 
-def test_clouds_in_inches(tmp_path):
+def test_clouds_in_inches(tmp_path: Path) -> None:
     """The sample that comes with the project, its clouds written in inches; the line cures."""
     path = recipe_names()["ur5_phoxi-m_sample"]
     archive = tmp_path / "inches"
@@ -134,7 +139,9 @@ def test_clouds_in_inches(tmp_path):
     assert examine(open_session(archive, REGISTRY, corrected_session), CHECKS).findings == ()
 
 
-def test_a_log_of_ours_needs_no_recipe(tmp_path, monkeypatch, capsys):
+def test_a_log_of_ours_needs_no_recipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The sample that comes with the project, run and then examined from its log alone."""
     monkeypatch.setattr(
         sys, "argv", ["flangeye", "run", "ur5_phoxi-m_sample", "--out", str(tmp_path / "o")]
@@ -157,7 +164,7 @@ def run(monkeypatch, capsys, *words):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path: Path) -> Callable[..., Any]:
     """An archive of ready-made centres in the layout of the Kinect's recording, with a session."""
 
     def write(session):
@@ -185,7 +192,7 @@ steps:
 
 
 @pytest.fixture
-def recipe(tmp_path):
+def recipe(tmp_path: Path) -> Path:
     path = tmp_path / "recipe.yaml"
     path.write_text(RECIPE)
     return path
@@ -195,14 +202,21 @@ def session_of(seed=1):
     return clean(np.random.default_rng(seed), kind="centres")
 
 
-def test_nothing_found_is_exit_code_zero(monkeypatch, capsys, folder):
+def test_nothing_found_is_exit_code_zero(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Callable[..., Any]
+) -> None:
     code, out, _ = run(monkeypatch, capsys, folder(session_of()))
     assert code == 0
     assert out.splitlines()[0] == "20 of 20 samples have a target in them; 13 checks"
     assert out.splitlines()[-1] == "nothing found"
 
 
-def test_a_finding_is_exit_code_one_and_its_line_mends_it(monkeypatch, capsys, folder, recipe):
+def test_a_finding_is_exit_code_one_and_its_line_mends_it(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    folder: Callable[..., Any],
+    recipe: Path,
+) -> None:
     session = session_of()
     archive = folder(session.with_poses(inverted(session.poses)))
     code, out, _ = run(monkeypatch, capsys, archive, "--recipe", recipe)
@@ -219,7 +233,9 @@ def test_a_finding_is_exit_code_one_and_its_line_mends_it(monkeypatch, capsys, f
     assert run(monkeypatch, capsys, archive, "--recipe", recipe)[0] == 0
 
 
-def test_json_for_programs(monkeypatch, capsys, folder):
+def test_json_for_programs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Callable[..., Any]
+) -> None:
     session = session_of()
     archive = folder(session.with_poses(scaled(session.poses, 1e3)))
     code, out, _ = run(monkeypatch, capsys, archive, "--json")
@@ -246,14 +262,23 @@ def test_json_for_programs(monkeypatch, capsys, folder):
          "the doctor needs a recipe that begins with acquire.archive or acquire.centres"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_read_is_exit_code_two(monkeypatch, capsys, tmp_path, make, words, line):
+def test_what_cannot_be_read_is_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    make: Callable[..., Any],
+    words: list[Any],
+    line: str,
+) -> None:
     monkeypatch.chdir(tmp_path)
     make(tmp_path)
     code, _, err = run(monkeypatch, capsys, *words)
     assert (code, err.splitlines()[-1]) == (2, line)
 
 
-def test_scans_are_segmented_and_fitted_whatever_is_wrong_with_their_poses(ancorasir, tmp_path):
+def test_scans_are_segmented_and_fitted_whatever_is_wrong_with_their_poses(
+    ancorasir: Path, tmp_path: Path
+) -> None:
     """Six real scans, their poses in millimetres read as metres: beyond any arm for a run."""
     name = "franka_phoxi-m_2019-sample_archive"
     text = (

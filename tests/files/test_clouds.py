@@ -3,7 +3,7 @@
 import time
 import tracemalloc
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -127,7 +127,9 @@ clouds = st.integers(1, 60).flatmap(lambda n: hnp.arrays(np.float32, (n, 3), ele
 
 @QUICK
 @given(clouds, st.sampled_from(["ascii", "binary", "binary_compressed"]), st.booleans())
-def test_pcd_round_trips_in_every_encoding(tmp_path, xyz, encoding, extras):
+def test_pcd_round_trips_in_every_encoding(
+    tmp_path: Path, xyz: Any, encoding: Any, extras: bool
+) -> None:
     path = tmp_path / "a.pcd"
     path.write_bytes(pcd(with_extras(xyz, extras), encoding))
     assert check_cloud_file(path) == len(xyz)
@@ -143,7 +145,9 @@ def test_pcd_round_trips_in_every_encoding(tmp_path, xyz, encoding, extras):
     st.booleans(),
     st.booleans(),
 )
-def test_ply_round_trips_in_every_encoding(tmp_path, xyz, encoding, extras, others):
+def test_ply_round_trips_in_every_encoding(
+    tmp_path: Path, xyz: Any, encoding: Any, extras: bool, others: bool
+) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(ply(with_extras(xyz, extras), encoding, others))
     assert check_cloud_file(path) == len(xyz)
@@ -152,7 +156,9 @@ def test_ply_round_trips_in_every_encoding(tmp_path, xyz, encoding, extras, othe
 
 @QUICK
 @given(st.data(), st.integers(2, 6), st.integers(1, 6))
-def test_organised_clouds_keep_their_grid_and_their_gaps(tmp_path, data, height, width):
+def test_organised_clouds_keep_their_grid_and_their_gaps(
+    tmp_path: Path, data: Any, height: int, width: int
+) -> None:
     xyz = data.draw(hnp.arrays(np.float32, (height, width, 3), elements=coordinates))
     path = tmp_path / "a.pcd"
     write_cloud(path, PointCloud(CAMERA, xyz))
@@ -167,20 +173,20 @@ def test_organised_clouds_keep_their_grid_and_their_gaps(tmp_path, data, height,
 
 @QUICK
 @given(hnp.arrays(np.float32, (7, 3), elements=st.floats(-5, 5, width=32)))
-def test_millimetres_come_back_as_metres(tmp_path, xyz):
+def test_millimetres_come_back_as_metres(tmp_path: Path, xyz: Any) -> None:
     path = tmp_path / "a.pcd"
     write_cloud(path, PointCloud(CAMERA, xyz), unit="mm")
     np.testing.assert_allclose(read_cloud(path, "mm").xyz, xyz, rtol=2e-7, atol=1e-30)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i4"])
-def test_coordinates_may_be_of_any_number_type(tmp_path, dtype):
+def test_coordinates_may_be_of_any_number_type(tmp_path: Path, dtype: str) -> None:
     record = np.array([(1, 2, 400), (3, 4, 500)], [(axis, dtype) for axis in "xyz"])
     (tmp_path / "a.pcd").write_bytes(pcd(record, "binary"))
     assert read_cloud(tmp_path / "a.pcd", "mm").xyz[1].tolist() == pytest.approx([3e-3, 4e-3, 0.5])
 
 
-def test_plain_text_is_read_with_and_without_a_heading(tmp_path):
+def test_plain_text_is_read_with_and_without_a_heading(tmp_path: Path) -> None:
     for name, text in {
         "a.xyz": "1 2 3 200\n4 5 6 210\n",
         "b.csv": "intensity,x,y,z\n200,1,2,3\n210,4,5,6\n",
@@ -190,12 +196,12 @@ def test_plain_text_is_read_with_and_without_a_heading(tmp_path):
         assert read_cloud(tmp_path / name).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_nothing_but_nan_is_a_valid_file(tmp_path):
+def test_nothing_but_nan_is_a_valid_file(tmp_path: Path) -> None:
     write_cloud(tmp_path / "a.pcd", PointCloud(CAMERA, np.full((4, 3), np.nan)))
     assert len(read_cloud(tmp_path / "a.pcd").points()) == 0
 
 
-def test_padding_after_binary_points_is_not_a_fault(tmp_path):
+def test_padding_after_binary_points_is_not_a_fault(tmp_path: Path) -> None:
     for encoding in ("binary", "binary_compressed"):
         path = tmp_path / f"{encoding}.pcd"
         path.write_bytes(pcd(with_extras(POINTS, False), encoding) + bytes(4096))
@@ -205,7 +211,7 @@ def test_padding_after_binary_points_is_not_a_fault(tmp_path):
 @QUICK
 @given(st.binary(max_size=400).flatmap(lambda b: st.just(b) | st.just(b * 9)), st.integers(0, 4000))
 @example(bytes(9000), 9000)
-def test_lzf_decompresses_what_was_compressed_and_no_further(data, wanted):
+def test_lzf_decompresses_what_was_compressed_and_no_further(data: Any, wanted: int) -> None:
     wanted = min(wanted, len(data))
     assert bytes(decompress(compress(data), wanted)) == data[:wanted]
 
@@ -218,7 +224,7 @@ def test_lzf_decompresses_what_was_compressed_and_no_further(data, wanted):
         (b"\x00a\x20\x07", "it refers to bytes before its beginning"),
     ],
 )
-def test_a_damaged_lzf_stream_is_refused(stream, message):
+def test_a_damaged_lzf_stream_is_refused(stream: bytes, message: str) -> None:
     with pytest.raises(LzfError, match=message):
         decompress(stream, 99)
 
@@ -298,7 +304,7 @@ DEFECTS = {
 
 
 @pytest.mark.parametrize("name", DEFECTS)
-def test_a_defect_is_refused_in_one_line_before_decoding(tmp_path, name):
+def test_a_defect_is_refused_in_one_line_before_decoding(tmp_path: Path, name: str) -> None:
     file, content, message = DEFECTS[name]
     path = tmp_path / file
     path.write_bytes(content)
@@ -316,7 +322,7 @@ def test_a_defect_is_refused_in_one_line_before_decoding(tmp_path, name):
         (np.array([{}]), "holds 'object', not numbers"),
     ],
 )
-def test_an_array_that_is_no_cloud_is_refused(tmp_path, array, message):
+def test_an_array_that_is_no_cloud_is_refused(tmp_path: Path, array: Any, message: str) -> None:
     path = tmp_path / "a.npy"
     np.save(path, array)
     with pytest.raises(StageError) as refused:
@@ -324,7 +330,7 @@ def test_an_array_that_is_no_cloud_is_refused(tmp_path, array, message):
     assert str(refused.value) == f"{path}: {message}"
 
 
-def test_a_truncated_array_is_refused(tmp_path):
+def test_a_truncated_array_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     path.write_bytes(npy(np.zeros((4, 3)), tmp_path)[:-8])
     with pytest.raises(StageError) as refused:
@@ -332,7 +338,7 @@ def test_a_truncated_array_is_refused(tmp_path):
     assert str(refused.value) == f"{path}: truncated: shape (4, 3) needs 96 bytes, it has 88"
 
 
-def test_missing_files_and_folders_are_refused(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     for path, message in ((tmp_path / "a.pcd", "does not exist"),):
         with pytest.raises(StageError, match=f"^{path}: {message}$"):
             check_cloud_file(path)
@@ -341,7 +347,7 @@ def test_missing_files_and_folders_are_refused(tmp_path):
         read_cloud(tmp_path / "b.pcd")
 
 
-def test_damage_inside_the_data_is_found_when_it_is_decoded(tmp_path):
+def test_damage_inside_the_data_is_found_when_it_is_decoded(tmp_path: Path) -> None:
     text, packed = tmp_path / "a.pcd", tmp_path / "b.pcd"
     text.write_bytes(ASCII.replace(b"-0.2", b"-0.x"))
     packed.write_bytes(PACKED[:-6] + b"\xff" * 6)
@@ -357,7 +363,7 @@ def test_damage_inside_the_data_is_found_when_it_is_decoded(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_a_header_of_a_billion_points_allocates_nothing(tmp_path, encoding):
+def test_a_header_of_a_billion_points_allocates_nothing(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "a.pcd"
     content = pcd(with_extras(POINTS, False), encoding)
     path.write_bytes(
@@ -371,7 +377,7 @@ def test_a_header_of_a_billion_points_allocates_nothing(tmp_path, encoding):
     assert peak < 1e6
 
 
-def test_a_small_stream_cannot_promise_much(tmp_path):
+def test_a_small_stream_cannot_promise_much(tmp_path: Path) -> None:
     path = tmp_path / "a.pcd"
     n = 10**8
     header = PACKED[: STREAM - 8].replace(b" 50\n", f" {n}\n".encode())
@@ -388,7 +394,9 @@ def test_a_small_stream_cannot_promise_much(tmp_path):
     st.lists(st.tuples(st.integers(0, 600), st.binary(min_size=1, max_size=4)), max_size=4),
     st.integers(0, 600),
 )  # fmt: skip
-def test_whatever_the_bytes_are_there_is_a_cloud_or_one_line(tmp_path, file, edits, cut):
+def test_whatever_the_bytes_are_there_is_a_cloud_or_one_line(
+    tmp_path: Path, file: Any, edits: Any, cut: int
+) -> None:
     name, content = file
     damaged = bytearray(content[: len(content) - cut] if cut < len(content) else content)
     for at, new in edits:
@@ -404,7 +412,7 @@ def test_whatever_the_bytes_are_there_is_a_cloud_or_one_line(tmp_path, file, edi
 # --- real files and speed ----------------------------------------------------------------------
 
 
-def test_published_clouds_are_read_as_open3d_reads_them(ancorasir):
+def test_published_clouds_are_read_as_open3d_reads_them(ancorasir: Path) -> None:
     from open3d import io
 
     for name in (
@@ -419,7 +427,9 @@ def test_published_clouds_are_read_as_open3d_reads_them(ancorasir):
         np.testing.assert_allclose(ours, np.asarray(theirs.points), rtol=1e-6)
 
 
-def test_a_scan_of_three_million_points_is_read_at_a_few_times_the_cost_of_its_bytes(tmp_path):
+def test_a_scan_of_three_million_points_is_read_at_a_few_times_the_cost_of_its_bytes(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.pcd"
     write_cloud(path, PointCloud(CAMERA, np.ones((1544, 2064, 3), np.float32)))
     began = time.process_time()

@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ moto_server = pytest.importorskip("moto.server")
 
 
 @pytest.fixture(scope="module")
-def server():
+def server() -> Iterator[Any]:
     server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
     server.start()
     host, port = server.get_host_and_port()
@@ -40,7 +41,7 @@ def server():
 
 
 @pytest.fixture
-def bucket(server, monkeypatch):
+def bucket(server: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     for name, value in {
         "AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "nobody",
         "AWS_SECRET_ACCESS_KEY": "nothing", "AWS_DEFAULT_REGION": "us-east-1",
@@ -55,7 +56,7 @@ def bucket(server, monkeypatch):
 
 
 @pytest.fixture
-def archive(tmp_path):
+def archive(tmp_path: Path) -> Path:
     """A folder with two scans beyond what is fetched at once, and a file of poses."""
     folder = tmp_path / "archive"
     (folder / "scans").mkdir(parents=True)
@@ -74,7 +75,7 @@ def folder_at(where: str) -> Iterator[Path]:
         yield root
 
 
-def test_scans_are_fetched_one_at_a_time_and_let_go(bucket, archive):
+def test_scans_are_fetched_one_at_a_time_and_let_go(bucket: Any, archive: Path) -> None:
     bucket.put(f"{archive}/", "cell/monday/", recursive=True)
     with folder_at("s3://cell/monday") as root:
         assert (root / "poses.csv").read_text() == "cloud\n"
@@ -87,7 +88,9 @@ def test_scans_are_fetched_one_at_a_time_and_let_go(bucket, archive):
     assert not root.exists()
 
 
-def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(bucket, archive):
+def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(
+    bucket: Any, archive: Path
+) -> None:
     shutil.copy(archive / "scans" / "0.pcd", archive / "scans" / "2.pcd")
     bucket.put(f"{archive}/", "cell/monday/", recursive=True)
     with folder_at("s3://cell/monday") as root:
@@ -99,7 +102,7 @@ def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(bucket,
     assert print_of("s3://cell/monday") != before
 
 
-def test_an_archive_in_a_zip_file(archive, tmp_path):
+def test_an_archive_in_a_zip_file(archive: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "monday.zip", "w") as packed:
         for file in archive.rglob("*.*"):
             packed.write(file, file.relative_to(archive))
@@ -107,13 +110,13 @@ def test_an_archive_in_a_zip_file(archive, tmp_path):
         assert read_cloud(root / "scans" / "1.pcd").xyz[0, 0, 0] == 1.5
 
 
-def test_an_archive_that_is_one_file(bucket, tmp_path):
+def test_an_archive_that_is_one_file(bucket: Any, tmp_path: Path) -> None:
     bucket.pipe("cell/run.mcap", b"a log")
     with archive_at("s3://cell/run.mcap") as path:
         assert path.name == "run.mcap" and path.read_bytes() == b"a log"
 
 
-def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket):
+def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket: Any) -> None:
     with (
         pytest.raises(StageError, match="s3://cell/out/run.mcap"),
         results_at("s3://cell/out") as out,
@@ -138,13 +141,13 @@ def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket):
         ("s3://cell/nothing", "s3://cell/nothing: holds nothing"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_opened_is_one_line(bucket, url, message):
+def test_what_cannot_be_opened_is_one_line(bucket: Any, url: str, message: str) -> None:
     with pytest.raises(StageError) as caught, archive_at(url):
         pass
     assert str(caught.value) == message
 
 
-def test_a_store_that_does_not_answer_is_one_line(monkeypatch):
+def test_a_store_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "nobody")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "nothing")
@@ -156,7 +159,7 @@ def test_a_store_that_does_not_answer_is_one_line(monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_a_name_that_leads_out_is_refused(tmp_path):
+def test_a_name_that_leads_out_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "bad.zip", "w") as packed:
         packed.writestr("../../escaped.csv", "x")
     url = f"zip://::{tmp_path}/bad.zip"
@@ -165,7 +168,7 @@ def test_a_name_that_leads_out_is_refused(tmp_path):
     assert not list(Path(tmp_path).rglob("escaped.csv"))
 
 
-def test_a_path_is_a_path(tmp_path):
+def test_a_path_is_a_path(tmp_path: Path) -> None:
     assert not is_url("C:\\data") and not is_url("a/b") and is_url("s3://a")
     with folder_at(str(tmp_path)) as path, at_hand(path):
         assert path == tmp_path
@@ -173,7 +176,9 @@ def test_a_path_is_a_path(tmp_path):
         assert nothing is None and none is None
 
 
-def test_a_run_from_a_bucket_into_a_bucket_has_the_result_of_one_on_disk(bucket, tmp_path):
+def test_a_run_from_a_bucket_into_a_bucket_has_the_result_of_one_on_disk(
+    bucket: Any, tmp_path: Path
+) -> None:
     sample = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
     bucket.put(f"{sample}/", "cell/sample/", recursive=True)
     words = ["run", "ur5_phoxi-m_sample", "--archive"]

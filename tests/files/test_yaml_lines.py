@@ -1,3 +1,6 @@
+from pathlib import Path
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +17,7 @@ from flangeye.files.yaml_lines import parse_yaml, read_yaml
         ("'1'", "1"), ("2026-11-21", "2026-11-21"), (".5", 0.5), ("-3", -3), ("", None),
     ],
 )  # fmt: skip
-def test_scalars_mean_what_they_look_like(text, value):
+def test_scalars_mean_what_they_look_like(text: str, value: Any) -> None:
     read = parse_yaml(f"a: {text}", "x").data["a"]
     assert read == value
     assert type(read) is type(value)
@@ -36,19 +39,19 @@ def test_scalars_mean_what_they_look_like(text, value):
         ("a: \x00", "x: not valid YAML: unacceptable character #x0000: special characters are not allowed"),
     ],
 )  # fmt: skip
-def test_what_is_refused_names_the_line(text, message):
+def test_what_is_refused_names_the_line(text: Any, message: str) -> None:
     with pytest.raises(RecipeError) as error:
         parse_yaml(text, "x")
     assert str(error.value) == message
 
 
-def test_lines_are_those_of_the_file():
+def test_lines_are_those_of_the_file() -> None:
     document = parse_yaml("a: 1\nsteps:\n  - fit.rim:\n      inlier: 3\n", "x")
     assert document.line(("steps", 0, "fit.rim", "inlier")) == 4
     assert document.line(("steps", 0, "fit.rim", "unknown")) == 3
 
 
-def test_a_file_that_cannot_be_read(tmp_path):
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"none.yaml: cannot be read: No such file or directory"):
         read_yaml(tmp_path / "none.yaml")
     (tmp_path / "latin.yaml").write_bytes(b"a: \xff")
@@ -60,7 +63,7 @@ def test_a_file_that_cannot_be_read(tmp_path):
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_read_or_refused(text):
+def test_any_text_is_read_or_refused(text: str) -> None:
     try:
         parse_yaml(text, "x")
     except RecipeError as error:

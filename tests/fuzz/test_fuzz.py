@@ -2,6 +2,8 @@
 
 import random
 import resource
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -15,7 +17,7 @@ CASES = 140
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_spoilt_input_is_read_or_refused(name, tmp_path):
+def test_spoilt_input_is_read_or_refused(name: Any, tmp_path: Path) -> None:
     target, chance = TARGETS[name], random.Random(name)
     sound = target.seeds(tmp_path)
     for number in range(CASES):
@@ -27,7 +29,7 @@ def test_spoilt_input_is_read_or_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name, tmp_path):
+def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name: Any, tmp_path: Path) -> None:
     target = TARGETS[name]
     sound = target.seeds(tmp_path)
     for number, raw in enumerate([*sound, *NASTY]):
@@ -37,7 +39,7 @@ def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_made_input_is_read_or_refused(name, tmp_path):
+def test_made_input_is_read_or_refused(name: Any, tmp_path: Path) -> None:
     target, path = TARGETS[name], tmp_path / f"made{TARGETS[name].suffix}"
 
     @settings(deadline=None, suppress_health_check=list(HealthCheck), database=None)
@@ -53,7 +55,7 @@ FOUND = sorted(SEEDS.glob("*/*")) if SEEDS.is_dir() else []
 
 
 @pytest.mark.parametrize("find", FOUND, ids=lambda p: f"{p.parent.name}-{p.name}")
-def test_what_was_once_found_stays_mended(find, tmp_path):
+def test_what_was_once_found_stays_mended(find: Any, tmp_path: Path) -> None:
     target = TARGETS[find.parent.name]
     target.seeds(tmp_path)
     path = tmp_path / f"find{target.suffix}"
@@ -61,7 +63,7 @@ def test_what_was_once_found_stays_mended(find, tmp_path):
     survives(target, path)
 
 
-def test_the_damage_is_worth_its_name(tmp_path):
+def test_the_damage_is_worth_its_name(tmp_path: Path) -> None:
     chance = random.Random(0)
     raw = bytes(range(200))
     changed = {spoilt(raw, chance) for _ in range(100)}

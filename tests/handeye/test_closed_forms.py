@@ -40,7 +40,7 @@ def solve(name, made):
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS_OF_ONE_ARM)
 @pytest.mark.parametrize("name", ONE_ARM)
-def test_exact_poses_give_the_exact_answer(name, configuration):
+def test_exact_poses_give_the_exact_answer(name: str, configuration: str) -> None:
     made = session(
         CONFIGURATIONS[configuration], np.random.default_rng(1), n=8, tilt=0.5, noise=EXACT
     )
@@ -59,7 +59,7 @@ def test_exact_poses_give_the_exact_answer(name, configuration):
         ("two arms, flange", "centre"), ("two arms, flange", "normal"),
     ],
 )  # fmt: skip
-def test_exact_circles_give_the_exact_answer(configuration, feature):
+def test_exact_circles_give_the_exact_answer(configuration: str, feature: str) -> None:
     made = session(
         CONFIGURATIONS[configuration], np.random.default_rng(2), noise=EXACT, feature=feature
     )
@@ -67,7 +67,7 @@ def test_exact_circles_give_the_exact_answer(configuration, feature):
     assert np.abs(errors(estimate, made.truth[estimate.transform.name])).max() < 1e-8
 
 
-def test_kronecker_is_exact_for_two_arms():
+def test_kronecker_is_exact_for_two_arms() -> None:
     made = session(CONFIGURATIONS["two arms, marker"], np.random.default_rng(3), noise=EXACT)
     for unknown, estimate in solve("kronecker", made).transforms.items():
         assert np.abs(errors(estimate, made.truth[unknown])).max() < 1e-7
@@ -82,13 +82,13 @@ def resting(rng, n=8):
     return (a, invert(a @ x) @ (y @ c @ z), c), (x, y, z)
 
 
-def test_two_steps_are_exact_where_each_arm_rests_once():
+def test_two_steps_are_exact_where_each_arm_rests_once() -> None:
     given, truth = resting(np.random.default_rng(4))
     for found, true in zip(two_steps(*given), truth, strict=True):
         assert np.allclose(found, true, atol=1e-9)
 
 
-def test_two_steps_need_an_arm_that_rests():
+def test_two_steps_need_an_arm_that_rests() -> None:
     made = session(CONFIGURATIONS["two arms, marker"], np.random.default_rng(5))
     with pytest.raises(CalibrationRefused) as error:
         solve("two_steps", made)
@@ -99,7 +99,7 @@ def test_two_steps_need_an_arm_that_rests():
 
 
 @pytest.mark.parametrize("name", ["tsai_lenz", "park_martin"])
-def test_a_camera_turned_by_half_a_turn_is_no_exception(name):
+def test_a_camera_turned_by_half_a_turn_is_no_exception(name: str) -> None:
     for axis in np.eye(3):
         rng = np.random.default_rng(6)
         x = rigid(rotation_exp(np.pi * axis), np.array([0.05, 0.02, 0.04]))
@@ -112,7 +112,7 @@ def test_a_camera_turned_by_half_a_turn_is_no_exception(name):
         assert np.allclose(found, x, atol=1e-9)
 
 
-def test_motions_of_half_a_turn_alone_are_refused():
+def test_motions_of_half_a_turn_alone_are_refused() -> None:
     rng = np.random.default_rng(7)
     half = rigid(rotation_exp(np.array([np.pi, 0, 0])), np.zeros(3))
     carried = np.array([np.eye(4), half])
@@ -154,20 +154,22 @@ def test_motions_of_half_a_turn_alone_are_refused():
         ),
     ],
 )  # fmt: skip
-def test_what_a_closed_form_cannot_take_is_named(name, configuration, feature, told):
+def test_what_a_closed_form_cannot_take_is_named(
+    name: str, configuration: str, feature: str, told: str
+) -> None:
     made = session(CONFIGURATIONS[configuration], np.random.default_rng(8), feature=feature)
     with pytest.raises(StageError) as error:
         solve(name, made)
     assert str(error.value) == told
 
 
-def test_kronecker_says_how_many_poses_it_needs():
+def test_kronecker_says_how_many_poses_it_needs() -> None:
     made = session(CONFIGURATIONS["two arms, marker"], np.random.default_rng(9), n=9)
     with pytest.raises(StageError, match="solve.kronecker: 12 poses needed, 9 given"):
         solve("kronecker", made)
 
 
-def test_alternation_only_climbs():
+def test_alternation_only_climbs() -> None:
     rng = np.random.default_rng(10)
     x, y, z = random_rotations(rng)
     a, c = (np.array([rotation(rng) for _ in range(12)]) for _ in range(2))
@@ -178,7 +180,7 @@ def test_alternation_only_climbs():
 
 
 @pytest.mark.parametrize("name", ONE_ARM)
-def test_the_region_of_a_closed_form_holds_its_share(name):
+def test_the_region_of_a_closed_form_holds_its_share(name: str) -> None:
     rng, inside = np.random.default_rng(11), []
     for _ in range(12):
         made = session(CONFIGURATIONS["eye-in-hand, marker"], rng, n=8)
@@ -189,7 +191,7 @@ def test_the_region_of_a_closed_form_holds_its_share(name):
 
 
 @pytest.mark.slow
-def test_axb_ycz_converges_from_a_random_start():
+def test_axb_ycz_converges_from_a_random_start() -> None:
     rng, good = np.random.default_rng(12), 0
     for _ in range(500):
         made = session(CONFIGURATIONS["two arms, marker"], rng)
@@ -203,7 +205,7 @@ def test_axb_ycz_converges_from_a_random_start():
     assert good >= 0.99 * 500
 
 
-def test_kronecker_alone_is_a_start():
+def test_kronecker_alone_is_a_start() -> None:
     made = session(CONFIGURATIONS["two arms, marker"], np.random.default_rng(13))
     given = (
         np.array([o.base_T_flange.matrix for o in made.observations]),

@@ -21,38 +21,38 @@ def six(turned=0.0, shifted=0.0):
 
 
 @pytest.mark.parametrize("freedom", [1.0, 0.9, 0.5])
-def test_what_is_added_brings_the_squares_to_the_freedom(freedom):
+def test_what_is_added_brings_the_squares_to_the_freedom(freedom: float) -> None:
     variance, scale = residuals(9e-8, freedom * 3 * N).extra(OWN)
     assert variance == pytest.approx(9e-8 / freedom - 1e-8 - FINEST**2, rel=1e-6)
     assert scale == 1.0
 
 
 @pytest.mark.parametrize("freedom", [1.0, 0.9])
-def test_covariances_that_explain_too_much_are_scaled_and_nothing_is_added(freedom):
+def test_covariances_that_explain_too_much_are_scaled_and_nothing_is_added(freedom: float) -> None:
     variance, scale = residuals(0.25e-8, freedom * 3 * N).extra(OWN)
     assert variance == 0.0
     assert scale == pytest.approx(0.25 * 1e-8 / (1e-8 + FINEST**2) / freedom, rel=1e-6)
 
 
-def test_the_scale_has_an_end_and_without_freedom_nothing_is_found():
+def test_the_scale_has_an_end_and_without_freedom_nothing_is_found() -> None:
     assert residuals(0.0).extra(OWN) == (0.0, 1e-6)
     assert residuals(9e-8, np.inf).extra(OWN) == (0.0, 1.0)
     assert residuals(9e-8, np.inf).factor(OWN, OWN, np.inf) == 0.0
 
 
-def test_less_than_one_free_number_counts_as_one():
+def test_less_than_one_free_number_counts_as_one() -> None:
     one = Residuals(np.array([[3e-4, 0.0, 0.0]]), EYE[:1], 0.25)
     assert one.extra(OWN[:1])[0] == pytest.approx(9e-8 - 1e-8 - FINEST**2, rel=1e-6)
 
 
-def test_only_what_was_measured_counts():
+def test_only_what_was_measured_counts() -> None:
     along = np.diag([1.0, 1.0, 0.0])
     errors = np.tile([3e-4, 3e-4, 1.0], (N, 1))
     seen = Residuals(errors @ along, np.tile(along, (N, 1, 1)), 2.0 * N)
     assert seen.extra(OWN)[0] == pytest.approx(9e-8 - 1e-8 - FINEST**2, rel=1e-6)
 
 
-def test_a_factor_on_what_is_oblique_to_the_own_noise():
+def test_a_factor_on_what_is_oblique_to_the_own_noise() -> None:
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     own = np.tile(turn @ np.diag([1e-8, 4e-8, 9e-8]) @ turn.T, (N, 1, 1))
     errors = np.tile(turn @ np.sqrt([1e-8, 4e-8, 9e-8]) * 3.0, (N, 1))
@@ -60,11 +60,11 @@ def test_a_factor_on_what_is_oblique_to_the_own_noise():
     assert factor == pytest.approx(8.0, rel=1e-4)
 
 
-def test_a_factor_beyond_reason_is_not_looked_for():
+def test_a_factor_beyond_reason_is_not_looked_for() -> None:
     assert residuals(1.0).factor(OWN, 1e-30 * EYE, 3.0 * N) == LARGEST
 
 
-def test_the_arms_explain_translations_as_far_as_rotations_allow():
+def test_the_arms_explain_translations_as_far_as_rotations_allow() -> None:
     arms = six(turned=1e-8, shifted=1e-8)
     own = six(turned=1e-8, shifted=1e-8)
     turned, shifted = residuals(1e-8), residuals(5e-8)
@@ -77,7 +77,7 @@ def test_the_arms_explain_translations_as_far_as_rotations_allow():
     assert noise_of(turned, shifted, own, 0 * arms).arms == 1.0
 
 
-def test_what_the_arms_do_not_explain_is_added_evenly():
+def test_what_the_arms_do_not_explain_is_added_evenly() -> None:
     own = six(turned=1e-8, shifted=1e-8)
     found = noise_of(residuals(4e-8), residuals(9e-8), own, 0 * own)
     assert found.tilt == pytest.approx(3e-8 - FINEST**2, rel=1e-5)
@@ -86,7 +86,7 @@ def test_what_the_arms_do_not_explain_is_added_evenly():
 
 
 @pytest.mark.parametrize("name", ["pose", "tilt", "centre_scale", "normal_scale", "arms"])
-def test_noises_are_close_to_a_thousandth(name):
+def test_noises_are_close_to_a_thousandth(name: str) -> None:
     base = dict(pose=1e-4, tilt=1e-4, centre_scale=0.5, normal_scale=0.5, arms=0.5, size=0.5)
     noise = Noise(**base)
     assert noise.is_close(Noise(**{**base, name: base[name] * 1.0009}))
@@ -94,11 +94,11 @@ def test_noises_are_close_to_a_thousandth(name):
     assert not Noise(**{**base, name: base[name] * 1.0012}).is_close(noise)
 
 
-def test_without_more_said_nothing_is_scaled():
+def test_without_more_said_nothing_is_scaled() -> None:
     assert Noise(0.0, 0.0) == Noise(0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
 
 
-def test_a_nuisances_size_is_compared_by_its_variance():
+def test_a_nuisances_size_is_compared_by_its_variance() -> None:
     noise = Noise(0.0, 0.0, size=0.5)
     assert noise.is_close(Noise(0.0, 0.0, size=0.5 * 1.00049))
     assert not noise.is_close(Noise(0.0, 0.0, size=0.5 * 1.0006))

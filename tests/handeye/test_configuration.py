@@ -1,6 +1,8 @@
 """A recipe names camera, target and their carriers; what is unknown follows."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import EVERY, Configuration, carriers_of, mapped_and_expected
 from flangeye.models.robots import RobotModel
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import RunFolder
 from flangeye.run.restart import restart_at
@@ -55,7 +58,7 @@ def solve_loop(
 
 
 @pytest.fixture
-def registry(toy_registry):
+def registry(toy_registry: Registry) -> Any:
     class Module:
         @hookimpl
         def flangeye_stages(self):
@@ -120,7 +123,9 @@ def recipe(registry, configuration, solve="solve.toy_loop", fit="fit.toy"):
         ),
     ],
 )
-def test_the_unknowns_follow_from_the_frames(registry, written, unknowns, equation):
+def test_the_unknowns_follow_from_the_frames(
+    registry: Any, written: str, unknowns: tuple[Any, ...], equation: str
+) -> None:
     found = recipe(registry, written).context[Configuration]
     assert found.unknowns == unknowns
     assert found.equation == equation
@@ -149,13 +154,13 @@ def test_the_unknowns_follow_from_the_frames(registry, written, unknowns, equati
         ),
     ],
 )
-def test_frames_that_cannot_be_are_refused(registry, written, complaint):
+def test_frames_that_cannot_be_are_refused(registry: Any, written: str, complaint: str) -> None:
     with pytest.raises(RecipeError) as error:
         recipe(registry, written)
     assert str(error.value) == f"r.yaml:3: configuration: {complaint}"
 
 
-def test_a_link_needs_the_robots_model(registry):
+def test_a_link_needs_the_robots_model(registry: Any) -> None:
     text = (
         "title: T\nconfiguration: {name: eye-on-arm, camera: link3}\nsteps:\n"
         "  - acquire.toy\n  - segment.toy\n  - fit.toy\n  - solve.toy_loop\n"
@@ -167,7 +172,7 @@ def test_a_link_needs_the_robots_model(registry):
         parse_recipe(text, "r.yaml", registry)
 
 
-def test_a_solver_that_knows_the_flange_only_is_refused_elsewhere(registry):
+def test_a_solver_that_knows_the_flange_only_is_refused_elsewhere(registry: Any) -> None:
     with pytest.raises(RecipeError) as error:
         recipe(registry, "{name: eye-in-hand}", solve="solve.svd")
     assert str(error.value) == (
@@ -176,7 +181,7 @@ def test_a_solver_that_knows_the_flange_only_is_refused_elsewhere(registry):
     )
 
 
-def test_a_solver_that_takes_circles_gets_no_poses(registry):
+def test_a_solver_that_takes_circles_gets_no_poses(registry: Any) -> None:
     with pytest.raises(RecipeError) as error:
         recipe(registry, "{}", solve="solve.svd", fit="fit.toy_marker")
     assert str(error.value) == (
@@ -185,7 +190,7 @@ def test_a_solver_that_takes_circles_gets_no_poses(registry):
     )
 
 
-def test_a_marker_needs_no_segment_step(registry, tmp_path):
+def test_a_marker_needs_no_segment_step(registry: Any, tmp_path: Path) -> None:
     text = (
         "title: T\nlog: {clouds: full}\nsteps:\n  - acquire.toy: {bad: 1, verification: 2}\n"
         "  - fit.toy_marker\n  - solve.toy_loop\n"
@@ -203,7 +208,7 @@ def test_a_marker_needs_no_segment_step(registry, tmp_path):
     assert repeated.transforms == result.transforms
 
 
-def test_a_place_is_written_as_a_pose(registry):
+def test_a_place_is_written_as_a_pose(registry: Any) -> None:
     written = (
         "{name: eye-in-hand, place: {position: [0 mm, 0 mm, 12 mm], rpy: [0 deg, 0 deg, 90 deg]}}"
     )
@@ -217,7 +222,7 @@ def observation(*others, joints=None):
     return Observation("7", PoseFeature(seen, np.eye(6)), by_frame(pose, *others), joints)
 
 
-def test_the_loop_closes_for_two_arms():
+def test_the_loop_closes_for_two_arms() -> None:
     x, y, z = (
         rigid(rotation_exp(np.array(v)), np.array(v)[::-1])
         for v in ([0.1, 0, 0.2], [0, 1, 0.5], [2, 0, 0])
@@ -234,7 +239,7 @@ def test_the_loop_closes_for_two_arms():
     assert np.allclose(mapped, expected, atol=1e-12)
 
 
-def test_a_missing_second_pose_is_named():
+def test_a_missing_second_pose_is_named() -> None:
     with pytest.raises(StageError) as error:
         carriers_of(Configuration("two-arms", FLANGE, FLANGE2), [observation()], None)
     assert str(error.value) == (
@@ -243,7 +248,7 @@ def test_a_missing_second_pose_is_named():
     )
 
 
-def test_a_link_is_where_its_joints_put_it(registry):
+def test_a_link_is_where_its_joints_put_it(registry: Any) -> None:
     arm = Arm(recipe(registry, "{}").context[RobotModel])
     configuration = Configuration("eye-on-arm", "link3", FLANGE, None)
     joints = np.linspace(-1, 1, 6)
@@ -257,7 +262,7 @@ def test_a_link_is_where_its_joints_put_it(registry):
     )
 
 
-def test_a_pose_feature_has_what_every_feature_has():
+def test_a_pose_feature_has_what_every_feature_has() -> None:
     seen = observation().feature
     assert np.allclose(seen.centre, [0, 0, 0.5])
     assert np.allclose(seen.normal, [0, 0, 1])

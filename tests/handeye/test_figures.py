@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +16,14 @@ OPENCV = json.loads(
 
 @pytest.mark.parametrize("case", hand_eye.CASES)
 @pytest.mark.parametrize("name", [*hand_eye.BY_MOTIONS, *hand_eye.BY_BOTH])
-def test_no_closed_form_is_less_accurate_than_opencvs(name, case):
+def test_no_closed_form_is_less_accurate_than_opencvs(name: Any, case: Any) -> None:
     made = hand_eye.sessions(case, 60)
     ours = hand_eye.rms([hand_eye.closed(name, m) for m in made], made)
     assert (np.array(ours) <= 1.001 * np.array(OPENCV[case][name])).all()
 
 
 @pytest.mark.slow
-def test_maximum_likelihood_reaches_the_bound():
+def test_maximum_likelihood_reaches_the_bound() -> None:
     made = hand_eye.sessions("n=15, 17 deg", 400)
     found = np.array(hand_eye.rms([hand_eye.most_likely(m) for m in made], made))
     bound = np.array(hand_eye.bound(made))
@@ -31,12 +32,12 @@ def test_maximum_likelihood_reaches_the_bound():
 
 
 @pytest.mark.slow
-def test_closed_forms_stand_where_they_are_known_to():
+def test_closed_forms_stand_where_they_are_known_to() -> None:
     made = hand_eye.sessions("n=15, 17 deg", 200)
     turn, shift = hand_eye.rms([hand_eye.closed("park_martin", m) for m in made], made)
     assert turn < 0.17
     assert shift < 1.4
 
 
-def test_one_random_start_is_enough_for_two_arms():
+def test_one_random_start_is_enough_for_two_arms() -> None:
     assert hand_eye.converged(20) >= 19

@@ -118,7 +118,7 @@ def error(found, true):
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_every_unknown_of_a_cell_is_found_with_its_covariance(name):
+def test_every_unknown_of_a_cell_is_found_with_its_covariance(name: str) -> None:
     frames, unknown, _ = CELLS[name]
     found = solved(name)
     assert list(found.places) == unknown
@@ -130,14 +130,14 @@ def test_every_unknown_of_a_cell_is_found_with_its_covariance(name):
     assert np.sqrt((found.residuals[:, 3:] ** 2).mean()) == pytest.approx(SHIFT, rel=0.35)
 
 
-def test_without_noise_it_is_exact():
+def test_without_noise_it_is_exact() -> None:
     name = "two fixed scanners and one arm"
     found = solved(name, scale=0.0)
     for each in CELLS[name][1]:
         assert np.abs(error(found.places[each], CELLS[name][0][each].place)).max() < 1e-7
 
 
-def test_what_nothing_ties_is_named():
+def test_what_nothing_ties_is_named() -> None:
     frames, _, _ = CELLS["two fixed scanners and one arm"]
     given = {**frames, "left": Frame("base"), "other": Frame("base"), "marker": Frame("flange")}
     sightings = seen(frames, [("left", "marker")], np.random.default_rng(0))
@@ -145,7 +145,7 @@ def test_what_nothing_ties_is_named():
         solve_graph(given, sightings)
 
 
-def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands():
+def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands() -> None:
     """A shift of arm and camera together changes nothing that either sees: the rail only slides."""
     frames, _, pairs = CELLS["an arm on a rail"]
     given = {
@@ -158,7 +158,7 @@ def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands():
         solve_graph(given, seen(frames, pairs, np.random.default_rng(0)))
 
 
-def test_frames_that_lead_to_two_roots_are_refused():
+def test_frames_that_lead_to_two_roots_are_refused() -> None:
     with pytest.raises(StageError, match="stand on base and floor, which nothing ties"):
         solve_graph({"a": Frame("base"), "b": Frame("floor")}, [])
     with pytest.raises(StageError, match="stands on itself"):
@@ -170,7 +170,7 @@ def arm_noise(frames):
     return {name: np.diag([1e-4**2] * 3 + [5e-5**2] * 3) for name in moved}
 
 
-def test_wrong_sightings_of_every_pair_are_set_aside():
+def test_wrong_sightings_of_every_pair_are_set_aside() -> None:
     name = "a scanner in the hand and one on the wall that never see the same thing"
     frames, unknown, pairs = CELLS[name]
     given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
@@ -185,7 +185,7 @@ def test_wrong_sightings_of_every_pair_are_set_aside():
         assert np.linalg.norm(error(found.places[each], frames[each].place)[3:]) < 1e-3
 
 
-def test_the_noise_of_what_moves_is_found_from_the_residuals():
+def test_the_noise_of_what_moves_is_found_from_the_residuals() -> None:
     frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
     rng = np.random.default_rng(4)
     shaken = frames["flange"].place.copy()
@@ -198,7 +198,7 @@ def test_the_noise_of_what_moves_is_found_from_the_residuals():
     assert 5e-5 * np.sqrt(found.movers) == pytest.approx(5e-4, rel=0.35)
 
 
-def test_circles_on_the_flange_itself_tie_two_scanners():
+def test_circles_on_the_flange_itself_tie_two_scanners() -> None:
     """Centres with normals: the flange's own circle, its place known, its turn not seen."""
     frames, _, _ = CELLS["two fixed scanners and one arm"]
     frames = {**frames, "marker": Frame("flange", np.eye(4))}

@@ -1,6 +1,7 @@
 """solve.robust of any configuration: exact where data are, honest where they are not, refused where they must."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def solve(made, **params):
 
 
 @pytest.mark.parametrize(("name", "feature"), CASES)
-def test_exact_data_give_the_exact_answer(name, feature):
+def test_exact_data_give_the_exact_answer(name: Any, feature: Any) -> None:
     made = session(CONFIGURATIONS[name], np.random.default_rng(1), noise=EXACT, feature=feature)
     found = solve(made)
     assert set(found.transforms) == set(made.configuration.unknowns)
@@ -50,7 +51,7 @@ def test_exact_data_give_the_exact_answer(name, feature):
 
 
 @pytest.mark.parametrize("name", ["eye-in-hand, marker", "eye-on-arm 2, base circle"])
-def test_gross_outliers_are_found_and_named(name):
+def test_gross_outliers_are_found_and_named(name: str) -> None:
     made = session(CONFIGURATIONS[name], np.random.default_rng(2), n=20)
     wrong = {"003", "007", "011", "012", "016", "018"}
     rng = np.random.default_rng(0)
@@ -72,7 +73,7 @@ def spoil(observation, rng):
     return replace(observation, feature=feature)
 
 
-def test_two_arms_with_outliers():
+def test_two_arms_with_outliers() -> None:
     made = session(TWO, np.random.default_rng(3), n=24)
     rng = np.random.default_rng(1)
     spoilt = [spoil(o, rng) if int(o.id) % 6 == 0 else o for o in made.observations]
@@ -86,7 +87,7 @@ def refusal(made, kind=CalibrationRefused, **params):
     return str(error.value)
 
 
-def test_pure_translation_is_named():
+def test_pure_translation_is_named() -> None:
     shifts = moves(np.random.default_rng(0), 12, 0.0)
     made = session(MARKER, np.random.default_rng(4), n=12, poses=shifts)
     assert refusal(made) == (
@@ -104,7 +105,7 @@ def parallel(rng, n, still=False):
     return out
 
 
-def test_parallel_axes_are_named():
+def test_parallel_axes_are_named() -> None:
     poses = parallel(np.random.default_rng(0), 12)
     made = session(MARKER, np.random.default_rng(5), n=12, poses=poses)
     told = refusal(made)
@@ -116,7 +117,7 @@ def test_parallel_axes_are_named():
     )
 
 
-def test_an_arm_of_four_axes_gets_all_but_the_height():
+def test_an_arm_of_four_axes_gets_all_but_the_height() -> None:
     poses = parallel(np.random.default_rng(0), 20)
     made = session(MARKER, np.random.default_rng(6), n=20, poses=poses)
     found = solve(made, unobservable="mark")
@@ -132,14 +133,14 @@ def test_an_arm_of_four_axes_gets_all_but_the_height():
     assert abs(height) < 1e-9
 
 
-def test_only_the_last_joint_is_named():
+def test_only_the_last_joint_is_named() -> None:
     poses = parallel(np.random.default_rng(0), 12, still=True)
     made = session(MARKER, np.random.default_rng(7), n=12, poses=poses)
     told = refusal(made, unobservable="mark")
     assert "the arm turned only its last joint, about (" in told
 
 
-def test_an_arm_that_rests_is_named():
+def test_an_arm_that_rests_is_named() -> None:
     made = session(TWO, np.random.default_rng(8), n=14)
     assert refusal(_with_resting_second_arm(made)) == (
         "the camera's pose cannot be told from these poses: the second arm stood still; move it too"
@@ -158,7 +159,7 @@ def _with_resting_second_arm(made):
     return replace(made, observations=resting)
 
 
-def test_half_turns_between_poses_do_not_matter():
+def test_half_turns_between_poses_do_not_matter() -> None:
     rng = np.random.default_rng(9)
     poses = moves(rng, 12, 0.3)
     poses[::2, :3, :3] = poses[::2, :3, :3] @ rotation_from_rpy(np.pi - 1e-3, 0, 0)
@@ -168,7 +169,7 @@ def test_half_turns_between_poses_do_not_matter():
     assert np.abs(errors(found.camera, made.truth[name])[3:]).max() < 1e-3
 
 
-def test_too_few_poses():
+def test_too_few_poses() -> None:
     made = session(MARKER, np.random.default_rng(10), n=2)
     assert refusal(made, StageError) == (
         "3 poses needed for what this configuration leaves unknown, 2 given: add poses, or see "
@@ -176,13 +177,13 @@ def test_too_few_poses():
     )
 
 
-def test_poses_that_are_all_the_same():
+def test_poses_that_are_all_the_same() -> None:
     made = session(MARKER, np.random.default_rng(11), n=5, poses=np.tile(np.eye(4), (5, 1, 1)))
     assert refusal(made, StageError) == ("all 5 poses are the same: move the arm between captures")
 
 
 @pytest.mark.parametrize("feature", ["normal", "centre"])
-def test_normals_tell_the_turn_about_a_line_of_centres(feature):
+def test_normals_tell_the_turn_about_a_line_of_centres(feature: str) -> None:
     """As well as a tilt common to all of them is known; without normals nothing does."""
     along = np.tile(np.eye(4), (6, 1, 1))
     along[:, 0, 3] = np.linspace(-0.12, 0.12, 6)
@@ -198,7 +199,7 @@ def test_normals_tell_the_turn_about_a_line_of_centres(feature):
     assert 0.05 < np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])) < 0.3
 
 
-def test_a_mirrored_camera_is_recognised():
+def test_a_mirrored_camera_is_recognised() -> None:
     made = session(MARKER, np.random.default_rng(12), n=15)
     flip = np.diag([1.0, 1.0, -1.0, 1.0])
     mirrored = [
@@ -216,7 +217,7 @@ def test_a_mirrored_camera_is_recognised():
     assert told.endswith("flip one axis of the scanner's or the robot's frame")
 
 
-def test_scans_of_other_poses_are_refused():
+def test_scans_of_other_poses_are_refused() -> None:
     made = session(MARKER, np.random.default_rng(13), n=15, tilt=0.4)
     features = [o.feature for o in made.observations]
     shuffled = [
@@ -227,7 +228,7 @@ def test_scans_of_other_poses_are_refused():
     assert "check that each scan belongs to its robot pose" in told
 
 
-def test_two_arms_and_a_circle_of_unknown_place_are_refused():
+def test_two_arms_and_a_circle_of_unknown_place_are_refused() -> None:
     made = session(TWO, np.random.default_rng(14), n=15, feature="normal")
     assert refusal(made) == (
         "two arms and a circle whose place is not known cannot be solved: give its place, which "
@@ -235,7 +236,7 @@ def test_two_arms_and_a_circle_of_unknown_place_are_refused():
     )
 
 
-def test_noise_that_is_not_stated_is_found():
+def test_noise_that_is_not_stated_is_found() -> None:
     rng = np.random.default_rng(15)
     made = session(MARKER, rng, n=60, noise=Noise(arm_shift=5e-4))
     (note,) = solve(made).notes
@@ -255,7 +256,7 @@ def resized(made, factor):
     return replace(made, observations=seen)  # fmt: skip
 
 
-def test_a_size_that_is_unknown_is_found():
+def test_a_size_that_is_unknown_is_found() -> None:
     made = session(MARKER, np.random.default_rng(17), n=20)
     assert "target_size: unknown finds it" in refusal(resized(made, 2.0))
     found = solve(resized(made, 2.0), target_size="unknown")
@@ -266,7 +267,7 @@ def test_a_size_that_is_unknown_is_found():
     assert error @ np.linalg.solve(found.camera.covariance, error) < 30
 
 
-def test_a_size_that_the_motion_does_not_tell_is_refused():
+def test_a_size_that_the_motion_does_not_tell_is_refused() -> None:
     poses = moves(np.random.default_rng(0), 12, 0.3, reach=0.0)
     made = session(MARKER, np.random.default_rng(18), n=12, poses=poses, noise=Noise().scaled(20))
     told = refusal(made, target_size="unknown")
@@ -274,7 +275,7 @@ def test_a_size_that_the_motion_does_not_tell_is_refused():
     assert told.endswith("move the arm further between poses, or say target_size: known")
 
 
-def test_a_camera_that_wanders_is_no_noise():
+def test_a_camera_that_wanders_is_no_noise() -> None:
     """What lasts for twenty poses widens the region, and none of it counts as many."""
     ours, without = list[float](), list[float]()
     for seed in range(4):
@@ -289,7 +290,7 @@ def test_a_camera_that_wanders_is_no_noise():
     assert np.mean(ours) < 10 < np.mean(without)  # six are expected
 
 
-def test_the_former_name_solves_the_same_and_says_so():
+def test_the_former_name_solves_the_same_and_says_so() -> None:
     made = session(MARKER, np.random.default_rng(0), n=12)
     found = solve_maximum_likelihood(
         made.stream(), MaximumLikelihoodParams(), made.configuration, ROBOT
@@ -318,7 +319,7 @@ OF_95_PERCENT = 12.592
         ("two arms, marker", "pose"),
     ],
 )  # fmt: skip
-def test_a_95_percent_region_holds_its_share(name, feature, stated):
+def test_a_95_percent_region_holds_its_share(name: str, feature: str, stated: bool) -> None:
     """A share of 95 % varies by 0.6 % in 1,350 draws: nothing is added to 93 to 97 % for them."""
     rng, inside = np.random.default_rng(16), []
     params = STATED if stated else RobustParams()

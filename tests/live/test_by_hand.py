@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ class Person:
         write_cloud(self.folder / f"scan_{self.count}.pcd", PointCloud(CAMERA, xyz))
 
 
-def test_a_person_and_a_folder_are_a_cell(tmp_path):
+def test_a_person_and_a_folder_are_a_cell(tmp_path: Path) -> None:
     (tmp_path / "cell.yaml").write_text(RECIPE)
     person = Person(tmp_path)
     process = subprocess.Popen(

@@ -2,6 +2,9 @@
 
 import signal
 import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +15,13 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture
-def cell(tmp_path):
+def cell(tmp_path: Path) -> Iterator[Any]:
     pytest.importorskip("rtde_control", reason="needs ur-rtde")
     with Cell(tmp_path) as cell:
         yield cell
 
 
-def test_without_move_the_plan_is_shown_and_nothing_moves(cell):
+def test_without_move_the_plan_is_shown_and_nothing_moves(cell: Any) -> None:
     before = cell.control.truth().joints
     code, out, err = cell.run(cell.recipe(), "--out", "run")
     assert (code, err) == (0, "")
@@ -36,7 +39,7 @@ def test_without_move_the_plan_is_shown_and_nothing_moves(cell):
     assert not (cell.folder / "run").exists()
 
 
-def test_a_run_that_is_stopped_goes_on_where_it_was(cell):
+def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
     recipe = cell.recipe(count=6)
     process = cell.start(recipe, "--move", "--out", "run")
     cell.wait_until(lambda: len(cell.finished()) >= 2, patience=120)
@@ -67,7 +70,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell):
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell):
+def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell: Any) -> None:
     process = cell.start(cell.recipe(), "--move", "--out", "run")
     cell.wait_until(cell.finished, patience=120)
     cell.wait_until(cell.moving)
@@ -89,7 +92,9 @@ def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell):
         ("freeze=30 s@moving", "ur5e at"),
     ],
 )
-def test_a_doubt_ends_the_run_and_nothing_gathered_is_lost(cell, fault, line):
+def test_a_doubt_ends_the_run_and_nothing_gathered_is_lost(
+    cell: Any, fault: str, line: str
+) -> None:
     process = cell.start(cell.recipe(), "--move", "--out", "run")
     cell.wait_until(lambda: len(cell.finished()) >= 2, patience=120)
     cell.control.fault(fault)
@@ -103,7 +108,7 @@ def test_a_doubt_ends_the_run_and_nothing_gathered_is_lost(cell, fault, line):
     assert taken == finished
 
 
-def test_a_scanner_that_is_lost_stops_the_arm(cell):
+def test_a_scanner_that_is_lost_stops_the_arm(cell: Any) -> None:
     code, _, err = cell.run(cell.recipe(scanner="lost_after: 2"), "--move", "--out", "run")
     assert code == 2
     assert "gone after 2 exposures" in err.splitlines()[-1]
@@ -112,7 +117,7 @@ def test_a_scanner_that_is_lost_stops_the_arm(cell):
 
 
 @pytest.mark.slow
-def test_a_dropped_frame_costs_one_pose(cell):
+def test_a_dropped_frame_costs_one_pose(cell: Any) -> None:
     recipe = cell.recipe(count=8, scanner="dropped: 0.4, seed: 3")
     code, _, err = cell.run(recipe, "--move", "--out", "run")
     log = cell.log()
@@ -124,7 +129,7 @@ def test_a_dropped_frame_costs_one_pose(cell):
 
 
 @pytest.mark.slow
-def test_the_arm_stands_while_it_is_scanned_and_the_pose_is_its_own(cell):
+def test_the_arm_stands_while_it_is_scanned_and_the_pose_is_its_own(cell: Any) -> None:
     code, _, err = cell.run(cell.recipe(), "--move", "--out", "run")
     assert code == 0, err
     for observation in cell.log().observations():
@@ -134,7 +139,7 @@ def test_the_arm_stands_while_it_is_scanned_and_the_pose_is_its_own(cell):
     assert held_out < 1e-3
 
 
-def test_an_arm_outside_its_limits_is_not_moved(tmp_path):
+def test_an_arm_outside_its_limits_is_not_moved(tmp_path: Path) -> None:
     pytest.importorskip("rtde_control", reason="needs ur-rtde")
     with Cell(tmp_path, "--joints", "0 -90 90 -90 -90 0 deg") as cell:
         code, _, err = cell.run(cell.recipe(), "--move", "--out", "run")

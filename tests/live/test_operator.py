@@ -11,6 +11,9 @@ import sys
 import termios
 import threading
 import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,7 +26,7 @@ CYCLE = 0.002
 
 
 @pytest.fixture
-def cell(tmp_path):
+def cell(tmp_path: Path) -> Iterator[Any]:
     pytest.importorskip("rtde_control", reason="needs ur-rtde")
     with Cell(tmp_path) as cell:
         yield cell
@@ -59,7 +62,7 @@ class Terminal:
 
 
 @pytest.mark.parametrize(("key", "said"), [(b" ", "the space bar"), (b"\x03", "Ctrl-C")])
-def test_a_key_stops_the_arm(cell, key, said):
+def test_a_key_stops_the_arm(cell: Any, key: bytes, said: str) -> None:
     terminal = Terminal(cell, cell.recipe(), "--move", "--out", "run")
     cell.wait_until(cell.moving, patience=120)
     terminal.press(key)
@@ -70,7 +73,7 @@ def test_a_key_stops_the_arm(cell, key, said):
     assert "Traceback" not in text
 
 
-def test_ctrl_c_reaches_the_controller_at_once(cell):
+def test_ctrl_c_reaches_the_controller_at_once(cell: Any) -> None:
     process = cell.start(cell.recipe(speed="100 mm/s"), "--move", "--out", "run")
     cell.wait_until(cell.finished, patience=120)  # so that a scan is being computed on the way
     cell.wait_until(cell.moving)

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -44,11 +45,11 @@ def until(condition, patience):
 
 
 @pytest.fixture
-def live():
+def live() -> None:
     pytest.importorskip("rtde_control", reason="needs ur-rtde")
 
 
-def test_two_runs_side_by_side_have_a_controller_each(live, tmp_path):
+def test_two_runs_side_by_side_have_a_controller_each(live: None, tmp_path: Path) -> None:
     runs = [start(tmp_path) for _ in range(2)]
     told = [run.communicate(timeout=120) for run in runs]
     for run, (out, err) in zip(runs, told, strict=True):
@@ -57,7 +58,7 @@ def test_two_runs_side_by_side_have_a_controller_each(live, tmp_path):
         assert not listens(host_of(run))
 
 
-def test_a_killed_run_leaves_no_controller(live, tmp_path):
+def test_a_killed_run_leaves_no_controller(live: None, tmp_path: Path) -> None:
     run = start(tmp_path, "--move", "--out", "run")
     until(lambda: listens(host_of(run)), patience=60)
     os.killpg(run.pid, signal.SIGKILL)
@@ -65,7 +66,7 @@ def test_a_killed_run_leaves_no_controller(live, tmp_path):
     until(lambda: not listens(host_of(run)), patience=5)
 
 
-def test_offline_asks_no_arm(tmp_path):
+def test_offline_asks_no_arm(tmp_path: Path) -> None:
     home = "[180 deg, -90 deg, 90 deg, -90 deg, -90 deg, 0 deg]"
     nowhere = "robot.driver={ur_rtde: {host: 127.0.0.254}}"
     run = start(tmp_path, "--offline", "--set", nowhere, "--set", f"acquire.live.home={home}")
@@ -78,7 +79,9 @@ def test_offline_asks_no_arm(tmp_path):
     assert "not known" not in out
 
 
-def test_an_arm_that_does_not_answer_is_named_and_the_plan_shown(live, tmp_path):
+def test_an_arm_that_does_not_answer_is_named_and_the_plan_shown(
+    live: None, tmp_path: Path
+) -> None:
     run = start(tmp_path, "--set", "robot.driver={ur_rtde: {host: 127.0.0.254}}")
     out, _ = run.communicate(timeout=60)
     assert run.returncode == 0
@@ -88,7 +91,7 @@ def test_an_arm_that_does_not_answer_is_named_and_the_plan_shown(live, tmp_path)
     ) in out
 
 
-def test_a_home_of_another_arm_and_an_offline_move_are_refused(tmp_path):
+def test_a_home_of_another_arm_and_an_offline_move_are_refused(tmp_path: Path) -> None:
     for words, line in [
         (
             ("--offline", "--set", "acquire.live.home=[0 deg, 0 deg]"),

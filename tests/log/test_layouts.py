@@ -1,6 +1,7 @@
 """What other viewers are given: circles as points, the flanges in base, and a layout."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from flangeye import types as t
 from flangeye.log.foxglove import points_of
 from flangeye.log.layouts import CLOUDS
 from flangeye.log.record import Recorder
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner
 from tests import toy
@@ -19,7 +21,7 @@ from tests.conftest import TOY_RECIPE
 
 
 @pytest.fixture
-def messages(toy_registry, tmp_path):
+def messages(toy_registry: Registry, tmp_path: Path) -> Any:
     """The decoded messages of a toy run, by topic."""
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
     toy_registry.hooks.register(recorder)
@@ -34,7 +36,7 @@ def messages(toy_registry, tmp_path):
     return found
 
 
-def test_circles_are_points_too(messages):
+def test_circles_are_points_too(messages: Any) -> None:
     assert len(messages["/circle"]) == 6
     points = points_of(messages["/circle"][0])
     assert messages["/circle"][0].frame_id == "camera"
@@ -43,7 +45,7 @@ def test_circles_are_points_too(messages):
     assert np.allclose(np.linalg.norm(points[:361] - centre, axis=1), 0.01, atol=1e-5)
 
 
-def test_the_flanges_are_in_base_once_solved(messages):
+def test_the_flanges_are_in_base_once_solved(messages: Any) -> None:
     assert len(messages["/base/flanges"]) == 6
     seen = messages["/base/flanges"][0]
     assert seen.frame_id == "base"
@@ -51,7 +53,7 @@ def test_the_flanges_are_in_base_once_solved(messages):
     assert np.allclose(points_of(seen), toy.BASE_T_CAMERA.apply(first), atol=1e-3)
 
 
-def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in, tmp_path):
+def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in: Any, tmp_path: Path) -> None:
     assert flangeye_in("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
     layout = json.loads((tmp_path / "l.json").read_text())
     shown = layout["configById"]["3D!cell"]["topics"]
@@ -60,12 +62,12 @@ def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in, tmp_path):
     assert all(panel in named for panel in layout["configById"])
 
 
-def test_a_rerun_blueprint_is_written(flangeye_in, tmp_path):
+def test_a_rerun_blueprint_is_written(flangeye_in: Any, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     assert flangeye_in("layout", "rerun", "--out", tmp_path / "l.rbl")[0] == 0
     assert (tmp_path / "l.rbl").read_bytes()[:4] == b"RRF2"
 
 
-def test_another_viewer_is_not_known(flangeye_in):
+def test_another_viewer_is_not_known(flangeye_in: Any) -> None:
     code, _, err = flangeye_in("layout", "rviz")
     assert (code, err) == (2, "error: no layout for 'rviz'; known: foxglove, rerun\n")

@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def recorded(path, full=True):
     return recorder
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_what_is_written_is_read(tmp_path: Path) -> None:
     recorder = recorded(tmp_path / "r.mcap")
     recorder.flangeye_run_finished({"status": "verified"})
     log = read_run(tmp_path / "r.mcap")
@@ -61,7 +62,9 @@ def test_what_is_written_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])
-def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(tmp_path, shape):
+def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(
+    tmp_path: Path, shape: tuple[Any, ...]
+) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
     matrix = np.array([[500.0, 0, 20], [0, 501, 15], [0, 0, 1]])
     image = t.Image(pixels, matrix, np.array([-0.1, 0.01]))
@@ -86,7 +89,7 @@ def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(tmp_path, shape
     assert other.image is None
 
 
-def test_viewers_find_foxglove_schemas_and_frames(tmp_path):
+def test_viewers_find_foxglove_schemas_and_frames(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     recorder = recorded(tmp_path / "r.mcap")
@@ -102,7 +105,7 @@ def test_viewers_find_foxglove_schemas_and_frames(tmp_path):
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.5, 0.8, 0.99])
-def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path, keep):
+def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path: Path, keep: float) -> None:
     path = tmp_path / "r.mcap"
     recorded(path).flangeye_run_finished({})
     data = path.read_bytes()
@@ -112,7 +115,9 @@ def test_a_cut_file_is_read_as_far_as_it_goes(tmp_path, keep):
 
 
 @given(st.integers(0, 2_000), st.binary(min_size=1, max_size=40))
-def test_a_damaged_file_never_raises_anything_else(tmp_path_factory, at, junk):
+def test_a_damaged_file_never_raises_anything_else(
+    tmp_path_factory: pytest.TempPathFactory, at: int, junk: bytes
+) -> None:
     path = tmp_path_factory.mktemp("d") / "r.mcap"
     recorded(path).flangeye_run_finished({})
     data = bytearray(path.read_bytes())
@@ -124,7 +129,7 @@ def test_a_damaged_file_never_raises_anything_else(tmp_path_factory, at, junk):
         assert str(path) in str(error)
 
 
-def test_what_is_no_log_is_said(tmp_path):
+def test_what_is_no_log_is_said(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="none.mcap: cannot be read: No such file"):
         read_run(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("hello, this is no log at all")
@@ -135,7 +140,7 @@ def test_what_is_no_log_is_said(tmp_path):
 
 
 @given(arrays(np.float64, (3, 3), elements=st.floats(-1e9, 1e9)), st.floats(0, 1))
-def test_values_are_lossless(covariance, coverage):
+def test_values_are_lossless(covariance: Any, coverage: float) -> None:
     circle = t.CircleFeature(
         covariance[0], np.array([0, 0, -1.0]), {"rim": coverage}, covariance, np.eye(3), coverage
     )
@@ -144,7 +149,7 @@ def test_values_are_lossless(covariance, coverage):
     assert again.radii == circle.radii
 
 
-def test_kill_minus_nine_loses_nothing_that_was_finished(tmp_path, toy_recipe):
+def test_kill_minus_nine_loses_nothing_that_was_finished(tmp_path: Path, toy_recipe: Path) -> None:
     script = f"""
 import sys, time
 sys.path.insert(0, {str(Path(__file__).parents[2])!r})
@@ -181,7 +186,7 @@ Runner(recipe, registry, t.ArchivePath()).run()
     assert [e.capture for e in log.of_kind("fit")][:3] == ["000", "001", "002"]
 
 
-def test_a_full_disk_is_one_line(tmp_path):
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     script = f"""
 import resource, sys
 from pathlib import Path
@@ -205,7 +210,7 @@ except LogWriteError as error:
     )
 
 
-def test_the_clouds_of_a_step_keep_their_rows_and_columns(tmp_path):
+def test_the_clouds_of_a_step_keep_their_rows_and_columns(tmp_path: Path) -> None:
     grid = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
     scan = t.WorkpieceScan(t.PointCloud(t.CAMERA, grid), "a scan")
     recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "title: T"}, full_clouds=False)

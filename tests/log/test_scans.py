@@ -1,5 +1,8 @@
 """A whole scan in the log: bit for bit, in fewer bytes than zstandard alone reaches."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import zstandard
@@ -24,26 +27,26 @@ def scan(rows=300, columns=400):
 
 @settings(max_examples=40, deadline=None)
 @given(arrays.arrays(np.uint32, st.integers(0, 40)), st.sampled_from([0, 1, BLOCK - 1, BLOCK]))
-def test_every_bit_comes_back(bits, more):
+def test_every_bit_comes_back(bits: Any, more: Any) -> None:
     flat = np.resize(bits, 3 * (len(bits) + more)).astype(np.uint32).view(np.float32)
     points = flat.reshape(-1, 3)
     assert unpack(pack(points), points.shape).tobytes() == points.tobytes()
 
 
-def test_it_is_smaller_than_the_points_by_zstandard():
+def test_it_is_smaller_than_the_points_by_zstandard() -> None:
     xyz = scan()
     assert len(pack(xyz)) < 0.8 * len(zstandard.compress(xyz.tobytes()))
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (6, 3), (10**9, 3), (5, 4)])
-def test_points_of_another_number_or_damaged_are_none(shape):
+def test_points_of_another_number_or_damaged_are_none(shape: tuple[Any, ...]) -> None:
     packed = pack(np.zeros((4, 3), np.float32))
     assert unpack(packed, shape) is None
     assert unpack(packed[:-3], (4, 3)) is None
     assert unpack(b"nothing of the kind", (4, 3)) is None
 
 
-def test_viewers_see_the_scan_thinned_and_runs_have_all_of_it(tmp_path):
+def test_viewers_see_the_scan_thinned_and_runs_have_all_of_it(tmp_path: Path) -> None:
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
     from mcap.reader import make_reader
 

@@ -3,6 +3,8 @@
 import socket
 import threading
 import time
+from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -13,13 +15,14 @@ from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
 from flangeye.log.watch import watch_run
 from flangeye.log.watch.tail import follow
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner
 from tests.conftest import TOY_RECIPE
 
 
 @pytest.fixture
-def log(toy_registry, tmp_path):
+def log(toy_registry: Registry, tmp_path: Path) -> Any:
     """Return what runs the toy recipe into a log, slowly enough to be watched."""
     path = tmp_path / "2026_toy" / "run.mcap"
     path.parent.mkdir()
@@ -42,7 +45,7 @@ def plain():
     return Console(record=True, width=120, force_terminal=False)
 
 
-def test_a_run_is_followed_while_it_is_written(log):
+def test_a_run_is_followed_while_it_is_written(log: Any) -> None:
     path, run = log
     runner = threading.Thread(target=run, args=(0.5,))
     runner.start()
@@ -60,7 +63,7 @@ def test_a_run_is_followed_while_it_is_written(log):
     assert view.events[-1].startswith("4.verify.toy done: verify.toy: 0.")
 
 
-def test_a_killed_run_is_given_up_on(log, tmp_path):
+def test_a_killed_run_is_given_up_on(log: Any, tmp_path: Path) -> None:
     path, run = log
     run()
     torn = tmp_path / "torn.mcap"
@@ -69,14 +72,14 @@ def test_a_killed_run_is_given_up_on(log, tmp_path):
         watch_run(torn, None, plain(), patience=0.3)
 
 
-def test_what_is_no_log_is_one_line(tmp_path):
+def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"x" * 100)
     with pytest.raises(StageError, match=r"bad.mcap: is not an MCAP file"):
         list(follow(bad, lambda: None))
 
 
-def test_no_run_is_one_line(tmp_path, monkeypatch):
+def test_no_run_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StageError) as error:
         watch_run(None, None, plain(), patience=0.2)
@@ -86,7 +89,7 @@ def test_no_run_is_one_line(tmp_path, monkeypatch):
     assert str(error.value).endswith("nowhere.mcap: no run came to be watched within 0.2 s")
 
 
-def test_a_run_that_is_still_to_come_is_waited_for(log):
+def test_a_run_that_is_still_to_come_is_waited_for(log: Any) -> None:
     path, run = log
     late = threading.Timer(0.5, run)
     late.start()
@@ -95,7 +98,7 @@ def test_a_run_that_is_still_to_come_is_waited_for(log):
     assert view.ended
 
 
-def test_a_run_that_failed_is_not_waited_for(tmp_path):
+def test_a_run_that_failed_is_not_waited_for(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": TOY_RECIPE}, False)
     recorder.ended("step 3 failed")
     recorder.close()
@@ -105,7 +108,7 @@ def test_a_run_that_failed_is_not_waited_for(tmp_path):
     assert read_run(tmp_path).messages == ["step 3 failed"]
 
 
-def test_a_journal_and_a_solvers_progress_are_shown(log):
+def test_a_journal_and_a_solvers_progress_are_shown(log: Any) -> None:
     path, _ = log
     recorder = Recorder(path, {}, False)
     recorder.flangeye_noted("3.solve.robust", "progress", t.Progress(7, 0.4e-3, 0.35e-3))
@@ -114,7 +117,7 @@ def test_a_journal_and_a_solvers_progress_are_shown(log):
     assert rows["error so far"] == "95 % below 0.400 mm after 7 poses, 0.350 mm required"
 
 
-def test_foxglove_is_served_the_same_messages(log):
+def test_foxglove_is_served_the_same_messages(log: Any) -> None:
     websockets = pytest.importorskip("websockets.sync.client")
     path, run = log
     run()
@@ -135,7 +138,7 @@ def test_foxglove_is_served_the_same_messages(log):
         assert topic in str(advertised)
 
 
-def test_a_port_that_is_taken_is_one_line(log):
+def test_a_port_that_is_taken_is_one_line(log: Any) -> None:
     pytest.importorskip("foxglove")
     path, run = log
     run()

@@ -1,5 +1,7 @@
 """Rotations of one vector and of many, against a library's."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,19 +14,19 @@ VECTORS = st.lists(st.floats(-7.0, 7.0), min_size=3, max_size=3).map(np.array)
 
 
 @given(VECTORS)
-def test_one_and_many_are_the_rotations_of_the_library(vector):
+def test_one_and_many_are_the_rotations_of_the_library(vector: Any) -> None:
     expected = Rotation.from_rotvec(vector).as_matrix()
     np.testing.assert_allclose(rotation_exp(vector), expected, atol=1e-14)
     np.testing.assert_allclose(rotation_exp(np.stack([vector, -vector]))[0], expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-300, 1e-160, 1e-12, 1e-8, np.pi])
-def test_at_no_turn_a_small_one_and_half_a_turn(length):
+def test_at_no_turn_a_small_one_and_half_a_turn(length: Any) -> None:
     vector = length * np.array([0.6, 0.0, -0.8])
     expected = Rotation.from_rotvec(vector).as_matrix()
     np.testing.assert_allclose(rotation_exp(vector), expected, atol=1e-14)
 
 
 @given(VECTORS.filter(lambda v: np.linalg.norm(v) < 3.1))
-def test_the_logarithm_undoes_it(vector):
+def test_the_logarithm_undoes_it(vector: Any) -> None:
     np.testing.assert_allclose(rotation_log(rotation_exp(vector)), vector, atol=1e-12)

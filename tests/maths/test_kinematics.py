@@ -1,5 +1,7 @@
 """Kinematics against published poses, finite differences and itself."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -41,13 +43,15 @@ def poised_arms(draw):
         ),
     ],
 )
-def test_published_poses(robot, joints, position, z_axis):
+def test_published_poses(
+    robot: str, joints: list[Any], position: list[Any], z_axis: list[Any]
+) -> None:
     pose = ARMS[robot].flange(np.array(joints, dtype=float))
     assert pose[:3, 3] == pytest.approx(position, abs=1e-5)
     assert pose[:3, 2] == pytest.approx(z_axis, abs=1e-9)
 
 
-def test_aubo_is_the_chain_of_its_urdf():
+def test_aubo_is_the_chain_of_its_urdf() -> None:
     origins = [
         ((0, 0, 0.122), (0, 0, PI)),
         ((0, 0.1215, 0), (-PI / 2, -PI / 2, 0)),
@@ -66,7 +70,7 @@ def test_aubo_is_the_chain_of_its_urdf():
 
 @given(poised_arms())
 @settings(max_examples=40, deadline=None)
-def test_inverse_leads_back(poised):
+def test_inverse_leads_back(poised: Any) -> None:
     arm, joints = poised
     pose = arm.flange(joints)
     solutions = arm.inverse(pose)
@@ -77,7 +81,7 @@ def test_inverse_leads_back(poised):
 
 # The Aubo has the same eight, two of them beyond its limits of 175 degrees.
 @pytest.mark.parametrize(("robot", "branches"), [("ur5", 8), ("ur10e", 8), ("aubo-i5", 6)])
-def test_inverse_finds_all_branches(robot, branches):
+def test_inverse_finds_all_branches(robot: str, branches: int) -> None:
     arm = ARMS[robot]
     joints = np.array([0.4, -1.2, 1.5, -1.9, -1.4, 0.3])
     solutions = arm.inverse(arm.flange(joints))
@@ -88,7 +92,7 @@ def test_inverse_finds_all_branches(robot, branches):
 
 @given(poised_arms())
 @settings(max_examples=40, deadline=None)
-def test_jacobian_is_the_derivative(poised):
+def test_jacobian_is_the_derivative(poised: Any) -> None:
     arm, joints = poised
     step = 1e-6
     for i, column in enumerate(arm.jacobian(joints).T):
@@ -101,7 +105,7 @@ def test_jacobian_is_the_derivative(poised):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_many_joint_vectors_at_once(robot):
+def test_many_joint_vectors_at_once(robot: str) -> None:
     arm = ARMS[robot]
     joints = np.random.default_rng(1).uniform(-1, 1, (3, 4, arm.n))
     assert arm.frames(joints).shape == (3, 4, arm.n + 1, 4, 4)
@@ -110,7 +114,7 @@ def test_many_joint_vectors_at_once(robot):
     assert np.array_equal(arm.flange(joints)[2, 1], arm.flange(joints[2, 1]))
 
 
-def test_inverse_respects_limits():
+def test_inverse_respects_limits() -> None:
     # The Panda's elbow bends one way only; its fourth joint cannot be straight.
     arm = ARMS["franka-panda"]
     solutions = arm.inverse(arm.flange(np.array([0.1, 0.2, 0.3, -1.8, 0.2, 1.6, 0.5])))
@@ -118,25 +122,25 @@ def test_inverse_respects_limits():
     assert (solutions[:, 3] <= -0.0698).all()
 
 
-def test_inverse_of_a_pose_out_of_reach_is_empty():
+def test_inverse_of_a_pose_out_of_reach_is_empty() -> None:
     pose = rigid(np.eye(3), np.array([3.0, 0, 0]))
     assert ARMS["ur5"].inverse(pose).shape == (0, 6)
 
 
-def test_inverse_is_the_same_every_time():
+def test_inverse_is_the_same_every_time() -> None:
     arm = ARMS["franka-panda"]
     pose = arm.flange(np.array([0.1, 0.2, 0.3, -1.8, 0.2, 1.6, 0.5]))
     assert np.array_equal(arm.inverse(pose), arm.inverse(pose))
 
 
-def test_manipulability_vanishes_where_axes_align():
+def test_manipulability_vanishes_where_axes_align() -> None:
     arm = ARMS["ur5"]
     assert arm.manipulability(np.array([0.3, -1, 1.2, 0.4, 0.0, 0.2])) == pytest.approx(0, abs=1e-9)
     assert arm.manipulability(np.array([0.3, -1, 1.2, 0.4, 1.2, 0.2])) > 0.02
 
 
 @pytest.mark.parametrize("robot", [name for name in ROBOTS if name != "franka-panda"])
-def test_the_closed_form_finds_what_many_starts_find(robot):
+def test_the_closed_form_finds_what_many_starts_find(robot: Any) -> None:
     pytest.importorskip("eaik")
     arm = ARMS[robot]
     for joints in np.random.default_rng(3).uniform(-2.5, 2.5, (6, 6)):
@@ -145,7 +149,7 @@ def test_the_closed_form_finds_what_many_starts_find(robot):
         assert np.abs(arm.inverse(pose) - iterated).max() < 1e-7
 
 
-def test_a_calibrated_arm_starts_from_the_nominal_one():
+def test_a_calibrated_arm_starts_from_the_nominal_one() -> None:
     """A UR's factory calibration moves origins far along axes that are no longer parallel."""
     robot = load_model("robots", "ur5e")
     along = (0.0, 0.3, -0.28, -0.02, 0.0, 0.0)
@@ -175,7 +179,7 @@ def rail_and_arm():
     return Arm(ur5.model_copy(update=changed))
 
 
-def test_a_rail_slides_and_axes_point_anywhere():
+def test_a_rail_slides_and_axes_point_anywhere() -> None:
     arm = rail_and_arm()
     half = np.sqrt(0.5)
     assert arm.flange(np.array([1.0, 0, 0]))[:3, 3] == pytest.approx([half + 0.3, half, 0.5])
@@ -189,7 +193,7 @@ def test_a_rail_slides_and_axes_point_anywhere():
         assert column == pytest.approx(np.concatenate(numeric) / (2 * step), abs=1e-6)
 
 
-def test_a_pose_of_an_arm_on_a_rail_is_found_within_the_rails_ends():
+def test_a_pose_of_an_arm_on_a_rail_is_found_within_the_rails_ends() -> None:
     arm = rail_and_arm()
     joints = np.array([1.4, 0.6, -0.4])
     solutions = arm.inverse(arm.flange(joints))
@@ -197,13 +201,13 @@ def test_a_pose_of_an_arm_on_a_rail_is_found_within_the_rails_ends():
     assert len(arm.inverse(arm.flange(joints + [1.0, 0, 0]))) == 0
 
 
-def test_an_axis_needs_a_direction():
+def test_an_axis_needs_a_direction() -> None:
     with pytest.raises(ValueError, match="an axis needs a direction"):
         Joint(axis=(0, 0, 0))
 
 
 @pytest.mark.parametrize("name", ["franka-fr3", "kuka-iiwa14-r820"])
-def test_seven_joints_are_solved_with_one_of_them_held(name):
+def test_seven_joints_are_solved_with_one_of_them_held(name: str) -> None:
     arm = Arm(load_model("robots", name))
     assert arm.in_closed_form
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)

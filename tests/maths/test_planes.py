@@ -1,5 +1,7 @@
 """Many planes in one computation are the planes one at a time."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,7 +24,7 @@ def patch(rng, count, noise=1e-4):
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(40, 900), min_size=2, max_size=6))
-def test_groups_of_any_size_do_not_see_each_other(seed, sizes):
+def test_groups_of_any_size_do_not_see_each_other(seed: int, sizes: Any) -> None:
     rng = np.random.default_rng(seed)
     made = [patch(rng, size) for size in sizes]
     together = robust_planes(
@@ -37,7 +39,7 @@ def test_groups_of_any_size_do_not_see_each_other(seed, sizes):
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32))
-def test_single_precision_is_enough(seed):
+def test_single_precision_is_enough(seed: int) -> None:
     points, rough, normal = patch(np.random.default_rng(seed), 600)
     single = robust_plane(points.astype(np.float32), rough, 1e-3)
     double = robust_plane(points, rough, 1e-3)
@@ -45,7 +47,7 @@ def test_single_precision_is_enough(seed):
     assert np.linalg.norm(np.cross(double.normal, normal)) < 2e-3
 
 
-def test_the_plane_is_least_squares_on_what_lies_in_its_slab():
+def test_the_plane_is_least_squares_on_what_lies_in_its_slab() -> None:
     points, rough, _ = patch(np.random.default_rng(3), 5000)
     plane = robust_plane(points, rough, 1e-3)
     near = np.abs(plane.heights(points)) <= 3 * plane.sigma
@@ -56,7 +58,7 @@ def test_the_plane_is_least_squares_on_what_lies_in_its_slab():
     assert pytest.approx(1e-4, rel=0.1) == plane.sigma and SIGMA_OF_MAD > 1
 
 
-def test_a_group_without_points_near_has_no_plane():
+def test_a_group_without_points_near_has_no_plane() -> None:
     points, rough, _ = patch(np.random.default_rng(1), 300)
     away = rough._replace(point=rough.point + rough.normal)
     found = robust_planes([points, points], [rough, away], np.full(2, 1e-3))

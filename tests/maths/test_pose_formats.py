@@ -1,5 +1,7 @@
 """Poses as makers write them: against the definitions, against each other, and as people type."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,7 +26,7 @@ def about(axis, degrees):
 
 @settings(deadline=None)
 @given(poses(), st.sampled_from(ALL))
-def test_a_pose_survives_being_written_and_read(pose, name):
+def test_a_pose_survives_being_written_and_read(pose: Any, name: Any) -> None:
     convention = CONVENTIONS[name]
     numbers = convention.numbers(pose)
     np.testing.assert_allclose(convention.matrix(numbers), pose, atol=1e-9)
@@ -33,7 +35,7 @@ def test_a_pose_survives_being_written_and_read(pose, name):
 
 @settings(max_examples=40, deadline=None)
 @given(poses(), st.sampled_from(EULER_ORDERS), st.sampled_from(["deg", "rad"]))
-def test_any_order_of_angles_is_the_product_of_its_turns(pose, order, angle):
+def test_any_order_of_angles_is_the_product_of_its_turns(pose: Any, order: Any, angle: Any) -> None:
     labels = ("X", "Y", "Z", "1", "2", "3")
     convention = PoseConvention(order, labels, order, "m", angle)
     angles = convention.numbers(pose)[3:]
@@ -61,13 +63,15 @@ def test_any_order_of_angles_is_the_product_of_its_turns(pose, order, angle):
         ("quaternion_wxyz", [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], about("z", 90)),
     ],
 )
-def test_each_maker_turns_about_the_axes_of_its_manual(name, numbers, rotation):
+def test_each_maker_turns_about_the_axes_of_its_manual(
+    name: str, numbers: Any, rotation: Any
+) -> None:
     pose = CONVENTIONS[name].matrix([1, 2, 3, *numbers])
     unit = 1.0 if CONVENTIONS[name].length == "m" else 1e-3
     np.testing.assert_allclose(pose, rigid(rotation, unit * np.array([1.0, 2.0, 3.0])), atol=1e-12)
 
 
-def test_the_pole_of_the_angles_has_one_answer_of_many():
+def test_the_pole_of_the_angles_has_one_answer_of_many() -> None:
     pose = rigid(about("y", 90) @ about("x", 25), np.zeros(3))
     written = CONVENTIONS["kuka"].numbers(pose)
     assert written[5] == 0.0
@@ -89,11 +93,11 @@ KUKA = rigid(about("z", 90) @ about("y", -10) @ about("x", 180), np.array([0.4, 
         "0.4 m  0 m  0.3 m  1.5707963267948966 rad  -10°  1.8e2 deg",
     ],
 )
-def test_typed_and_pasted_text_is_read(text):
+def test_typed_and_pasted_text_is_read(text: str) -> None:
     np.testing.assert_allclose(CONVENTIONS["kuka"].read(text), KUKA, atol=1e-12)
 
 
-def test_scripts_of_other_makers_are_read():
+def test_scripts_of_other_makers_are_read() -> None:
     down = rigid(about("x", 180), np.array([0.4, 0.0, 0.3]))
     rapid = "[[400,0,300],[0,1,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
     np.testing.assert_allclose(CONVENTIONS["abb"].read(rapid), down, atol=1e-12)
@@ -121,13 +125,13 @@ def test_scripts_of_other_makers_are_read():
         ("kuka", "1e999 0 0 0 0 0", "KUKA ABC: a number is not finite"),
     ],
 )
-def test_what_is_no_pose_is_refused(name, text, message):
+def test_what_is_no_pose_is_refused(name: str, text: str, message: str) -> None:
     with pytest.raises(ValueError) as error:
         CONVENTIONS[name].read(text)
     assert str(error.value) == message
 
 
-def test_text_is_what_a_pendant_shows():
+def test_text_is_what_a_pendant_shows() -> None:
     assert CONVENTIONS["kuka"].text(KUKA) == (
         "X 400.00 mm  Y 0.00 mm  Z 300.00 mm  A 90.000 deg  B -10.000 deg  C 180.000 deg"
     )
@@ -141,7 +145,7 @@ def test_text_is_what_a_pendant_shows():
         ("ZYX", "XYZAB", "mine: 6 numbers need as many labels"),
     ],
 )
-def test_a_convention_is_checked_when_it_is_made(rotation, labels, message):
+def test_a_convention_is_checked_when_it_is_made(rotation: str, labels: str, message: str) -> None:
     with pytest.raises(ValueError) as error:
         PoseConvention("mine", tuple(labels), rotation, "m")
     assert str(error.value).startswith(message)

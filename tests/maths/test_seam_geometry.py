@@ -1,6 +1,8 @@
 """A planned seam: its log, its frames, its tube."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ def a_seam():
     return t.Seam(points, up, covariance, 0.7, 0.008, "test", {"rms": 1e-4}, ("note",), cloud)
 
 
-def test_a_seam_is_read_back_as_it_was(tmp_path):
+def test_a_seam_is_read_back_as_it_was(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": ""}, full_clouds=False)
     seam, scan = a_seam(), t.WorkpieceScan(a_seam().cloud, "file", (), {"V": np.eye(3)})
     for step, value in (("5.scan.file", scan), ("6.seam.cad", seam)):
@@ -48,12 +50,12 @@ def test_a_seam_is_read_back_as_it_was(tmp_path):
         ({"covariance": np.zeros((5, 2))}, "Seam.covariance has shape"),
     ],
 )
-def test_a_seam_that_is_none_is_not_made(change, message):
+def test_a_seam_that_is_none_is_not_made(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(a_seam(), **change)
 
 
-def test_the_frames_of_a_seam_are_right_handed_and_look_into_the_groove():
+def test_the_frames_of_a_seam_are_right_handed_and_look_into_the_groove() -> None:
     seam = a_seam()
     frames = seam_frames(seam)
     assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3))
@@ -62,7 +64,7 @@ def test_the_frames_of_a_seam_are_right_handed_and_look_into_the_groove():
     assert (frames[:, 2, 2] < -0.99).all()
 
 
-def test_a_tube_is_as_wide_as_the_uncertainty_across_the_seam():
+def test_a_tube_is_as_wide_as_the_uncertainty_across_the_seam() -> None:
     straight = np.column_stack([np.linspace(0, 1, 3), np.zeros(3), np.zeros(3)])
     seam = a_seam()
     seam = replace(seam, points_in_base=straight, openings_in_base=seam.openings_in_base[:3],
@@ -72,7 +74,7 @@ def test_a_tube_is_as_wide_as_the_uncertainty_across_the_seam():
     assert np.allclose(np.linalg.norm(rings - straight[:, None], axis=2), tube_radii(seam)[0])
 
 
-def test_the_distance_from_a_line_is_that_from_its_nearest_piece():
+def test_the_distance_from_a_line_is_that_from_its_nearest_piece() -> None:
     line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
     points = np.array([[0.5, 0, 0.2], [2, 0.5, 0], [-3, 0, 4]])
     assert distances_to_line(points, line) == pytest.approx([0.2, 1.0, 5.0])

@@ -26,7 +26,7 @@ def weighted(seed: int):
     return replace(bare, weights=weights, covariance=spread @ spread.T, size=1e-3)
 
 
-def test_a_field_moves_no_camera():
+def test_a_field_moves_no_camera() -> None:
     """Over the calibration's poses it has no rigid part, so the best camera stays the same."""
     moved = PLACES + displacement(weighted(0), PLACES)
     rotation, translation = kabsch(PLACES, moved)
@@ -34,7 +34,7 @@ def test_a_field_moves_no_camera():
     np.testing.assert_allclose(PLACES @ rotation.T + translation, PLACES, atol=3e-6)
 
 
-def test_a_quadratic_error_is_followed():
+def test_a_quadratic_error_is_followed() -> None:
     """What joints that are off do to a workspace of 0.3 m is a polynomial of low order."""
     field, u = field_over(PLACES), PLACES - PLACES.mean(axis=0)
     wanted = np.stack([4e-2 * u[:, 0] * u[:, 1], 3e-2 * u[:, 2] ** 2, -5e-2 * u[:, 0] ** 2], axis=1)
@@ -44,7 +44,7 @@ def test_a_quadratic_error_is_followed():
     assert np.abs(left).max() < 0.15 * np.abs(wanted).max()
 
 
-def test_covariances_are_those_of_the_weights():
+def test_covariances_are_those_of_the_weights() -> None:
     field, place = weighted(1), PLACES[:1] + 0.05
     rng = np.random.default_rng(2)
     drawn = rng.multivariate_normal(field.weights, field.covariance, 20000)
@@ -55,7 +55,7 @@ def test_covariances_are_those_of_the_weights():
     np.testing.assert_allclose(wide, 1e-6 * effects(field, place)[0] @ effects(field, place)[0].T)
 
 
-def test_a_correction_moves_the_reported_flange_by_the_field():
+def test_a_correction_moves_the_reported_flange_by_the_field() -> None:
     field, pose = weighted(3), rigid(np.eye(3), PLACES[3])
     moved = corrected_flange(pose, None, ArmCorrection(np.zeros(3), field=field), None)
     np.testing.assert_allclose(moved[:3, 3] - pose[:3, 3], displacement(field, PLACES[3]))

@@ -1,5 +1,7 @@
 """The arms of data/robots against what their makers publish apart from their models: the reach."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -50,21 +52,21 @@ def farthest(arm, of, start):
 
 
 @pytest.mark.parametrize("name", REACH)
-def test_the_reach_is_the_data_sheets(name):
+def test_the_reach_is_the_data_sheets(name: str) -> None:
     published, of, start = REACH[name]
     assert farthest(Arm(load_model("robots", name)), of, start) == pytest.approx(published, abs=1.5)
 
 
-def test_every_arm_is_compared_with_something():
+def test_every_arm_is_compared_with_something() -> None:
     assert set(model_names("robots")) == REACH.keys() | ELSEWHERE
 
 
-def test_crx_reaches_its_1418_mm_stretched():
+def test_crx_reaches_its_1418_mm_stretched() -> None:
     flange = Arm(load_model("robots", "fanuc-crx10ial")).flange(np.radians([0, 0, 90, 0, 0, 0]))
     assert 1e3 * np.linalg.norm(flange[:3, 3]) == pytest.approx(1418, abs=1.5)
 
 
-def test_gofa_reaches_its_950_mm_with_the_wrist_straight():
+def test_gofa_reaches_its_950_mm_with_the_wrist_straight() -> None:
     arm = Arm(load_model("robots", "abb-gofa-crb15000-5"))
     joints = np.radians([0, 90, -np.degrees(np.arctan2(470, 190)) + 0.0, 0, 0, 0])
     axis_6 = arm.axes(joints)[1][5] - arm.flange(joints)[:3, :3] @ [0, 0, 0.101]
@@ -79,13 +81,13 @@ def test_gofa_reaches_its_950_mm_with_the_wrist_straight():
         ("ufactory-xarm6", (207, 0, 112)),
     ],
 )
-def test_the_flange_at_zero(name, position):
+def test_the_flange_at_zero(name: str, position: tuple[Any, ...]) -> None:
     """UR: sums of the published lengths. xArm6: what its controller shows at zero."""
     flange = Arm(load_model("robots", name)).flange(np.zeros(6))
     assert 1e3 * flange[:3, 3] == pytest.approx(position, abs=0.1)
 
 
-def test_an_fr3_is_as_long_as_a_panda():
+def test_an_fr3_is_as_long_as_a_panda() -> None:
     panda, fr3 = (load_model("robots", f"franka-{name}") for name in ("panda", "fr3"))
     joints = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
     assert np.array_equal(Arm(panda).flange(joints), Arm(fr3).flange(joints))
@@ -93,7 +95,7 @@ def test_an_fr3_is_as_long_as_a_panda():
 
 
 @pytest.mark.parametrize("kind", ["robots", "scanners"])
-def test_every_model_is_read_and_says_its_source(kind):
+def test_every_model_is_read_and_says_its_source(kind: Any) -> None:
     for name in model_names(kind):
         model = load_model(kind, name)
         assert model.model == name

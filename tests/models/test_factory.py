@@ -1,5 +1,8 @@
 """A UR's factory calibration: from the controller, and from the ROS driver."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -43,7 +46,7 @@ def ros_file(folder, change=0.0):
     return written(folder, "\n".join([*lines, "  hash: calib_1234567890", ""]), "kinematics.yaml")
 
 
-def test_the_controllers_numbers_are_added_to_the_table(tmp_path):
+def test_the_controllers_numbers_are_added_to_the_table(tmp_path: Path) -> None:
     found = as_built(UR5E, written(tmp_path, CONF))
     assert found.joints[1].a == pytest.approx(UR5E.joints[1].a + 2e-4)
     assert found.joints[4].d == pytest.approx(UR5E.joints[4].d - 3e-4)
@@ -60,7 +63,7 @@ def test_the_controllers_numbers_are_added_to_the_table(tmp_path):
     assert "factory calibration from calibration.conf" in found.source
 
 
-def test_the_ros_drivers_file_is_the_same_arm(tmp_path):
+def test_the_ros_drivers_file_is_the_same_arm(tmp_path: Path) -> None:
     found = as_built(UR5E, ros_file(tmp_path))
     assert Arm(found).flange(JOINTS) == pytest.approx(Arm(UR5E).flange(JOINTS), abs=1e-9)
     higher = as_built(UR5E, ros_file(tmp_path, 1e-3))
@@ -68,7 +71,7 @@ def test_the_ros_drivers_file_is_the_same_arm(tmp_path):
     assert up == pytest.approx(np.tile([0, 0, 1e-3], (2, 1)), abs=1e-9)
 
 
-def test_the_arms_volume_stays_where_it_is(tmp_path):
+def test_the_arms_volume_stays_where_it_is(tmp_path: Path) -> None:
     found = as_built(UR5E, ros_file(tmp_path))
     axes = [ArmVolume(r).axes(Arm(r).frames(JOINTS[0])) for r in (UR5E, found)]
     assert axes[1] == pytest.approx(axes[0], abs=1e-9)
@@ -88,12 +91,12 @@ def test_the_arms_volume_stays_where_it_is(tmp_path):
         ("kinematics: {shoulder: {x: 1}}\n", "k.yaml", "not a kinematics file of the ROS driver"),
     ],
 )
-def test_a_file_that_is_none_is_refused(tmp_path, text, name, told):
+def test_a_file_that_is_none_is_refused(tmp_path: Path, text: Any, name: str, told: str) -> None:
     with pytest.raises(RecipeError, match=told):
         as_built(UR5E, written(tmp_path, text, name))
 
 
-def test_a_factory_calibration_is_a_urs(tmp_path):
+def test_a_factory_calibration_is_a_urs(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="a factory calibration is a UR's; franka-panda has none"):
         as_built(load_model("robots", "franka-panda"), written(tmp_path, CONF))
     with pytest.raises(RecipeError, match=r"no such file; copy calibration.conf from the controll"):
@@ -110,7 +113,7 @@ steps: [acquire.simulated, segment.flange, fit.rim, solve.robust]
 """
 
 
-def test_a_recipe_starts_from_the_arm_as_built(tmp_path):
+def test_a_recipe_starts_from_the_arm_as_built(tmp_path: Path) -> None:
     from flangeye.models.robots import RobotModel
 
     written(tmp_path, CONF)

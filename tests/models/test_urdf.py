@@ -1,5 +1,9 @@
 """An arm from its URDF: the chain, the frames, the volumes, and what is said when one is wrong."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -50,7 +54,7 @@ WORLD = (
 
 
 @pytest.fixture
-def kuka(tmp_path):
+def kuka(tmp_path: Path) -> Path:
     """A URDF as xacro writes it, and its meshes in a package beside it."""
     meshes = tmp_path / "kuka" / "m"
     meshes.mkdir(parents=True)
@@ -64,7 +68,7 @@ def kuka(tmp_path):
     return path
 
 
-def test_the_chain_is_the_makers(kuka):
+def test_the_chain_is_the_makers(kuka: Path) -> None:
     """Straight ahead at zero, as KUKA's drawing has it: 25 + 455 + 420 + 80 mm, at 435 mm."""
     robot = robot_from_urdf(kuka)
     assert robot.model == "kr6_r900"
@@ -79,7 +83,7 @@ def test_the_chain_is_the_makers(kuka):
     assert np.abs(solutions - [0.3, -1.0, 1.2, 0.4, 0.9, 0.2]).max(axis=1).min() < 1e-6
 
 
-def test_the_slowest_joint_that_turns_bounds_its_speed(kuka):
+def test_the_slowest_joint_that_turns_bounds_its_speed(kuka: Path) -> None:
     text = kuka.read_text()
     assert robot_from_urdf(kuka).joint_speed == 1.0
     kuka.write_text(text.replace('velocity="1"', 'velocity="3.5"', 4))
@@ -88,7 +92,7 @@ def test_the_slowest_joint_that_turns_bounds_its_speed(kuka):
     assert robot_from_urdf(kuka).joint_speed == pytest.approx(np.pi)
 
 
-def test_each_link_has_a_capsule_about_its_mesh(kuka):
+def test_each_link_has_a_capsule_about_its_mesh(kuka: Path) -> None:
     robot = robot_from_urdf(kuka)
     assert [volume.link for volume in robot.volumes] == list(range(7))
     half = np.array([0.06, 0.04, 0.03])
@@ -98,7 +102,9 @@ def test_each_link_has_a_capsule_about_its_mesh(kuka):
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 60))
 @settings(max_examples=30, deadline=None)
-def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(seed, count):
+def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(
+    seed: int, count: int
+) -> None:
     rng = np.random.default_rng(seed)
     points = (
         rng.normal(size=(count, 3))
@@ -112,7 +118,7 @@ def test_a_capsule_holds_its_points_and_is_no_larger_than_a_ball_about_them(seed
 
 
 @pytest.mark.parametrize("name", ["stl", "obj", "dae"])
-def test_meshes_as_they_are_published(kuka, name):
+def test_meshes_as_they_are_published(kuka: Path, name: str) -> None:
     for file in (kuka.parents[1] / "m").glob("*.stl"):
         trimesh.load_mesh(file).export(file.with_suffix(f".{name}"))
     kuka.write_text(kuka.read_text().replace(".stl", f".{name}"))
@@ -120,7 +126,7 @@ def test_meshes_as_they_are_published(kuka, name):
     assert radius == pytest.approx(0.05, rel=2e-3)
 
 
-def test_missing_meshes_matter_where_a_plan_needs_them(kuka, tmp_path):
+def test_missing_meshes_matter_where_a_plan_needs_them(kuka: Path, tmp_path: Path) -> None:
     moved = tmp_path / "alone.urdf"
     moved.write_text(kuka.read_text().replace("package://kuka", "package://kuka_support"))
     robot = robot_from_urdf(moved)
@@ -134,7 +140,7 @@ def test_missing_meshes_matter_where_a_plan_needs_them(kuka, tmp_path):
     assert len(named.volumes) == 7
 
 
-def test_a_rail_and_a_base_of_ones_own(kuka):
+def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
     text = kuka.read_text().replace(
         'name="joint_1" type="revolute"', 'name="joint_1" type="prismatic"'
     )
@@ -157,14 +163,16 @@ def test_a_rail_and_a_base_of_ones_own(kuka):
         (lambda t: t.replace("0 0 0.400", "0 0 x"), "is not three numbers"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_urdf_is_one_line(kuka, change, words):
+def test_what_is_wrong_with_a_urdf_is_one_line(
+    kuka: Path, change: Callable[..., Any], words: str
+) -> None:
     kuka.write_text(change(kuka.read_text()))
     with pytest.raises(RecipeError, match=words) as error:
         robot_from_urdf(kuka)
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka, tmp_path):
+def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "cell.yaml"
     recipe.write_text(
         "title: My cell\nrobot: {urdf: kuka/urdf/kr6.urdf}\nfeature: {standard: ISO 9409-1-40-4-M6}\n"
@@ -188,7 +196,7 @@ def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka, tmp_path):
         ("{urdf: a.urdf}", "robot.urdf: .*a.urdf: cannot be read"),
     ],
 )
-def test_what_does_not_go_together_is_refused(robot, words, tmp_path):
+def test_what_does_not_go_together_is_refused(robot: str, words: str, tmp_path: Path) -> None:
     recipe = tmp_path / "cell.yaml"
     recipe.write_text(f"title: T\nrobot: {robot}\nsteps: [acquire.samples, solve.shah]\n")
     with pytest.raises(RecipeError, match=words):

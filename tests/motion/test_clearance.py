@@ -1,5 +1,7 @@
 """Distances of segments, and what an arm may not touch."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +18,7 @@ coordinates = st.lists(st.floats(-1, 1), min_size=12, max_size=12)
 
 
 @given(coordinates)
-def test_segment_distance_is_the_smallest_of_all_pairs_of_points(numbers):
+def test_segment_distance_is_the_smallest_of_all_pairs_of_points(numbers: Any) -> None:
     first, second = np.array(numbers).reshape(2, 2, 3)
     share = np.linspace(0, 1, 41)[:, None]
     points1 = first[0] + share * (first[1] - first[0])
@@ -28,7 +30,7 @@ def test_segment_distance_is_the_smallest_of_all_pairs_of_points(numbers):
     assert found >= brute - spacing - A_POINT
 
 
-def test_segment_distance_works_on_many_at_once():
+def test_segment_distance_works_on_many_at_once() -> None:
     first = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]]], dtype=float)
     second = np.array([[[0.5, 1, 0], [0.5, 2, 0]], [[3, 4, 0], [3, 4, 9]]], dtype=float)
     assert segment_distance(first, second) == pytest.approx([1.0, 5.0])
@@ -40,7 +42,7 @@ def volume_at(robot, joints):
     return volume, volume.axes(Arm(model).frames(np.array(joints, dtype=float)))
 
 
-def test_an_arm_that_points_down_is_in_the_table():
+def test_an_arm_that_points_down_is_in_the_table() -> None:
     upright, axes = volume_at("ur5", [0, -np.pi / 2, 0, 0, 0, 0])
     assert upright.above(axes, 0.0)
     down, axes = volume_at("ur5", [0, 0.8, 0, 0, 0, 0])
@@ -48,18 +50,18 @@ def test_an_arm_that_points_down_is_in_the_table():
 
 
 @pytest.mark.parametrize("robot", ["ur3e", "ur5", "ur5e", "ur10e", "aubo-i5"])
-def test_an_arm_that_stands_upright_touches_nothing(robot):
+def test_an_arm_that_stands_upright_touches_nothing(robot: str) -> None:
     upright = [0, -np.pi / 2, 0, 0, 0, 0] if robot != "aubo-i5" else [0] * 6
     volume, axes = volume_at(robot, upright)
     assert volume.apart(axes)
 
 
-def test_a_folded_arm_touches_itself():
+def test_a_folded_arm_touches_itself() -> None:
     volume, axes = volume_at("ur5", [0, -np.pi / 2, 2.75, 0, 1.5, 0])
     assert not volume.apart(axes)
 
 
-def test_a_line_of_sight_through_the_arm_is_not_free():
+def test_a_line_of_sight_through_the_arm_is_not_free() -> None:
     volume, axes = volume_at("ur5", [0, -np.pi / 2, 0, 0, 0, 0])
     through = np.array([[[-1.0, -0.1, 0.4], [1.0, -0.1, 0.4]]])
     beside = np.array([[[-1.0, 0.4, 0.4], [1.0, 0.4, 0.4]]])

@@ -1,6 +1,7 @@
 """An arm under guard: it arrives, or it stops and says why; nothing is waited for in vain."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -30,7 +31,7 @@ def way_to(arm, **turns):
     return Router(MODEL, LIMITS, joints).route(joints, turned(joints, **turns))
 
 
-def test_it_drives_there_and_has_settled():
+def test_it_drives_there_and_has_settled() -> None:
     robot, told = StandIn(), list[RobotState]()
     with watched(driver_of(robot), MODEL, LIMITS, told.append) as arm:
         goal = turned(arm.state.joints, j1=0.3)
@@ -43,7 +44,7 @@ def test_it_drives_there_and_has_settled():
     assert all(a.time_ns < b.time_ns for a, b in pairwise(told))
 
 
-def test_it_knows_where_the_arm_was():
+def test_it_knows_where_the_arm_was() -> None:
     with watched(driver_of(StandIn()), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.1))
         end = arm.wait().time_ns
@@ -93,7 +94,7 @@ def protected(robot, state):
         (protected, "the controller reports protective stop: collision of joint 2"),
     ],
 )
-def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
+def test_any_doubt_stops_the_arm_and_is_told(misbehaviour: Any, line: str) -> None:
     robot = StandIn(under_way(misbehaviour))
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.8))
@@ -105,7 +106,7 @@ def test_any_doubt_stops_the_arm_and_is_told(misbehaviour, line):
     assert robot.commands().count("move") == 1  # a safety fault is not outlived
 
 
-def test_an_arm_that_does_not_set_off_is_noticed(monkeypatch):
+def test_an_arm_that_does_not_set_off_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = StandIn()
     monkeypatch.setattr(robot.arm, "step", lambda: None)
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
@@ -122,7 +123,7 @@ class GoesHalfWay(StandIn):
         super().move_joints(here + 0.5 * (joints - here), speed, acceleration)
 
 
-def test_an_arm_that_never_arrives_is_noticed():
+def test_an_arm_that_never_arrives_is_noticed() -> None:
     robot = GoesHalfWay()
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.3))
@@ -134,7 +135,7 @@ def pushed(robot, state):
     return replace(state, joint_speeds=np.full(6, 0.1)) if robot.cycles > 1500 else state
 
 
-def test_an_arm_that_moves_untold_is_noticed():
+def test_an_arm_that_moves_untold_is_noticed() -> None:
     robot = StandIn(pushed)
     with (
         watched(driver_of(robot), MODEL, LIMITS) as arm,
@@ -152,13 +153,13 @@ def test_an_arm_that_moves_untold_is_noticed():
         (lambda r, s: replace(s, joints=np.zeros(7)), "the arm has 7 joints, its model 6"),
     ],
 )  # fmt: skip
-def test_another_arm_than_the_model_is_refused(change, line):
+def test_another_arm_than_the_model_is_refused(change: Callable[..., Any], line: str) -> None:
     with pytest.raises(DeviceError) as error, watched(driver_of(StandIn(change)), MODEL, LIMITS):
         pass
     assert str(error.value) == line
 
 
-def test_a_driver_that_cannot_open_says_so():
+def test_a_driver_that_cannot_open_says_so() -> None:
     with (
         pytest.raises(DeviceError, match=r"^robot.nowhere: nobody answers at 10.0.0.1$"),
         watched(opened_nowhere(), MODEL, LIMITS),
@@ -166,7 +167,7 @@ def test_a_driver_that_cannot_open_says_so():
         pass
 
 
-def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go():
+def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go() -> None:
     def broken(robot, state):
         raise ZeroDivisionError("division by zero")
 
@@ -198,7 +199,7 @@ class Wire:
 
 
 @pytest.mark.parametrize("key", ["alarm", "keyboard"])
-def test_the_operator_stops_it_within_one_cycle(monkeypatch, key):
+def test_the_operator_stops_it_within_one_cycle(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
     reading, writing = os.pipe()
     robot = StandIn()
     joints = robot.arm.stance.joints
@@ -221,7 +222,7 @@ def test_the_operator_stops_it_within_one_cycle(monkeypatch, key):
     assert robot.arm.standing
 
 
-def test_the_person_reads_who_stopped_it():
+def test_the_person_reads_who_stopped_it() -> None:
     robot = StandIn()
     reading, writing = os.pipe()
     driver = driver_of(robot)
@@ -239,7 +240,7 @@ def test_the_person_reads_who_stopped_it():
                 arm.wait()
 
 
-def test_a_program_that_dies_stops_the_arm():
+def test_a_program_that_dies_stops_the_arm() -> None:
     robot = StandIn()
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))

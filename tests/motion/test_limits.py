@@ -1,5 +1,7 @@
 """What a recipe allows an arm, and how it says that something is beyond it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,14 +15,14 @@ def section(**more):
     return LimitsSection.model_validate({"box": BOX, **more})
 
 
-def test_the_defaults_are_slow():
+def test_the_defaults_are_slow() -> None:
     assert LIMITS.speed <= 0.1
     assert LIMITS.joint_speed <= np.radians(30.0)
     assert LIMITS.low == pytest.approx([-1.0, -1.0, -0.3])
     assert LIMITS.high == pytest.approx([1.0, 1.0, 1.1])
 
 
-def test_a_place_outside_the_box_is_named():
+def test_a_place_outside_the_box_is_named() -> None:
     assert LIMITS.outside(np.zeros(3)) is None
     assert LIMITS.outside(np.array([0.0, -1.2, 0.0])) == (
         "outside the box: y is -1200 mm, allowed -1000 to 1000 mm"
@@ -28,7 +30,7 @@ def test_a_place_outside_the_box_is_named():
     assert LIMITS.outside(np.array([0.0, -1.001, 0.0]), slack=0.002) is None
 
 
-def test_the_joint_nearest_to_its_limit_is_named():
+def test_the_joint_nearest_to_its_limit_is_named() -> None:
     ranges = [["-90 deg", "90 deg"]] * 6
     limits = limits_of(section(joints=ranges), MODEL)
     joints = np.radians([0.0, 0.0, 88.0, 0.0, 0.0, 0.0])
@@ -38,7 +40,7 @@ def test_the_joint_nearest_to_its_limit_is_named():
     )
 
 
-def test_the_recipe_narrows_the_arm_and_never_widens_it():
+def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:
     limits = limits_of(section(joints=[["-900 deg", "90 deg"]] * 6), MODEL)
     assert limits.lower == pytest.approx([joint.lower for joint in MODEL.joints])
     assert limits.upper == pytest.approx(np.full(6, np.radians(90.0)))
@@ -53,7 +55,7 @@ def test_the_recipe_narrows_the_arm_and_never_widens_it():
          "robot.limits.joints: no angle is left for joint 6 of a ur5e; the lower limit comes first"),
     ],
 )  # fmt: skip
-def test_limits_for_another_arm_are_refused(joints, line):
+def test_limits_for_another_arm_are_refused(joints: Any, line: str) -> None:
     with pytest.raises(StageError) as error:
         limits_of(section(joints=joints), MODEL)
     assert str(error.value) == line
@@ -73,7 +75,7 @@ LOOPBACK = "ur5e_phoxi-m_loopback"
         ("robot.limits.box.centre=[50 m, 0 m, 0 m]", "is no box for a ur5e, which reaches"),
     ],
 )
-def test_limits_are_held_against_what_the_arm_can_do(override, said):
+def test_limits_are_held_against_what_the_arm_can_do(override: str, said: str) -> None:
     from flangeye.errors import RecipeError
     from flangeye.plugin.registry import load_registry
     from flangeye.recipe.load import find_recipe, load_recipe

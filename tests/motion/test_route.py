@@ -1,6 +1,7 @@
 """Ways between postures: checked from end to end, and as slow as the limits want."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ ROUTER = Router(MODEL, LIMITS, HOME)
 @given(st.lists(st.floats(-0.6, 0.6), min_size=6, max_size=6))
 @example([0.0, 0.25, 0.0, 0.5, 0.5, 0.0])
 @settings(max_examples=20, deadline=None)
-def test_flange_and_joints_stay_below_their_speeds(turns):
+def test_flange_and_joints_stay_below_their_speeds(turns: Any) -> None:
     goal = HOME + np.array(turns)
     way = ROUTER.route(HOME, goal)
     if isinstance(way, Barred) or np.abs(goal - HOME).max() < 1e-3:
@@ -32,21 +33,21 @@ def test_flange_and_joints_stay_below_their_speeds(turns):
     assert fastest / seconds_a_step <= LIMITS.speed * 1.01
 
 
-def test_the_time_is_that_of_a_ramp_up_a_ride_and_a_ramp_down():
+def test_the_time_is_that_of_a_ramp_up_a_ride_and_a_ramp_down() -> None:
     way = ROUTER.route(HOME, turned(HOME, j6=1.0))
     (leg,) = way.legs
     assert leg.speed == pytest.approx(LIMITS.joint_speed)
     assert way.seconds == pytest.approx(1.0 / leg.speed + leg.speed / leg.acceleration)
 
 
-def test_a_way_that_leads_through_the_table_is_barred():
+def test_a_way_that_leads_through_the_table_is_barred() -> None:
     low = np.radians([0.0, 0.0, 30.0, -90.0, -90.0, 0.0])
     way = ROUTER.route(HOME, low)
     assert isinstance(way, Barred)
     assert "table" in way.reason
 
 
-def test_a_way_out_of_the_box_is_barred_and_says_where():
+def test_a_way_out_of_the_box_is_barred_and_says_where() -> None:
     narrow = replace(LIMITS, high=np.array([-0.4, 1.0, 1.1]))
     way = Router(MODEL, narrow, HOME).route(HOME, turned(HOME, j1=np.pi))
     assert isinstance(way, Barred)
@@ -54,7 +55,7 @@ def test_a_way_out_of_the_box_is_barred_and_says_where():
     assert "allowed -1000 to -400 mm" in way.reason
 
 
-def test_where_the_straight_way_is_barred_it_goes_by_home():
+def test_where_the_straight_way_is_barred_it_goes_by_home() -> None:
     arm, start, goal = Arm(MODEL), turned(HOME, j1=-1.2), turned(HOME, j1=1.2)
     furthest = np.abs(arm.flange(HOME)[0, 3])
     behind = replace(LIMITS, low=np.array([-furthest + 0.02, -1.0, -0.3]))

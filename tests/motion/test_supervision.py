@@ -1,6 +1,7 @@
 """When an arm is doubted: to the sample, on either side of each bound."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def halted_at(at):
 
 
 @pytest.mark.parametrize("start", [SECOND, 7 * SECOND])
-def test_an_arm_may_brake_for_its_time_and_no_longer(start):
+def test_an_arm_may_brake_for_its_time_and_no_longer(start: Any) -> None:
     braking = int(supervision.BRAKING * SECOND)
     watch = halted_at(start)
     assert not watch.judge(moving(start + braking))
@@ -33,7 +34,7 @@ def test_an_arm_may_brake_for_its_time_and_no_longer(start):
         watch.judge(moving(start + braking + 1_000_000))
 
 
-def test_the_time_to_brake_begins_anew_with_every_halt():
+def test_the_time_to_brake_begins_anew_with_every_halt() -> None:
     braking = int(supervision.BRAKING * SECOND)
     watch = halted_at(SECOND)
     watch.judge(moving(SECOND + braking, 0.0))
@@ -43,7 +44,7 @@ def test_the_time_to_brake_begins_anew_with_every_halt():
         watch.judge(moving(SECOND + 2 * braking + 1_000_000))
 
 
-def test_an_arm_that_stands_is_never_doubted():
+def test_an_arm_that_stands_is_never_doubted() -> None:
     watch = halted_at(SECOND)
     slow = 10 * supervision.STANDING
     assert not watch.judge(moving(100 * SECOND, slow))
@@ -51,13 +52,13 @@ def test_an_arm_that_stands_is_never_doubted():
         watch.judge(moving(101 * SECOND, slow * 1.01))
 
 
-def test_who_else_moves_it_and_that_it_goes_on_is_said():
+def test_who_else_moves_it_and_that_it_goes_on_is_said() -> None:
     watch = halted_at(SECOND)
     with pytest.raises(SafetyFault, match="another program drives it and goes on; stop it"):
         watch.judge(moving(100 * SECOND))
 
 
-def test_a_joint_may_be_a_little_faster_than_told_and_no_more():
+def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
     watch = Watch(MODEL, LIMITS)
     watch.led()
     fast = supervision.FAST * LIMITS.joint_speed

@@ -2,6 +2,9 @@
 
 import csv
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +15,7 @@ from flangeye.types import ArchivePath
 
 
 @pytest.fixture(scope="session")
-def paper():
+def paper() -> Callable[..., Any]:
     """Run a recipe by name; return the figures of a step and the whole result."""
     registry = load_registry()
 
@@ -26,7 +29,7 @@ def paper():
 
 
 @pytest.fixture
-def batch(tmp_path):
+def batch(tmp_path: Path) -> Callable[..., Any]:
     """Write what flangeye batch leaves: one session for each of (row, step, figures)."""
 
     def write(name, *sessions, errors=None, extra=None):

@@ -1,6 +1,8 @@
 """From the tables of batches to CSV files and pictures, on batches made up here."""
 
 import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ def figures_at(noise, factor):
 
 
 @pytest.fixture
-def fig9_batches(batch):
+def fig9_batches(batch: Callable[..., Any]) -> Any:
     for method, factor in WORSE.items():
         sessions = [
             ({"steps.0.noise": f"{n} mm"}, REALISED, figures_at(n * 1e-3, factor)) for n in (1, 2)
@@ -41,7 +43,7 @@ def fig9_batches(batch):
     return batch("fig9-pools", *pools)
 
 
-def test_fig9_tells_growth_and_ratios(fig9_batches, tmp_path):
+def test_fig9_tells_growth_and_ratios(fig9_batches: Any, tmp_path: Path) -> None:
     fig9.fig9(fig9_batches, tmp_path)
     summary = {row["method"]: row for row in read_csv(tmp_path / "fig9_summary.csv")}
     robust = summary["solve.robust"]
@@ -54,7 +56,7 @@ def test_fig9_tells_growth_and_ratios(fig9_batches, tmp_path):
     assert (tmp_path / "fig9.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_pictures_are_the_same_for_the_same_numbers(fig9_batches, tmp_path):
+def test_pictures_are_the_same_for_the_same_numbers(fig9_batches: Any, tmp_path: Path) -> None:
     pictures = []
     for _ in range(2):
         fig10.fig10(fig9_batches, tmp_path)
@@ -62,7 +64,7 @@ def test_pictures_are_the_same_for_the_same_numbers(fig9_batches, tmp_path):
     assert pictures[0] == pictures[1]
 
 
-def test_fig10_shows_every_method_at_the_work(fig9_batches, tmp_path):
+def test_fig10_shows_every_method_at_the_work(fig9_batches: Any, tmp_path: Path) -> None:
     fig10.fig10(fig9_batches, tmp_path)
     rows = read_csv(tmp_path / "fig10_summary.csv")
     assert [row["poses"] for row in rows] == ["5", "10", "20", "40", "75"]
@@ -75,7 +77,7 @@ def icp_figures(y):
     return found | {"rms": 2e-4, "share": 1.0, "iterations": 5.0}
 
 
-def test_table1_puts_the_printed_numbers_beside_ours(batch, tmp_path):
+def test_table1_puts_the_printed_numbers_beside_ours(batch: Any, tmp_path: Any) -> None:
     stored = dict.fromkeys(AXES, 2e-3) | {f"{axis}_std": 1e-4 for axis in AXES}
     for name in ("ur5", "franka"):
         batch(f"table1_{name}", ({}, table1.STORED, stored))
@@ -114,7 +116,7 @@ def stored_results(folder, robot):
     )  # fmt: skip
 
 
-def test_fig11_compares_runs_with_those_stored(batch, tmp_path):
+def test_fig11_compares_runs_with_those_stored(batch: Callable[..., Any], tmp_path: Path) -> None:
     for robot in fig11.ROBOTS:
         stored_results(tmp_path / "published", robot)
     figures = {f"{axis}_{n:02d}": 1e-4 for axis in AXES for n in (4, 5, 6)}
@@ -131,7 +133,9 @@ def test_fig11_compares_runs_with_those_stored(batch, tmp_path):
     assert float(summary[0]["translation mean mm"]) == pytest.approx(3**0.5 * 0.1, abs=1e-3)
 
 
-def test_heldout_compares_methods_on_the_same_poses(batch, tmp_path):
+def test_heldout_compares_methods_on_the_same_poses(
+    batch: Callable[..., Any], tmp_path: Path
+) -> None:
     for robot in ("aubo", "ur5", "franka"):
         stored_results(tmp_path / "published", robot)
     poses = [
@@ -152,7 +156,9 @@ def test_heldout_compares_methods_on_the_same_poses(batch, tmp_path):
     assert len(rows) == 4 * 4 + 3
 
 
-def test_table2_measures_at_the_camera_and_at_the_work(batch, tmp_path):
+def test_table2_measures_at_the_camera_and_at_the_work(
+    batch: Callable[..., Any], tmp_path: Path
+) -> None:
     found, truth = np.eye(4), np.eye(4)
     truth[0, 3] = 1e-3
     extra = {
@@ -168,7 +174,7 @@ def test_table2_measures_at_the_camera_and_at_the_work(batch, tmp_path):
     assert (first["x mm"], first["workspace rms mm"]) == ("1.00", "2.000")
 
 
-def test_a_batch_that_is_not_there(tmp_path):
+def test_a_batch_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(FlangeyeError) as error:
         read_sessions(tmp_path)
     assert str(error.value) == (
@@ -177,7 +183,7 @@ def test_a_batch_that_is_not_there(tmp_path):
     )
 
 
-def test_a_page_shows_the_columns_it_asks_for(tmp_path):
+def test_a_page_shows_the_columns_it_asks_for(tmp_path: Path) -> None:
     write_csv(tmp_path / "t.csv", [{"a": 1.0, "b": "x", "c": None}])
     page = "before\n<!-- begin t.csv: c | a -->\nold\n<!-- end -->\nafter"
     assert refreshed(page, tmp_path) == (

@@ -24,25 +24,25 @@ def bump():
     return points
 
 
-def test_sound_normals_of_a_plate_stand_on_it():
+def test_sound_normals_of_a_plate_stand_on_it() -> None:
     normals = normals_of(plate(), 1.0, "sound")
     np.testing.assert_allclose(np.abs(normals[:, 2]), 1.0, atol=1e-9)
 
 
-def test_defective_normals_of_a_flat_plate_lie_in_it():
+def test_defective_normals_of_a_flat_plate_lie_in_it() -> None:
     normals = normals_of(plate(), 1.0, "open3d_0_7_normals")
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     lying = np.abs(normals[:, 2]) < 0.1
     assert lying.mean() > 0.3
 
 
-def test_on_a_curved_patch_both_agree():
+def test_on_a_curved_patch_both_agree() -> None:
     sound, old = (normals_of(bump(), 1.0, kind) for kind in ("sound", "open3d_0_7_normals"))
     cosines = np.abs(np.einsum("ni,ni->n", sound, old))
     assert np.median(cosines) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_neighbours_beyond_the_radius_do_not_count():
+def test_neighbours_beyond_the_radius_do_not_count() -> None:
     lonely = np.vstack([plate(), [[0.0, 0.0, 0.5]]])
     normals = normals_of(lonely, 0.01, "open3d_0_7_normals")
     np.testing.assert_array_equal(normals[-1], [0.0, 0.0, 1.0])  # the library's fallback
@@ -55,7 +55,7 @@ def corner():
     return points, np.repeat(np.eye(3)[[2, 1, 0]], len(face), axis=0)
 
 
-def test_icp_finds_the_motion():
+def test_icp_finds_the_motion() -> None:
     target, normals = corner()
     motion = rigid(rotation_exp(np.array([0.01, -0.02, 0.015])), np.array([1e-3, -5e-4, 2e-4]))
     source = (target - motion[:3, 3]) @ motion[:3, :3]
@@ -65,13 +65,13 @@ def test_icp_finds_the_motion():
     assert fit.iterations < 100
 
 
-def test_icp_stops_when_told():
+def test_icp_stops_when_told() -> None:
     target, normals = corner()
     source = target + [2e-3, 1e-3, 0.0]
     assert icp(source, target, normals, 1.0, Stop(2, 0.0)).iterations == 2
     assert icp(source, target, normals, 1.0, Stop(30, 1.0)).iterations == 1
 
 
-def test_icp_fails_when_nothing_is_near():
+def test_icp_fails_when_nothing_is_near() -> None:
     target, normals = corner()
     assert icp(target + 1.0, target, normals, 0.1, CONVERGED) is None

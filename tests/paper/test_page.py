@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,7 +12,7 @@ FOLDER = Path(__file__).parents[2] / "recipes" / "paper"
 README = FOLDER / "README.md"
 
 
-def test_the_tables_are_those_of_the_csv_files():
+def test_the_tables_are_those_of_the_csv_files() -> None:
     page = README.read_text("utf-8")
     assert refreshed(page, FOLDER) == page
     for table in sorted(FOLDER.glob("*_summary.csv")):
@@ -19,11 +20,11 @@ def test_the_tables_are_those_of_the_csv_files():
 
 
 @pytest.mark.parametrize("target", re.findall(r"\]\(([^)#:]+)\)", README.read_text("utf-8")))
-def test_links_lead_somewhere(target):
+def test_links_lead_somewhere(target: Any) -> None:
     assert (FOLDER / target).exists()
 
 
-def test_every_recipe_is_run_by_the_script():
+def test_every_recipe_is_run_by_the_script() -> None:
     script = (FOLDER / "reproduce.sh").read_text("utf-8")
     for study in ("fig9", "fig11", "table1", "table2", "heldout"):
         for recipe in FOLDER.glob(f"{study}_*.yaml"):
@@ -31,6 +32,6 @@ def test_every_recipe_is_run_by_the_script():
             assert recipe.name in script or (f"{study}_$" in script and rest in script)
 
 
-def test_it_is_small_enough_to_keep():
+def test_it_is_small_enough_to_keep() -> None:
     kept = [path for ending in ("csv", "png", "md") for path in FOLDER.glob(f"*.{ending}")]
     assert sum(path.stat().st_size for path in kept) < 1_000_000

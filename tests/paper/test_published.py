@@ -1,5 +1,9 @@
 """Table 1, figure 11 and the Kinect's row on the authors' recordings."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -25,7 +29,9 @@ def printed(figures):
     return np.array(shift + [np.degrees(figures[axis]) for axis in ("roll", "pitch", "yaw")])
 
 
-def test_the_aubo_row_is_reproduced_by_the_defect_of_2019(paper, ancorasir):
+def test_the_aubo_row_is_reproduced_by_the_defect_of_2019(
+    paper: Callable[..., Any], ancorasir: Path
+) -> None:
     figures, result = paper("table1_aubo", ICP, archive=ancorasir)
     off = np.abs(printed(figures) - [-0.259, 0.269, -0.351, 0.135, 0.045, 0.007])
     # The defect normalises rounding errors, so the last digits are those of the machine and its
@@ -36,7 +42,9 @@ def test_the_aubo_row_is_reproduced_by_the_defect_of_2019(paper, ancorasir):
     assert len(result.observations) == 54
 
 
-def test_sound_normals_and_a_converged_icp_tell_another_story(paper, ancorasir):
+def test_sound_normals_and_a_converged_icp_tell_another_story(
+    paper: Callable[..., Any], ancorasir: Path
+) -> None:
     overrides = ["steps.2.normals=sound", "steps.2.iterations=60", "steps.2.change=1e-9"]
     figures, _ = paper("table1_aubo", ICP, *overrides, archive=ancorasir)
     np.testing.assert_allclose(
@@ -51,12 +59,16 @@ def test_sound_normals_and_a_converged_icp_tell_another_story(paper, ancorasir):
         ("franka", [4.34, -4.06, -0.13, -0.30, -0.34, -0.07], [0.1] * 3 + [0.03] * 3),
     ],
 )
-def test_stored_results_imply_the_printed_rows(paper, ancorasir, name, row, atol):
+def test_stored_results_imply_the_printed_rows(
+    paper: Callable[..., Any], ancorasir: Path, name: str, row: list[Any], atol: Any
+) -> None:
     figures, _ = paper(f"table1_{name}", STORED, archive=ancorasir)
     assert (np.abs(printed(figures) - row) <= atol).all()
 
 
-def test_the_published_matrix_is_that_of_the_recipe(paper, ancorasir):
+def test_the_published_matrix_is_that_of_the_recipe(
+    paper: Callable[..., Any], ancorasir: Path
+) -> None:
     for name, folder in (("aubo", "aubo"), ("ur5", "ur5"), ("franka", "franka")):
         _, result = paper(f"table1_{name}", STORED, archive=ancorasir)
         found = np.array(result.transforms["base_T_camera"].matrix)
@@ -65,13 +77,15 @@ def test_the_published_matrix_is_that_of_the_recipe(paper, ancorasir):
         np.testing.assert_allclose(found, theirs, atol=3e-7)
 
 
-def test_the_kinect_s_icp_does_not_even_begin_at_a_millimetre(paper, ancorasir):
+def test_the_kinect_s_icp_does_not_even_begin_at_a_millimetre(
+    paper: Callable[..., Any], ancorasir: Path
+) -> None:
     figures, result = paper("table1_kinect", ICP, archive=ancorasir)
     assert figures == {}
     assert result.refused == "ICP failed: too few points match, the error is infinite"
 
 
-def test_a_shuffle_is_the_seed_s(ancorasir):
+def test_a_shuffle_is_the_seed_s(ancorasir: Path) -> None:
     params = PublishedParams(reader=reader.bind(AncorasirParams(robot="aubo")), shuffle=True)
     path = ArchivePath(ancorasir)
     orders = [
@@ -81,7 +95,7 @@ def test_a_shuffle_is_the_seed_s(ancorasir):
     assert sorted(orders[0]) == sorted(orders[2])
 
 
-def test_algorithm_1_by_iteration_improves_as_it_goes():
+def test_algorithm_1_by_iteration_improves_as_it_goes() -> None:
     calibration = solve_svd(acquire_points(0, PointsParams(poses=30)), SvdParams())
     params = ByIterationParams(
         error=error_oracle.bind(), cost=cost_translation.bind(TranslationParams(at="camera"))
@@ -94,13 +108,13 @@ def test_algorithm_1_by_iteration_improves_as_it_goes():
 
 
 @pytest.mark.slow
-def test_figure_11_ends_where_the_authors_did(paper, ancorasir):
+def test_figure_11_ends_where_the_authors_did(paper: Callable[..., Any], ancorasir: Path) -> None:
     figures, _ = paper("fig11_aubo", "verify.algorithm_1_by_iteration", archive=ancorasir)
     assert np.linalg.norm(printed(figures)[:3]) < 0.4
     assert 0.5e-3 < figures["others_rms"] < 1.3e-3
 
 
-def test_where_no_verification_cloud_was_published_it_says_so(ancorasir):
+def test_where_no_verification_cloud_was_published_it_says_so(ancorasir: Path) -> None:
     views = Views()
     params = PublishedParams(reader=reader.bind(AncorasirParams(robot="ur5")))
     acquire_published_centres(ArchivePath(ancorasir), views, 0, params)
@@ -112,7 +126,7 @@ def test_where_no_verification_cloud_was_published_it_says_so(ancorasir):
     )
 
 
-def test_stored_results_that_are_not_there(tmp_path):
+def test_stored_results_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         verify_stored_results(None, ArchivePath(tmp_path), StoredParams(robot="ur5"))
     assert str(error.value) == (

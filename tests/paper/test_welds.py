@@ -2,6 +2,8 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,26 +43,26 @@ def weld(torch_off=0.0, robot_off=0.0, phases=("following",), mode="tactile"):
     )  # fmt: skip
 
 
-def test_the_deviation_is_that_of_the_torch_on_the_part_asked_for():
+def test_the_deviation_is_that_of_the_torch_on_the_part_asked_for() -> None:
     found = SeenWeld(weld(np.where(TIP - 0.04 > 0.1, 2e-3, 1e-3)), TRUTH)
     np.testing.assert_allclose(found.deviation((0.0, 0.09)), 1e-3)
     np.testing.assert_allclose(found.deviation((0.11, 0.2)), 2e-3)
     assert found.deviation().max() == pytest.approx(2e-3)
 
 
-def test_recovery_is_the_tip_s_way_until_the_torch_is_near_for_good():
+def test_recovery_is_the_tip_s_way_until_the_torch_is_near_for_good() -> None:
     off = np.where((TIP < 0.02) | ((TIP > 0.05) & (TIP < 0.06)), -1e-3, 0.3e-3)
     assert SeenWeld(weld(off), TRUTH).recovery == pytest.approx(0.06, abs=2e-4)
     assert SeenWeld(weld(), TRUTH).recovery == 0.0
 
 
-def test_contact_is_regained_only_after_it_was_lost():
+def test_contact_is_regained_only_after_it_was_lost() -> None:
     assert SeenWeld(weld(phases=("following", "bridging", "following")), TRUTH).regained
     assert not SeenWeld(weld(phases=("following", "bridging")), TRUTH).regained
     assert not SeenWeld(weld(phases=("following", "ending")), TRUTH).regained
 
 
-def test_a_step_counts_at_the_end_and_a_ramp_by_what_it_does_in_a_tenth_of_a_second():
+def test_a_step_counts_at_the_end_and_a_ramp_by_what_it_does_in_a_tenth_of_a_second() -> None:
     early = np.where(TIP > 0.1, 1e-3, 0.0)
     assert SeenWeld(weld(robot_off=early), TRUTH).end_step == pytest.approx(0.0, abs=1e-12)
     late = np.where(TIP > 0.21, 1e-3, 0.0)
@@ -98,7 +100,7 @@ def batch(folder, *reports):
 
 
 @pytest.fixture
-def batches(tmp_path):
+def batches(tmp_path: Path) -> Any:
     bridged = weld(0.1e-3, phases=("following", "bridging", "following"))
     stopped = replace(weld(10e-3, mode="as_printed"), completed=False, reason="astray")
     for name in fig13.WORKPIECES:
@@ -109,7 +111,7 @@ def batches(tmp_path):
     return tmp_path
 
 
-def test_the_table_says_what_the_welds_did(batches, tmp_path):
+def test_the_table_says_what_the_welds_did(batches: Any, tmp_path: Path) -> None:
     fig13.fig13(batches, tmp_path)
     rows = {row["followed"]: row for row in read_csv(tmp_path / "fig13.csv")[:5]}
     touch = rows["by touch"]
@@ -126,7 +128,7 @@ def test_the_table_says_what_the_welds_did(batches, tmp_path):
     assert (tmp_path / "fig13.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_session_that_did_not_weld(tmp_path):
+def test_a_session_that_did_not_weld(tmp_path: Path) -> None:
     log(tmp_path / "s0", scan())
     with pytest.raises(FlangeyeError, match="did not weld"):
         seen(SessionRow({}, tmp_path / "s0"))
@@ -138,7 +140,7 @@ def test_a_session_that_did_not_weld(tmp_path):
 
 
 @pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
-def test_the_planning_error_is_as_large_as_asked_and_differs_by_seed(workpiece):
+def test_the_planning_error_is_as_large_as_asked_and_differs_by_seed(workpiece: str) -> None:
     params = MisplannedParams(workpiece=workpiece)
     truth = scan_as_laid.function(LaidParams(workpiece=workpiece)).truth["groove"]
     seams = [seam_misplanned.function(None, seed, params) for seed in range(6)]

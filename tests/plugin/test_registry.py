@@ -9,7 +9,12 @@ import pytest
 
 from flangeye import hookimpl, stage
 from flangeye import types as t
-from flangeye.plugin.registry import DuplicatePluginError, PluginNotFoundError, load_registry
+from flangeye.plugin.registry import (
+    DuplicatePluginError,
+    PluginNotFoundError,
+    Registry,
+    load_registry,
+)
 from flangeye.plugin.stage import PARTS, part
 from tests import toy
 
@@ -20,7 +25,7 @@ def module_offering(*stages):
     return module
 
 
-def test_two_plugins_with_one_name_are_an_error(toy_registry):
+def test_two_plugins_with_one_name_are_an_error(toy_registry: Registry) -> None:
     with pytest.raises(DuplicatePluginError) as error:
         toy_registry.register("acme", module_offering(toy.solve))
     assert str(error.value) == (
@@ -28,7 +33,7 @@ def test_two_plugins_with_one_name_are_an_error(toy_registry):
     )
 
 
-def test_a_broken_plugin_is_named_only_when_something_is_missing(toy_registry):
+def test_a_broken_plugin_is_named_only_when_something_is_missing(toy_registry: Registry) -> None:
     toy_registry.broken["acme"] = ModuleNotFoundError("No module named 'acme_sdk'")
     assert toy_registry.stage("solve.toy") is toy.solve
     with pytest.raises(PluginNotFoundError) as error:
@@ -39,20 +44,22 @@ def test_a_broken_plugin_is_named_only_when_something_is_missing(toy_registry):
     )
 
 
-def test_a_misspelt_hook_is_a_broken_plugin(monkeypatch, toy_registry):
+def test_a_misspelt_hook_is_a_broken_plugin(
+    monkeypatch: pytest.MonkeyPatch, toy_registry: Registry
+) -> None:
     module = python_types.ModuleType("vendor")
     vars(module)["flangeye_stagez"] = hookimpl(lambda: ())
     with pytest.raises(Exception, match="unknown hook 'flangeye_stagez'"):
         toy_registry.register("acme", module)
 
 
-def test_the_built_ins_come_through_the_same_door():
+def test_the_built_ins_come_through_the_same_door() -> None:
     registry = load_registry()
     assert registry.broken == {}
     assert set(registry.owners.values()) >= {"builtin"}
 
 
-def test_a_signature_is_checked_when_it_is_declared():
+def test_a_signature_is_checked_when_it_is_declared() -> None:
     def no_docstring(capture: t.Capture) -> t.FlangeCloud:
         raise NotImplementedError
 
@@ -94,7 +101,7 @@ def test_a_signature_is_checked_when_it_is_declared():
          "part 'reader.x': a 'reader' part is called with path, and has no arguments"),
     ],
 )  # fmt: skip
-def test_a_part_keeps_the_contract_of_its_kind(name, declare, message):
+def test_a_part_keeps_the_contract_of_its_kind(name: str, declare: str, message: str) -> None:
     given = {"PoseError": t.PoseError}
     exec(declare, given)
     with pytest.raises(TypeError) as caught:
@@ -102,7 +109,7 @@ def test_a_part_keeps_the_contract_of_its_kind(name, declare, message):
     assert str(caught.value) == message
 
 
-def test_every_kind_of_part_has_a_protocol_in_the_engine():
+def test_every_kind_of_part_has_a_protocol_in_the_engine() -> None:
     for kind, declared in PARTS.items():
         module, _, protocol = declared.contract.partition(":")
         contract = getattr(importlib.import_module(module), protocol)
@@ -110,7 +117,7 @@ def test_every_kind_of_part_has_a_protocol_in_the_engine():
         assert contract.__call__.__doc__
 
 
-def test_a_stage_says_which_configurations_it_serves():
+def test_a_stage_says_which_configurations_it_serves() -> None:
     with pytest.raises(TypeError) as caught:
         stage("solve.x", serves=["eye-on-wall"])
     assert str(caught.value) == (
@@ -119,7 +126,7 @@ def test_a_stage_says_which_configurations_it_serves():
     )
 
 
-def test_a_former_name_still_works_and_is_said():
+def test_a_former_name_still_works_and_is_said() -> None:
     registry = load_registry()
     assert registry.part("robot.loopback") is registry.part("robot.emulator")
     assert registry.notes() == [
@@ -134,7 +141,9 @@ def offering(**places):
     return module
 
 
-def test_a_stage_named_by_its_place_is_imported_when_it_is_asked_for(toy_registry):
+def test_a_stage_named_by_its_place_is_imported_when_it_is_asked_for(
+    toy_registry: Registry,
+) -> None:
     toy_registry.register("acme", offering(away="acme_away:solve", toy2="tests.toy:solve"))
     assert "solve.away" in toy_registry.stages
     with pytest.raises(
@@ -147,7 +156,7 @@ def test_a_stage_named_by_its_place_is_imported_when_it_is_asked_for(toy_registr
     assert isinstance(toy_registry.broken["acme"], PluginNotFoundError)
 
 
-def test_every_name_of_ours_is_where_it_is_said_to_be():
+def test_every_name_of_ours_is_where_it_is_said_to_be() -> None:
     registry = load_registry()
     offered = registry.everything()
     assert registry.broken == {}
@@ -157,7 +166,7 @@ def test_every_name_of_ours_is_where_it_is_said_to_be():
     assert former == registry.renamed
 
 
-def test_finding_plugins_imports_none_of_their_modules():
+def test_finding_plugins_imports_none_of_their_modules() -> None:
     code = (
         "import sys; from flangeye.plugin.registry import load_registry; load_registry(); "
         "print([m for m in sys.modules if m.startswith('flangeye_plugins.')])"
@@ -166,7 +175,7 @@ def test_finding_plugins_imports_none_of_their_modules():
     assert done.stdout.strip() == "[]"
 
 
-def test_help_waits_for_no_arrays():
+def test_help_waits_for_no_arrays() -> None:
     code = "import sys; import flangeye.cli; print({'numpy', 'pydantic'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

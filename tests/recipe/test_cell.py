@@ -1,5 +1,7 @@
 """The ``cell`` section: what stands on what, and every mistake in it, word for word."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ def mistakes(text):
     return str(error.value).splitlines()
 
 
-def test_a_cell_says_what_is_to_be_found():
+def test_a_cell_says_what_is_to_be_found() -> None:
     cell = parsed(TWO + STEPS).context[Cell]
     assert cell.unknowns == ("base_T_left", "base_T_right", "arm_T_marker")
     assert cell.describe() == (
@@ -33,7 +35,7 @@ def test_a_cell_says_what_is_to_be_found():
     assert isinstance(cell.movers["arm"], RobotModel)
 
 
-def test_rails_and_positioners_move_along_and_about_their_axis():
+def test_rails_and_positioners_move_along_and_about_their_axis() -> None:
     text = (
         "cell: {rails: {rail: {axis: [0, 2, 0]}}, positioners: {table: {axis: [0, 0, 1], "
         "place: unknown}}, arms: {arm: {model: ur5, on: rail}}, cameras: {hand: arm}, "
@@ -81,12 +83,12 @@ def test_rails_and_positioners_move_along_and_about_their_axis():
         ),
     ],
 )  # fmt: skip
-def test_a_mistake_in_a_cell_is_named_with_its_line(text, expected):
+def test_a_mistake_in_a_cell_is_named_with_its_line(text: Any, expected: str) -> None:
     found = mistakes(text + STEPS)
     assert found == [expected]
 
 
-def test_steps_for_one_camera_are_refused_in_a_cell():
+def test_steps_for_one_camera_are_refused_in_a_cell() -> None:
     found = mistakes(
         TWO + "steps: [acquire.simulated_marker, solve.robust, verify.holdout, export.matrix]\n"
     )
@@ -99,6 +101,6 @@ def test_steps_for_one_camera_are_refused_in_a_cell():
     ]
 
 
-def test_a_cells_steps_are_refused_without_one():
+def test_a_cells_steps_are_refused_without_one() -> None:
     found = mistakes("robot: ur5\n" + STEPS)
     assert "needs a cell: write cell: {arms: {arm: ur5}" in found[0]

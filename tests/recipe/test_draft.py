@@ -1,6 +1,7 @@
 """``flangeye init``: from folders as newcomers have them to a recipe that passes check, or a line."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ POSES = [(np.array([0.4, -0.1, 0.3]) + 0.05 * k * np.array([1, -1, (-1) ** k]),
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rec").mkdir()
     return tmp_path / "rec"
@@ -91,7 +92,9 @@ def matrix(k, place, turn):
         ("", matrix, "\t", []),
     ],
 )  # fmt: skip
-def test_a_table_is_read_as_its_heading_says(folder, heading, row, separator, words):
+def test_a_table_is_read_as_its_heading_says(
+    folder: Path, heading: str, row: Any, separator: str, words: list[Any]
+) -> None:
     clouds(folder)
     table(folder, heading, row, separator=separator)
     told = init(*words)
@@ -103,7 +106,7 @@ def test_a_table_is_read_as_its_heading_says(folder, heading, row, separator, wo
     assert "recipe.yaml: ok, 5 steps; next: flangeye run recipe.yaml" in told
 
 
-def test_defaults_are_told_and_answers_are_not(folder):
+def test_defaults_are_told_and_answers_are_not(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     told = init("--robot", "ur5", "--scanner", "phoxi-m")
     assert "assumed: what carries the camera (base or flange): base (--camera says" in told
@@ -111,7 +114,7 @@ def test_defaults_are_told_and_answers_are_not(folder):
     assert recipe(folder).header.robot.model == "ur5"
 
 
-def test_it_asks_what_it_cannot_see(folder):
+def test_it_asks_what_it_cannot_see(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     init(typed="ur5\nflange\nphoxi-m\nbase\n")
     assert recipe(folder).header.scanner.model == "phoxi-m"
@@ -128,7 +131,9 @@ def test_it_asks_what_it_cannot_see(folder):
          lambda k, p, t: [*p, *t.as_quat(), *p], ["--camera", "flange"], "acquire.centres"),
     ],
 )  # fmt: skip
-def test_what_the_camera_measured_may_stand_in_the_table(folder, heading, row, words, stage):
+def test_what_the_camera_measured_may_stand_in_the_table(
+    folder: Path, heading: str, row: Callable[..., Any], words: list[Any], stage: str
+) -> None:
     table(folder, heading, row)
     init(*words)
     checked = recipe(folder)
@@ -137,7 +142,7 @@ def test_what_the_camera_measured_may_stand_in_the_table(folder, heading, row, w
     assert len(read_poses(folder)) == 5
 
 
-def test_two_streams_are_joined_by_time(folder):
+def test_two_streams_are_joined_by_time(folder: Path) -> None:
     arm = "".join(f"{0.1 * k},{0.1 * (k // 10)},0,0.5,0,0,0,1\n" for k in range(60))
     seen = "".join(f"{0.5 + k},{0.1 * k},0,0.4,0,0,0,1\n" for k in range(6))
     (folder / "arm.csv").write_text("time,x,y,z,qx,qy,qz,qw\n" + arm)
@@ -147,7 +152,7 @@ def test_two_streams_are_joined_by_time(folder):
     assert recipe(folder).steps[0].params.reader.params.target.time == "t"
 
 
-def test_images_need_to_know_the_target(folder):
+def test_images_need_to_know_the_target(folder: Path) -> None:
     table(folder, "x,y,z,qx,qy,qz,qw", quaternion)
     for k in range(5):
         cv2.imwrite(str(folder / f"{k}.png"), np.zeros((8, 8), np.uint8))
@@ -157,7 +162,7 @@ def test_images_need_to_know_the_target(folder):
     assert names == ["acquire.images", "fit.charuco", "solve.robust", "verify.holdout"]
 
 
-def test_zivids_folder_is_known(folder):
+def test_zivids_folder_is_known(folder: Path) -> None:
     clouds(folder)
     for k in range(5):
         (folder / f"scan_{k}.xyz").rename(folder / f"img{k}.xyz")
@@ -167,7 +172,7 @@ def test_zivids_folder_is_known(folder):
     assert np.abs(read_poses(folder)[:, :3, 3]).max() < 1
 
 
-def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder):
+def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     init("--out", "of_sample.yaml")
     of_sample = load_recipe(folder.parent / "of_sample.yaml", load_registry()).steps[0].params
@@ -243,7 +248,9 @@ def arrays(folder):
         (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "no robot 'ur55'"),
     ],
 )  # fmt: skip
-def test_what_is_missing_is_one_line_with_what_to_add(folder, made, words, line):
+def test_what_is_missing_is_one_line_with_what_to_add(
+    folder: Path, made: Any, words: list[Any], line: str
+) -> None:
     made(folder)
     done = CliRunner().invoke(app, ["init", "rec", "--yes", *words])
     assert str(done.exception).startswith(line)
@@ -251,14 +258,14 @@ def test_what_is_missing_is_one_line_with_what_to_add(folder, made, words, line)
     assert not (folder.parent / "recipe.yaml").exists()
 
 
-def test_a_recipe_is_not_written_over(folder):
+def test_a_recipe_is_not_written_over(folder: Path) -> None:
     sample(folder)
     init("--robot", "ur5")
     done = CliRunner().invoke(app, ["init", "rec", "--yes"])
     assert str(done.exception) == "recipe.yaml: is there already; take another name with --out"
 
 
-def test_a_question_without_an_answer_names_the_option(folder):
+def test_a_question_without_an_answer_names_the_option(folder: Path) -> None:
     sample(folder)
     done = CliRunner().invoke(app, ["init", "rec"], input="")
     assert str(done.exception) == (

@@ -1,6 +1,8 @@
 """Every mistake a recipe can hold, word for word."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -9,7 +11,7 @@ from flangeye.errors import RecipeError
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.targets import Flange
-from flangeye.plugin.registry import load_registry
+from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.load import find_recipe, load_recipe, parse_recipe
 from flangeye.recipe.schema import header_line, recipe_schema
 from tests.conftest import TOY_RECIPE
@@ -28,7 +30,7 @@ def mistakes(text, registry, overrides=(), tmp_path=None):
     return str(error.value).splitlines()
 
 
-def test_a_good_recipe_resolves_to_itself(toy_registry):
+def test_a_good_recipe_resolves_to_itself(toy_registry: Registry) -> None:
     recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)
     assert [step.label for step in recipe.steps] == [
         "0.acquire.toy", "1.segment.toy", "2.fit.toy", "3.solve.toy", "4.verify.toy",
@@ -146,7 +148,9 @@ def test_a_good_recipe_resolves_to_itself(toy_registry):
         ),
     ],
 )  # fmt: skip
-def test_each_mistake_names_place_and_cure(text, expected, toy_registry):
+def test_each_mistake_names_place_and_cure(
+    text: Any, expected: list[Any], toy_registry: Registry
+) -> None:
     assert mistakes(text, toy_registry) == expected
 
 
@@ -171,12 +175,14 @@ def test_each_mistake_names_place_and_cure(text, expected, toy_registry):
          "values"),
     ],
 )  # fmt: skip
-def test_an_override_is_validated_like_the_file(override, expected, toy_registry, tmp_path):
+def test_an_override_is_validated_like_the_file(
+    override: str, expected: str, toy_registry: Registry, tmp_path: Path
+) -> None:
     assert mistakes(STEPS, toy_registry, [override], tmp_path) == [expected]
 
 
 @pytest.mark.parametrize("path", ["steps.2.inlier", "steps.2.fit.toy.inlier", "fit.toy.inlier"])
-def test_an_override_changes_one_value(path, toy_registry, tmp_path):
+def test_an_override_changes_one_value(path: str, toy_registry: Registry, tmp_path: Path) -> None:
     file = tmp_path / "r.yaml"
     file.write_text(STEPS)
     recipe = load_recipe(file, toy_registry, [f"{path}=0.2 mm", "seed=7"])
@@ -184,7 +190,7 @@ def test_an_override_changes_one_value(path, toy_registry, tmp_path):
     assert recipe.header.seed == 7
 
 
-def test_a_recipe_is_found_by_name_or_path(tmp_path):
+def test_a_recipe_is_found_by_name_or_path(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"^no recipe 'zzz'; 'flangeye recipes' lists them$"):
         find_recipe("zzz")
     with pytest.raises(RecipeError, match=r"none.yaml: no such recipe file; .* holds no recipe"):
@@ -198,7 +204,7 @@ def test_a_recipe_is_found_by_name_or_path(tmp_path):
         find_recipe("ur5_phoxi-m_sampel.yaml")
 
 
-def test_the_schema_knows_every_stage_and_unit(toy_registry):
+def test_the_schema_knows_every_stage_and_unit(toy_registry: Registry) -> None:
     schema = recipe_schema(toy_registry)
     text = json.dumps(schema)
     for name in toy_registry.stages:
@@ -209,7 +215,7 @@ def test_the_schema_knows_every_stage_and_unit(toy_registry):
     assert '"scaled"' in text  # parts are offered where they are chosen
 
 
-def test_a_step_is_exchanged_for_another_stage(toy_registry, tmp_path):
+def test_a_step_is_exchanged_for_another_stage(toy_registry: Registry, tmp_path: Path) -> None:
     file = tmp_path / "r.yaml"
     file.write_text(STEPS.replace("- fit.toy", "- fit.toy: {inlier: 0.5 mm}"))
     plain = load_recipe(file, toy_registry, ["steps.2=fit.toy", "steps.3={solve.toy: {}}"])
@@ -233,7 +239,7 @@ steps:
 """
 
 
-def test_every_mistake_at_once_and_nothing_that_follows_from_one(toy_registry):
+def test_every_mistake_at_once_and_nothing_that_follows_from_one(toy_registry: Registry) -> None:
     told = mistakes(HEADER, toy_registry)
     assert [line.split(": ")[1] for line in told] == [
         "robot.limits.box.centre.0", "robot.limits.box.size", "robot.limits.box.sise",
@@ -258,7 +264,9 @@ def test_every_mistake_at_once_and_nothing_that_follows_from_one(toy_registry):
                 "flange: ISO 9409-1-50-4-M6"]),
     ],
 )  # fmt: skip
-def test_an_arm_is_a_word_a_model_or_its_plate_alone(robot, expected, toy_registry):
+def test_an_arm_is_a_word_a_model_or_its_plate_alone(
+    robot: str, expected: list[Any], toy_registry: Registry
+) -> None:
     text = f"robot: {robot}\n" + STEPS
     if expected:
         assert mistakes(text, toy_registry) == expected
@@ -273,7 +281,9 @@ def test_an_arm_is_a_word_a_model_or_its_plate_alone(robot, expected, toy_regist
     [("phoxi-m", (0.458, 1.118), True), ("{name: ACME, range: [300 mm, 1 m]}", (0.3, 1.0), False),
      ("{name: ACME}", (0.1, 10.0), False)],
 )  # fmt: skip
-def test_a_scanner_is_a_word_or_a_name_and_a_range(scanner, range_, whole, toy_registry):
+def test_a_scanner_is_a_word_or_a_name_and_a_range(
+    scanner: str, range_: tuple[Any, ...], whole: bool, toy_registry: Registry
+) -> None:
     context = parse_recipe(f"scanner: {scanner}\n" + STEPS, "r.yaml", toy_registry).context
     assert context[ScannerData].range == range_
     assert (ScannerModel in context) == whole
@@ -289,7 +299,7 @@ steps:
 """
 
 
-def test_what_is_demanded_is_what_is_used():
+def test_what_is_demanded_is_what_is_used() -> None:
     """An archive's poses need no kinematics; its flange needs a plate, a marker needs none."""
     registry = load_registry()
     assert mistakes(ARCHIVE, registry) == [
@@ -307,7 +317,7 @@ def test_what_is_demanded_is_what_is_used():
     parse_recipe(seen + marker + board + "  - solve.maximum_likelihood\n", "r.yaml", registry)
 
 
-def test_live_and_simulated_runs_say_what_kinematics_are_for():
+def test_live_and_simulated_runs_say_what_kinematics_are_for() -> None:
     registry = load_registry()
     live = "robot: {flange: ISO 9409-1-50-4-M6}\nscanner: {name: ACME}\n" + ARCHIVE.replace(
         "acquire.archive", "acquire.simulated"
@@ -369,6 +379,8 @@ SOUND = "{centre: [450 mm, 0 mm, 500 mm], size: [1 m, 1 m, 900 mm]}"
         ),
     ],
 )
-def test_limits_are_held_against_the_arms_own_data(model, limits, expected):
+def test_limits_are_held_against_the_arms_own_data(
+    model: str, limits: str, expected: list[Any]
+) -> None:
     told = mistakes(DRIVEN.format(model=model, limits=limits), load_registry())
     assert [line.partition(": ")[2] for line in told if "robot.limits" in line] == expected

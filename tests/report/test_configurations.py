@@ -1,6 +1,7 @@
 """The page of configurations other than the default: drawn in frames that fit them."""
 
 import base64
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def columns(trace):
     return np.array([np.frombuffer(column, "<f4") for column in raw]).T / 1e3
 
 
-def test_the_workspace_of_an_eye_in_the_hand_is_drawn_in_the_flanges_frame(tmp_path):
+def test_the_workspace_of_an_eye_in_the_hand_is_drawn_in_the_flanges_frame(tmp_path: Path) -> None:
     drawing = workspace_drawing(logged(tmp_path / "r.mcap"))
     assert drawing.frame == "the frame flange"
     (used,) = [x for x in drawing.figure["data"] if x.get("name") == "target, used"]
@@ -67,7 +68,7 @@ def test_the_workspace_of_an_eye_in_the_hand_is_drawn_in_the_flanges_frame(tmp_p
     assert (np.linalg.norm(columns(used), axis=1) > 0.1).all()
 
 
-def test_what_stands_still_lies_in_one_place_when_the_camera_moves(tmp_path):
+def test_what_stands_still_lies_in_one_place_when_the_camera_moves(tmp_path: Path) -> None:
     drawing = cell_drawing(logged(tmp_path / "r.mcap"))
     assert drawing.frame == "the robot's base"
     seen = {x["name"]: columns(x) for x in drawing.figure["data"] if "name" in x}
@@ -76,12 +77,12 @@ def test_what_stands_still_lies_in_one_place_when_the_camera_moves(tmp_path):
     assert np.ptp(seen["the camera at every capture"], axis=0).min() > 0.05
 
 
-def test_a_camera_on_a_link_is_drawn_in_the_links_frame(tmp_path):
+def test_a_camera_on_a_link_is_drawn_in_the_links_frame(tmp_path: Path) -> None:
     drawing = cell_drawing(logged(tmp_path / "r.mcap", carrier="link3"))
     assert drawing.frame == "the frame link3"
 
 
-def test_the_image_shows_the_corners_and_what_the_pose_misses(tmp_path):
+def test_the_image_shows_the_corners_and_what_the_pose_misses(tmp_path: Path) -> None:
     view = image_view(logged(tmp_path / "r.mcap"))
     assert view.id == "1"  # the first that was used
     assert view.corners[0] == (100, 80)
@@ -95,13 +96,13 @@ def test_the_image_shows_the_corners_and_what_the_pose_misses(tmp_path):
 
 
 @pytest.mark.parametrize("solved", [True, False])
-def test_the_page_is_made(tmp_path, solved):
+def test_the_page_is_made(tmp_path: Path, solved: bool) -> None:
     text = page.render(logged(tmp_path / "r.mcap", solved=solved).log)
     assert text.count("<circle cx=") == 4
     assert "The target in the image" in text
 
 
-def test_an_image_without_its_target_is_shown_with_the_reason(tmp_path):
+def test_an_image_without_its_target_is_shown_with_the_reason(tmp_path: Path) -> None:
     facts = logged(tmp_path / "r.mcap", hidden=(2, 5))
     view = missed_view(facts)
     assert (view.id, view.box) == ("2", (-0.5, -0.5, 320.0, 240.0))

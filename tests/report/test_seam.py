@@ -1,8 +1,9 @@
 """The planned seam in the report and in the terminal."""
 
 import io
+from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ TUBE = 1e-4 * np.sqrt(5.9915)
 
 
 @pytest.fixture
-def log(tmp_path):
+def log(tmp_path: Path) -> Any:
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, full_clouds=False)
     recorder.flangeye_run_started(source=t.Source("hash"), total=0)
     for step, value in (("5.scan.file", SCAN), ("6.seam.cad", SEAM)):
@@ -44,7 +45,7 @@ def log(tmp_path):
     return read_run(tmp_path / "run.mcap")
 
 
-def test_the_report_shows_cloud_seam_tube_and_truth(log):
+def test_the_report_shows_cloud_seam_tube_and_truth(log: Any) -> None:
     view = seam_view(Facts(log, cast(r.Result, SimpleNamespace(seam=None)), ""))
     assert [trace["name"] for trace in view.space["data"]] == [
         "scan", "tube, 95 % × 25", "planned seam", "towards the torch", "start", "true seam",
@@ -54,13 +55,13 @@ def test_the_report_shows_cloud_seam_tube_and_truth(log):
     assert ("Half angle of the groove", "40.0°") in view.facts
 
 
-def test_the_page_has_the_section_even_of_a_run_that_did_not_end(log):
+def test_the_page_has_the_section_even_of_a_run_that_did_not_end(log: Any) -> None:
     page = render(log)
     assert '<h2 id="seam">The planned seam</h2>' in page
     assert '<a href="#seam">Seam</a>' in page
 
 
-def test_the_result_has_the_tube_and_the_true_error():
+def test_the_result_has_the_tube_and_the_true_error() -> None:
     told = seam_result(SEAM, SCAN)
     assert told.tube == pytest.approx([TUBE] * 41, rel=1e-4)
     assert told.truth.rms == pytest.approx(1e-4)
@@ -69,7 +70,7 @@ def test_the_result_has_the_tube_and_the_true_error():
     assert seam_result(SEAM, None).truth is None
 
 
-def test_the_terminal_tells_the_seam():
+def test_the_terminal_tells_the_seam() -> None:
     result = r.Result(
         title="T", status="verified", transforms={}, observations=[], verifications={},
         seam=seam_result(SEAM, SCAN), timing={},

@@ -1,9 +1,11 @@
 """The weld in the report: what is drawn is what was done."""
 
 import base64
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -46,7 +48,7 @@ def facts(log):
 
 
 @pytest.fixture
-def logged(tmp_path):
+def logged(tmp_path: Path) -> Callable[..., Any]:
     def write(weld, scan=SCAN):
         recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
         recorder.flangeye_run_started(source=t.Source("hash"), total=0)
@@ -68,7 +70,7 @@ def traces(figure):
     return {trace["name"]: (numbers(trace["x"]), numbers(trace["y"])) for trace in figure["data"]}
 
 
-def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
+def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged: Callable[..., Any]) -> None:
     drawn = traces(weld_drawing(facts(logged(WELD))).paths)
     assert list(drawn) == ["planned", "felt (refined)", "robot", "tip", "torch"]
     x, y = drawn["torch"]
@@ -77,7 +79,7 @@ def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged):
     np.testing.assert_allclose(drawn["robot"][1], 3.0, atol=1e-3)
 
 
-def test_the_deviation_is_the_torch_s_beside_the_seam(logged):
+def test_the_deviation_is_the_torch_s_beside_the_seam(logged: Callable[..., Any]) -> None:
     drawn = traces(weld_drawing(facts(logged(WELD))).deviation)
     x, y = drawn["believed, from the seam as felt"]
     assert x.min() >= 0.0
@@ -87,7 +89,7 @@ def test_the_deviation_is_the_torch_s_beside_the_seam(logged):
     assert list(alone) == ["believed, from the seam as felt"]
 
 
-def test_the_phases_are_bands_over_the_deflection(logged):
+def test_the_phases_are_bands_over_the_deflection(logged: Callable[..., Any]) -> None:
     layout = weld_drawing(facts(logged(WELD))).contact["layout"]
     assert [note["text"] for note in layout["annotations"]] == ["seeking", "bridging", "ending"]
     seeking, bridging, ending = [(band["x0"], band["x1"]) for band in layout["shapes"]]
@@ -96,7 +98,7 @@ def test_the_phases_are_bands_over_the_deflection(logged):
     assert ending == pytest.approx((25.0, 40.0))
 
 
-def test_speeds_and_the_loop_are_told_in_people_s_units(logged):
+def test_speeds_and_the_loop_are_told_in_people_s_units(logged: Callable[..., Any]) -> None:
     drawing = weld_drawing(facts(logged(WELD)))
     speeds = traces(drawing.speeds)
     np.testing.assert_allclose(speeds["robot [mm/s]"][1], 5.0, rtol=1e-5)
@@ -105,7 +107,7 @@ def test_speeds_and_the_loop_are_told_in_people_s_units(logged):
     assert ("with the tag", "590") in drawing.loop
 
 
-def test_the_page_says_why_a_weld_was_stopped(logged):
+def test_the_page_says_why_a_weld_was_stopped(logged: Callable[..., Any]) -> None:
     stopped = replace(WELD, completed=False, reason="no tag was seen for 500 ms")
     page = render(logged(stopped))
     assert "The weld was stopped: no tag was seen for 500 ms." in page
@@ -113,25 +115,25 @@ def test_the_page_says_why_a_weld_was_stopped(logged):
         assert f"figure-weld-{name}" in page
 
 
-def test_a_weld_that_felt_nothing_is_still_drawn(logged):
+def test_a_weld_that_felt_nothing_is_still_drawn(logged: Callable[..., Any]) -> None:
     nothing = replace(WELD, refined=np.zeros((0, 3)), mode="vision", loop={})
     drawing = weld_drawing(facts(logged(nothing)))
     assert list(traces(drawing.deviation)) == ["true, from the true seam"]
     assert [name for name, _ in drawing.loop] == ["images read", "with the tag"]
 
 
-def test_a_run_without_a_weld(logged):
+def test_a_run_without_a_weld(logged: Callable[..., Any]) -> None:
     assert weld_drawing(facts(logged(None))) is None
 
 
-def test_a_line_goes_on_beyond_its_ends():
+def test_a_line_goes_on_beyond_its_ends() -> None:
     corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     along, across = off_line(corner, np.array([[-0.5, 0.1], [0.5, -0.2], [0.9, 0.5], [1.1, 1.5]]))
     np.testing.assert_allclose(along, [-0.5, 0.5, 1.5, 2.5])
     np.testing.assert_allclose(across, [0.1, -0.2, 0.1, -0.1])
 
 
-def test_believed_and_true_torch_are_shown_with_the_band(logged):
+def test_believed_and_true_torch_are_shown_with_the_band(logged: Callable[..., Any]) -> None:
     band = np.full(len(WELD.torch), 0.3e-3)
     drawn = traces(
         weld_drawing(

@@ -76,7 +76,7 @@ FIGURES = {
 }  # fmt: skip
 
 
-def test_the_pose_is_that_of_the_arm_as_reported():
+def test_the_pose_is_that_of_the_arm_as_reported() -> None:
     both = corrected()
     assert both.as_reported().correction is None
     assert both.as_reported().camera is both.camera
@@ -86,13 +86,13 @@ def test_the_pose_is_that_of_the_arm_as_reported():
     assert calibration().as_corrected() is None
 
 
-def test_where_on_the_flange_the_circle_is_belongs_to_both():
+def test_where_on_the_flange_the_circle_is_belongs_to_both() -> None:
     tool = ArmCorrection(np.array([1e-3, 0, 0]))
     assert calibration(correction=tool).as_corrected() is None
     assert calibration(correction=tool).as_reported().correction.tool_offset[0] == 1e-3
 
 
-def test_both_stand_side_by_side_with_the_error_to_expect():
+def test_both_stand_side_by_side_with_the_error_to_expect() -> None:
     answers = document(corrected(), FIGURES).answers
     noise = 3 * SIGMA**2
     assert answers.as_reported.expected_rms == pytest.approx(np.sqrt(0.4e-3**2 - noise))
@@ -106,20 +106,20 @@ def test_both_stand_side_by_side_with_the_error_to_expect():
     assert poses[1][1, 3] - poses[0][1, 3] == pytest.approx(3e-3)
 
 
-def test_noise_that_explains_everything_leaves_what_the_pose_is_known_to():
+def test_noise_that_explains_everything_leaves_what_the_pose_is_known_to() -> None:
     answers = document(calibration(), {**FIGURES, "rms_inliers": SIGMA}).answers
     of_pose = answers.as_reported.transforms["base_T_camera"].covariance
     least = np.sqrt(np.trace(np.array(of_pose)[3:, 3:]))
     assert answers.as_reported.expected_rms == pytest.approx(least, rel=1e-6)
 
 
-def test_without_poses_held_out_nobody_says_what_to_expect():
+def test_without_poses_held_out_nobody_says_what_to_expect() -> None:
     answers = document(corrected()).answers
     assert answers.as_reported.expected_rms is None
     assert document(calibration(), FIGURES).answers.corrected is None
 
 
-def test_the_console_gives_both():
+def test_the_console_gives_both() -> None:
     said = told(document(corrected(), FIGURES))
     assert (
         "arm as it reports  (600.00, 0.00, 1000.00) mm, (180.000, 0.000, 0.000) deg; 0.361 mm"
@@ -132,7 +132,7 @@ def test_the_console_gives_both():
     assert "Two answers" not in told(document(calibration(), FIGURES))
 
 
-def test_the_calibration_file_carries_both():
+def test_the_calibration_file_carries_both() -> None:
     written = yaml.safe_load(calibration_yaml(document(corrected(), FIGURES)))
     assert written["base_T_camera"]["translation_m"][1] == 0.0
     other = written["corrected_arm"]
@@ -141,7 +141,7 @@ def test_the_calibration_file_carries_both():
     assert "corrected_arm" not in yaml.safe_load(calibration_yaml(document(calibration())))
 
 
-def test_what_was_not_measured_has_no_sigma():
+def test_what_was_not_measured_has_no_sigma() -> None:
     open_turn = [0, 0, 1, 0, 0, 0]
     found = HandEye(estimate(unobservable=open_turn), (), "solve.svd")
     result = document(found)

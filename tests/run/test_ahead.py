@@ -7,6 +7,7 @@ import time
 import pytest
 
 from flangeye import types as t
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run import runner
 from flangeye.run.ahead import Done, cores, worked_ahead
@@ -15,7 +16,7 @@ from tests import toy
 from tests.conftest import TOY_RECIPE
 
 
-def test_results_come_in_order_whatever_finishes_first():
+def test_results_come_in_order_whatever_finishes_first() -> None:
     def work(k):
         time.sleep(0.002 * (k % 3))
         return k * k
@@ -25,7 +26,7 @@ def test_results_come_in_order_whatever_finishes_first():
     ]
 
 
-def test_no_more_is_pulled_than_workers_and_two():
+def test_no_more_is_pulled_than_workers_and_two() -> None:
     pulled = []
 
     def items():
@@ -41,7 +42,7 @@ def test_no_more_is_pulled_than_workers_and_two():
     assert len(pulled) <= 5 + 2 and threading.active_count() < 10
 
 
-def test_what_was_raised_is_raised_when_it_is_asked_for():
+def test_what_was_raised_is_raised_when_it_is_asked_for() -> None:
     def fail():
         raise ValueError("no")
 
@@ -50,7 +51,7 @@ def test_what_was_raised_is_raised_when_it_is_asked_for():
         done.result()
 
 
-def test_what_ends_the_items_is_raised_after_what_they_were():
+def test_what_ends_the_items_is_raised_after_what_they_were() -> None:
     def items():
         yield from (1, 2)
         raise ValueError("torn")
@@ -62,14 +63,16 @@ def test_what_ends_the_items_is_raised_after_what_they_were():
     assert seen == [(1, 1), (2, 2)]
 
 
-def test_threads_are_those_that_openmp_is_told(monkeypatch):
+def test_threads_are_those_that_openmp_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert cores() == 1
     monkeypatch.delenv("OMP_NUM_THREADS")
     assert cores() >= 1
 
 
-def test_a_run_on_one_core_and_on_many_is_the_same(toy_registry, monkeypatch):
+def test_a_run_on_one_core_and_on_many_is_the_same(
+    toy_registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def run(threads):
         monkeypatch.setattr(runner, "cores", lambda: threads)
         recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)

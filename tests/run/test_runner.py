@@ -3,7 +3,10 @@
 import gc
 import json
 import weakref
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
+from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.restart import FromNothing, restart_at
 from flangeye.run.runner import Runner
@@ -20,7 +24,7 @@ from tests.conftest import TOY_RECIPE, replaced
 
 
 @pytest.fixture
-def execute(toy_registry, tmp_path):
+def execute(toy_registry: Registry, tmp_path: Path) -> Callable[..., Any]:
     """Run recipe text with a log; return the result and the log."""
     runs: list[Recorder] = []
 
@@ -45,19 +49,21 @@ def without_timing(result):
     return {k: v for k, v in result.model_dump(mode="json").items() if k != "timing"}
 
 
-def test_the_same_recipe_gives_the_same_result_bit_for_bit(execute):
+def test_the_same_recipe_gives_the_same_result_bit_for_bit(execute: Callable[..., Any]) -> None:
     first, second = execute(TOY_RECIPE)[0], execute(TOY_RECIPE)[0]
     assert json.dumps(without_timing(first)) == json.dumps(without_timing(second))
     assert first.status == "verified"
     assert first.truth.rms_over_workspace < 1e-3
 
 
-def test_a_solver_that_stops_pulling_stops_the_acquisition(execute):
+def test_a_solver_that_stops_pulling_stops_the_acquisition(execute: Callable[..., Any]) -> None:
     execute(TOY_RECIPE.replace("- solve.toy", "- solve.toy: {at_most: 4}"))
     assert toy.acquired == ["000", "001", "002", "003"]
 
 
-def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(execute):
+def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(
+    execute: Callable[..., Any],
+) -> None:
     plain = toy.acquire.function
 
     def unread(seed, params):
@@ -75,7 +81,7 @@ def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(execute):
     assert "002" not in log.poses
 
 
-def test_captures_are_not_kept(execute):
+def test_captures_are_not_kept(execute: Callable[..., Any]) -> None:
     alive, most = weakref.WeakSet[t.Capture](), list[int]()
     plain = toy.segment.function
 
@@ -90,7 +96,7 @@ def test_captures_are_not_kept(execute):
     assert max(most) <= 2
 
 
-def test_a_bad_capture_is_data(execute):
+def test_a_bad_capture_is_data(execute: Callable[..., Any]) -> None:
     result, log = execute(TOY_RECIPE.replace("count: 6", "count: 6, bad: 2"))
     aside = [o for o in result.observations if not o.used]
     assert [(o.id, o.reason) for o in aside] == [
@@ -100,14 +106,16 @@ def test_a_bad_capture_is_data(execute):
     assert result.status == "verified"
 
 
-def test_verification_captures_are_kept_from_the_solver(execute):
+def test_verification_captures_are_kept_from_the_solver(execute: Callable[..., Any]) -> None:
     result, log = execute(TOY_RECIPE.replace("count: 6", "count: 6, verification: 2"))
     assert {o.id for o in result.observations} == {"002", "003", "004", "005"}
     assert result.verifications["4.verify.toy"].figures["views"] == 2
     assert [v.id for v in log.views()] == ["000", "001"]
 
 
-def test_views_that_an_acquire_step_adds_reach_the_verification(execute, monkeypatch):
+def test_views_that_an_acquire_step_adds_reach_the_verification(
+    execute: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = toy.acquire.function
     monkeypatch.setitem(toy.acquire.needs, "views", t.Views | None)
 
@@ -124,7 +132,7 @@ def test_views_that_an_acquire_step_adds_reach_the_verification(execute, monkeyp
     assert result.verifications["4.verify.toy"].figures["views"] == 1
 
 
-def test_a_refused_calibration_keeps_its_evidence(execute):
+def test_a_refused_calibration_keeps_its_evidence(execute: Callable[..., Any]) -> None:
     result, log = execute(TOY_RECIPE.replace("2 mm", "0.001 mm"))
     assert result.status == "refused"
     assert result.refused.startswith("verify.toy: 0.0")
@@ -132,7 +140,7 @@ def test_a_refused_calibration_keeps_its_evidence(execute):
     assert log.result["verifications"]["4.verify.toy"]["passed"] is False
 
 
-def test_weld_runs_only_after_verification(execute):
+def test_weld_runs_only_after_verification(execute: Callable[..., Any]) -> None:
     text = TOY_RECIPE + "  - seam.toy\n  - weld.toy\n"
     _, log = execute(text)
     assert [e.step for e in log.entries][-2:] == ["5.seam.toy", "6.weld.toy"]
@@ -143,7 +151,7 @@ def test_weld_runs_only_after_verification(execute):
 SEAM_RECIPE = TOY_RECIPE + "  - scan.toy\n  - seam.toy\n  - weld.toy\n"
 
 
-def test_a_seam_and_its_true_error_are_in_the_result(execute):
+def test_a_seam_and_its_true_error_are_in_the_result(execute: Callable[..., Any]) -> None:
     result, log = execute(SEAM_RECIPE)
     assert result.seam.length == pytest.approx(np.sqrt(2))
     assert result.seam.truth.rms == pytest.approx(0, abs=1e-12)
@@ -153,14 +161,14 @@ def test_a_seam_and_its_true_error_are_in_the_result(execute):
 
 
 @pytest.mark.parametrize("at", ["verify.toy", "scan.toy", "seam.toy", "weld.toy"])
-def test_a_seam_is_planned_again_from_the_log(execute, at):
+def test_a_seam_is_planned_again_from_the_log(execute: Callable[..., Any], at: str) -> None:
     first, log = execute(SEAM_RECIPE)
     again, _ = execute(SEAM_RECIPE, at, log)
     assert without_timing(again) == without_timing(first)
 
 
 @pytest.mark.parametrize("at", ["segment.toy", "fit.toy", "solve.toy", "verify.toy", "3"])
-def test_a_log_is_an_archive(execute, at):
+def test_a_log_is_an_archive(execute: Callable[..., Any], at: str) -> None:
     text = TOY_RECIPE.replace("seed: 3", "seed: 3\nlog: {clouds: full}")
     text = text.replace("count: 6", "count: 7, bad: 1, verification: 2")
     first, log = execute(text)
@@ -173,7 +181,7 @@ def test_a_log_is_an_archive(execute, at):
         assert third.transforms == first.transforms
 
 
-def test_what_a_log_cannot_give_is_said(execute):
+def test_what_a_log_cannot_give_is_said(execute: Callable[..., Any]) -> None:
     _, log = execute(TOY_RECIPE)
     with pytest.raises(StageError, match="holds thinned scans only, which cannot be segmented"):
         execute(TOY_RECIPE, "segment.toy", log)
@@ -187,12 +195,12 @@ def test_what_a_log_cannot_give_is_said(execute):
     )
 
 
-def test_too_few_poses_stop_the_run(execute):
+def test_too_few_poses_stop_the_run(execute: Callable[..., Any]) -> None:
     with pytest.raises(StageError, match="solve.toy: 3 poses needed, 2 given"):
         execute(TOY_RECIPE.replace("count: 6", "count: 2"))
 
 
-def test_a_plugin_that_breaks_is_named(execute):
+def test_a_plugin_that_breaks_is_named(execute: Callable[..., Any]) -> None:
     with replaced(toy.fit, lambda cloud, params: 1 / 0), pytest.raises(StageError) as error:
         execute(TOY_RECIPE)
     assert str(error.value) == (
@@ -201,7 +209,7 @@ def test_a_plugin_that_breaks_is_named(execute):
     )
 
 
-def test_stopwatch_charges_each_step_its_own_time(execute):
+def test_stopwatch_charges_each_step_its_own_time(execute: Callable[..., Any]) -> None:
     result, _ = execute(TOY_RECIPE)
     assert set(result.timing) == {
         "0.acquire.toy", "1.segment.toy", "2.fit.toy", "3.solve.toy", "4.verify.toy",
@@ -209,7 +217,7 @@ def test_stopwatch_charges_each_step_its_own_time(execute):
     assert result.timing["1.segment.toy"].calls == 6
 
 
-def test_values_survive_the_log_bit_for_bit(execute):
+def test_values_survive_the_log_bit_for_bit(execute: Callable[..., Any]) -> None:
     result, log = execute(TOY_RECIPE)
     logged = log.calibration()
     assert np.array_equal(
@@ -220,7 +228,9 @@ def test_values_survive_the_log_bit_for_bit(execute):
         assert observation.circle.centre.tolist() == told.centre_in_camera
 
 
-def test_a_refining_step_changes_the_calibration_that_is_verified(execute):
+def test_a_refining_step_changes_the_calibration_that_is_verified(
+    execute: Callable[..., Any],
+) -> None:
     text = TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy")
     result, log = execute(text)
     assert result.provenance.notes[-1] == "refined"
@@ -230,7 +240,7 @@ def test_a_refining_step_changes_the_calibration_that_is_verified(execute):
     assert without_timing(again) == without_timing(result)
 
 
-def test_what_is_solved_again_is_refined_again(execute):
+def test_what_is_solved_again_is_refined_again(execute: Callable[..., Any]) -> None:
     told = []
 
     def verify(calibration, solve, views, params):

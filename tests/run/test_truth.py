@@ -2,6 +2,7 @@
 
 from functools import partial
 from types import MappingProxyType, MethodType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def truths_in(arguments):
 
 
 @pytest.fixture
-def spied(monkeypatch):
+def spied(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Walk the arguments of every step when it is called, and when it has been."""
     found, called = list[tuple[str, object]](), list[str]()
     arguments_of = Runner._arguments
@@ -73,7 +74,9 @@ def spied(monkeypatch):
         ("ur5_phoxi-m_simulated", ("steps.0.resolution=0.3",)),
     ],
 )
-def test_no_argument_of_a_stage_leads_to_the_truth(name, overrides, spied):
+def test_no_argument_of_a_stage_leads_to_the_truth(
+    name: str, overrides: tuple[Any, ...], spied: Any
+) -> None:
     registry = load_registry()
     recipe = load_recipe(find_recipe(name), registry, overrides)
     result = Runner(recipe, registry, t.ArchivePath()).run()
@@ -83,7 +86,7 @@ def test_no_argument_of_a_stage_leads_to_the_truth(name, overrides, spied):
     assert not found
 
 
-def test_the_walk_finds_a_truth_that_is_there():
+def test_the_walk_finds_a_truth_that_is_there() -> None:
     truth = t.Truth(t.Transform(t.BASE, t.CAMERA, np.eye(4)))
     source = t.Source("x", truth=truth)
     assert list(truths_in({"observations": t.Observations([], source)})) == [truth]

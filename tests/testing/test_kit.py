@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -689,7 +690,9 @@ def kit_of(kind, plugin, attributes):
     CASES,
     ids=lambda v: v if isinstance(v, str) and v.isidentifier() else "",
 )
-def test_a_check_finds_the_plugin_that_fails_it(kind, check, plugin, message, attributes):
+def test_a_check_finds_the_plugin_that_fails_it(
+    kind: str, check: str, plugin: Any, message: str, attributes: dict[str, Any]
+) -> None:
     with pytest.raises(AssertionError, match=message) as error:
         getattr(kit_of(kind, plugin, attributes), check)()
     assert "\n" not in str(error.value)
@@ -700,7 +703,7 @@ def defined(cls, check):
     return getattr(cls, check).__qualname__
 
 
-def test_every_check_is_proven():
+def test_every_check_is_proven() -> None:
     checks = {
         defined(cls, name) for cls in K.values() for name in dir(cls) if name.startswith("test_")
     }
@@ -708,7 +711,7 @@ def test_every_check_is_proven():
     assert checks == proven
 
 
-def test_a_class_without_a_plugin_says_what_to_set():
+def test_a_class_without_a_plugin_says_what_to_set() -> None:
     with pytest.raises(AssertionError) as error:
         K["fit"]().test_it_declares_what_it_is()
     assert str(error.value) == "FitConformance: set stage or part to your plugin"
@@ -716,7 +719,7 @@ def test_a_class_without_a_plugin_says_what_to_set():
         kit_of("fit", fit_rim.function, {}).test_it_declares_what_it_is()
 
 
-def test_what_the_kit_cannot_give_is_said():
+def test_what_the_kit_cannot_give_is_said() -> None:
     from flangeye import stage
 
     @stage("fit.curious")
@@ -731,7 +734,7 @@ def test_what_the_kit_cannot_give_is_said():
     )
 
 
-def test_the_kit_needs_no_pytest():
+def test_the_kit_needs_no_pytest() -> None:
     import subprocess
     import sys
 

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 import sysconfig
+from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -22,7 +24,7 @@ def run(*words, **more):
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory):
+def python(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An interpreter of its own that sees what this one sees."""
     folder = tmp_path_factory.mktemp("venv")
     run(sys.executable, "-m", "venv", "--without-pip", folder)
@@ -45,11 +47,11 @@ def passed(python, folders):
     )  # fmt: skip
 
 
-def test_there_is_a_template_and_a_kit_for_every_kind():
+def test_there_is_a_template_and_a_kit_for_every_kind() -> None:
     assert set(kinds()) == set(KITS) == {*KINDS, *PARTS}
 
 
-def test_a_new_scanner_passes_its_tests(python, tmp_path):
+def test_a_new_scanner_passes_its_tests(python: Any, tmp_path: Path) -> None:
     told = CliRunner().invoke(
         app, ["new-plugin", "quick_eye", "--kind", "scanner", "--into", str(tmp_path)]
     )
@@ -64,14 +66,14 @@ def test_a_new_scanner_passes_its_tests(python, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_new_plugin_of_every_kind_passes_its_tests(python, tmp_path):
+def test_a_new_plugin_of_every_kind_passes_its_tests(python: Any, tmp_path: Path) -> None:
     folders = [write_plugin(f"new_{kind}", kind, tmp_path) for kind in kinds()]
     installed(python, folders)
     assert " passed" in passed(python, folders)
 
 
 @pytest.mark.parametrize("kind", kinds())
-def test_what_is_written_is_clean(kind, tmp_path):
+def test_what_is_written_is_clean(kind: Any, tmp_path: Path) -> None:
     folder = write_plugin("acme", kind, tmp_path)
     run(
         sys.executable,
@@ -100,14 +102,14 @@ def test_what_is_written_is_clean(kind, tmp_path):
         ("acme", "camera", f"no kind 'camera'; kinds: {', '.join(kinds())}"),
     ],
 )
-def test_what_cannot_be_written_is_said(name, kind, message, tmp_path):
+def test_what_cannot_be_written_is_said(name: str, kind: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         write_plugin(name, kind, tmp_path)
     assert str(error.value) == message
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_written_over(tmp_path):
+def test_nothing_is_written_over(tmp_path: Path) -> None:
     write_plugin("acme", "fit", tmp_path)
     with pytest.raises(StageError) as error:
         write_plugin("acme", "cost", tmp_path)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -102,7 +104,9 @@ def test_the_history_comes_back_as_it_was(cell: Path, tmp_path: Path) -> None:
     ],
     ids=["broken", "another"],
 )
-def test_a_history_that_is_not_ours_is_refused(cell, tmp_path, write, message) -> None:
+def test_a_history_that_is_not_ours_is_refused(
+    cell: Path, tmp_path: Path, write: Callable[..., Any], message: str
+) -> None:
     history = tmp_path / "h.parquet"
     write(history)
     refused = monitor(cell, history, "ok-00")
@@ -119,7 +123,9 @@ def test_a_history_that_is_not_ours_is_refused(cell, tmp_path, write, message) -
         (("--live", "--limit", "3"), "--limit: '3' has no unit"),
     ],
 )
-def test_mistakes_are_one_line(cell: Path, tmp_path: Path, options, message) -> None:
+def test_mistakes_are_one_line(
+    cell: Path, tmp_path: Path, options: tuple[Any, ...], message: str
+) -> None:
     refused = monitor(cell, tmp_path / "h.parquet", options=options)
     assert isinstance(refused.exception, FlangeyeError)
     assert "\n" not in str(refused.exception)

@@ -6,6 +6,6 @@ from tests.emulators.controllers.desk import Desk
 
 
 @pytest.fixture
-def desk():
+def desk() -> Desk:
     """A UR5e that waits for commands."""
     return Desk()

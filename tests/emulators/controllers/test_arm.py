@@ -1,5 +1,7 @@
 """The arm in simulated time, through the register protocol."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,7 +14,7 @@ MOVE_JOINTS, MOVE_STRAIGHT, SPEED_JOINTS, SPEED, SERVO, STOP_SPEED = 1, 3, 9, 10
 OTHER = np.array([0.3, -1.3, 1.2, -1.5, -1.4, 0.5])
 
 
-def test_a_joint_move_is_a_trapezoid(desk):
+def test_a_joint_move_is_a_trapezoid(desk: Desk) -> None:
     assert desk.order(MOVE_JOINTS, [*OTHER, 1.0, 2.0])
     assert np.array_equal(desk.arm.stance.joints, OTHER)
     way = np.abs(OTHER - HOME).max()
@@ -23,7 +25,7 @@ def test_a_joint_move_is_a_trapezoid(desk):
     assert np.abs(np.diff(speeds, axis=0)).max() / 0.002 <= 2.0 + 1e-6
 
 
-def test_a_straight_move_is_straight_at_its_speed(desk):
+def test_a_straight_move_is_straight_at_its_speed(desk: Desk) -> None:
     target = away(desk.pose(), 0.1, 0.05, -0.1, 0.0, 0.0, 0.0)
     start = desk.pose()[:3]
     assert desk.order(MOVE_STRAIGHT, [*target, 0.2, 1.0])
@@ -40,7 +42,7 @@ def test_a_straight_move_is_straight_at_its_speed(desk):
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.tuples(*[st.floats(-0.15, 0.15)] * 3), st.floats(0.05, 0.5), st.floats(0.2, 3.0))
-def test_limits_hold_whatever_the_move(offset, speed, acceleration):
+def test_limits_hold_whatever_the_move(offset: Any, speed: float, acceleration: float) -> None:
     desk = Desk()
     target = away(desk.pose(), *offset, 0.0, 0.0, 0.0)
     if desk.order(MOVE_STRAIGHT, [*target, speed, acceleration]):
@@ -51,7 +53,7 @@ def test_limits_hold_whatever_the_move(offset, speed, acceleration):
     assert (turned <= desk.arm.speed_limits * 1.05 + 1e-9).all()
 
 
-def test_the_same_commands_give_the_same_motion_bit_for_bit():
+def test_the_same_commands_give_the_same_motion_bit_for_bit() -> None:
     traces = []
     for _ in range(2):
         desk = Desk()
@@ -61,7 +63,7 @@ def test_the_same_commands_give_the_same_motion_bit_for_bit():
     assert np.array_equal(*traces)
 
 
-def test_a_velocity_is_reached_with_its_acceleration_and_kept(desk):
+def test_a_velocity_is_reached_with_its_acceleration_and_kept(desk: Desk) -> None:
     desk.stream(SPEED, [0, 0, -0.1, 0, 0, 0, 0.5, 0], seconds=0.1)
     assert desk.arm.twist[2] == pytest.approx(-0.05, abs=2e-3)
     desk.seconds(0.3)
@@ -70,20 +72,20 @@ def test_a_velocity_is_reached_with_its_acceleration_and_kept(desk):
     assert desk.arm.standing
 
 
-def test_the_time_of_a_velocity_does_not_end_it(desk):
+def test_the_time_of_a_velocity_does_not_end_it(desk: Desk) -> None:
     """As with ur_rtde 1.6 on the robot: its thread gives the velocity again when it is over."""
     desk.stream(SPEED, [0.05, 0, 0, 0, 0, 0, 1.0, 0.1], seconds=1.0)
     assert desk.arm.twist[0] == pytest.approx(0.05, abs=1e-4)
 
 
-def test_joint_velocities(desk):
+def test_joint_velocities(desk: Desk) -> None:
     desk.stream(SPEED_JOINTS, [0.5, 0, 0, 0, 0, -0.25, 5.0, 0], seconds=0.5)
     assert desk.arm.speeds == pytest.approx([0.5, 0, 0, 0, 0, -0.25], abs=1e-9)
     assert desk.order(STOP_SPEED, [5.0])
     assert desk.arm.standing
 
 
-def test_a_servo_follows_a_ramp_its_lookahead_behind(desk):
+def test_a_servo_follows_a_ramp_its_lookahead_behind(desk: Desk) -> None:
     for cycle in range(500):
         target = HOME + 0.2 * cycle * 0.002 * np.eye(6)[0]
         desk.stream(SERVO, [*target, 0, 0, 0.002, 0.1, 300])
@@ -92,7 +94,7 @@ def test_a_servo_follows_a_ramp_its_lookahead_behind(desk):
     assert desk.arm.speeds[0] == pytest.approx(0.2, rel=1e-3)
 
 
-def test_a_servo_that_jumps_keeps_the_joints_limits(desk):
+def test_a_servo_that_jumps_keeps_the_joints_limits(desk: Desk) -> None:
     desk.stream(SERVO, [*(HOME + 2.0 * np.eye(6)[0]), 0, 0, 0.002, 0.03, 2000], seconds=3.0)
     turned = np.abs(np.diff(desk.joints(), axis=0)) / 0.002
     assert turned.max() <= np.pi * (1 + 1e-9)
@@ -100,7 +102,7 @@ def test_a_servo_that_jumps_keeps_the_joints_limits(desk):
     assert desk.box.safety is SafetyMode.NORMAL
 
 
-def test_the_slider_slows_the_arm_on_its_path(desk):
+def test_the_slider_slows_the_arm_on_its_path(desk: Desk) -> None:
     target = away(desk.pose(), 0.1, 0, 0, 0, 0, 0)
     desk.arm.slider = 0.5
     desk.seconds(0.5)
@@ -110,7 +112,7 @@ def test_the_slider_slows_the_arm_on_its_path(desk):
     assert desk.misses(target) < 1e-9
 
 
-def test_a_killed_move_brakes_and_does_not_jump(desk):
+def test_a_killed_move_brakes_and_does_not_jump(desk: Desk) -> None:
     target = away(desk.pose(), 0.2, 0, 0, 0, 0, 0)
     assert desk.order(MOVE_STRAIGHT, [*target, 0.3, 2.0], [1])
     desk.seconds(0.4)
@@ -121,7 +123,7 @@ def test_a_killed_move_brakes_and_does_not_jump(desk):
     assert np.abs(np.diff(speeds, axis=0)).max() / 0.002 < 15.0
 
 
-def test_a_singular_position_stops_the_arm():
+def test_a_singular_position_stops_the_arm() -> None:
     desk = Desk(joints=[0.0, -1.2, 1.0, -1.4, -1.2, 0.0])
     outwards = desk.pose()[:3] * [1, 1, 0] / np.linalg.norm(desk.pose()[:2])
     desk.stream(SPEED, [*(0.25 * outwards), 0, 0, 0, 1.0, 0], seconds=6.0)
@@ -133,7 +135,7 @@ def test_a_singular_position_stops_the_arm():
     assert (turned <= desk.arm.speed_limits * 1.05 + 1e-9).all()
 
 
-def test_a_joint_limit_stops_the_arm():
+def test_a_joint_limit_stops_the_arm() -> None:
     desk = Desk(joints=away(HOME, 6.1, 0, 0, 0, 0, 0))
     desk.stream(SPEED_JOINTS, [1.0, 0, 0, 0, 0, 0, 5.0, 0], seconds=1.0)
     assert desk.box.safety is SafetyMode.PROTECTIVE_STOP
@@ -142,7 +144,7 @@ def test_a_joint_limit_stops_the_arm():
     assert desk.arm.standing
 
 
-def test_out_of_reach_ends_the_program(desk):
+def test_out_of_reach_ends_the_program(desk: Desk) -> None:
     target = away(desk.pose(), -1.0, 0, 0, 0, 0, 0)
     assert not desk.order(2, [*target, 1.0, 1.0])
     assert desk.box.runtime is Runtime.STOPPED
@@ -152,7 +154,7 @@ def test_out_of_reach_ends_the_program(desk):
     )
 
 
-def test_two_threads_cannot_move_the_arm(desk):
+def test_two_threads_cannot_move_the_arm(desk: Desk) -> None:
     desk.stream(SPEED, [0, 0, 0.05, 0, 0, 0, 0.5, 0], seconds=0.2)
     assert not desk.order(MOVE_JOINTS, [*OTHER, 1.0, 1.0])
     assert desk.log()[-1] == (
@@ -163,7 +165,7 @@ def test_two_threads_cannot_move_the_arm(desk):
 
 
 @pytest.mark.parametrize(("model", "rate"), [("ur3e", 500), ("ur5", 125), ("ur10e", 500)])
-def test_other_arms_move_too(model, rate):
+def test_other_arms_move_too(model: str, rate: int) -> None:
     desk = Desk(model)
     target = away(desk.pose(), 0.02, 0.02, -0.05, 0, 0, 0.1)
     assert desk.order(MOVE_STRAIGHT, [*target, 0.1, 1.0])
@@ -171,7 +173,7 @@ def test_other_arms_move_too(model, rate):
     assert desk.box.box.rate == rate
 
 
-def test_true_zeros_move_the_flange_and_not_the_reading():
+def test_true_zeros_move_the_flange_and_not_the_reading() -> None:
     zeros = np.array([0.0, 2e-4, -1e-4, 3e-4, 0.0, 1e-4])
     off, exact = Desk(zeros=zeros), Desk()
     assert np.array_equal(off.pose(), exact.pose())

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,7 @@ joint_angles = st.tuples(*[st.floats(-3.0, 3.0)] * 6).map(np.array)
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_stance_agrees_with_the_kinematics_of_the_engine(model):
+def test_a_stance_agrees_with_the_kinematics_of_the_engine(model: str) -> None:
     robot = load_model("robots", model)
     chain, arm = Chain(robot), Arm(robot)
     joints = np.random.default_rng(1).uniform(-2, 2, arm.n)
@@ -22,7 +24,7 @@ def test_a_stance_agrees_with_the_kinematics_of_the_engine(model):
     assert np.allclose(stance.jacobian[[3, 4, 5, 0, 1, 2]], arm.jacobian(joints), atol=1e-14)
 
 
-def test_the_jacobian_is_the_tools():
+def test_the_jacobian_is_the_tools() -> None:
     chain = Chain(load_model("robots", "ur5e"))
     chain.flange_T_tcp = pose_matrix([0.05, 0.0, 0.12, 0.0, 0.3, 0.0])
     joints, step = np.array([0.2, -1.5, 1.4, -1.2, -1.5, 0.4]), 1e-6
@@ -37,7 +39,7 @@ CHAIN = Chain(load_model("robots", "ur5e"))
 
 
 @given(joint_angles, st.tuples(*[st.floats(-0.02, 0.02)] * 6).map(np.array))
-def test_a_near_pose_is_reached_or_refused(joints, away):
+def test_a_near_pose_is_reached_or_refused(joints: Any, away: Any) -> None:
     here, there = CHAIN.stance(joints), CHAIN.stance(joints + away)
     try:
         found = CHAIN.solve(there.base_T_tcp, here)
@@ -47,13 +49,13 @@ def test_a_near_pose_is_reached_or_refused(joints, away):
         assert np.abs(twist_between(found.base_T_tcp, there.base_T_tcp)).max() < 1e-9
 
 
-def test_every_branch_is_found_and_turns_stay_near():
+def test_every_branch_is_found_and_turns_stay_near() -> None:
     joints = np.array([0.3, -1.4, 1.5, -1.6, -1.5, 5.5])
     stance = CHAIN.stance(joints)
     assert np.allclose(CHAIN.solve_any(stance.base_T_tcp, joints), joints, atol=1e-6)
 
 
-def test_out_of_reach_is_said():
+def test_out_of_reach_is_said() -> None:
     here = CHAIN.stance(np.array([0.3, -1.4, 1.5, -1.6, -1.5, 0.0]))
     far = here.base_T_tcp.copy()
     far[:3, 3] = [2.0, 0.0, 0.0]

@@ -1,5 +1,6 @@
 import asyncio
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def clocked(step, seconds, cycle=0.002):
     return run(count())
 
 
-def test_the_clock_does_not_drift():
+def test_the_clock_does_not_drift() -> None:
     """Every step costs half a cycle; the count follows the wall all the same."""
     began = time.monotonic()
     clock = clocked(lambda: time.sleep(0.001), 1.0)
@@ -36,7 +37,7 @@ def test_the_clock_does_not_drift():
         assert figures["ticks"] >= elapsed / 0.002 - 30
 
 
-def test_a_short_delay_is_made_up_and_a_long_one_is_a_gap():
+def test_a_short_delay_is_made_up_and_a_long_one_is_a_gap() -> None:
     for pause, gaps in ((0.02, 0), (0.2, 1)):
         pauses = [0.0] * 20 + [pause] + [0.0] * 10_000
         clock = clocked(lambda pauses=pauses: time.sleep(pauses.pop(0)), 0.4)
@@ -45,12 +46,12 @@ def test_a_short_delay_is_made_up_and_a_long_one_is_a_gap():
         assert clock.figures()["late_max"] >= pause - 0.003
 
 
-def test_a_clock_that_never_ticked_has_no_figures():
+def test_a_clock_that_never_ticked_has_no_figures() -> None:
     assert Clock(0.002, lambda: None).figures() == {"ticks": 0}
 
 
 @pytest.mark.parametrize("delays", [[0.0] * 5, [0.03, 0.02, 0.01, 0.0, 0.02]])
-def test_a_delay_line_keeps_the_order(delays):
+def test_a_delay_line_keeps_the_order(delays: Any) -> None:
     async def push():
         arrived: list[bytes] = []
         line = DelayLine(arrived.append)
@@ -62,7 +63,7 @@ def test_a_delay_line_keeps_the_order(delays):
     assert run(push()) == bytes(range(5))
 
 
-def test_what_is_late_is_late_by_the_delay():
+def test_what_is_late_is_late_by_the_delay() -> None:
     async def push():
         arrived = []
         loop = asyncio.get_running_loop()

@@ -7,7 +7,7 @@ from flangeye_emulators.controllers.ur.dashboard import answer
 from flangeye_emulators.controllers.ur.scriptport import run_program
 from flangeye_emulators.controllers.ur.state import RobotMode, Runtime, SafetyMode
 from flangeye_emulators.controllers.ur.urscript import ScriptSource
-from tests.emulators.controllers.desk import away
+from tests.emulators.controllers.desk import Desk, away
 
 SPEED, MOVE = 10, 3
 SCRIPT = ScriptSource("rtde_control", "def rtde_control():\nend")
@@ -22,7 +22,7 @@ def moving(desk):
     return target
 
 
-def test_a_protective_stop_holds_the_arm_on_its_path(desk):
+def test_a_protective_stop_holds_the_arm_on_its_path(desk: Desk) -> None:
     start = desk.pose()
     target = moving(desk)
     desk.box.protective_stop("test")
@@ -40,7 +40,7 @@ def test_a_protective_stop_holds_the_arm_on_its_path(desk):
     assert desk.misses(target) < 1e-9
 
 
-def test_a_protective_stop_cannot_be_unlocked_at_once(desk):
+def test_a_protective_stop_cannot_be_unlocked_at_once(desk: Desk) -> None:
     desk.box.protective_stop("test")
     refusal = (
         "Cannot unlock protective stop until 5s after occurrence. "
@@ -54,7 +54,7 @@ def test_a_protective_stop_cannot_be_unlocked_at_once(desk):
     assert desk.box.safety is SafetyMode.NORMAL
 
 
-def test_while_stopped_nothing_is_played_or_loaded(desk):
+def test_while_stopped_nothing_is_played_or_loaded(desk: Desk) -> None:
     desk.box.protective_stop("test")
     assert answer(desk.box, "play") == "Failed to execute: play"
     run_program(desk.box, SCRIPT)
@@ -62,7 +62,7 @@ def test_while_stopped_nothing_is_played_or_loaded(desk):
     assert desk.box.runtime is Runtime.PAUSED
 
 
-def test_a_stop_that_left_the_path_cannot_be_played_on(desk):
+def test_a_stop_that_left_the_path_cannot_be_played_on(desk: Desk) -> None:
     desk.stream(9, [0.0, 0, 0, 0, 0, 20.0, 40.0, 0], seconds=1.0)
     assert desk.box.safety is SafetyMode.PROTECTIVE_STOP
     desk.box.unlock_after = 0.0
@@ -72,7 +72,7 @@ def test_a_stop_that_left_the_path_cannot_be_played_on(desk):
     assert desk.box.runtime is Runtime.PLAYING
 
 
-def test_pause_and_play(desk):
+def test_pause_and_play(desk: Desk) -> None:
     target = moving(desk)
     assert answer(desk.box, "pause") == "Pausing program"
     assert answer(desk.box, "programState") == "PAUSED loopback.urp"
@@ -86,7 +86,7 @@ def test_pause_and_play(desk):
     assert desk.misses(target) < 1e-9
 
 
-def test_the_dashboards_stop_brakes_the_arm(desk):
+def test_the_dashboards_stop_brakes_the_arm(desk: Desk) -> None:
     moving(desk)
     assert answer(desk.box, "stop") == "Stopped"
     assert answer(desk.box, "running") == "Program running: false"
@@ -94,7 +94,7 @@ def test_the_dashboards_stop_brakes_the_arm(desk):
     assert desk.arm.standing
 
 
-def test_an_emergency_stop_takes_the_power(desk):
+def test_an_emergency_stop_takes_the_power(desk: Desk) -> None:
     moving(desk)
     desk.box.emergency_stop("test")
     desk.seconds(0.3)
@@ -114,7 +114,7 @@ def test_an_emergency_stop_takes_the_power(desk):
     desk.run(2)
 
 
-def test_in_local_control_programs_are_ignored(desk):
+def test_in_local_control_programs_are_ignored(desk: Desk) -> None:
     desk.box.stop_program("test")
     desk.box.remote_control = False
     run_program(desk.box, SCRIPT)
@@ -122,7 +122,7 @@ def test_in_local_control_programs_are_ignored(desk):
     assert answer(desk.box, "is in remote control") == "false"
 
 
-def test_the_watchdog_stops_an_arm_whose_client_is_silent(desk):
+def test_the_watchdog_stops_an_arm_whose_client_is_silent(desk: Desk) -> None:
     assert desk.order(35, [10.0])
     for _ in range(100):
         desk.stream(SPEED, [0.05, 0, 0, 0, 0, 0, 0.5, 0])
@@ -133,7 +133,7 @@ def test_the_watchdog_stops_an_arm_whose_client_is_silent(desk):
     assert desk.log()[-1] == "program stopped: watchdog: input_int_register_0 was not renewed"
 
 
-def test_without_a_watchdog_the_arm_goes_on_for_a_silent_client(desk):
+def test_without_a_watchdog_the_arm_goes_on_for_a_silent_client(desk: Desk) -> None:
     desk.stream(SPEED, [0.02, 0, 0, 0, 0, 0, 0.5, 0], seconds=5.0)
     assert desk.arm.twist[0] == pytest.approx(0.02, abs=1e-4)
 
@@ -153,5 +153,5 @@ def test_without_a_watchdog_the_arm_goes_on_for_a_silent_client(desk):
         ("dance", "could not understand: 'dance'"),
     ],
 )
-def test_the_words_of_the_dashboard(desk, command, said):
+def test_the_words_of_the_dashboard(desk: Desk, command: str, said: str) -> None:
     assert answer(desk.box, command) == said

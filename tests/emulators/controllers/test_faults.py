@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 
 from flangeye.errors import StageError
@@ -18,7 +20,7 @@ KINDS = {
         ("freeze=3 s@moving", Fault("freeze", 3.0, None)),
     ],
 )
-def test_what_goes_wrong_and_when_is_read(text, fault):
+def test_what_goes_wrong_and_when_is_read(text: str, fault: Any) -> None:
     assert parse_fault(text, KINDS) == fault
 
 
@@ -39,13 +41,13 @@ def test_what_goes_wrong_and_when_is_read(text, fault):
         ),
     ],
 )
-def test_what_cannot_go_wrong_is_said(text, message):
+def test_what_cannot_go_wrong_is_said(text: str, message: str) -> None:
     with pytest.raises(StageError) as error:
         parse_fault(text, KINDS)
     assert str(error.value) == message
 
 
-def test_faults_wait_for_their_time():
+def test_faults_wait_for_their_time() -> None:
     happened: list[tuple[str, float | None]] = []
 
     def kind(name: str) -> Kind:

@@ -10,16 +10,16 @@ from flangeye.errors import StageError
 from flangeye.models.emulator import Emulator, EmulatorOptions, find_emulator
 from flangeye.models.loading import load_model
 from flangeye.plugin import registry
-from flangeye.plugin.registry import load_registry
+from flangeye.plugin.registry import Registry, load_registry
 
 
-def test_the_built_in_controllers_come_through_the_hook():
+def test_the_built_in_controllers_come_through_the_hook() -> None:
     offered = [one for some in load_registry().hooks.hook.flangeye_emulators() for one in some]
     for model in ("ur3e", "ur5", "ur5e", "ur10e"):
         assert find_emulator(offered, load_model("robots", model)).name == "ur"
 
 
-def test_without_plugins_there_are_none():
+def test_without_plugins_there_are_none() -> None:
     with pytest.raises(StageError) as error:
         find_emulator([], load_model("robots", "ur5e"))
     assert str(error.value) == (
@@ -27,7 +27,9 @@ def test_without_plugins_there_are_none():
     )
 
 
-def test_a_vendors_controller_is_found(monkeypatch, toy_registry):
+def test_a_vendors_controller_is_found(
+    monkeypatch: pytest.MonkeyPatch, toy_registry: Registry
+) -> None:
     served: list[EmulatorOptions] = []
     vendor = types.ModuleType("vendor")
     offered = [Emulator("fr", "Franka Emika", served.append)]

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,19 +21,19 @@ poses = st.tuples(*[coordinates] * 6).map(np.array)
 
 
 @given(vectors)
-def test_rotations_agree_with_the_geometry_of_the_engine(vector):
+def test_rotations_agree_with_the_geometry_of_the_engine(vector: Any) -> None:
     rotation = rotation_matrix(vector)
     assert np.allclose(rotation, rotation_exp(vector), atol=1e-14)
     assert np.allclose(rotation_vector(rotation), rotation_log(rotation), atol=1e-9)
 
 
 @given(vectors, st.floats(1e-12, 1e-3))
-def test_tiny_turns_keep_their_digits(vector, scale):
+def test_tiny_turns_keep_their_digits(vector: Any, scale: float) -> None:
     small = scale * vector
     assert np.allclose(rotation_vector(rotation_matrix(small)), small, rtol=1e-9, atol=1e-17)
 
 
-def test_half_a_turn_has_a_vector_of_length_pi():
+def test_half_a_turn_has_a_vector_of_length_pi() -> None:
     for axis in np.eye(3):
         vector = rotation_vector(rotation_matrix(np.pi * axis))
         assert np.isclose(np.linalg.norm(vector), np.pi)
@@ -39,7 +41,7 @@ def test_half_a_turn_has_a_vector_of_length_pi():
 
 
 @given(poses, poses)
-def test_a_twist_leads_from_pose_to_pose(first, second):
+def test_a_twist_leads_from_pose_to_pose(first: Any, second: Any) -> None:
     start, end = pose_matrix(first), pose_matrix(second)
     assert np.allclose(carried(start, twist_between(start, end), 1.0), end, atol=1e-9)
     assert np.allclose(inverse_pose(start) @ start, np.eye(4), atol=1e-12)

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ pieces = st.lists(st.tuples(st.floats(1e-6, 2.0), st.floats(1e-3, 3.0)), min_siz
 
 
 @given(pieces, st.floats(0.05, 20.0))
-def test_limits_are_kept_and_the_end_is_reached_at_rest(pieces, acceleration):
+def test_limits_are_kept_and_the_end_is_reached_at_rest(pieces: Any, acceleration: float) -> None:
     lengths, speeds = zip(*pieces, strict=True)
     profile = Profile(lengths, speeds, acceleration)
     times = np.linspace(0.0, profile.duration, 1501)
@@ -27,11 +29,11 @@ def test_limits_are_kept_and_the_end_is_reached_at_rest(pieces, acceleration):
         assert (velocity[inside] <= speed * (1 + 1e-6)).all()
 
 
-def test_a_long_move_is_a_trapezoid_and_a_short_one_a_triangle():
+def test_a_long_move_is_a_trapezoid_and_a_short_one_a_triangle() -> None:
     assert Profile([1.0], [0.25], 1.0).duration == pytest.approx(1.0 / 0.25 + 0.25)
     assert Profile([0.01], [0.25], 1.0).duration == pytest.approx(2 * np.sqrt(0.01))
 
 
-def test_no_way_takes_no_time():
+def test_no_way_takes_no_time() -> None:
     profile = Profile([], [], 1.0)
     assert (profile.duration, profile.at(0.0), profile.at(1.0)) == (0.0, 0.0, 0.0)

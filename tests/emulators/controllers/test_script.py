@@ -35,7 +35,7 @@ PATH = """\
 """
 
 
-def test_programs_are_cut_out_of_a_stream_that_comes_in_pieces():
+def test_programs_are_cut_out_of_a_stream_that_comes_in_pieces() -> None:
     text = CONTROL_SCRIPT.format(offset=0, path=PATH) + "def second():\n\tsync()\nend\n"
     found, buffer = [], ""
     for i in range(0, len(text), 37):
@@ -48,7 +48,7 @@ def test_programs_are_cut_out_of_a_stream_that_comes_in_pieces():
     assert found[1].text == "def second():\n\tsync()\nend"
 
 
-def test_moves_and_offset_are_read_from_the_control_script():
+def test_moves_and_offset_are_read_from_the_control_script() -> None:
     script = CONTROL_SCRIPT.format(offset=24, path=PATH)
     assert register_offset(script) == 24
     first, second = injected_path(script)
@@ -60,7 +60,7 @@ def test_moves_and_offset_are_read_from_the_control_script():
     assert register_offset("def rtde_control():\nend") == 0
 
 
-def test_a_command_is_done_until_it_is_cleared(desk):
+def test_a_command_is_done_until_it_is_cleared(desk: Desk) -> None:
     desk.write(29, [0, 0, 0.1, 0, 0, 0])
     desk.run(1)
     assert desk.answer() == 2
@@ -72,26 +72,26 @@ def test_a_command_is_done_until_it_is_cleared(desk):
     assert desk.answer() == 1
 
 
-def test_a_client_may_use_the_upper_registers():
+def test_a_client_may_use_the_upper_registers() -> None:
     desk = Desk(offset=24)
     assert desk.order(40)
     assert desk.order(3, [*(away(desk.pose(), 0.01, 0, 0, 0, 0, 0)), 0.1, 1.0])
     assert desk.box.registers.output_int[0] == 0
 
 
-def test_the_stop_command_ends_the_script(desk):
+def test_the_stop_command_ends_the_script(desk: Desk) -> None:
     desk.write(255)
     desk.run(2)
     assert desk.box.runtime is Runtime.STOPPED
     assert desk.log()[-1] == "program stopped: the program ended"
 
 
-def test_an_unknown_command_is_done_and_noted(desk):
+def test_an_unknown_command_is_done_and_noted(desk: Desk) -> None:
     assert desk.order(99)
     assert desk.log()[-1] == "command 99 is not simulated"
 
 
-def test_the_answers_to_questions(desk):
+def test_the_answers_to_questions(desk: Desk) -> None:
     tool = [0.0, 0.01, 0.12, 0.0, 0.3, 0.0]
     flange = desk.pose()
     assert desk.order(29, tool)
@@ -117,7 +117,7 @@ def test_the_answers_to_questions(desk):
     assert np.array_equal(desk.given(), HOME)
 
 
-def test_what_can_be_reached_and_what_cannot(desk):
+def test_what_can_be_reached_and_what_cannot(desk: Desk) -> None:
     far = [2.0, 0, 0, 0, 0, 0]
     for code, target, yes in (
         (60, desk.pose(), 1),
@@ -134,7 +134,7 @@ def test_what_can_be_reached_and_what_cannot(desk):
         assert desk.given_integer() == yes
 
 
-def test_payload_keeps_its_centre_when_none_is_given(desk):
+def test_payload_keeps_its_centre_when_none_is_given(desk: Desk) -> None:
     assert desk.order(17, [1.5, 0.0, 0.0, 0.05])
     assert desk.order(17, [2.0, 0.0, 0.0, 0.0])
     mass, centre = desk.box.payload
@@ -142,7 +142,7 @@ def test_payload_keeps_its_centre_when_none_is_given(desk):
     assert centre == pytest.approx([0, 0, 0.05])
 
 
-def test_a_move_in_the_background_shows_its_progress_and_can_be_stopped(desk):
+def test_a_move_in_the_background_shows_its_progress_and_can_be_stopped(desk: Desk) -> None:
     target = away(desk.pose(), 0.1, 0, 0, 0, 0, 0)
     assert desk.order(3, [*target, 0.1, 1.0], [1])
     assert desk.progress() == 0
@@ -155,7 +155,7 @@ def test_a_move_in_the_background_shows_its_progress_and_can_be_stopped(desk):
     assert desk.misses(target) < 1e-9
 
 
-def test_a_new_move_takes_the_place_of_one_in_the_background(desk):
+def test_a_new_move_takes_the_place_of_one_in_the_background(desk: Desk) -> None:
     home = desk.pose()
     assert desk.order(3, [*(away(home, 0.1, 0, 0, 0, 0, 0)), 0.2, 1.0], [1])
     desk.seconds(0.3)
@@ -173,7 +173,7 @@ def square(pose, blend):
 
 
 @pytest.mark.parametrize("blend", [0, 0.01])
-def test_a_path_passes_its_waypoints(blend):
+def test_a_path_passes_its_waypoints(blend: float) -> None:
     home = Desk().pose()
     desk = Desk(path=square(home, blend))
     shown = []
@@ -192,7 +192,7 @@ def test_a_path_passes_its_waypoints(blend):
     assert stops == (4 if blend == 0 else 1)
 
 
-def test_a_path_in_joints_keeps_every_joints_limit():
+def test_a_path_in_joints_keeps_every_joints_limit() -> None:
     line = "\tmovej([{}],a=20,v=3.1,r={})\n"
     stops = ["1.5,-1.0,1.2,-1.5,-1.5,0", "-0.5,-1.5,1.5,-1.0,-1.5,1"]
     text = line.format(stops[0], 0.05) + line.format(stops[1], 0)
@@ -203,7 +203,7 @@ def test_a_path_in_joints_keeps_every_joints_limit():
     assert turned.max() > 2.0
 
 
-def test_jogging_goes_along_the_tools_axes(desk):
+def test_jogging_goes_along_the_tools_axes(desk: Desk) -> None:
     axis = desk.arm.stance.base_T_tcp[:3, 2]
     assert desk.order(41, [0, 0, 0.05, 0, 0, 0, 1, 0.5])
     desk.seconds(0.5)
@@ -212,7 +212,7 @@ def test_jogging_goes_along_the_tools_axes(desk):
     assert desk.arm.standing
 
 
-def test_a_custom_program_runs_line_by_line(desk):
+def test_a_custom_program_runs_line_by_line(desk: Desk) -> None:
     lines = [
         "write_output_integer_register(0 +0, 1)",
         "movej([0,-1.5,1.5,-1.5,-1.5,0], a=2, v=1)  # a comment",
@@ -239,7 +239,7 @@ def test_a_custom_program_runs_line_by_line(desk):
         ("set_tcp(p[0, 0])", "set_tcp takes a pose of six numbers"),
     ],
 )
-def test_a_custom_program_that_cannot_run_stops(desk, line, why):
+def test_a_custom_program_that_cannot_run_stops(desk: Desk, line: str, why: str) -> None:
     desk.box.load(CustomProgram(desk.box, f"def job():\n\t{line}\nend"), "job")
     desk.run(2)
     assert desk.log()[-1] == f"program stopped: runtime error: {why}"

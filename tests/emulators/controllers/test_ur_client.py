@@ -1,6 +1,8 @@
 """The unmodified ur_rtde client against a controller in a process of its own."""
 
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,7 +66,7 @@ class Cell:
 
 
 @pytest.fixture(scope="module")
-def running():
+def running() -> Iterator[Cell]:
     with Process() as process:
         cell = Cell(process)
         yield cell
@@ -72,7 +74,7 @@ def running():
 
 
 @pytest.fixture
-def cell(running):
+def cell(running: Cell) -> Any:
     """The cell at rest, with nothing around it."""
     running.control.clear()
     running.control.set_surfaces()
@@ -85,7 +87,7 @@ def cell(running):
     return running
 
 
-def test_it_connects_and_sees_the_arm(cell):
+def test_it_connects_and_sees_the_arm(cell: Any) -> None:
     assert cell.receive.isConnected()
     assert cell.robot.isConnected()
     assert cell.robot.isProgramRunning()
@@ -99,7 +101,7 @@ def test_it_connects_and_sees_the_arm(cell):
     assert cell.receive.getRobotStatus() == 3
 
 
-def test_moves(cell):
+def test_moves(cell: Any) -> None:
     target = away(cell.pose(), 0.08, 0.05, -0.06, 0, 0, 0)
     began = time.monotonic()
     assert cell.robot.moveL(target.tolist(), 0.25, 1.2)
@@ -115,7 +117,7 @@ def test_moves(cell):
     assert cell.robot.isSteady()
 
 
-def test_a_move_in_the_background_and_its_stop(cell):
+def test_a_move_in_the_background_and_its_stop(cell: Any) -> None:
     start = cell.pose()
     target = away(start, 0.1, 0, 0, 0, 0, 0)
     assert cell.robot.moveL(target.tolist(), 0.1, 1.0, True)
@@ -130,7 +132,7 @@ def test_a_move_in_the_background_and_its_stop(cell):
     cell.reaches(target, 1e-9)
 
 
-def test_paths(cell):
+def test_paths(cell: Any) -> None:
     start = cell.pose()
     corners = [
         away(start, dx, dy, 0, 0, 0, 0) for dx, dy in ((0.05, 0), (0.05, 0.05), (0, 0.05), (0, 0))
@@ -152,7 +154,7 @@ def test_paths(cell):
     cell.reaches(start, 1e-5)
 
 
-def test_a_stream_of_velocities(cell):
+def test_a_stream_of_velocities(cell: Any) -> None:
     start = cell.pose()
     for cycle in range(300):
         began = cell.robot.initPeriod()
@@ -171,7 +173,7 @@ def test_a_stream_of_velocities(cell):
 
 
 @pytest.mark.parametrize("how", ["servoJ", "servoL"])
-def test_a_servo_follows(cell, how):
+def test_a_servo_follows(cell: Any, how: str) -> None:
     start = cell.pose()
     for cycle in range(300):
         began = cell.robot.initPeriod()
@@ -189,7 +191,7 @@ def test_a_servo_follows(cell, how):
     assert cell.robot.servoStop()
 
 
-def test_touch(cell):
+def test_touch(cell: Any) -> None:
     floor = cell.pose()[2] - 0.02
     cell.control.set_surfaces(Surface(np.array([0, 0, floor]), np.array([0, 0, 1])))
     assert cell.robot.zeroFtSensor()
@@ -219,7 +221,7 @@ def test_touch(cell):
     assert cell.pose()[2] == pytest.approx(floor, abs=3e-4)
 
 
-def test_questions(cell):
+def test_questions(cell: Any) -> None:
     tool = [0.0, 0.0, 0.12, 0.0, 0.0, 0.0]
     flange = cell.pose()
     assert cell.robot.setTcp(tool)
@@ -245,7 +247,7 @@ def test_questions(cell):
     assert cell.receive.getPayloadCog() == pytest.approx([0, 0, 0.05])
 
 
-def test_questions_in_the_stream_answer_late(cell):
+def test_questions_in_the_stream_answer_late(cell: Any) -> None:
     """The client does not wait for these answers, so the first one may be an older number."""
     for ask, answer in (
         (cell.robot.getStepTime, pytest.approx(0.002)),
@@ -257,7 +259,7 @@ def test_questions_in_the_stream_answer_late(cell):
     cell.until(lambda: np.allclose(pose_matrix(cell.robot.getActualToolFlangePose()), flange))
 
 
-def test_outputs_and_the_slider(cell):
+def test_outputs_and_the_slider(cell: Any) -> None:
     assert cell.io.setStandardDigitalOut(3, True)
     assert cell.io.setToolDigitalOut(1, True)
     assert cell.io.setConfigurableDigitalOut(2, True)
@@ -279,7 +281,7 @@ def test_outputs_and_the_slider(cell):
     assert cell.io.setSpeedSlider(1.0)
 
 
-def test_the_dashboard(cell):
+def test_the_dashboard(cell: Any) -> None:
     board = cell.dashboard
     assert board.isConnected()
     assert board.polyscopeVersion() == "5.21.3.1"
@@ -300,14 +302,14 @@ def test_the_dashboard(cell):
     board.loadURP("seam.urp")
 
 
-def test_custom_functions(cell):
+def test_custom_functions(cell: Any) -> None:
     lines = "movej([0.1,-1.5,1.5,-1.5,-1.5,0],a=2,v=1)\nsleep(0.05)\ntextmsg(1)"
     assert cell.robot.sendCustomScriptFunction("there", lines)
     cell.until(lambda: abs(cell.receive.getActualQ()[0] - 0.1) < 1e-9)
     assert cell.robot.isProgramRunning()
 
 
-def test_jogging_and_accepted_settings(cell):
+def test_jogging_and_accepted_settings(cell: Any) -> None:
     start = cell.pose()
     assert cell.robot.jogStart([0.05, 0, 0, 0, 0, 0], 0, 0.5)
     cell.until(lambda: cell.receive.getActualTCPSpeed()[0] > 0.049)
@@ -318,7 +320,7 @@ def test_jogging_and_accepted_settings(cell):
     assert cell.robot.forceModeSetGainScaling(0.5)
 
 
-def test_a_protective_stop_and_the_way_back(cell):
+def test_a_protective_stop_and_the_way_back(cell: Any) -> None:
     assert cell.robot.triggerProtectiveStop()
     cell.until(cell.receive.isProtectiveStopped)
     target = (away(cell.pose(), 0.05, 0, 0, 0, 0, 0)).tolist()
@@ -331,7 +333,7 @@ def test_a_protective_stop_and_the_way_back(cell):
     assert cell.robot.moveL(target)
 
 
-def test_packages_come_at_500_hertz(cell):
+def test_packages_come_at_500_hertz(cell: Any) -> None:
     """By the controller's clock; how many of them a client sees depends on the machine's load."""
     stamps = set()
     limit = time.monotonic() + 1.0
@@ -344,7 +346,7 @@ def test_packages_come_at_500_hertz(cell):
 
 
 @pytest.mark.parametrize("model", ["ur3e", "ur5", "ur10e"])
-def test_other_arms_and_older_boxes(model):
+def test_other_arms_and_older_boxes(model: str) -> None:
     with Process(model=model) as process:
         robot = rtde_control.RTDEControlInterface(process.host)
         receive = rtde_receive.RTDEReceiveInterface(process.host)
@@ -356,7 +358,7 @@ def test_other_arms_and_older_boxes(model):
         receive.disconnect()
 
 
-def test_the_upper_registers_and_no_external_sensor():
+def test_the_upper_registers_and_no_external_sensor() -> None:
     with Process() as process:
         control = rtde_control.RTDEControlInterface
         flags = (

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -93,20 +95,20 @@ def client(host, code):
 
 
 @pytest.fixture(scope="module")
-def running():
+def running() -> Iterator[Any]:
     with Process() as process:
         yield process
 
 
 @pytest.fixture
-def controller(running):
+def controller(running: Any) -> Any:
     """A controller that survives the test."""
     running.control.reset()
     return running
 
 
 @pytest.fixture
-def doomed():
+def doomed() -> Iterator[Any]:
     """A controller that does not."""
     with Process() as process:
         yield process
@@ -122,7 +124,7 @@ MOVING = """
 """
 
 
-def test_nobody_there_is_an_error_at_once():
+def test_nobody_there_is_an_error_at_once() -> None:
     code = """
         try:
             say(seconds(lambda: rtde_receive.RTDEReceiveInterface(host)))
@@ -136,7 +138,7 @@ def test_nobody_there_is_an_error_at_once():
         ]
 
 
-def test_after_the_controllers_death_the_last_pose_is_returned_for_ever(doomed):
+def test_after_the_controllers_death_the_last_pose_is_returned_for_ever(doomed: Any) -> None:
     code = """
         receive = rtde_receive.RTDEReceiveInterface(host)
         before = receive.getActualTCPPose()
@@ -159,7 +161,7 @@ def test_after_the_controllers_death_the_last_pose_is_returned_for_ever(doomed):
         assert running.rest() == ["True True"]
 
 
-def test_a_frozen_stream_is_noticed_after_two_and_a_half_seconds(controller):
+def test_a_frozen_stream_is_noticed_after_two_and_a_half_seconds(controller: Any) -> None:
     code = """
         receive = rtde_receive.RTDEReceiveInterface(host)
         say("ready")
@@ -178,7 +180,7 @@ def test_a_frozen_stream_is_noticed_after_two_and_a_half_seconds(controller):
         assert stale == "True"
 
 
-def test_a_move_blocks_for_ever_after_the_controllers_death(doomed):
+def test_a_move_blocks_for_ever_after_the_controllers_death(doomed: Any) -> None:
     with client(doomed.host, MOVING + "\n    robot.moveL(target, 0.1, 0.5)\n    say('never')") as (
         running
     ):
@@ -189,7 +191,7 @@ def test_a_move_blocks_for_ever_after_the_controllers_death(doomed):
         assert running.hangs(5.0)
 
 
-def test_a_frozen_controller_blocks_a_move(doomed):
+def test_a_frozen_controller_blocks_a_move(doomed: Any) -> None:
     with client(doomed.host, MOVING + "\n    robot.moveL(target, 0.1, 0.5)\n    say('never')") as (
         running
     ):
@@ -200,7 +202,7 @@ def test_a_frozen_controller_blocks_a_move(doomed):
         assert running.hangs(4.0)
 
 
-def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doomed):
+def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doomed: Any) -> None:
     code = """
         io = rtde_io.RTDEIOInterface(host)
         say("ready")
@@ -215,7 +217,7 @@ def test_an_output_interface_that_is_never_disconnected_aborts_the_process(doome
         assert "terminate called" in running.errors
 
 
-def test_constructors_keep_other_threads_from_running(controller):
+def test_constructors_keep_other_threads_from_running(controller: Any) -> None:
     """So a driver must not connect in the process that serves anything else."""
     controller.control.fault("latency=20 ms")
     code = """
@@ -245,7 +247,9 @@ def test_constructors_keep_other_threads_from_running(controller):
         ("program-stop", ("NORMAL", "STOPPED", "RUNNING")),
     ],
 )
-def test_a_move_that_is_stopped_returns_false_soon(controller, fault, left):
+def test_a_move_that_is_stopped_returns_false_soon(
+    controller: Any, fault: str, left: tuple[Any, ...]
+) -> None:
     code = (
         MOVING
         + """
@@ -267,7 +271,7 @@ def test_a_move_that_is_stopped_returns_false_soon(controller, fault, left):
         assert controller.control.truth().speed == 0.0
 
 
-def test_in_local_control_the_client_refuses_to_connect(controller):
+def test_in_local_control_the_client_refuses_to_connect(controller: Any) -> None:
     controller.control.fault("remote-control-off")
     code = """
         try:
@@ -279,7 +283,7 @@ def test_in_local_control_the_client_refuses_to_connect(controller):
         assert running.rest() == ["ur_rtde: Please enable remote control on the robot!"]
 
 
-def test_local_control_after_connecting_loses_the_next_program(controller):
+def test_local_control_after_connecting_loses_the_next_program(controller: Any) -> None:
     code = (
         MOVING
         + """
@@ -298,7 +302,7 @@ def test_local_control_after_connecting_loses_the_next_program(controller):
         assert running.rest() == ["True", "True", "False False"]
 
 
-def test_a_second_client_is_refused(controller):
+def test_a_second_client_is_refused(controller: Any) -> None:
     code = (
         MOVING
         + """
@@ -316,7 +320,7 @@ def test_a_second_client_is_refused(controller):
         assert running.rest() == ["One of the RTDE input registers are already in use! Curre"]
 
 
-def test_a_slow_network_is_slow_and_nothing_else(controller):
+def test_a_slow_network_is_slow_and_nothing_else(controller: Any) -> None:
     controller.control.fault("latency=50 ms")
     code = """
         receive = rtde_receive.RTDEReceiveInterface(host)
@@ -333,7 +337,7 @@ def test_a_slow_network_is_slow_and_nothing_else(controller):
         assert running.rest(30.0) == ["True"] * 4
 
 
-def test_reset_connections_come_back_for_reading_and_in_a_new_process(controller):
+def test_reset_connections_come_back_for_reading_and_in_a_new_process(controller: Any) -> None:
     """The control interface reconnects by itself, over and over: it cannot be trusted any more."""
     code = (
         MOVING
@@ -355,7 +359,7 @@ def test_reset_connections_come_back_for_reading_and_in_a_new_process(controller
         assert running.rest() == ["True"]
 
 
-def test_a_velocity_outlives_its_client_unless_a_watchdog_is_set(controller):
+def test_a_velocity_outlives_its_client_unless_a_watchdog_is_set(controller: Any) -> None:
     code = (
         MOVING
         + """
@@ -377,7 +381,7 @@ def test_a_velocity_outlives_its_client_unless_a_watchdog_is_set(controller):
         assert (controller.control.truth().speed > 0.0) is moves
 
 
-def test_a_network_that_dies_for_a_while(controller):
+def test_a_network_that_dies_for_a_while(controller: Any) -> None:
     """The arm goes on meanwhile: it is the network that is dead, not the robot."""
     code = (
         MOVING

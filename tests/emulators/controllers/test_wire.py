@@ -6,6 +6,8 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture(scope="module")
-def process():
+def process() -> Iterator[Any]:
     with Process() as running:
         yield running
 
@@ -64,27 +66,27 @@ class Rtde:
 
 
 @pytest.fixture
-def rtde(process):
+def rtde(process: Any) -> Iterator[Any]:
     with contextlib.closing(Rtde(process.host).socket) as connection:
         client = Rtde.__new__(Rtde)
         client.socket = connection
         yield client
 
 
-def test_the_version_is_negotiated(rtde):
+def test_the_version_is_negotiated(rtde: Any) -> None:
     assert rtde.ask("V", struct.pack(">H", 2)) == b"\1"
     assert rtde.ask("V", struct.pack(">H", 1)) == b"\0"
     assert struct.unpack(">4I", rtde.ask("v")) == (5, 21, 3, 1)
 
 
-def test_types_of_variables_are_told_and_unknown_ones_refused(rtde):
+def test_types_of_variables_are_told_and_unknown_ones_refused(rtde: Any) -> None:
     assert rtde.outputs("timestamp,actual_q,robot_mode,") == b"\1DOUBLE,VECTOR6D,INT32"
     assert rtde.outputs("timestamp,wishes") == b"\0DOUBLE,NOT_FOUND"
     assert rtde.ask("S") == b"\0"
     assert rtde.ask("I", b"input_int_register_40,wishes") == b"\0INT32,NOT_FOUND"
 
 
-def test_an_input_has_one_writer(process, rtde):
+def test_an_input_has_one_writer(process: Any, rtde: Any) -> None:
     assert rtde.ask("I", b"input_int_register_41,input_double_register_41") == b"\1INT32,DOUBLE"
     assert rtde.ask("I", b"input_int_register_41") == b"\2INT32"
     other = Rtde(process.host)
@@ -96,7 +98,7 @@ def test_an_input_has_one_writer(process, rtde):
 
 
 @pytest.mark.parametrize("rate", [500, 125, 10])
-def test_packages_come_at_the_rate_that_was_asked(rtde, rate):
+def test_packages_come_at_the_rate_that_was_asked(rtde: Any, rate: int) -> None:
     assert rtde.outputs("timestamp", rate)[:1] == b"\1"
     assert rtde.ask("S") == b"\1"
     times = [struct.unpack(">Bd", body)[1] for body in rtde.packages(6)]
@@ -112,7 +114,7 @@ def test_packages_come_at_the_rate_that_was_asked(rtde, rate):
         rtde.receive()
 
 
-def test_what_is_sent_is_where_the_arm_is(process, rtde):
+def test_what_is_sent_is_where_the_arm_is(process: Any, rtde: Any) -> None:
     process.control.put(HOME)
     rtde.outputs("actual_q,actual_TCP_pose,runtime_state,safety_status_bits")
     rtde.ask("S")
@@ -124,7 +126,7 @@ def test_what_is_sent_is_where_the_arm_is(process, rtde):
     assert values[12:] == [1, 1]
 
 
-def test_packages_may_come_in_pieces_and_nonsense_ends_the_connection(rtde):
+def test_packages_may_come_in_pieces_and_nonsense_ends_the_connection(rtde: Any) -> None:
     for byte in struct.pack(">HB", 3, ord("v")):
         rtde.socket.sendall(bytes([byte]))
         time.sleep(0.005)
@@ -138,7 +140,7 @@ def test_packages_may_come_in_pieces_and_nonsense_ends_the_connection(rtde):
         rtde.receive()
 
 
-def test_a_client_that_does_not_read_does_not_hold_the_clock(process, rtde):
+def test_a_client_that_does_not_read_does_not_hold_the_clock(process: Any, rtde: Any) -> None:
     rtde.outputs(",".join(["actual_q"] * 30))
     rtde.ask("S")
     before = process.control.figures()["ticks"]
@@ -146,7 +148,7 @@ def test_a_client_that_does_not_read_does_not_hold_the_clock(process, rtde):
     assert process.control.figures()["ticks"] - before > 400
 
 
-def test_the_dashboard_speaks_in_lines(process):
+def test_the_dashboard_speaks_in_lines(process: Any) -> None:
     with socket.create_connection((process.host, 29999), timeout=2.0) as connection:
         lines = connection.makefile("rw", newline="\n")
         assert lines.readline() == "Connected: Universal Robots Dashboard Server\n"
@@ -157,7 +159,7 @@ def test_the_dashboard_speaks_in_lines(process):
         assert lines.readline() == ""
 
 
-def test_the_control_channel_tells_the_truth(process):
+def test_the_control_channel_tells_the_truth(process: Any) -> None:
     process.control.put(HOME)
     truth = process.control.truth()
     assert np.allclose(truth.base_T_flange, Arm(load_model("robots", "ur5e")).flange(HOME))
@@ -174,7 +176,7 @@ def test_the_control_channel_tells_the_truth(process):
     assert figures["cpu"] > 0
 
 
-def test_the_control_channel_refuses_with_a_reason(process):
+def test_the_control_channel_refuses_with_a_reason(process: Any) -> None:
     for action, arguments, message in (
         ("sing", {}, "loopback: cannot do 'sing'; can do truth, state, log, figures, fault,"),
         ("fault", {"fault": "melt"}, "loopback: no fault 'melt'; there are protective-stop,"),
@@ -187,7 +189,7 @@ def test_the_control_channel_refuses_with_a_reason(process):
         assert str(error.value).startswith(message)
 
 
-def test_surfaces_can_be_changed(process):
+def test_surfaces_can_be_changed(process: Any) -> None:
     process.control.put(HOME)
     height = process.control.truth().base_T_flange[2, 3]
     process.control.set_surfaces(
@@ -200,7 +202,7 @@ def test_surfaces_can_be_changed(process):
     assert process.control.state()["force"][2] == 0.0
 
 
-def test_faults_on_the_command_line_happen_in_their_time():
+def test_faults_on_the_command_line_happen_in_their_time() -> None:
     with Process("--fault", "protective-stop@300 ms", "--fault", "remote-control-off") as own:
         states = [own.control.state()]
         while states[-1]["safety"] == "NORMAL" and states[-1]["time"] < 10.0:
@@ -214,7 +216,7 @@ def test_faults_on_the_command_line_happen_in_their_time():
         assert own.control.state()["remote_control"]
 
 
-def test_nobody_there_is_said():
+def test_nobody_there_is_said() -> None:
     host = free_address()
     with pytest.raises(StageError) as error:
         EmulatorControl(host)
@@ -224,7 +226,7 @@ def test_nobody_there_is_said():
     )
 
 
-def test_the_end_is_orderly():
+def test_the_end_is_orderly() -> None:
     with Process("--floor", "200 mm", "--joints", "10 -90 90 -90 -90 0 deg", "--seed", "3") as own:
         assert own.greeting == (
             f"ur5e on {own.host}: RTDE 30004, script 30003, dashboard 29999, control 29998; "
@@ -239,7 +241,9 @@ def test_the_end_is_orderly():
 
 
 @pytest.fixture
-def loopback(monkeypatch, capsys):
+def loopback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Any]:
     """Run the command here, for what ends before anything listens."""
 
     def run(*arguments):
@@ -285,11 +289,13 @@ def loopback(monkeypatch, capsys):
         ),
     ],
 )
-def test_mistakes_on_the_command_line_are_one_line(loopback, arguments, message):
+def test_mistakes_on_the_command_line_are_one_line(
+    loopback: Callable[..., Any], arguments: list[Any], message: str
+) -> None:
     assert loopback(*arguments) == (2, message)
 
 
-def test_a_taken_address_is_said(process, loopback):
+def test_a_taken_address_is_said(process: Any, loopback: Callable[..., Any]) -> None:
     assert loopback("ur5e", "--host", process.host) == (
         2,
         f"error: {process.host}:30004 cannot be opened (Address already in use); where another "

@@ -23,13 +23,13 @@ def rms(trial):
 @pytest.mark.parametrize(
     "name", ["finger gain +20 %", "finger gain -20 %", "tag's rest off 0.2 mm"]
 )
-def test_a_finger_that_is_not_as_calibrated_is_measured_before_the_weld(name):
+def test_a_finger_that_is_not_as_calibrated_is_measured_before_the_weld(name: str) -> None:
     found = try_condition(CONDITIONS[name], 0, SHORT, 16e-3)
     assert found.done
     assert rms(found) < 0.1e-3
 
 
-def test_delays_of_arm_and_images_are_measured_and_made_up_for():
+def test_delays_of_arm_and_images_are_measured_and_made_up_for() -> None:
     name = "20 mm/s, latency 100 ms, lag 100 ms, dead time 60 ms"
     found = try_condition(CONDITIONS[name], 0)
     assert isinstance(found.controller, Follower)
@@ -48,7 +48,7 @@ def test_delays_of_arm_and_images_are_measured_and_made_up_for():
         ("tag hidden 0.6 s", "no tag was seen"),
     ],
 )
-def test_what_cannot_be_welded_is_stopped_with_its_reason(name, reason):
+def test_what_cannot_be_welded_is_stopped_with_its_reason(name: str, reason: str) -> None:
     found = try_condition(CONDITIONS[name], 0, period=16e-3)
     assert found.phases[-1] == "stopped"
     assert any(word in found.controller.reason for word in reason.split("|"))
@@ -62,31 +62,31 @@ def test_what_cannot_be_welded_is_stopped_with_its_reason(name, reason):
         ("arm wavy 0.3 mm", "of arm_sigma and of distortion"),
     ],
 )
-def test_what_is_known_beforehand_is_refused_beforehand(name, message):
+def test_what_is_known_beforehand_is_refused_beforehand(name: str, message: str) -> None:
     with pytest.raises(StageError, match=message):
         try_condition(CONDITIONS[name], 0)
 
 
-def test_noise_of_a_tenth_of_a_millimetre_is_no_silent_failure():
+def test_noise_of_a_tenth_of_a_millimetre_is_no_silent_failure() -> None:
     found = try_condition(CONDITIONS["tip noise 0.1 mm"], 0, period=16e-3)
     stated = found.column("bound")[found.beside]
     assert not found.done or (found.errors <= stated).all()
 
 
-def test_heat_stays_within_the_stated_bound():
+def test_heat_stays_within_the_stated_bound() -> None:
     hot = CONDITIONS["heat: 1 mm around the torch"]
     found = try_condition(hot, 0, SHORT, 16e-3)
     assert (found.errors <= found.column("bound")[found.beside]).all()
 
 
-def test_a_wavy_seam_is_followed_as_far_as_it_is_felt():
+def test_a_wavy_seam_is_followed_as_far_as_it_is_felt() -> None:
     found = try_condition(CONDITIONS["seam wavy 1 mm per 10 mm"], 0, 0.1, 16e-3)
     assert found.column("torch_s").max() > 0.09
     assert rms(found) < 0.2e-3
     assert (found.errors <= found.column("bound")[found.beside]).all()
 
 
-def test_a_tip_that_is_not_where_its_file_says_is_in_the_stated_bound():
+def test_a_tip_that_is_not_where_its_file_says_is_in_the_stated_bound() -> None:
     """In a curve the tool turns between the tip's and the torch's passing."""
     wrong = Condition({"tool": {"tip": ["1.5 mm", "0 mm", "0 mm"], "torch": ["1.5 mm", "0 mm"]}})
     known = wrong._replace(belief={"tip_sigma": 0.8e-3}, settings={"max_error": "4 mm"})
@@ -116,7 +116,9 @@ def _reachable(value):
             left.extend(each if hasattr(each, "popleft") else [])
 
 
-def test_nothing_of_the_world_is_reachable_from_the_controller(monkeypatch):
+def test_nothing_of_the_world_is_reachable_from_the_controller(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     given = []
 
     def spy(controller, nominal, truth, start, seed):
@@ -141,12 +143,12 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(monkeypatch):
     assert not [name for name in modules if name.startswith("flangeye_emulators")]
 
 
-def test_worlds_are_drawn_again_as_they_were():
+def test_worlds_are_drawn_again_as_they_were() -> None:
     assert drawn(3) == drawn(3) != drawn(4)
 
 
 @pytest.mark.slow
-def test_no_weld_is_reported_done_beyond_its_bound():
+def test_no_weld_is_reported_done_beyond_its_bound() -> None:
     verdicts = [judged(seed) for seed in range(2000, 2040)]
     done = [v for v in verdicts if v.done]
     assert len(done) >= 6

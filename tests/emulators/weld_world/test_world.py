@@ -36,7 +36,7 @@ def params(model, **given):
     return model.model_validate(given)
 
 
-def test_the_arm_follows_late_and_lagging():
+def test_the_arm_follows_late_and_lagging() -> None:
     truth = params(ArmTruth, lag="100 ms", dead_time="50 ms")
     arm = ArmResponse(truth, pose(), 10e-3)
     travelled = []
@@ -49,7 +49,7 @@ def test_the_arm_follows_late_and_lagging():
     assert 0.01 - travelled[-1] == pytest.approx(0.01 * 0.15, rel=0.05)
 
 
-def test_the_arm_is_not_where_it_says():
+def test_the_arm_is_not_where_it_says() -> None:
     backlash = ArmError(params(ArmTruth, backlash="0.1 mm"), RNG(0))
     ways = [0.0, 1e-3, 2e-3, 1.95e-3, 1e-3]
     off = [backlash.true_pose(pose(y=y)).position[1] - y for y in ways]
@@ -63,7 +63,7 @@ def test_the_arm_is_not_where_it_says():
     assert np.ptp(aside) == pytest.approx(0.6e-3, rel=0.01)
 
 
-def test_the_tool_is_where_the_world_has_it():
+def test_the_tool_is_where_the_world_has_it() -> None:
     tool = TrueTool(
         params(ToolTruth, tip=["1 mm", "0 mm", "2 mm"], torch=["0 mm", "0.5 mm"]), 40e-3
     )
@@ -73,7 +73,7 @@ def test_the_tool_is_where_the_world_has_it():
     assert turned.torch(pose())[1] == pytest.approx(-40e-3 * np.sin(np.pi / 180))
 
 
-def test_the_finger_shows_less_and_later_than_it_feels():
+def test_the_finger_shows_less_and_later_than_it_feels() -> None:
     play = TrueFinger(params(FingerTruth, play="0.4 mm"))
     shown = [
         play.shown(t, np.array([0.0, y, 0.0]))[1] for t, y in enumerate([1e-3, -1e-3, -0.7e-3])
@@ -92,7 +92,7 @@ def test_the_finger_shows_less_and_later_than_it_feels():
     assert loop.shown(2.0, np.array([0, 3e-3, 0]))[1] - up == pytest.approx(0.4e-3)
 
 
-def test_images_are_late_lost_and_wrongly_stamped():
+def test_images_are_late_lost_and_wrongly_stamped() -> None:
     truth = params(ClockTruth, rate=100, latency="50 ms", jitter="0 ms", stamp="20 ms", dropped=0)
     shutter: Shutter[str] = Shutter(truth, RNG(0))
     assert shutter.due(0.0)
@@ -106,7 +106,7 @@ def test_images_are_late_lost_and_wrongly_stamped():
     assert 70 < sum(lossy.arrived(1e9) is not None for _ in range(200)) < 130
 
 
-def test_the_workpiece_is_not_its_cad():
+def test_the_workpiece_is_not_its_cad() -> None:
     truth = params(
         WorkpieceTruth, wave="1 mm", wave_length="20 mm", bow="2 mm", root_gap="1 mm",
         tacks=[{"start": "50 mm"}],
@@ -121,7 +121,7 @@ def test_the_workpiece_is_not_its_cad():
     assert np.std(rough.relief.fill) == pytest.approx(0.1e-3 * 0.8, rel=0.2)
 
 
-def test_heat_moves_the_seam_as_a_whole_and_near_the_torch():
+def test_heat_moves_the_seam_as_a_whole_and_near_the_torch() -> None:
     whole = Distortion(params(HeatTruth, shift="2 mm"), 0.1)
     assert whole.at(0.05, -0.01) == 0.0
     assert whole.at(0.09, 0.05) == pytest.approx(1e-3)
@@ -130,7 +130,7 @@ def test_heat_moves_the_seam_as_a_whole_and_near_the_torch():
     assert near.at(0.09, 0.05) < 0.05e-3
 
 
-def test_friction_holds_a_tip_on_a_wall_and_on_the_face():
+def test_friction_holds_a_tip_on_a_wall_and_on_the_face() -> None:
     groove = Groove(Path(LINE), SECTION)
     seat = 1.5e-3 / np.sin(SECTION.half_angle)
 
@@ -150,12 +150,12 @@ def test_friction_holds_a_tip_on_a_wall_and_on_the_face():
 @pytest.mark.parametrize(
     ("name", "rms"), [("tool yaw 1 deg", 0.698e-3), ("torch 0.5 mm aside", 0.5e-3)]
 )
-def test_the_torch_is_scored_where_it_truly_is(name, rms):
+def test_the_torch_is_scored_where_it_truly_is(name: str, rms: float) -> None:
     told = CONDITIONS[name]
     trial = try_condition(Condition(told.world, {}, (0.0, 0.0)), seed=0, length=0.06)
     assert np.sqrt(np.mean(trial.errors**2)) == pytest.approx(rms, rel=0.1)
 
 
-def test_every_condition_is_a_world():
+def test_every_condition_is_a_world() -> None:
     for condition in CONDITIONS.values():
         assert isinstance(condition.truth, WorldParams)

@@ -3,6 +3,7 @@
 import gc
 import weakref
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,12 +41,12 @@ def in_flange(capture, truth):
     return camera_T_flange.inverse().apply(capture.cloud.points())
 
 
-def test_it_is_an_acquire_stage():
+def test_it_is_an_acquire_stage() -> None:
     assert acquire_simulated.name == "acquire.simulated"
     assert set(acquire_simulated.gives) <= set(KINDS["acquire"].gives)
 
 
-def test_captures_are_complete():
+def test_captures_are_complete() -> None:
     found = scanned()
     assert acquire().total == len(found) == 5
     assert [c.id for c in found] == ["0000", "0001", "0002", "0003", "0004"]
@@ -59,7 +60,7 @@ def test_captures_are_complete():
     assert (times == 4_000_000_000).all()
 
 
-def test_the_truth_is_the_papers_camera_pose():
+def test_the_truth_is_the_papers_camera_pose() -> None:
     source = acquire().source
     expected = [[0, -1, 0, 0.6], [-1, 0, 0, -0.0125], [0, 0, -1, 1], [0, 0, 0, 1]]
     assert source.truth.camera.matrix == pytest.approx(np.array(expected), abs=1e-15)
@@ -68,7 +69,7 @@ def test_the_truth_is_the_papers_camera_pose():
     assert source.notes == ("simulated: ur5 before phoxi-m, 4 poses",)
 
 
-def test_the_flange_is_where_the_robot_says():
+def test_the_flange_is_where_the_robot_says() -> None:
     captures = acquire(robot_errors=0.0, noise=0.0, resolution=0.25)
     for capture in captures:
         points = in_flange(capture, captures.source.truth)
@@ -78,7 +79,7 @@ def test_the_flange_is_where_the_robot_says():
         assert np.median(np.abs(face[:, 2])) < 2e-6
 
 
-def test_the_reported_pose_is_that_of_the_reported_joints():
+def test_the_reported_pose_is_that_of_the_reported_joints() -> None:
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(load_model("robots", "ur5"))
@@ -86,7 +87,7 @@ def test_the_reported_pose_is_that_of_the_reported_joints():
         assert capture.base_T_flange.matrix == pytest.approx(arm.flange(capture.joints), abs=1e-12)
 
 
-def test_robot_errors_move_the_flange_by_tenths_of_a_millimetre():
+def test_robot_errors_move_the_flange_by_tenths_of_a_millimetre() -> None:
     def heights(errors):
         captures = acquire(robot_errors=errors, noise=0.0, resolution=0.15)
         for capture in captures:
@@ -100,7 +101,7 @@ def test_robot_errors_move_the_flange_by_tenths_of_a_millimetre():
     assert 2e-5 < np.abs(wrong).max() < 1e-3
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_does_not():
+def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
     first, again, other = scanned(), list(acquire()), scanned(seed=1)
     for one, two in zip(first, again, strict=True):
         assert one.cloud.xyz.tobytes() == two.cloud.xyz.tobytes()
@@ -109,7 +110,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not():
     assert first[1].cloud.xyz.tobytes() != other[1].cloud.xyz.tobytes()
 
 
-def test_the_fingerprint_stands_for_everything():
+def test_the_fingerprint_stands_for_everything() -> None:
     prints = [
         acquire().source.fingerprint,
         acquire(seed=1).source.fingerprint,
@@ -120,7 +121,7 @@ def test_the_fingerprint_stands_for_everything():
     assert acquire().source.fingerprint == prints[0]
 
 
-def test_nothing_is_scanned_before_it_is_asked_for_and_nothing_is_kept():
+def test_nothing_is_scanned_before_it_is_asked_for_and_nothing_is_kept() -> None:
     captures = acquire(plan={"counts": (2, 2, 2)})
     alive = []
     for capture in captures:
@@ -131,7 +132,7 @@ def test_nothing_is_scanned_before_it_is_asked_for_and_nothing_is_kept():
     assert len(alive) == captures.total
 
 
-def test_covered_flanges_are_outliers():
+def test_covered_flanges_are_outliers() -> None:
     captures = acquire(plan={"counts": (2, 2, 2)}, outliers=0.5, robot_errors=0.0)
     seen = []
     for capture in captures:
@@ -142,7 +143,7 @@ def test_covered_flanges_are_outliers():
     assert seen[1:].count(False) == round(0.5 * (len(seen) - 1))
 
 
-def test_a_robot_asked_for_its_wrist_circle_still_carries_its_plate():
+def test_a_robot_asked_for_its_wrist_circle_still_carries_its_plate() -> None:
     captures = acquire("ur10e", "azure-kinect", wrist=0.09, resolution=1.0, noise=0.0)
     points = in_flange(next(iter(captures)), captures.source.truth)
     radius = np.hypot(points[:, 0], points[:, 1])
@@ -160,19 +161,19 @@ def test_a_robot_asked_for_its_wrist_circle_still_carries_its_plate():
         ("aubo-i5", "phoxi-s", {"size": ("120 mm", "120 mm", "60 mm")}),
     ],
 )
-def test_other_cells_work(robot, scanner, plan):
+def test_other_cells_work(robot: str, scanner: str, plan: dict[str, Any]) -> None:
     captures = acquire(robot, scanner, plan=plan | {"counts": (2, 2, 2)}, resolution=0.05)
     assert captures.total >= 5
     assert np.isfinite(next(iter(captures)).cloud.xyz).any()
 
 
-def test_verification_captures_may_be_left_out_or_be_several():
+def test_verification_captures_may_be_left_out_or_be_several() -> None:
     none, two = (list(acquire(verification=n, resolution=0.02)) for n in (0, 2))
     assert [c.role for c in none] == 4 * ["calibration"]
     assert [c.role for c in two] == 2 * ["verification"] + 4 * ["calibration"]
 
 
-def test_an_arm_that_is_too_short_is_told_so():
+def test_an_arm_that_is_too_short_is_told_so() -> None:
     with pytest.raises(StageError) as error:
         acquire("ur3e")
     assert str(error.value) == (
@@ -182,20 +183,20 @@ def test_an_arm_that_is_too_short_is_told_so():
     )
 
 
-def test_a_camera_that_looks_away_is_told_so():
+def test_a_camera_that_looks_away_is_told_so() -> None:
     away = CameraPose(position=("600 mm", "0 mm", "1000 mm"), rpy=("0 deg", "0 deg", "0 deg"))
     with pytest.raises(StageError, match="0 of 4 planned poses, 3 are needed"):
         acquire(camera=away)
 
 
-def test_a_middle_where_nothing_can_be_verified_is_told():
+def test_a_middle_where_nothing_can_be_verified_is_told() -> None:
     # Corners that can be reached around a middle that cannot: the plan has poses, the check none.
     with pytest.raises(StageError, match="no pose for verification near the middle"):
         acquire(plan={"size": ("0 mm", "0 mm", "640 mm"), "counts": (1, 1, 9), "tilt": "0 deg",
                       "centre": ("600 mm", "0 mm", "560 mm")})  # fmt: skip
 
 
-def test_the_recipes_default_plan_is_the_grid():
+def test_the_recipes_default_plan_is_the_grid() -> None:
     class Lookup:
         def part(self, name):
             assert name == "plan.grid"

@@ -1,6 +1,7 @@
 """Arms that are as bad as real ones: how much, in which shape, and nobody is told."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,13 +72,13 @@ def rms_left(errors, seed, robot="ur5"):
 
 
 @pytest.mark.parametrize("robot", ["ur5", "aubo-i5"])
-def test_a_real_arm_leaves_what_published_recordings_leave(robot):
+def test_a_real_arm_leaves_what_published_recordings_leave(robot: str) -> None:
     left = [rms_left(ArmErrors(quality="real"), seed, robot) for seed in range(30)]
     assert 0.35e-3 < np.median(left) < 0.7e-3
     assert np.median([rms_left(ArmErrors(), seed, robot) for seed in range(30)]) < 0.2e-3
 
 
-def test_what_it_leaves_is_smooth():
+def test_what_it_leaves_is_smooth() -> None:
     """Second powers of the place tell most of it; of independent noise they told a sixth."""
     model, joints = load_model("robots", "ur5"), workspace_joints("ur5")
     shares = []
@@ -94,7 +95,7 @@ def test_what_it_leaves_is_smooth():
 
 
 @pytest.mark.parametrize("name", ErrorSizes._fields)
-def test_each_error_moves_the_arm_and_none_the_report(name):
+def test_each_error_moves_the_arm_and_none_the_report(name: Any) -> None:
     unit = "mm" if name == "lengths" else "mrad"
     errors = ArmErrors(**{"zeros": "0 mrad"} | {name: f"{getattr(REAL, name) * 1e3} {unit}"})
     model, joints = load_model("robots", "ur5"), session_joints()
@@ -106,7 +107,7 @@ def test_each_error_moves_the_arm_and_none_the_report(name):
     assert np.array_equal(arm.reported(joints), Arm(model).flange(joints))
 
 
-def test_sag_lowers_the_flange_and_more_the_farther_out():
+def test_sag_lowers_the_flange_and_more_the_farther_out() -> None:
     model = load_model("robots", "ur5")
     errors = ArmErrors(zeros="0 mrad", sag="2 mrad")
     arm = ImperfectArm(model, 1.0, np.random.default_rng(0), errors)
@@ -119,7 +120,7 @@ def test_sag_lowers_the_flange_and_more_the_farther_out():
     assert 0 < drop(folded) < drop(stretched)
 
 
-def test_backlash_depends_on_the_way_there():
+def test_backlash_depends_on_the_way_there() -> None:
     arm = ImperfectArm(
         load_model("robots", "ur5"), 1.0, np.random.default_rng(0),
         ArmErrors(zeros="0 mrad", backlash="0.2 mrad"),
@@ -129,7 +130,7 @@ def test_backlash_depends_on_the_way_there():
     assert downwards - upwards == pytest.approx(np.full(6, 0.2e-3))
 
 
-def test_no_scale_is_a_perfect_arm():
+def test_no_scale_is_a_perfect_arm() -> None:
     model = load_model("robots", "franka-panda")
     arm = ImperfectArm(model, 0.0, np.random.default_rng(0), ArmErrors(quality="real"))
     joints = np.random.default_rng(0).uniform(-1, 1, (5, 7))
@@ -142,7 +143,7 @@ def planned(errors, configuration=EYE_IN_HAND, **changes):
     return plan_session(load_model("robots", "ur5"), None, configuration, (params, VIEW), rng)
 
 
-def test_a_session_of_any_configuration_keeps_what_it_reports():
+def test_a_session_of_any_configuration_keeps_what_it_reports() -> None:
     kind, real = planned(ArmErrors()), planned(ArmErrors(quality="real"))
     assert np.array_equal(kind.reported.flange, real.reported.flange)
     off = np.linalg.norm((real.actual.camera - real.reported.camera)[:, :3, 3], axis=1)
@@ -151,7 +152,7 @@ def test_a_session_of_any_configuration_keeps_what_it_reports():
     assert len(real.unseen) == 60
 
 
-def test_poses_that_took_no_part_show_the_arms_error_at_the_work():
+def test_poses_that_took_no_part_show_the_arms_error_at_the_work() -> None:
     session = planned(ArmErrors(quality="real"))
     camera, place = session.places.x, session.places.z
     for seen in session.unseen[:5]:
@@ -159,25 +160,25 @@ def test_poses_that_took_no_part_show_the_arms_error_at_the_work():
         assert 1e-5 < np.linalg.norm((mapped - place)[:3, 3]) < 10e-3
 
 
-def test_a_link_that_carries_the_camera_is_off_too():
+def test_a_link_that_carries_the_camera_is_off_too() -> None:
     on_link = Configuration("eye-on-arm", "link3", FLANGE, np.eye(4))
     session = planned(ArmErrors(quality="real"), on_link, distance="500 mm")
     assert np.abs(session.actual.camera - session.reported.camera).max() > 1e-4
 
 
-def test_four_axes_have_no_joints_to_be_wrong():
+def test_four_axes_have_no_joints_to_be_wrong() -> None:
     with pytest.raises(StageError, match="four axes has no joints to be wrong; leave 'arm' out"):
         planned(ArmErrors(quality="real"), four_axes=True)
 
 
-def test_a_size_replaces_that_of_the_quality():
+def test_a_size_replaces_that_of_the_quality() -> None:
     model = load_model("robots", "ur5")
     sizes = ArmErrors(quality="real", zeros="4 mrad").sizes(model)
     assert sizes == REAL._replace(zeros=4e-3)
     assert ArmErrors().sizes(model) == ErrorSizes(model.joint_accuracy)
 
 
-def test_truth_at_the_work_goes_through_the_log():
+def test_truth_at_the_work_goes_through_the_log() -> None:
     from pydantic import TypeAdapter
 
     unseen = planned(ArmErrors(quality="real")).unseen[:1]

@@ -1,6 +1,7 @@
 """Every robot and scanner in the catalogue is there, plausible, and says where it is from."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,13 +20,13 @@ REACH = {
 }  # fmt: skip
 
 
-def test_the_papers_robots_and_scanners_are_there():
+def test_the_papers_robots_and_scanners_are_there() -> None:
     assert {"ur3e", "ur5", "ur5e", "ur10e", "franka-panda", "aubo-i5"} <= set(ROBOTS)
     assert {"phoxi-m", "phoxi-s", "azure-kinect"} <= set(SCANNERS)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_robot_is_plausible(name):
+def test_robot_is_plausible(name: Any) -> None:
     robot = load_model("robots", name)
     assert robot.model == name
     assert len(robot.source) > 20
@@ -38,7 +39,7 @@ def test_robot_is_plausible(name):
 
 
 @pytest.mark.parametrize("name", sorted(REACH))
-def test_robot_reaches_as_far_as_its_data_sheet_says(name):
+def test_robot_reaches_as_far_as_its_data_sheet_says(name: Any) -> None:
     arm = Arm(load_model("robots", name))
     joints = np.random.default_rng(0).uniform(
         np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi), (20000, arm.n)
@@ -50,7 +51,7 @@ def test_robot_reaches_as_far_as_its_data_sheet_says(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_flange_fits_together(name):
+def test_flange_fits_together(name: Any) -> None:
     robot = load_model("robots", name)
     if robot.flange.standard is None:
         pytest.skip("its maker's plate could not be checked; the recipe names it")
@@ -67,7 +68,7 @@ def test_flange_fits_together(name):
 
 
 @pytest.mark.parametrize("name", SCANNERS)
-def test_scanner_is_plausible(name):
+def test_scanner_is_plausible(name: Any) -> None:
     scanner = load_model("scanners", name)
     assert scanner.model == name
     assert len(scanner.source) > 20
@@ -81,7 +82,7 @@ def test_scanner_is_plausible(name):
     assert scanner.baseline == 0 or scanner.principle == "structured light"
 
 
-def test_every_yaml_value_of_the_catalogue_has_a_source_line():
+def test_every_yaml_value_of_the_catalogue_has_a_source_line() -> None:
     for kind in ("robots", "scanners"):
         for path in (bundled("data") / kind).glob("*.yaml"):
             assert "source:" in Path(path).read_text()

@@ -1,5 +1,7 @@
 """Shapes are where they should be, to a micrometre."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -22,13 +24,13 @@ def polygon(radius, segments):
     return 0.5 * segments * radius**2 * np.sin(2 * np.pi / segments)
 
 
-def test_a_measured_circle_is_round_to_a_micrometre():
+def test_a_measured_circle_is_round_to_a_micrometre() -> None:
     inside = circle(50e-3, FINE)
     middles = (inside + np.roll(inside, 1, axis=0)) / 2
     assert 50e-3 - np.hypot(*middles.T).min() < 1e-6
 
 
-def test_a_region_has_the_area_of_its_outline_less_its_holes():
+def test_a_region_has_the_area_of_its_outline_less_its_holes() -> None:
     holes = [circle(0.01, 90, (0.02, 0)), circle(0.005, 60, (-0.02, 0.01))]
     mesh = region(circle(0.05, 180), holes, 0.3)
     wanted = polygon(0.05, 180) - polygon(0.01, 90) - polygon(0.005, 60)
@@ -37,7 +39,7 @@ def test_a_region_has_the_area_of_its_outline_less_its_holes():
 
 
 @pytest.mark.parametrize("robot", ["ur5", "franka-panda", "aubo-i5"])
-def test_the_face_is_the_rim_less_bore_holes_and_recesses(robot):
+def test_the_face_is_the_rim_less_bore_holes_and_recesses(robot: str) -> None:
     shape = flange(robot)
     mesh = flange_mesh(shape)
     face = (mesh.vertices[mesh.triangles][:, :, 2] == 0).all(axis=1)
@@ -48,7 +50,7 @@ def test_the_face_is_the_rim_less_bore_holes_and_recesses(robot):
     assert area(mesh, face) == pytest.approx(wanted, rel=3e-4)
 
 
-def test_the_chamfers_fall_at_45_degrees():
+def test_the_chamfers_fall_at_45_degrees() -> None:
     shape = flange()
     vertices = flange_mesh(shape).vertices
     radius = np.hypot(vertices[:, 0], vertices[:, 1])
@@ -59,14 +61,14 @@ def test_the_chamfers_fall_at_45_degrees():
     assert vertices[inner, 2].max() == pytest.approx(-shape.details.bore_chamfer)
 
 
-def test_the_flange_lies_behind_its_face_and_before_the_wrist():
+def test_the_flange_lies_behind_its_face_and_before_the_wrist() -> None:
     shape = flange()
     z = flange_mesh(shape).vertices[:, 2]
     assert z.max() == 0
     assert wrist_mesh(shape).vertices[:, 2].max() == -shape.details.thickness
 
 
-def test_a_recess_follows_its_circle():
+def test_a_recess_follows_its_circle() -> None:
     recess = flange("franka-panda").details.recesses[0]
     outline = recess_outline(recess)
     radius = np.hypot(*outline.T)
@@ -77,7 +79,7 @@ def test_a_recess_follows_its_circle():
 
 
 @pytest.mark.parametrize("end", [(0, 0, 0.3), (0.1, -0.2, 0.05), (0, 0, 0)])
-def test_every_point_of_a_capsule_is_a_radius_from_its_axis(end):
+def test_every_point_of_a_capsule_is_a_radius_from_its_axis(end: tuple[Any, ...]) -> None:
     start, stop = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]) + end
     vertices = capsule(start, stop, 0.05, 24).vertices
     along = stop - start
@@ -86,19 +88,19 @@ def test_every_point_of_a_capsule_is_a_radius_from_its_axis(end):
     assert distance == pytest.approx(np.full(len(vertices), 0.05), abs=1e-12)
 
 
-def test_box_disc_and_merging():
+def test_box_disc_and_merging() -> None:
     both = merged([box([0, 0, 0], [1, 2, 3]), disc(1.0, 5.0)])
     assert area(both) == pytest.approx(2 * (2 + 3 + 6) + polygon(1.0, FINE))
     assert both.triangles.max() == len(both.vertices) - 1
 
 
-def test_a_plate_of_another_standard_has_none_of_the_robots_recesses():
+def test_a_plate_of_another_standard_has_none_of_the_robots_recesses() -> None:
     robot = load_model("robots", "franka-panda")
     small = flange_mesh(flange_of(robot.flange, load_standard("40-4-M6")))
     assert not np.isclose(small.vertices[:, 2], -robot.flange.recesses[0].depth, atol=1e-9).any()
 
 
-def test_holes_that_do_not_fit_are_refused():
+def test_holes_that_do_not_fit_are_refused() -> None:
     crowded = flange().model_copy(update={"pitch": 0.019})
     with pytest.raises(StageError) as error:
         flange_mesh(crowded)

@@ -9,7 +9,7 @@ from flangeye_emulators.world.raycast import Scene, pixels_of
 from tests.emulators.world.bench import SCANNER, facing, flange, flange_scene, plate, zoomed
 
 
-def test_pixels_fill_the_field_of_view():
+def test_pixels_fill_the_field_of_view() -> None:
     pixels = pixels_of(SCANNER)
     assert pixels.directions.shape == (1544, 2064, 3)
     middle_row = pixels.directions[772]
@@ -18,14 +18,14 @@ def test_pixels_fill_the_field_of_view():
     assert middle_row[-1, 0] + pixels.size / 2 == pytest.approx(half, rel=1e-6)
 
 
-def test_resolution_scales_the_image_and_keeps_the_field():
+def test_resolution_scales_the_image_and_keeps_the_field() -> None:
     pixels = pixels_of(SCANNER, 0.25)
     assert pixels.directions.shape == (386, 516, 3)
     assert pixels.size == pytest.approx(4 * pixels_of(SCANNER).size, rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
-def test_looking_at_every_second_pixel_finds_what_every_pixel_sees(tilt):
+def test_looking_at_every_second_pixel_finds_what_every_pixel_sees(tilt: float) -> None:
     pixels = pixels_of(zoomed())
     scene = flange_scene(facing(tilt))
     quick, full = scene.look(pixels), scene._cast(pixels.directions)
@@ -36,7 +36,7 @@ def test_looking_at_every_second_pixel_finds_what_every_pixel_sees(tilt):
     assert turned.min() > 0.999
 
 
-def test_shadows_at_every_second_pixel_are_those_at_every_pixel():
+def test_shadows_at_every_second_pixel_are_those_at_every_pixel() -> None:
     pixels = pixels_of(zoomed())
     scene = flange_scene(facing(0.3))
     light = np.array([0.35, 0.0, 0.07])
@@ -46,14 +46,14 @@ def test_shadows_at_every_second_pixel_are_those_at_every_pixel():
     assert differs.mean() < 1e-3
 
 
-def test_a_gap_shows_nothing():
+def test_a_gap_shows_nothing() -> None:
     pixels = pixels_of(SCANNER, 0.05)
     seen = Scene([plate(0.8, half=0.1)]).look(pixels)
     assert not np.isfinite(seen.depth[0, 0])
     assert seen.depth[38, 51] == pytest.approx(0.8, abs=1e-6)
 
 
-def test_a_plane_is_flat_to_single_precision():
+def test_a_plane_is_flat_to_single_precision() -> None:
     pixels = pixels_of(zoomed())
     camera_T_flange = facing(0.3)
     seen = flange_scene(camera_T_flange).look(pixels)
@@ -68,7 +68,7 @@ def test_a_plane_is_flat_to_single_precision():
     assert np.quantile(np.abs(local[face, 2]), 0.99) < 5e-7
 
 
-def test_the_cell_has_a_second_disc_of_a_similar_size():
+def test_the_cell_has_a_second_disc_of_a_similar_size() -> None:
     robot_flange = flange()
     cell = Cell(
         load_model("robots", "ur5"),
@@ -85,7 +85,7 @@ def test_the_cell_has_a_second_disc_of_a_similar_size():
     assert post.material.albedo < 0.05
 
 
-def test_an_arm_without_volumes_is_a_flange_in_the_air():
+def test_an_arm_without_volumes_is_a_flange_in_the_air() -> None:
     robot = load_model("robots", "ur5").model_copy(update={"volumes": ()})
     cell = Cell(robot, flange(), np.array([0.6, 0, 0.3]), np.array([0.3, 0.3, 0.2]))
     assert len(cell.arm(np.tile(np.eye(4), (7, 1, 1)), np.eye(4))) == 2

@@ -1,5 +1,7 @@
 """What the structured-light scanner measures, misses and gets wrong."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -36,7 +38,7 @@ def tilted_plate(tilt, material=materials.WALL):
     return Scene([Body(box([-0.6, -0.6, 0], [0.6, 0.6, 0.01]), material).moved(turn)])
 
 
-def test_without_noise_the_face_is_a_plane_and_the_rim_a_circle():
+def test_without_noise_the_face_is_a_plane_and_the_rim_a_circle() -> None:
     pose = facing(0.2)
     points = in_flange(scan(zoomed(quiet()), flange_scene(pose), noise=0.0), pose)
     radius, shape = np.hypot(points[:, 0], points[:, 1]), flange()
@@ -52,7 +54,7 @@ def test_without_noise_the_face_is_a_plane_and_the_rim_a_circle():
     assert shape.bore <= innermost.mean() < shape.bore + 0.15e-3
 
 
-def test_a_scan_is_organised_and_missing_points_are_nan():
+def test_a_scan_is_organised_and_missing_points_are_nan() -> None:
     points = scan(SCANNER, flange_scene(facing()), resolution=0.1)
     assert points.shape == (154, 206, 3)
     assert points.dtype == np.float32
@@ -63,7 +65,7 @@ def test_a_scan_is_organised_and_missing_points_are_nan():
     assert depth.min() > SCANNER.near - 2e-3 and depth.max() < SCANNER.far + 2e-3
 
 
-def test_the_projector_throws_shadows_away_from_itself():
+def test_the_projector_throws_shadows_away_from_itself() -> None:
     block = Body(box([-0.05, -0.05, 0.7], [0.05, 0.05, 0.72]), materials.WALL)
     points = scan(quiet(projection=None), Scene([block, plate(0.9)]), 0.2, noise=0.0)
     pixels = pixels_of(SCANNER, 0.2)
@@ -83,14 +85,14 @@ def test_the_projector_throws_shadows_away_from_itself():
     assert not missing[(x_behind > 0.05 * 0.9 / 0.7 + 1e-3) & (x_behind < 0.3)].any()
 
 
-def test_the_projector_lights_only_its_own_field():
+def test_the_projector_lights_only_its_own_field() -> None:
     points = scan(quiet(), Scene([plate(1.1, half=1.0)]), 0.1, noise=0.0)
     missing = np.isnan(points[..., 2]).mean(axis=0) > 0.5
     assert missing[-1] and not missing[0], "far off, its field lies towards its far side"
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
-def test_noise_is_as_the_data_sheet_says_and_grows_with_incidence(tilt):
+def test_noise_is_as_the_data_sheet_says_and_grows_with_incidence(tilt: float) -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
     points = scan(scanner, tilted_plate(tilt))
     exact = scan(scanner, tilted_plate(tilt), noise=0.0)
@@ -102,7 +104,7 @@ def test_noise_is_as_the_data_sheet_says_and_grows_with_incidence(tilt):
     assert abs(error.mean()) < 4 * error.std() / np.sqrt(error.size)
 
 
-def test_noise_grows_with_the_square_of_the_depth():
+def test_noise_grows_with_the_square_of_the_depth() -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
     deviation = [
         np.nanstd(scan(scanner, Scene([plate(depth)]))[100:200, 100:300, 2]) for depth in (0.5, 1.0)
@@ -111,13 +113,13 @@ def test_noise_grows_with_the_square_of_the_depth():
 
 
 @pytest.mark.parametrize(("material", "grain"), [(materials.METAL, 1.2), (materials.ANODISED, 1.5)])
-def test_metal_is_noisier(material, grain):
+def test_metal_is_noisier(material: Any, grain: float) -> None:
     scanner = zoomed(quiet(calibration_error=0.0))
     points = scan(scanner, Scene([plate(0.788, material)]))[120:180, 160:240, 2]
     assert np.nanstd(points) == pytest.approx(grain * scanner.temporal_noise, rel=0.05)
 
 
-def test_neighbours_share_their_noise():
+def test_neighbours_share_their_noise() -> None:
     image = correlated_normal((400, 500), 1.7, rng())
     assert image.std() == pytest.approx(1.0, rel=0.03)
     for apart in (1, 3):
@@ -125,11 +127,11 @@ def test_neighbours_share_their_noise():
         assert measured == pytest.approx(np.exp(-(apart**2) / (4 * 1.7**2)), abs=0.03)
 
 
-def test_the_quantile_is_that_of_the_normal_distribution():
+def test_the_quantile_is_that_of_the_normal_distribution() -> None:
     assert normal_quantile(np.array([0.5, 0.8413, 0.1587])) == pytest.approx([0, 1, -1], abs=0.03)
 
 
-def test_distortion_has_its_rms_and_is_smooth():
+def test_distortion_has_its_rms_and_is_smooth() -> None:
     pixels = pixels_of(SCANNER, 0.05)
     fields = [Distortion(SCANNER, pixels, 1e-4, rng(seed)) for seed in range(3)]
     depths = np.linspace(SCANNER.near, SCANNER.far, 21)
@@ -144,7 +146,7 @@ def test_distortion_has_its_rms_and_is_smooth():
     assert not aside[..., 2].any()
 
 
-def test_scans_are_the_same_for_the_same_seed_and_no_other():
+def test_scans_are_the_same_for_the_same_seed_and_no_other() -> None:
     scene = flange_scene(facing(0.2))
     first, again, other = (
         scan(SCANNER, scene, resolution=0.2, seed=seed) for seed in (3, 3, 4)
@@ -153,7 +155,7 @@ def test_scans_are_the_same_for_the_same_seed_and_no_other():
     assert not np.array_equal(first, other, equal_nan=True)
 
 
-def test_metal_is_lost_where_it_mirrors_the_projector():
+def test_metal_is_lost_where_it_mirrors_the_projector() -> None:
     # The bisector of the directions to camera and projector leans half of 24 degrees to x.
     bisecting = np.arctan2(SCANNER.baseline, 0.788 - 0.071) / 2
     lost = {}
@@ -166,7 +168,7 @@ def test_metal_is_lost_where_it_mirrors_the_projector():
     assert lost["wall", -bisecting] < 0.01
 
 
-def test_dark_surfaces_are_lost_when_seen_at_an_angle():
+def test_dark_surfaces_are_lost_when_seen_at_an_angle() -> None:
     lost = {
         (material.albedo, tilt): np.isnan(scan(zoomed(), tilted_plate(tilt, material))).mean()
         for material in (materials.ANODISED, materials.PAINTED)
@@ -177,7 +179,7 @@ def test_dark_surfaces_are_lost_when_seen_at_an_angle():
     assert lost[materials.PAINTED.albedo, 1.0] < 0.02
 
 
-def test_edges_lose_points_and_few_fly():
+def test_edges_lose_points_and_few_fly() -> None:
     pose = facing(0.1)
     points = in_flange(scan(zoomed(), flange_scene(pose)), pose)
     clean = in_flange(scan(zoomed(quiet()), flange_scene(pose)), pose)

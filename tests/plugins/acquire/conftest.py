@@ -1,6 +1,8 @@
 """Small archives with poses and clouds that agree, made on the spot."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +14,13 @@ from flangeye_plugins.reader.folder import write_folder
 
 
 @pytest.fixture
-def scanner():
+def scanner() -> Any:
     """A scanner that sees 0.384 to 0.520 m."""
     return load_model("scanners", "phoxi-s")
 
 
 @pytest.fixture
-def captures():
+def captures() -> Any:
     """One verification capture and four to calibrate with; the verification comes last."""
     rng = np.random.default_rng(3)
     made = []
@@ -40,7 +42,7 @@ def captures():
 
 
 @pytest.fixture
-def archive(tmp_path, captures) -> Path:
+def archive(tmp_path: Path, captures: Any) -> Path:
     """Those captures as a folder of clouds with poses.csv."""
     folder = tmp_path / "archive"
     write_folder(folder, captures)
@@ -48,7 +50,7 @@ def archive(tmp_path, captures) -> Path:
 
 
 @pytest.fixture
-def edit(archive):
+def edit(archive: Path) -> Callable[..., Any]:
     """Replace text in one of the archive's files."""
 
     def replace(old: str, new: str, name: str = "poses.csv") -> None:

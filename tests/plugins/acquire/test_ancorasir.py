@@ -2,6 +2,8 @@
 
 import json
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +49,7 @@ def quaternions():
 
 
 @pytest.fixture
-def repository(tmp_path):
+def repository(tmp_path: Path) -> Path:
     """All six recordings as the repository has them, five poses each."""
     root = tmp_path / "flange_handeye_calibration"
     for name in ("data/aubo", "data/ur5", "data/ur10e", "data/franka", "Kinect_Result",
@@ -115,7 +117,7 @@ CLOUD_UNITS = {"aubo": "m"}
 
 
 @pytest.mark.parametrize("robot", ["aubo", "ur5", "ur10e", "franka", "sample-2019"])
-def test_poses_and_centres_come_out_in_metres(repository, robot):
+def test_poses_and_centres_come_out_in_metres(repository: Path, robot: str) -> None:
     archive = read(repository, robot)
     recordings = [r for r in archive.recordings if r.role == "calibration"]
     assert [r.id for r in recordings] == POSES.get(robot, [str(i) for i in range(N)])
@@ -128,7 +130,7 @@ def test_poses_and_centres_come_out_in_metres(repository, robot):
             np.testing.assert_allclose(recording.centre_in_camera, CENTRES[i], rtol=1e-6)
 
 
-def test_the_aubo_has_clouds_and_one_to_verify_with(repository):
+def test_the_aubo_has_clouds_and_one_to_verify_with(repository: Path) -> None:
     archive = read(repository, "aubo")
     names = [r.cloud and r.cloud.name for r in archive.recordings]
     assert names == ["tool0_5.pcd", "tool0_1545_0.pcd", None, "tool0_1545_2.pcd",
@@ -137,7 +139,7 @@ def test_the_aubo_has_clouds_and_one_to_verify_with(repository):
     assert archive.recordings[0].base_T_flange[0, 3] == 0.27704067625331485
 
 
-def test_the_kinect_has_millimetres_and_rotation_vectors(repository):
+def test_the_kinect_has_millimetres_and_rotation_vectors(repository: Path) -> None:
     verification, *recordings = read(repository, "kinect").recordings
     for i, recording in enumerate(recordings):
         expected = rotation_exp(np.array([0.1 * i, 0.2, -0.3]))
@@ -148,7 +150,7 @@ def test_the_kinect_has_millimetres_and_rotation_vectors(repository):
     assert verification.base_T_flange[0, 3] == pytest.approx(-0.49888)
 
 
-def test_the_i_th_cloud_of_the_sample_belongs_to_the_i_th_pose(repository):
+def test_the_i_th_cloud_of_the_sample_belongs_to_the_i_th_pose(repository: Path) -> None:
     names = [r.cloud.name for r in read(repository, "sample-2019").recordings]
     assert names == [f"0{2 * i + 1}_tool_valid.pcd" for i in range(N)]
 
@@ -166,11 +168,13 @@ def test_the_i_th_cloud_of_the_sample_belongs_to_the_i_th_pose(repository):
         ("calib_toolbox/data/2019-06-14-sample", "sample-2019", "ancorasir sample-2019"),
     ],
 )
-def test_the_path_may_be_the_whole_or_a_part(repository, path, robot, layout):
+def test_the_path_may_be_the_whole_or_a_part(
+    repository: Path, path: str, robot: str | None, layout: str
+) -> None:
     assert read(repository / path, robot).layout == layout
 
 
-def test_a_recording_moved_away_is_known_by_its_files(repository):
+def test_a_recording_moved_away_is_known_by_its_files(repository: Path) -> None:
     moved = repository / "data/aubo"
     moved = moved.rename(repository.parent / "monday")
     assert read(moved).layout == "ancorasir aubo"
@@ -179,14 +183,14 @@ def test_a_recording_moved_away_is_known_by_its_files(repository):
 # --- what it refuses ---------------------------------------------------------------------------
 
 
-def test_several_recordings_are_not_guessed_between(repository):
+def test_several_recordings_are_not_guessed_between(repository: Path) -> None:
     assert refused(repository) == (
         f"{repository}: holds the recordings aubo, ur5, ur10e, franka, kinect, sample-2019; "
         "choose one, for example reader: {ancorasir: {robot: aubo}}"
     )
 
 
-def test_a_recording_that_is_not_there(repository):
+def test_a_recording_that_is_not_there(repository: Path) -> None:
     folder = repository / "data/aubo"
     assert refused(folder, "ur5") == (
         f"{folder}: no recording 'ur5' (no data/ur5/calibration_robot_pose_data.npz); found: aubo"
@@ -201,7 +205,7 @@ def spoil(folder, robot, file, old, new):
     return refused(folder, robot)
 
 
-def test_spoilt_poses_of_the_aubo(repository):
+def test_spoilt_poses_of_the_aubo(repository: Path) -> None:
     folder = repository / "data/aubo"
     file = folder / "data.txt"
     whole = file.read_text()
@@ -224,7 +228,7 @@ def test_spoilt_poses_of_the_aubo(repository):
     assert refused(folder) == f"{file}: holds no poses (no line 'p_robot 6-DoF index:<id>')"
 
 
-def test_a_cloud_whose_pose_is_missing(repository):
+def test_a_cloud_whose_pose_is_missing(repository: Path) -> None:
     folder = repository / "data/aubo"
     cloud(folder / "tool0_77.pcd", 77)
     assert refused(folder) == (
@@ -232,7 +236,7 @@ def test_a_cloud_whose_pose_is_missing(repository):
     )
 
 
-def test_centres_and_poses_that_do_not_belong_together(repository):
+def test_centres_and_poses_that_do_not_belong_together(repository: Path) -> None:
     folder = repository / "data/ur5"
     np.save(folder / "p_camera_mat.npy", CENTRES[:2].T)
     assert refused(folder) == (
@@ -250,7 +254,7 @@ def test_centres_and_poses_that_do_not_belong_together(repository):
     )
 
 
-def test_poses_that_are_no_poses(repository):
+def test_poses_that_are_no_poses(repository: Path) -> None:
     folder = repository / "data/ur5"
     file = folder / "calibration_robot_pose_data.npz"
     poses = np.tile(np.eye(4), (N, 1, 1))
@@ -268,7 +272,7 @@ def test_poses_that_are_no_poses(repository):
     assert refused(folder) == f"{file}: is not a NumPy .npz file: File is not a zip file"
 
 
-def test_counts_that_differ(repository):
+def test_counts_that_differ(repository: Path) -> None:
     folder = repository / "Kinect_Result"
     text = (folder / "measureRobot.txt").read_text()
     (folder / "measureRobot.txt").write_text(text.partition("\n")[2])
@@ -282,7 +286,7 @@ def test_counts_that_differ(repository):
     )
 
 
-def test_spoilt_text(repository):
+def test_spoilt_text(repository: Path) -> None:
     folder = repository / "Kinect_Result"
     (folder / "measureRobot.txt").write_text("1 2 3\n4 5\n")
     assert refused(folder) == (f"{folder}/measureRobot.txt:2: has 2 numbers, not 3 that are finite")
@@ -302,14 +306,14 @@ def test_spoilt_text(repository):
         ("[]", 'expected an object of numbered poses, {"0": {…}, …}'),
     ],
 )  # fmt: skip
-def test_spoilt_json(repository, text, message):
+def test_spoilt_json(repository: Path, text: str, message: str) -> None:
     folder = repository / "calib_toolbox/data/2019-06-14-sample"
     file = folder / "calib_data.json"
     file.write_text(text)
     assert refused(folder) == f"{file}: {message}"
 
 
-def test_a_spoilt_entry(repository):
+def test_a_spoilt_entry(repository: Path) -> None:
     folder = repository / "calib_toolbox/data/2019-06-14-sample"
     file = folder / "calib_data.json"
     whole = json.loads(file.read_text())
@@ -329,7 +333,7 @@ def acquire(path, robot, scanner, **params):
     return acquire_archive(scanner, ArchivePath(path), ArchiveParams(reader=reader, **params))
 
 
-def test_the_published_aubo_recording(ancorasir_folder, scanner):
+def test_the_published_aubo_recording(ancorasir_folder: Any, scanner: Any) -> None:
     stream = acquire(ancorasir_folder, "aubo", scanner)
     captures = list(stream)
     assert captures[0].role == "verification"
@@ -345,8 +349,8 @@ def test_the_published_aubo_recording(ancorasir_folder, scanner):
 
 
 def test_the_whole_published_folder_says_which_nine_poses_it_skips(
-    ancorasir_folder, scanner, tmp_path
-):
+    ancorasir_folder: Any, scanner: Any, tmp_path: Path
+) -> None:
     """Clouds stand in for the 24 that this copy lacks; poses and centres are the real ones."""
     original = ancorasir_folder / "data/aubo"
     for name in ("data.txt", "p_robot_mat.npy", "p_camera_mat.npy"):
@@ -361,12 +365,12 @@ def test_the_whole_published_folder_says_which_nine_poses_it_skips(
     assert re.fullmatch(r"skipped 9 of 63 poses, without a cloud: (\d+_\d+, ){8}\d+_\d+", skipped)
 
 
-def test_metres_of_the_aubo_declared_as_millimetres(ancorasir_folder, scanner):
+def test_metres_of_the_aubo_declared_as_millimetres(ancorasir_folder: Any, scanner: Any) -> None:
     with pytest.raises(StageError, match=r"these look like metres: set unit: m$"):
         acquire(ancorasir_folder, "aubo", scanner, unit="mm")
 
 
-def test_clouds_of_the_sample_lie_around_the_published_centres(ancorasir_folder):
+def test_clouds_of_the_sample_lie_around_the_published_centres(ancorasir_folder: Any) -> None:
     for recording in read(ancorasir_folder, "sample-2019").recordings:
         points = read_cloud(recording.cloud, "mm").points()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -374,11 +378,13 @@ def test_clouds_of_the_sample_lie_around_the_published_centres(ancorasir_folder)
 
 
 @pytest.mark.parametrize("robot", ["ur5", "franka", "kinect"])
-def test_recordings_without_clouds_name_the_other_way(ancorasir_folder, robot, scanner):
+def test_recordings_without_clouds_name_the_other_way(
+    ancorasir_folder: Any, robot: str, scanner: Any
+) -> None:
     with pytest.raises(StageError, match=r"; acquire\.centres can use its \d\d "):
         acquire(ancorasir_folder, robot, scanner)
 
 
 @pytest.fixture
-def ancorasir_folder(request):
+def ancorasir_folder(request: pytest.FixtureRequest) -> Any:
     return request.getfixturevalue("ancorasir")

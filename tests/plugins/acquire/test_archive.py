@@ -2,7 +2,10 @@
 
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +23,7 @@ from flangeye_plugins.reader.folder import write_folder
 
 
 @pytest.fixture
-def acquire(scanner, archive):
+def acquire(scanner: Any, archive: Path) -> Callable[..., Any]:
     """Call the stage on the archive."""
 
     def call(path=archive, recipe_path=None, **params):
@@ -31,7 +34,7 @@ def acquire(scanner, archive):
 
 
 @pytest.fixture
-def refused(acquire):
+def refused(acquire: Callable[..., Any]) -> Callable[..., Any]:
     """Call the stage, or run it to its end; return the one line it is refused with."""
 
     def call(to_the_end=False, **params):
@@ -57,7 +60,9 @@ def same(one: Capture, other: Capture) -> bool:
 # --- what it gives -----------------------------------------------------------------------------
 
 
-def test_captures_come_back_as_they_were_verification_first(acquire, captures):
+def test_captures_come_back_as_they_were_verification_first(
+    acquire: Callable[..., Any], captures: Any
+) -> None:
     stream = acquire()
     read = list(stream)
     assert stream.total == 5
@@ -65,7 +70,9 @@ def test_captures_come_back_as_they_were_verification_first(acquire, captures):
     assert all(map(same, read, [captures[-1], *captures[:-1]]))
 
 
-def test_clouds_are_read_one_at_a_time(acquire, monkeypatch):
+def test_clouds_are_read_one_at_a_time(
+    acquire: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = []
 
     def noted(path, *unit):
@@ -79,7 +86,7 @@ def test_clouds_are_read_one_at_a_time(acquire, monkeypatch):
     assert len(read) == 2
 
 
-def test_it_tells_what_it_found(acquire, archive):
+def test_it_tells_what_it_found(acquire: Callable[..., Any], archive: Path) -> None:
     assert acquire().source.notes == (
         f"archive: folder, poses.csv, {archive}",
         f"reader: folder, chosen by what {archive} holds",
@@ -88,7 +95,9 @@ def test_it_tells_what_it_found(acquire, archive):
     )
 
 
-def test_the_fingerprint_follows_every_input_and_not_the_place(acquire, archive, tmp_path, edit):
+def test_the_fingerprint_follows_every_input_and_not_the_place(
+    acquire: Callable[..., Any], archive: Path, tmp_path: Path, edit: Callable[..., Any]
+) -> None:
     first = acquire().source.fingerprint
     moved = tmp_path / "elsewhere"
     shutil.copytree(archive, moved)
@@ -102,13 +111,13 @@ def test_the_fingerprint_follows_every_input_and_not_the_place(acquire, archive,
     assert len({first, changed, acquire().source.fingerprint}) == 3
 
 
-def test_poses_can_be_left_out(acquire):
+def test_poses_can_be_left_out(acquire: Callable[..., Any]) -> None:
     stream = acquire(leave_out=("two", "check"))
     assert [capture.id for capture in stream] == ["one", "three", "four"]
     assert "left out as the recipe says: two, check" in stream.source.notes
 
 
-def test_a_log_is_an_archive(acquire, captures, tmp_path):
+def test_a_log_is_an_archive(acquire: Callable[..., Any], captures: Any, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, {}, full_clouds=True)
     recorder.flangeye_run_started(source=Source("before", ("as it was told",)), total=5)
@@ -121,7 +130,9 @@ def test_a_log_is_an_archive(acquire, captures, tmp_path):
     assert stream.source.fingerprint != "before"
 
 
-def test_a_log_of_thinned_scans_is_refused(refused, captures, tmp_path):
+def test_a_log_of_thinned_scans_is_refused(
+    refused: Callable[..., Any], captures: Any, tmp_path: Path
+) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, {}, full_clouds=False)
     recorder.flangeye_run_started(source=Source("x"), total=5)
@@ -149,7 +160,9 @@ def add_image(archive, name, bend=0.0):
     (archive / f"{name}.png").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
 
 
-def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(acquire, archive):
+def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     add_image(archive, "two")
     add_image(archive, "three")
     stream = acquire()
@@ -165,7 +178,9 @@ def test_an_image_beside_a_cloud_comes_with_the_camera_that_the_cloud_implies(ac
     ) in stream.source.notes
 
 
-def test_the_stated_camera_goes_before_what_the_clouds_imply(acquire, archive):
+def test_the_stated_camera_goes_before_what_the_clouds_imply(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     add_image(archive, "two", bend=30.0)
     stated = CameraParams(focal_length=(41, 42), principal_point=(9, 8), distortion=(0.1, 0.2))
     (image,) = [c.image for c in acquire(camera=stated) if c.image]
@@ -173,7 +188,9 @@ def test_the_stated_camera_goes_before_what_the_clouds_imply(acquire, archive):
     assert np.allclose(image.distortion, [0.1, 0.2])
 
 
-def test_images_of_no_known_camera_are_left_out_and_that_is_told(acquire, archive):
+def test_images_of_no_known_camera_are_left_out_and_that_is_told(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     add_image(archive, "two", bend=30.0)
     stream = acquire()
     assert all(capture.image is None for capture in stream)
@@ -183,7 +200,7 @@ def test_images_of_no_known_camera_are_left_out_and_that_is_told(acquire, archiv
     )
 
 
-def test_two_images_of_one_cloud_are_refused(refused, archive):
+def test_two_images_of_one_cloud_are_refused(refused: Callable[..., Any], archive: Path) -> None:
     add_image(archive, "two")
     shutil.copy(archive / "two.png", archive / "two.bmp")
     assert refused() == f"{archive}: two.bmp and two.png both belong to two.pcd; keep one of them"
@@ -193,7 +210,7 @@ def test_two_images_of_one_cloud_are_refused(refused, archive):
 
 
 @pytest.fixture
-def in_millimetres(archive, captures):
+def in_millimetres(archive: Path, captures: Any) -> None:
     """The clouds in millimetres, as many scanners write them."""
     for capture in captures:
         write_cloud(archive / f"{capture.id}.pcd", capture.cloud, unit="mm")
@@ -201,8 +218,8 @@ def in_millimetres(archive, captures):
 
 @pytest.mark.parametrize(("unit", "how"), [("auto", "detected"), ("mm", "as stated")])
 def test_millimetres_are_found_or_believed_and_reported(
-    acquire, captures, in_millimetres, unit, how
-):
+    acquire: Callable[..., Any], captures: Any, in_millimetres: None, unit: str, how: str
+) -> None:
     stream = acquire(unit=unit)
     assert stream.source.notes[-1] == (
         f"clouds in mm ({how}): the first has its median point at 0.450 m; phoxi-s sees "
@@ -211,14 +228,18 @@ def test_millimetres_are_found_or_believed_and_reported(
     assert np.allclose(next(iter(stream)).cloud.xyz, captures[-1].cloud.xyz, rtol=1e-6)
 
 
-def test_millimetres_declared_as_metres_are_refused(refused, archive, in_millimetres):
+def test_millimetres_declared_as_metres_are_refused(
+    refused: Callable[..., Any], archive: Path, in_millimetres: None
+) -> None:
     assert refused(unit="m") == (
         f"{archive}/check.pcd: median distance 450 m with unit m, but phoxi-s sees 0.384 to "
         "0.520 m; these look like millimetres: set unit: mm"
     )
 
 
-def test_metres_declared_as_millimetres_are_refused(refused, archive):
+def test_metres_declared_as_millimetres_are_refused(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     assert refused(unit="mm") == (
         f"{archive}/check.pcd: median distance 0.00045 m with unit mm, but phoxi-s sees 0.384 to "
         "0.520 m; these look like metres: set unit: m"
@@ -230,7 +251,9 @@ def _scale(archive, name, factor):
     write_cloud(archive / f"{name}.pcd", PointCloud("camera", points))
 
 
-def test_a_distance_that_fits_neither_unit_is_refused(refused, archive):
+def test_a_distance_that_fits_neither_unit_is_refused(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     _scale(archive, "check", 20.0)
     assert re.fullmatch(
         re.escape(f"{archive}/check.pcd: median distance 15.")
@@ -244,12 +267,16 @@ def test_a_distance_that_fits_neither_unit_is_refused(refused, archive):
     assert refused(unit="m").endswith("m with unit mm does not fit either; is it this scanner?")
 
 
-def test_one_cloud_in_another_unit_stops_the_run_when_it_comes(refused, archive):
+def test_one_cloud_in_another_unit_stops_the_run_when_it_comes(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     _scale(archive, "three", 1000.0)
     assert refused(to_the_end=True).startswith(f"{archive}/three.pcd: median distance 7")
 
 
-def test_a_scan_of_a_far_wall_is_no_reason_to_refuse(acquire, archive):
+def test_a_scan_of_a_far_wall_is_no_reason_to_refuse(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     _scale(archive, "one", 10.0)
     assert len(list(acquire())) == 5
 
@@ -257,25 +284,33 @@ def test_a_scan_of_a_far_wall_is_no_reason_to_refuse(acquire, archive):
 # --- files -------------------------------------------------------------------------------------
 
 
-def test_an_unreadable_cloud_stops_the_run_before_it_starts(refused, archive):
+def test_an_unreadable_cloud_stops_the_run_before_it_starts(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     (archive / "three.pcd").write_bytes(b"")
     assert refused() == f"{archive}/three.pcd: is empty (0 bytes)"
 
 
-def test_an_unreadable_cloud_can_be_set_aside_and_is_reported(acquire, archive):
+def test_an_unreadable_cloud_can_be_set_aside_and_is_reported(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     (archive / "three.pcd").unlink()
     stream = acquire(unreadable="reject")
     assert [capture.id for capture in stream] == ["check", "one", "two", "four"]
     assert f"set aside 'three': {archive}/three.pcd: does not exist" in stream.source.notes
 
 
-def test_what_is_set_aside_counts_damage_inside_the_data_too(acquire, archive):
+def test_what_is_set_aside_counts_damage_inside_the_data_too(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     text = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 x"
     (archive / "two.pcd").write_text(text)
     assert len(list(acquire(unreadable="reject"))) == 4
 
 
-def test_nan_everywhere_is_refused_but_one_empty_scan_is_not(acquire, refused, archive, captures):
+def test_nan_everywhere_is_refused_but_one_empty_scan_is_not(
+    acquire: Callable[..., Any], refused: Callable[..., Any], archive: Path, captures: Any
+) -> None:
     nothing = PointCloud("camera", np.full((4, 3), np.nan))
     write_cloud(archive / "check.pcd", nothing)
     assert len(next(iter(acquire())).cloud.points()) == 0
@@ -285,7 +320,9 @@ def test_nan_everywhere_is_refused_but_one_empty_scan_is_not(acquire, refused, a
     assert refused() == f"{archive}: none of its 5 clouds has a finite point (all NaN)"
 
 
-def test_a_verification_cloud_that_is_also_trained_with_is_refused(refused, archive):
+def test_a_verification_cloud_that_is_also_trained_with_is_refused(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     shutil.copy(archive / "check.pcd", archive / "two.pcd")
     assert refused() == (
         f"{archive}/two.pcd: is the verification cloud check.pcd again; a cloud that verifies must "
@@ -293,7 +330,7 @@ def test_a_verification_cloud_that_is_also_trained_with_is_refused(refused, arch
     )
 
 
-def test_one_cloud_at_two_poses_is_refused(refused, archive):
+def test_one_cloud_at_two_poses_is_refused(refused: Callable[..., Any], archive: Path) -> None:
     shutil.copy(archive / "one.pcd", archive / "two.pcd")
     assert refused() == f"{archive}/two.pcd: has the same content as one.pcd"
 
@@ -301,14 +338,16 @@ def test_one_cloud_at_two_poses_is_refused(refused, archive):
 # --- poses -------------------------------------------------------------------------------------
 
 
-def test_no_archive_given_is_refused(refused, tmp_path):
+def test_no_archive_given_is_refused(refused: Callable[..., Any], tmp_path: Path) -> None:
     assert refused(path=None) == (
         "acquire.archive: no archive given; add --archive PATH, or path: in the recipe"
     )
     assert refused(path=tmp_path / "no") == f"{tmp_path}/no: does not exist"
 
 
-def test_the_recipe_may_name_the_archive_and_the_command_line_comes_first(acquire, archive):
+def test_the_recipe_may_name_the_archive_and_the_command_line_comes_first(
+    acquire: Callable[..., Any], archive: Path
+) -> None:
     with pytest.raises(StageError, match="does not exist"):
         acquire(archive / "no", recipe_path=archive)
     assert acquire(None, recipe_path=archive).total == 5
@@ -323,14 +362,18 @@ def moved(capture, matrix):
     return replace(capture, poses={"flange": Transform("base", "flange", matrix)})
 
 
-def test_fewer_than_three_captures_are_refused(refused, archive, captures):
+def test_fewer_than_three_captures_are_refused(
+    refused: Callable[..., Any], archive: Path, captures: Any
+) -> None:
     rewrite(archive, [captures[0], captures[1], captures[4]])
     assert refused() == (
         f"{archive}: 2 captures to calibrate with; at least 3 are needed, at different places"
     )
 
 
-def test_all_poses_at_one_place_are_refused(refused, archive, captures):
+def test_all_poses_at_one_place_are_refused(
+    refused: Callable[..., Any], archive: Path, captures: Any
+) -> None:
     turned = []
     for i, capture in enumerate(captures):
         matrix = capture.base_T_flange.matrix.copy()
@@ -343,7 +386,9 @@ def test_all_poses_at_one_place_are_refused(refused, archive, captures):
     )
 
 
-def test_a_pose_given_twice_is_refused(refused, archive, captures):
+def test_a_pose_given_twice_is_refused(
+    refused: Callable[..., Any], archive: Path, captures: Any
+) -> None:
     captures[2] = moved(captures[2], captures[0].base_T_flange.matrix)
     rewrite(archive, captures)
     assert refused() == (
@@ -351,12 +396,16 @@ def test_a_pose_given_twice_is_refused(refused, archive, captures):
     )
 
 
-def test_two_poses_of_one_name_are_refused(refused, archive, edit):
+def test_two_poses_of_one_name_are_refused(
+    refused: Callable[..., Any], archive: Path, edit: Callable[..., Any]
+) -> None:
     edit("two.pcd,two,", "two.pcd,one,")
     assert refused() == f"{archive}: pose 'one' is given twice"
 
 
-def test_positions_in_millimetres_declared_as_metres_are_refused(refused, archive, edit):
+def test_positions_in_millimetres_declared_as_metres_are_refused(
+    refused: Callable[..., Any], archive: Path, edit: Callable[..., Any]
+) -> None:
     edit(",0.4625,", ",462.5,")
     assert refused() == (
         f"{archive}: pose 'two' is 462.5 m from the base, beyond any arm; are the positions in "
@@ -364,5 +413,7 @@ def test_positions_in_millimetres_declared_as_metres_are_refused(refused, archiv
     )
 
 
-def test_leaving_out_a_pose_that_is_not_there_is_refused(refused, archive):
+def test_leaving_out_a_pose_that_is_not_there_is_refused(
+    refused: Callable[..., Any], archive: Path
+) -> None:
     assert refused(leave_out=("nine",)) == f"{archive}: leave_out: there is no pose 'nine'"

@@ -1,5 +1,8 @@
 """acquire.centres: published centres without clouds, and the published results from them."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -32,7 +35,9 @@ def acquire(path, robot=None, **params):
         ("kinect", "Kinect_Result", 1e-3, []),
     ],
 )
-def test_published_centres_give_the_published_matrix(ancorasir, robot, folder, unit, dropped):
+def test_published_centres_give_the_published_matrix(
+    ancorasir: Path, robot: str, folder: str, unit: float, dropped: list[Any]
+) -> None:
     observations = list(acquire(ancorasir, robot))
     left_out = tuple(observations[i].id for i in dropped)
     used = list(acquire(ancorasir, robot, leave_out=left_out))
@@ -44,7 +49,7 @@ def test_published_centres_give_the_published_matrix(ancorasir, robot, folder, u
     assert np.abs(rigid(*kabsch(centres, tcps)) - published).max() < 1e-6
 
 
-def test_counts_and_residuals_of_the_aubo(ancorasir):
+def test_counts_and_residuals_of_the_aubo(ancorasir: Path) -> None:
     stream = acquire(ancorasir, "aubo")
     observations = list(stream)
     assert (len(observations), stream.total) == (54, 54)
@@ -57,7 +62,7 @@ def test_counts_and_residuals_of_the_aubo(ancorasir):
 
 
 @pytest.fixture
-def archive(tmp_path):
+def archive(tmp_path: Path) -> Any:
     """Four UR poses with centres."""
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = np.random.default_rng(1).uniform(0, 1, (4, 3))
@@ -67,7 +72,7 @@ def archive(tmp_path):
     return tmp_path
 
 
-def test_a_centre_has_the_stated_noise_and_no_normal(archive):
+def test_a_centre_has_the_stated_noise_and_no_normal(archive: Any) -> None:
     stream = acquire(archive, centre_noise=SI(0.5e-3))
     first = next(iter(stream))
     assert first.id == "0"
@@ -79,7 +84,7 @@ def test_a_centre_has_the_stated_noise_and_no_normal(archive):
     )
 
 
-def test_centres_of_a_wrist_circle_lie_behind_the_flange(archive):
+def test_centres_of_a_wrist_circle_lie_behind_the_flange(archive: Any) -> None:
     robot = load_model("robots", "ur10e")
     chosen = CentresParams(reader=auto.bind())
     wrist = acquire_centres(ArchivePath(archive), chosen, wrist_circle_of(robot.flange, 0.09))
@@ -90,13 +95,13 @@ def test_centres_of_a_wrist_circle_lie_behind_the_flange(archive):
         assert offset == pytest.approx(-6.5e-3 * behind.base_T_flange.rotation[:, 2], abs=1e-15)
 
 
-def test_the_fingerprint_follows_the_files(archive):
+def test_the_fingerprint_follows_the_files(archive: Any) -> None:
     first = acquire(archive).source.fingerprint
     np.save(archive / "p_camera_mat.npy", np.ones((3, 3)) * 401)
     assert acquire(archive).source.fingerprint != first
 
 
-def test_an_archive_without_centres_names_the_other_way(archive):
+def test_an_archive_without_centres_names_the_other_way(archive: Any) -> None:
     (archive / "p_camera_mat.npy").unlink()
     with pytest.raises(StageError) as error:
         acquire(archive)
@@ -106,7 +111,7 @@ def test_an_archive_without_centres_names_the_other_way(archive):
     )
 
 
-def test_two_centres_are_too_few(archive):
+def test_two_centres_are_too_few(archive: Any) -> None:
     with pytest.raises(StageError) as error:
         acquire(archive, leave_out=("1",))
     assert str(error.value) == (
@@ -114,7 +119,7 @@ def test_two_centres_are_too_few(archive):
     )
 
 
-def test_no_archive_given():
+def test_no_archive_given() -> None:
     with pytest.raises(StageError) as error:
         acquire(None)
     assert str(error.value) == (
@@ -122,7 +127,7 @@ def test_no_archive_given():
     )
 
 
-def test_a_log_gives_the_centres_it_holds(archive, tmp_path):
+def test_a_log_gives_the_centres_it_holds(archive: Any, tmp_path: Path) -> None:
     given = list(acquire(archive))
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, {}, full_clouds=False)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def refused(*args, **kwargs):
     return str(error.value)
 
 
-def test_the_smallest_csv(tmp_path):
+def test_the_smallest_csv(tmp_path: Path) -> None:
     archive = read(tmp_path, HEADING + ROW)
     (recording,) = archive.recordings
     assert (recording.id, recording.cloud) == ("a", tmp_path / "a.pcd")
@@ -42,7 +43,7 @@ def test_the_smallest_csv(tmp_path):
     assert archive.files == [tmp_path / "poses.csv"]
 
 
-def test_the_same_in_yaml_and_json_and_with_semicolons(tmp_path):
+def test_the_same_in_yaml_and_json_and_with_semicolons(tmp_path: Path) -> None:
     pose = {"cloud": "a.pcd", "position": [412.5, -120.0, 310.25], "quaternion_xyzw": [0, 1, 0, 0]}
     expected = read(tmp_path, HEADING + ROW).recordings[0].base_T_flange
     texts = {
@@ -57,7 +58,7 @@ def test_the_same_in_yaml_and_json_and_with_semicolons(tmp_path):
         (tmp_path / name).unlink()
 
 
-def test_rotation_vectors_joints_roles_and_times(tmp_path):
+def test_rotation_vectors_joints_roles_and_times(tmp_path: Path) -> None:
     text = (
         "id,cloud,role,time_ns,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,j2_rad,j1_rad\n"
         "v,sub/a.pcd,verification,17,0.1,0.2,0.3,0.1,-0.2,0.3,2,1\n"
@@ -68,7 +69,7 @@ def test_rotation_vectors_joints_roles_and_times(tmp_path):
     assert (recording.id, recording.role, recording.time_ns) == ("v", "verification", 17)
 
 
-def test_the_unit_may_come_from_the_recipe(tmp_path):
+def test_the_unit_may_come_from_the_recipe(tmp_path: Path) -> None:
     text = HEADING.replace("_mm", "") + ROW
     assert read(tmp_path, text, unit="mm").recordings[0].base_T_flange[0, 3] == 0.4125
     assert refused(tmp_path) == (
@@ -77,7 +78,7 @@ def test_the_unit_may_come_from_the_recipe(tmp_path):
     )
 
 
-def test_a_unit_said_twice_must_agree(tmp_path):
+def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
     assert refused(tmp_path, HEADING + ROW, unit="m") == (
         f"{tmp_path}/poses.csv: positions are in mm, but the recipe says unit: m"
     )
@@ -112,7 +113,7 @@ def test_a_unit_said_twice_must_agree(tmp_path):
          ":2: pose 'a': the quaternion's norm is 0; it must be 1 (within 0.001)"),
     ],
 )  # fmt: skip
-def test_a_csv_that_says_no_poses_is_refused(tmp_path, text, message):
+def test_a_csv_that_says_no_poses_is_refused(tmp_path: Path, text: Any, message: str) -> None:
     assert refused(tmp_path, text) == f"{tmp_path}/poses.csv{message}"
 
 
@@ -129,18 +130,18 @@ def test_a_csv_that_says_no_poses_is_refused(tmp_path, text, message):
         ("unit: mm\nunit: m\n", ":2: duplicate key 'unit', first given on line 1"),
     ],
 )  # fmt: skip
-def test_a_yaml_that_says_no_poses_is_refused(tmp_path, text, message):
+def test_a_yaml_that_says_no_poses_is_refused(tmp_path: Path, text: str, message: str) -> None:
     assert refused(tmp_path, text, "poses.yaml") == f"{tmp_path}/poses.yaml{message}"
 
 
-def test_a_heading_alone_is_an_archive_without_poses(tmp_path):
+def test_a_heading_alone_is_an_archive_without_poses(tmp_path: Path) -> None:
     archive = read(tmp_path, HEADING)
     with pytest.raises(StageError) as error:
         check_ids(archive)
     assert str(error.value) == f"{tmp_path}: holds no poses"
 
 
-def test_a_cloud_without_a_pose_is_refused(tmp_path):
+def test_a_cloud_without_a_pose_is_refused(tmp_path: Path) -> None:
     for name in ("a.pcd", "b.ply"):
         (tmp_path / name).touch()
     assert refused(tmp_path, HEADING + ROW) == (
@@ -148,27 +149,27 @@ def test_a_cloud_without_a_pose_is_refused(tmp_path):
     )
 
 
-def test_two_files_of_poses_are_refused(tmp_path):
+def test_two_files_of_poses_are_refused(tmp_path: Path) -> None:
     (tmp_path / "poses.json").write_text("{}")
     assert refused(tmp_path, HEADING + ROW) == (
         f"{tmp_path}: holds poses.csv and poses.json; keep one of them"
     )
 
 
-def test_clouds_without_poses_are_refused(tmp_path):
+def test_clouds_without_poses_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").touch()
     assert refused(tmp_path) == (
         f"{tmp_path}: holds clouds (1), but none of poses.csv, poses.yaml, poses.yml, poses.json"
     )
 
 
-def test_auto_says_what_it_took(tmp_path):
+def test_auto_says_what_it_took(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text(HEADING + ROW)
     assert auto(tmp_path).notes == (f"reader: folder, chosen by what {tmp_path} holds",)
     assert auto(tmp_path / "poses.csv").root == tmp_path
 
 
-def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path):
+def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         auto(tmp_path)
     assert str(error.value) == (
@@ -186,7 +187,7 @@ def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path):
     )
 
 
-def test_auto_asks_the_readers_of_plugins_too(tmp_path):
+def test_auto_asks_the_readers_of_plugins_too(tmp_path: Path) -> None:
     class StrangeParams(Params):
         house: str = Field(description="Whose; there is no default.")
 

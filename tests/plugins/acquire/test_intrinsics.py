@@ -1,5 +1,8 @@
 """A camera nobody calibrated: found by the views of the board, or refined, with how well."""
 
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -39,7 +42,7 @@ def images(board, count, tilt=0.45):
 
 
 @pytest.fixture(scope="module")
-def views():
+def views() -> Any:
     return images(BOARD, 12)
 
 
@@ -56,7 +59,7 @@ def misses(lens):
 
 
 @pytest.mark.parametrize("board", [BOARD, CIRCLES])
-def test_the_camera_is_found_as_well_as_it_says(board, views):
+def test_the_camera_is_found_as_well_as_it_says(board: Any, views: Any) -> None:
     lens = lens_of(views if board is BOARD else images(board, 12), board)
     assert lens.deviations[0] < 5
     assert np.abs(misses(lens)).max() < 6  # what detection moves all corners by is not in it
@@ -64,14 +67,14 @@ def test_the_camera_is_found_as_well_as_it_says(board, views):
     assert lens.error < 0.15
 
 
-def test_a_camera_that_is_nearly_known_is_refined(views):
+def test_a_camera_that_is_nearly_known_is_refined(views: Any) -> None:
     rough = MATRIX + np.diag([30.0, 30.0, 0.0])
     known = Image(views["0"], rough, np.zeros(0))
     refined = lens_of(views, BOARD, known)
     np.testing.assert_allclose(refined.matrix, lens_of(views, BOARD).matrix, atol=0.05)
 
 
-def test_images_without_a_board_are_left_out_and_named(views):
+def test_images_without_a_board_are_left_out_and_named(views: Any) -> None:
     blank = np.full_like(views["0"], 90)
     lens = lens_of({**views, "blank": blank}, BOARD)
     assert lens.left_out == ("blank",)
@@ -79,7 +82,7 @@ def test_images_without_a_board_are_left_out_and_named(views):
     assert lens.note().endswith("px; without blank")
 
 
-def test_too_few_or_too_equal_views_are_refused(views):
+def test_too_few_or_too_equal_views_are_refused(views: Any) -> None:
     few = {name: views[name] for name in "0123"}
     with pytest.raises(StageError, match="^4 of 4 images show the board, 6 are needed to tell the"):
         lens_of(few, BOARD)
@@ -89,7 +92,7 @@ def test_too_few_or_too_equal_views_are_refused(views):
         lens_of({**few, "small": views["0"][:100]}, BOARD)
 
 
-def test_a_folder_of_images_needs_no_calibrated_camera(views, tmp_path):
+def test_a_folder_of_images_needs_no_calibrated_camera(views: Any, tmp_path: Path) -> None:
     rows = ["cloud,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"]
     for k, (name, pixels) in enumerate(views.items()):
         cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
@@ -126,6 +129,6 @@ def table_reader():
         ),
     ],
 )
-def test_a_board_that_tells_no_camera_is_refused(given, line):
+def test_a_board_that_tells_no_camera_is_refused(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ValueError, match=line):
         SeenBoardParams(square=SI(0.03), **given)

@@ -1,5 +1,7 @@
 """What a live session makes of its devices; the devices themselves are tested with the loopback."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,18 +22,18 @@ def samples(*times, move=0.0, turn=0.0):
     ("start", "end", "expected"),
     [(10, 30, [10, 20, 30]), (12, 18, [10, 20]), (11, 21, [10, 20, 30]), (0, 40, [0, 10, 20, 30, 40])],
 )  # fmt: skip
-def test_an_exposure_is_framed_by_samples(start, end, expected):
+def test_an_exposure_is_framed_by_samples(start: int, end: int, expected: list[Any]) -> None:
     found = within(samples(0, 10, 20, 30, 40), start, end)
     assert [sample.time_ns for sample in found] == expected
 
 
 @pytest.mark.parametrize(("start", "end"), [(-1, 20), (20, 41), (50, 60)])
-def test_an_exposure_that_is_not_covered_has_no_pose(start, end):
+def test_an_exposure_that_is_not_covered_has_no_pose(start: int, end: int) -> None:
     assert within(samples(0, 10, 20, 30, 40), start, end) == []
     assert within([], start, end) == []
 
 
-def test_movement_counts_shifts_and_turns():
+def test_movement_counts_shifts_and_turns() -> None:
     assert movement(samples(0, 1, 2)) == 0.0
     assert movement(samples(0, 1, 2, move=1e-4)) == pytest.approx(2e-4)
     assert movement(samples(0, 1, 2, turn=1e-3)) == pytest.approx(2e-4, rel=1e-3)

@@ -2,6 +2,8 @@
 
 import csv
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +46,7 @@ def as_json(archive, second):
     (archive / "poses.json").write_text(json.dumps({"unit": "mm", "poses": poses}))
 
 
-def test_every_capture_says_where_the_second_arm_was(archive, scanner):
+def test_every_capture_says_where_the_second_arm_was(archive: Path, scanner: Any) -> None:
     as_json(archive, SECOND)
     params = ArchiveParams(reader=auto.bind())
     captures = list(acquire_archive(scanner, ArchivePath(archive), params))
@@ -55,7 +57,7 @@ def test_every_capture_says_where_the_second_arm_was(archive, scanner):
     assert np.allclose(places, [0.5, 0.501, 0.502, 0.503, 0.504])
 
 
-def test_what_is_written_of_two_arms_is_read_again(tmp_path):
+def test_what_is_written_of_two_arms_is_read_again(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
 
     def pose():
@@ -96,7 +98,9 @@ ROW = "a.pcd,1,2,3,0,1,0,0"
          "second_x_m, …"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_the_second_arms_columns_is_named(tmp_path, heading, row, line):
+def test_a_mistake_in_the_second_arms_columns_is_named(
+    tmp_path: Path, heading: str, row: str, line: str
+) -> None:
     (tmp_path / "poses.csv").write_text(f"{HEADING},{heading}\n{ROW},{row}\n")
     with pytest.raises(StageError) as error:
         folder(tmp_path, FolderParams())

@@ -295,19 +295,19 @@ def require_same(found, pose):
     assert np.linalg.norm(axis) / 2 < 1e-6
 
 
-def test_every_format_has_its_reader():
+def test_every_format_has_its_reader() -> None:
     assert set(READERS) == set(BY_NAME)
 
 
 @pytest.mark.parametrize("name", READERS)
 @settings(max_examples=40, deadline=None)
 @given(pose=poses())
-def test_what_is_written_is_read_back(name, pose):
+def test_what_is_written_is_read_back(name: str, pose: Any) -> None:
     require_same(READERS[name](written(name, pose).text), pose)
 
 
 @pytest.mark.parametrize("name", ["zivid", "opencv", "matrix"])
-def test_the_unit_is_the_one_asked_for(name):
+def test_the_unit_is_the_one_asked_for(name: str) -> None:
     pose = CalibratedPose(Transform(BASE, CAMERA, rigid(np.eye(3), [0.1, 0.2, 0.3])))
     by_default = 1e-3 if name == "zivid" else 1.0
     for length, metres in (("m", 1.0), ("mm", 1e-3)):
@@ -318,7 +318,9 @@ def test_the_unit_is_the_one_asked_for(name):
 
 @settings(max_examples=30, deadline=None)
 @given(pose=poses())
-def test_a_urdf_hangs_the_camera_by_its_mount(tmp_path_factory, pose):
+def test_a_urdf_hangs_the_camera_by_its_mount(
+    tmp_path_factory: pytest.TempPathFactory, pose: Any
+) -> None:
     """base_T_mount mount_T_optical is what was found, the mount given or from the camera's URDF."""
     roll, pitch, yaw = 10.0, -20.0, 170.0
     told = {
@@ -365,7 +367,7 @@ CAMERA_URDF = """<robot name="eye">
         ),
     ],
 )
-def test_a_camera_s_urdf_that_does_not_tell(tmp_path, text, message):
+def test_a_camera_s_urdf_that_does_not_tell(tmp_path: Path, text: Any, message: str) -> None:
     file = tmp_path / "camera.urdf"
     file.write_text(text)
     pose = CalibratedPose(Transform(BASE, CAMERA, np.eye(4)))
@@ -375,7 +377,7 @@ def test_a_camera_s_urdf_that_does_not_tell(tmp_path, text, message):
     assert str(error.value) == message.format(file)
 
 
-def test_every_format_keeps_to_the_kit():
+def test_every_format_keeps_to_the_kit() -> None:
     """What is asked of a vendor's export, asked of each of ours."""
     checks = [name for name in dir(ExportConformance) if name.startswith("test_")]
     for stage in EXPORTS:
@@ -384,6 +386,6 @@ def test_every_format_keeps_to_the_kit():
             getattr(kit, check)()
 
 
-def test_each_format_is_explained_in_the_docs():
+def test_each_format_is_explained_in_the_docs() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "exports.md").read_text()
     assert [name for name in BY_NAME if f"`{name}`" not in page] == []

@@ -1,5 +1,7 @@
 """Printed targets in rendered images: perspective, lens, blur and noise, with known truth."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -64,7 +66,7 @@ def error(feature, pose):
 @pytest.mark.parametrize("depth", [False, True])
 @pytest.mark.parametrize("camera", [SMALL, BENT])
 @pytest.mark.parametrize("kind", FITS)
-def test_a_tilted_target_is_found_where_it_is(kind, camera, depth):
+def test_a_tilted_target_is_found_where_it_is(kind: str, camera: Any, depth: bool) -> None:
     board, fit, params = FITS[kind]
     pose = looking()
     feature = fit(capture(board, pose, camera, depth), params)
@@ -76,19 +78,19 @@ def test_a_tilted_target_is_found_where_it_is(kind, camera, depth):
 
 @pytest.mark.parametrize("yaw", np.arange(0, 360, 72.0))
 @pytest.mark.parametrize("kind", FITS)
-def test_no_target_is_taken_for_itself_upside_down(kind, yaw):
+def test_no_target_is_taken_for_itself_upside_down(kind: str, yaw: Any) -> None:
     board, fit, params = FITS[kind]
     pose = looking(yaw=np.radians(yaw))
     feature = fit(capture(board, pose), params)
     assert np.degrees(np.linalg.norm(error(feature, pose)[:3])) < 0.3
 
 
-def test_the_axes_are_right_up_and_towards_the_camera():
+def test_the_axes_are_right_up_and_towards_the_camera() -> None:
     feature = fit_charuco(capture(CHARUCO, looking(tilt=0.0, yaw=0.0)), OF_CHARUCO)
     assert np.allclose(feature.camera_T_target.rotation, np.diag([1, -1, -1]), atol=5e-3)
 
 
-def test_a_markers_sides_are_not_taken_for_straight_where_the_lens_bends_them():
+def test_a_markers_sides_are_not_taken_for_straight_where_the_lens_bends_them() -> None:
     camera = BoardCamera(CAMERA_MATRIX, (800, 600), np.array([-0.2, 0.0, 0.0, 0.0]), noise=0.5)
     pose = looking(0.5)
     pose[:3, 3] = [0.1, 0.07, 0.5]  # a side is bent by half a pixel out there
@@ -97,7 +99,7 @@ def test_a_markers_sides_are_not_taken_for_straight_where_the_lens_bends_them():
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1
 
 
-def test_a_checkerboard_is_not_taken_one_square_beside_itself():
+def test_a_checkerboard_is_not_taken_one_square_beside_itself() -> None:
     """Where a side is covered, the sheet about the board can stand in for its outer squares."""
     matrix = np.array([[1400.0, 0, 639.5], [0, 1400, 511.5], [0, 0, 1]])
     lens = np.array([-0.12, 0.08, 0.0005, -0.0003, 0.0])
@@ -115,14 +117,14 @@ def test_a_checkerboard_is_not_taken_one_square_beside_itself():
         assert isinstance(found, Rejected)
 
 
-def test_the_corners_come_with_what_the_pose_misses():
+def test_the_corners_come_with_what_the_pose_misses() -> None:
     feature = fit_charuco(capture(CHARUCO, looking()), OF_CHARUCO)
     assert feature.corners.shape == (24, 4)
     assert np.sqrt((feature.corners[:, 2:] ** 2).mean()) == feature.figures["reprojection_px"]
     assert feature.figures["reprojection_px"] < 0.1
 
 
-def test_a_small_marker_seen_frontally_has_two_poses_and_is_set_aside():
+def test_a_small_marker_seen_frontally_has_two_poses_and_is_set_aside() -> None:
     small = Board("marker", 1, 1, 0.02, 0.0, "APRILTAG_36h11", 3)
     params = OF_MARKER.model_copy(update={"size": 0.02})
     rejected = [
@@ -134,7 +136,7 @@ def test_a_small_marker_seen_frontally_has_two_poses_and_is_set_aside():
     assert "tilt it by 15 deg and more" in rejected[0].reason
 
 
-def test_depth_decides_between_the_two_poses():
+def test_depth_decides_between_the_two_poses() -> None:
     small = Board("marker", 1, 1, 0.02, 0.0, "APRILTAG_36h11", 3)
     params = OF_MARKER.model_copy(update={"size": 0.02})
     pose = looking(tilt=0.12, distance=0.6)
@@ -142,7 +144,7 @@ def test_depth_decides_between_the_two_poses():
     assert np.degrees(np.linalg.norm(error(feature, pose)[:3])) < 1.0
 
 
-def test_the_better_of_image_and_depth_is_taken():
+def test_the_better_of_image_and_depth_is_taken() -> None:
     """A marker's tilt is known well from depth only; of a good board the image is as good."""
     assert fit_aruco(capture(MARKER, looking(0.05), depth=True), OF_MARKER).figures["by_depth"] == 1
     coarse = BoardCamera(CAMERA_MATRIX, (800, 600), depth_noise=3e-3)
@@ -151,7 +153,7 @@ def test_the_better_of_image_and_depth_is_taken():
 
 
 @pytest.mark.parametrize("kind", FITS)
-def test_a_print_in_another_size_is_named_by_depth(kind):
+def test_a_print_in_another_size_is_named_by_depth(kind: str) -> None:
     board, fit, params = FITS[kind]
     field = {"marker": "size", "circles": "spacing"}.get(kind, "square")
     said = params.model_copy(update={field: getattr(params, field) / 1.03})
@@ -175,23 +177,23 @@ def blank():
         ("marker", "marker 3 found 0 times, once is needed (found: none)"),
     ],
 )  # fmt: skip
-def test_nothing_to_be_seen_is_said(kind, reason):
+def test_nothing_to_be_seen_is_said(kind: str, reason: str) -> None:
     _, fit, params = FITS[kind]
     assert fit(blank(), params).reason == reason
 
 
-def test_a_capture_without_an_image_is_set_aside():
+def test_a_capture_without_an_image_is_set_aside() -> None:
     nothing = Capture("0", PointCloud(CAMERA, np.zeros((0, 3))), by_frame(POSE))
     assert fit_charuco(nothing, OF_CHARUCO).reason.startswith("there is no image")
 
 
-def test_depth_only_needs_depth():
+def test_depth_only_needs_depth() -> None:
     params = OF_CHARUCO.model_copy(update={"depth": "only"})
     reason = fit_charuco(capture(CHARUCO, looking()), params).reason
     assert reason == "the cloud has no depth at the corners; it must be organised as the image"
 
 
-def test_a_wrong_camera_matrix_is_told_by_the_corners():
+def test_a_wrong_camera_matrix_is_told_by_the_corners() -> None:
     seen = capture(CHARUCO, looking(0.7, distance=0.35))
     wrong = CAMERA_MATRIX * [[1.5, 1, 1], [1, 0.7, 1], [1, 1, 1]]
     rejected = fit_charuco(
@@ -211,13 +213,15 @@ def test_a_wrong_camera_matrix_is_told_by_the_corners():
         (MarkerParams, {"size": SI(0.02), "dictionary": "4X4_51"}, "no dictionary '4X4_51'; known:"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_with_the_recipe(model, values, message):
+def test_what_cannot_be_is_refused_with_the_recipe(
+    model: Any, values: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValidationError) as error:
         model.model_validate(values)
     assert message in str(error.value)
 
 
-def test_the_first_square_of_a_checkerboard_is_black():
+def test_the_first_square_of_a_checkerboard_is_black() -> None:
     printed = print_of(CHECKER, 10)
     assert printed.shape == (50, 80)
     assert (printed[:10, :10] == 0).all()
@@ -226,7 +230,7 @@ def test_the_first_square_of_a_checkerboard_is_black():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", FITS)
-def test_the_stated_covariance_holds_its_share(kind):
+def test_the_stated_covariance_holds_its_share(kind: str) -> None:
     board, fit, params = FITS[kind]
     rng = np.random.default_rng(7)
     inside = []
@@ -239,7 +243,7 @@ def test_the_stated_covariance_holds_its_share(kind):
     assert np.mean(inside) > 0.8
 
 
-def test_a_grid_of_circles_that_is_symmetric_or_partly_seen_is_refused():
+def test_a_grid_of_circles_that_is_symmetric_or_partly_seen_is_refused() -> None:
     with pytest.raises(ValidationError, match="10 rows looks the same after half a turn"):
         CirclesParams(columns=4, rows=10, spacing=SI(0.016), diameter=SI(0.014))
     pose = looking()

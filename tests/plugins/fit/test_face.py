@@ -26,7 +26,7 @@ def tilt(plane):
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.2, 0.35, 0.42])
-def test_the_floors_of_recesses_do_not_move_the_plane(floor):
+def test_the_floors_of_recesses_do_not_move_the_plane(floor: float) -> None:
     points = face(np.random.default_rng(0), floor=floor)
     plane = robust_plane(points, Plane(AT, NORMAL, 0.0), 3e-3)
     assert tilt(plane) < 0.02
@@ -36,7 +36,7 @@ def test_the_floors_of_recesses_do_not_move_the_plane(floor):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32), st.floats(-1.5, 1.5), st.floats(-2.0, 2.0))
-def test_a_rough_start_is_enough(seed, height, turn):
+def test_a_rough_start_is_enough(seed: int, height: float, turn: float) -> None:
     points = face(np.random.default_rng(seed), floor=0.3)
     normal = np.array([0.0, np.sin(np.radians(turn)), -np.cos(np.radians(turn))])
     rough = Plane(AT + 1e-3 * height * NORMAL, normal, 0.0)
@@ -45,17 +45,17 @@ def test_a_rough_start_is_enough(seed, height, turn):
     assert abs(plane.heights(AT)) < 5e-5
 
 
-def test_exact_points_have_a_plane():
+def test_exact_points_have_a_plane() -> None:
     points = face(np.random.default_rng(1), noise=0.0)
     plane = robust_plane(points, Plane(AT + 1e-3, NORMAL, 0.0), 3e-3)
     assert tilt(plane) < 1e-6 and plane.sigma < 1e-12
 
 
-def test_points_beyond_the_slab_have_none():
+def test_points_beyond_the_slab_have_none() -> None:
     points = face(np.random.default_rng(1))
     assert robust_plane(points, Plane(AT + np.array([0, 0, 0.1]), NORMAL, 0.0), 3e-3) is None
 
 
-def test_a_rough_plane_that_is_right_is_kept():
+def test_a_rough_plane_that_is_right_is_kept() -> None:
     rough = Plane(AT, NORMAL, 0.0)
     assert likeliest_plane(face(np.random.default_rng(2), noise=0.0), rough) is rough

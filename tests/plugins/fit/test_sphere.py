@@ -42,7 +42,7 @@ def fit(points, rough, sphere=SPHERE, **changes):
     return fit_sphere(cloud, sphere, SphereParams(**changes))
 
 
-def test_an_exact_cap_gives_the_exact_centre():
+def test_an_exact_cap_gives_the_exact_centre() -> None:
     found = fit(*cap(noise=0.0))
     assert np.abs(found.centre - CENTRE).max() < 2e-8  # single precision
     assert found.radii["sphere"] == pytest.approx(SPHERE.radius, abs=1e-7)
@@ -50,7 +50,7 @@ def test_an_exact_cap_gives_the_exact_centre():
     assert found.arc_coverage == 1.0
 
 
-def test_the_centre_belongs_where_the_recipe_says():
+def test_the_centre_belongs_where_the_recipe_says() -> None:
     found = fit(*cap())
     assert found.centre_in_flange.tolist() == list(SPHERE.centre_in_flange)
     pose = np.eye(4)
@@ -61,14 +61,14 @@ def test_the_centre_belongs_where_the_recipe_says():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(0.4, 1.2))
-def test_wherever_it_is_noise_averages_out(seed, x, y, z):
+def test_wherever_it_is_noise_averages_out(seed: int, x: float, y: float, z: float) -> None:
     centre = np.array([x, y, z])
     found = fit(*cap(seed, centre))
     assert np.linalg.norm(found.centre - centre) < 1e-5
 
 
 @pytest.mark.parametrize("radius", ["known", "free"])
-def test_the_covariance_is_that_of_the_errors(radius):
+def test_the_covariance_is_that_of_the_errors(radius: str) -> None:
     fits = [
         fit(*cap(seed, count=400), radius=radius, scanner_error=SI(0), radius_error=SI(0))
         for seed in range(150)
@@ -80,7 +80,7 @@ def test_the_covariance_is_that_of_the_errors(radius):
     assert np.trace(errors.T @ errors / 150) == pytest.approx(np.trace(stated), rel=0.25)
 
 
-def test_a_free_radius_costs_depth():
+def test_a_free_radius_costs_depth() -> None:
     along = CENTRE / np.linalg.norm(CENTRE)
     exact = {"scanner_error": SI(0), "radius_error": SI(0)}
     known, free = (fit(*cap(to=50.0), radius=r, **exact).covariance for r in ("known", "free"))
@@ -88,14 +88,14 @@ def test_a_free_radius_costs_depth():
 
 
 @pytest.mark.parametrize("share", [0.85, 0.95, 1.1, 1.2])
-def test_a_radius_that_is_known_roughly_is_found_on_a_cap(share):
+def test_a_radius_that_is_known_roughly_is_found_on_a_cap(share: float) -> None:
     radius = SPHERE.radius * share
     found = fit(*cap(to=65.0, radius=radius), radius="free", radius_tolerance=SI(6e-3))
     assert found.radii["sphere"] == pytest.approx(radius, abs=2e-5)
     assert np.linalg.norm(found.centre - CENTRE) < 3e-5
 
 
-def test_a_radius_that_is_off_moves_the_centre_as_the_covariance_says():
+def test_a_radius_that_is_off_moves_the_centre_as_the_covariance_says() -> None:
     larger = 2e-5
     exact = {"scanner_error": SI(0), "radius_error": SI(larger)}
     found = fit(*cap(noise=0.0, radius=SPHERE.radius + larger), **exact)
@@ -105,7 +105,7 @@ def test_a_radius_that_is_off_moves_the_centre_as_the_covariance_says():
     )
 
 
-def test_stray_points_do_not_matter():
+def test_stray_points_do_not_matter() -> None:
     points, rough = cap()
     rng = np.random.default_rng(1)
     points[rng.permutation(len(points))[:600]] += 1e-3 * rng.standard_normal((600, 3))
@@ -113,7 +113,7 @@ def test_stray_points_do_not_matter():
     assert np.linalg.norm(found.centre - CENTRE) < 1e-5
 
 
-def test_oblique_points_do_not_matter():
+def test_oblique_points_do_not_matter() -> None:
     points, rough = cap(to=85.0)
     offsets = points - CENTRE
     oblique = -np.einsum("ni,ni->n", offsets, points) < np.cos(np.radians(65)) * np.linalg.norm(
@@ -123,7 +123,7 @@ def test_oblique_points_do_not_matter():
     assert np.linalg.norm(fit(points, rough).centre - CENTRE) < 5e-6
 
 
-def test_half_a_cap_is_enough_and_less_is_not():
+def test_half_a_cap_is_enough_and_less_is_not() -> None:
     points, rough = cap()
     beside = (points - CENTRE) @ basis_of_plane(CENTRE)[0]
     half = fit(points[beside > 0], rough)
@@ -134,19 +134,19 @@ def test_half_a_cap_is_enough_and_less_is_not():
     assert third.reason == "33% of the cap seen within 60 deg, at least 40% is needed"
 
 
-def test_another_sphere_is_not_taken_for_it():
+def test_another_sphere_is_not_taken_for_it() -> None:
     found = fit(*cap(radius=0.020))
     assert isinstance(found, Rejected)
     assert found.reason == "sphere radius 20.00 mm, expected 19.05 mm within 0.5 mm"
 
 
-def test_few_points_are_rejected():
+def test_few_points_are_rejected() -> None:
     found = fit(*cap(count=20))
     assert isinstance(found, Rejected)
     assert found.reason == "20 points, at least 50 are needed"
 
 
-def test_the_order_of_the_points_and_repetition_change_nothing():
+def test_the_order_of_the_points_and_repetition_change_nothing() -> None:
     points, rough = cap()
     one, two = fit(points, rough), fit(points, rough)
     assert one.centre.tobytes() == two.centre.tobytes()
@@ -154,7 +154,7 @@ def test_the_order_of_the_points_and_repetition_change_nothing():
     assert np.abs(turned.centre - one.centre).max() < 1e-9
 
 
-def test_the_jacobian_is_the_derivative():
+def test_the_jacobian_is_the_derivative() -> None:
     points, _ = cap(count=5)
     exact = sphere_jacobian(points, CENTRE)
     for k in range(3):

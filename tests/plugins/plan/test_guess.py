@@ -30,7 +30,7 @@ def shown(joints):
     return view_shown(ARM, SCANNER, ShownParams(joints=degrees))
 
 
-def test_a_guess_is_taken_as_it_is():
+def test_a_guess_is_taken_as_it_is() -> None:
     params = GuessParams(position=["600 mm", "0 mm", "1 m"], rpy=["180 deg", "0 deg", "0 deg"])
     pose = view_guess(ARM, SCANNER, params)
     assert pose[:3, 3] == pytest.approx([0.6, 0.0, 1.0])
@@ -39,7 +39,7 @@ def test_a_guess_is_taken_as_it_is():
 
 @given(about=st.floats(-0.5, 0.5))
 @settings(max_examples=5, deadline=None)
-def test_poses_that_face_the_scanner_find_it(about):
+def test_poses_that_face_the_scanner_find_it(about: float) -> None:
     places = [[0.45, -0.15, 0.35], [0.6, 0.2, 0.3], [0.4, 0.25, 0.4]]
     pose = shown([facing(np.array(place), about) for place in places])
     assert np.linalg.norm(pose[:3, 3] - EYE) < 0.05
@@ -48,7 +48,7 @@ def test_poses_that_face_the_scanner_find_it(about):
     assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
 
 
-def test_parallel_flanges_leave_the_distance_to_the_scanners_own():
+def test_parallel_flanges_leave_the_distance_to_the_scanners_own() -> None:
     down = [rigid(rotation_from_rpy(0.0, 0.0, 0.3), p) for p in ([0.4, 0.0, 0.3], [0.5, 0.2, 0.3], [0.5, -0.1, 0.3])]  # fmt: skip
     pose = shown([ARM.inverse(each)[0] for each in down])
     middle = np.mean([each[:3, 3] for each in down], axis=0)
@@ -56,13 +56,13 @@ def test_parallel_flanges_leave_the_distance_to_the_scanners_own():
     assert pose[:3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=0.03)
 
 
-def test_poses_that_look_elsewhere_are_refused():
+def test_poses_that_look_elsewhere_are_refused() -> None:
     joints = [facing(np.array(p), 0.0) for p in ([0.45, -0.15, 0.35], [0.6, 0.2, 0.3])]
     sideways = rigid(rotation_from_rpy(np.pi / 2, 0.0, 0.0), [0.4, 0.3, 0.4])
     with pytest.raises(StageError, match=r"^view.shown: one of the flanges looks \d+ deg away"):
         shown([*joints, ARM.inverse(sideways)[0]])
 
 
-def test_angles_of_another_arm_are_refused():
+def test_angles_of_another_arm_are_refused() -> None:
     with pytest.raises(StageError, match="has 5 joint angles, the arm 6 joints"):
         shown(np.zeros((3, 5)))

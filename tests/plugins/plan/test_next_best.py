@@ -23,7 +23,7 @@ def planned(seed=0, place=None, **params):
 
 @given(seed=st.integers(0, 1000), count=st.integers(3, 8))
 @settings(max_examples=15, deadline=None)
-def test_poses_stay_in_the_region_and_face_the_scanner(seed, count):
+def test_poses_stay_in_the_region_and_face_the_scanner(seed: int, count: int) -> None:
     params = NextBestParams(count=count, candidates=50, facing="30 deg")
     poses = planned(seed, count=count, candidates=50, facing="30 deg")
     assert len(poses) == count
@@ -32,18 +32,18 @@ def test_poses_stay_in_the_region_and_face_the_scanner(seed, count):
         assert angle_between(pose[:3, 2], EYE - pose[:3, 3]) <= params.facing
 
 
-def test_it_goes_apart_rather_than_to_the_middle():
+def test_it_goes_apart_rather_than_to_the_middle() -> None:
     places = np.array(planned(count=8))[:, :3, 3] - CENTRE
     assert np.linalg.norm(places[1:], axis=1).min() > 0.15
     spread = np.linalg.eigvalsh(places.T @ places / 8)
     assert spread[0] > 0.1**2  # in every direction
 
 
-def test_the_same_seed_gives_the_same_poses():
+def test_the_same_seed_gives_the_same_poses() -> None:
     assert np.array(planned(3)).tolist() == np.array(planned(3)).tolist()
 
 
-def test_a_pose_that_told_nothing_is_made_up_for():
+def test_a_pose_that_told_nothing_is_made_up_for() -> None:
     lost: set[int] = set()
     place = site(lost=lambda: lost)
     plan = next_best(place, np.random.default_rng(0), NextBestParams(count=6))
@@ -56,14 +56,14 @@ def test_a_pose_that_told_nothing_is_made_up_for():
     assert apart.min() < 0.15  # it goes back to where it would tell most
 
 
-def test_what_the_arm_cannot_reach_is_passed_over():
+def test_what_the_arm_cannot_reach_is_passed_over() -> None:
     poses = planned(place=site(joints=lambda pose: None if pose[0, 3] > 0.6 else np.zeros(6)))
     assert (np.array(poses)[:, 0, 3] <= 0.6).all()
     assert planned(place=site(joints=lambda pose: None)) == []
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_it_needs_at_most_sixty_percent_of_the_grids_poses(seed):
+def test_it_needs_at_most_sixty_percent_of_the_grids_poses(seed: int) -> None:
     wanted, found = compare(seed)
     assert found is not None
     assert found.poses <= 0.6 * wanted.poses

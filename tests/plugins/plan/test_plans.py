@@ -1,5 +1,7 @@
 """The grid plan, with an arm that can go everywhere and with a real one."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +31,7 @@ def rng(seed=0):
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=25, deadline=None)
-def test_poses_stay_within_their_limits(counts, tilt, seed):
+def test_poses_stay_within_their_limits(counts: Any, tilt: float, seed: int) -> None:
     params = GridParams(counts=counts, tilt=f"{tilt!r} rad", facing="60 deg")
     plan = grid(easy_site(), rng(seed), params=params)
     assert len(plan.poses) == plan.wanted == np.prod(counts)
@@ -41,7 +43,7 @@ def test_poses_stay_within_their_limits(counts, tilt, seed):
         assert (turned <= params.tilt + 1e-9).all()
 
 
-def test_the_papers_grid():
+def test_the_papers_grid() -> None:
     plan = grid(easy_site(), rng(), params=GridParams(counts=(5, 5, 3)))
     assert plan.wanted == 75
     assert plan.size == pytest.approx([0.3, 0.3, 0.2])
@@ -49,7 +51,7 @@ def test_the_papers_grid():
     assert np.ptp(places, axis=0) == pytest.approx([0.3, 0.3, 0.2])
 
 
-def test_the_default_is_a_smaller_one_in_random_order():
+def test_the_default_is_a_smaller_one_in_random_order() -> None:
     plans = [grid(easy_site(), rng(seed), params=GridParams()) for seed in (0, 0, 1)]
     first, again, other = (np.array([p.base_T_flange for p in plan.poses]) for plan in plans)
     assert len(first) == 18
@@ -60,7 +62,7 @@ def test_the_default_is_a_smaller_one_in_random_order():
     assert (np.diff(places[:, 0]) >= -1e-12).all()
 
 
-def test_every_normal_is_near_enough_to_the_view():
+def test_every_normal_is_near_enough_to_the_view() -> None:
     params = GridParams(size=("1 m", "1 m", "100 mm"), facing="25 deg")
     plan = grid(easy_site(), rng(), params=params)
     assert 3 < len(plan.poses) < plan.wanted or len(plan.poses) == plan.wanted
@@ -70,20 +72,20 @@ def test_every_normal_is_near_enough_to_the_view():
         assert cosine >= np.cos(np.radians(25)) - 1e-12
 
 
-def test_a_point_where_the_arm_cannot_go_is_left_out():
+def test_a_point_where_the_arm_cannot_go_is_left_out() -> None:
     beyond = easy_site(lambda pose: np.zeros(6) if pose[0, 3] < 0.65 else None)
     plan = grid(beyond, rng(), params=GridParams())
     assert len(plan.poses) == 12
     assert plan.wanted == 18
 
 
-def test_an_arm_that_cannot_show_its_flange_has_no_plan():
+def test_an_arm_that_cannot_show_its_flange_has_no_plan() -> None:
     site = Site(np.zeros(3), np.ones(3), lambda centre: None, lambda pose: np.zeros(6))
     assert grid(site, rng(), params=GridParams()).poses == []
 
 
 @pytest.mark.parametrize("robot", ["ur5", "franka-panda"])
-def test_an_arm_reaches_what_is_planned_for_it(robot):
+def test_an_arm_reaches_what_is_planned_for_it(robot: str) -> None:
     model, scanner = load_model("robots", robot), load_model("scanners", "phoxi-m")
     base_T_camera = np.array(
         [[0, -1, 0, 0.6], [-1, 0, 0, -0.0125], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=float
@@ -98,7 +100,7 @@ def test_an_arm_reaches_what_is_planned_for_it(robot):
         assert reach.in_view(pose)
 
 
-def test_a_flange_beside_the_view_or_behind_the_range_is_not_in_view():
+def test_a_flange_beside_the_view_or_behind_the_range_is_not_in_view() -> None:
     model, scanner = load_model("robots", "ur5"), load_model("scanners", "phoxi-m")
     reach = Reach(model, scanner, np.eye(4), 0.04)
     pose = np.eye(4)

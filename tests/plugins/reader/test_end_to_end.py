@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -71,7 +72,7 @@ def transform(pose):
 
 
 @pytest.fixture
-def samples(tmp_path):
+def samples(tmp_path: Path) -> Path:
     """Fifteen samples of easy_handeye2, eye-in-hand, with noise."""
     rng = np.random.default_rng(1)
     robot = poses(15)
@@ -93,13 +94,20 @@ def recipe(tmp_path, kind):
     return path
 
 
-def test_samples_of_easy_handeye_are_calibrated(tmp_path, samples, monkeypatch):
+def test_samples_of_easy_handeye_are_calibrated(
+    tmp_path: Path, samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = recipe(tmp_path, "eye_in_hand")
     assert flangeye(monkeypatch, "run", path, "--archive", samples, "--out", tmp_path / "o") == 0
     check_result(tmp_path / "o", 0.1, 1e-3)
 
 
-def test_the_doctor_tells_the_wrong_type_of_samples(tmp_path, samples, monkeypatch, capsys):
+def test_the_doctor_tells_the_wrong_type_of_samples(
+    tmp_path: Path,
+    samples: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert (
         flangeye(monkeypatch, "doctor", samples, "--recipe", recipe(tmp_path, "eye_in_hand")) == 0
     )
@@ -112,7 +120,9 @@ def test_the_doctor_tells_the_wrong_type_of_samples(tmp_path, samples, monkeypat
     assert "reader: {easy_handeye: {calibration: eye_on_base}}, inverted: true" in told
 
 
-def test_a_folder_of_images_with_kuka_poses_is_calibrated(tmp_path, monkeypatch):
+def test_a_folder_of_images_with_kuka_poses_is_calibrated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(2)
     folder = tmp_path / "archive"
     folder.mkdir()
@@ -142,7 +152,9 @@ def test_a_folder_of_images_with_kuka_poses_is_calibrated(tmp_path, monkeypatch)
     assert flangeye(monkeypatch, "doctor", folder, "--recipe", path) == 1
 
 
-def test_organised_clouds_with_images_beside_them_need_no_camera_matrix(tmp_path, monkeypatch):
+def test_organised_clouds_with_images_beside_them_need_no_camera_matrix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(4)
     folder, robot, captures = tmp_path / "archive", poses(8), []
     for i, (pose, target) in enumerate(zip(robot, targets(robot), strict=True)):

@@ -1,5 +1,8 @@
 """A folder given where a file is meant, and the reverse: each reader says so, in one line."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 from pydantic import ValidationError
 
@@ -22,7 +25,7 @@ def readers():
 
 
 @pytest.mark.parametrize("read", [pytest.param(read, id=name) for name, read in readers()])
-def test_what_is_of_the_wrong_kind_is_refused_in_one_line(read, tmp_path):
+def test_what_is_of_the_wrong_kind_is_refused_in_one_line(read: Any, tmp_path: Path) -> None:
     for ending in ENDINGS:
         folder, inside, file = (
             tmp_path / f"d{ending}",

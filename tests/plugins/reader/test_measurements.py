@@ -1,5 +1,8 @@
 """Measurements in tables and arrays, however they are written, are the ones that were made."""
 
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -49,7 +52,9 @@ def params(**more):
      (" ", ".", "a.poses"), (";", ".", "a.tsv")],
 )  # fmt: skip
 @pytest.mark.parametrize("heading", [True, False])
-def test_separators_and_decimal_commas(tmp_path, mark, decimal, name, heading):
+def test_separators_and_decimal_commas(
+    tmp_path: Path, mark: str, decimal: str, name: str, heading: bool
+) -> None:
     names = ["x", "y", "z", "qx", "qy", "qz", "qw", "u", "v", "w"]
     rows = np.hstack([quaternions(ARM), SEEN[:, :3, 3] * 1e3])
     written(tmp_path / name, names if heading else None, rows, mark, decimal)
@@ -62,7 +67,9 @@ def test_separators_and_decimal_commas(tmp_path, mark, decimal, name, heading):
 
 @pytest.mark.parametrize("count", [12, 16])
 @pytest.mark.parametrize("turned", [True, False])
-def test_columns_in_any_order_and_matrices_either_way_round(tmp_path, count, turned):
+def test_columns_in_any_order_and_matrices_either_way_round(
+    tmp_path: Path, count: int, turned: bool
+) -> None:
     """Angles first, time last; the target as 12 or 16 numbers, or its inverse; a second arm."""
     angles = Rotation.from_matrix(ARM[:, :3, :3]).as_euler("ZYX", degrees=True)
     seen = np.linalg.inv(SEEN) if turned else SEEN
@@ -85,7 +92,7 @@ def test_columns_in_any_order_and_matrices_either_way_round(tmp_path, count, tur
     assert [r.time_ns for r in found] == [1_500_000_000 * i for i in range(6)]
 
 
-def test_a_commented_heading_is_a_heading_and_empty_cells_are_no_target(tmp_path):
+def test_a_commented_heading_is_a_heading_and_empty_cells_are_no_target(tmp_path: Path) -> None:
     rows = np.hstack([quaternions(ARM), SEEN[:, :3, 3]])
     lines = [" ".join(repr(float(x)) for x in row) for row in rows]
     lines[2] = lines[2].rsplit(" ", 3)[0] + " nan nan nan"
@@ -106,7 +113,9 @@ def moving(times, still):
 
 @pytest.mark.parametrize("still", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 0.18, -0.43])
-def test_two_streams_are_paired_and_their_clocks_compared(tmp_path, still, offset):
+def test_two_streams_are_paired_and_their_clocks_compared(
+    tmp_path: Path, still: bool, offset: float
+) -> None:
     """The camera's clock is ahead by ``offset``; X of AX = XB comes out to the same pairs."""
     base_T_camera, flange_T_target = random_pose(), random_pose()
     times = np.arange(0, 14, 0.008)
@@ -134,7 +143,7 @@ def test_two_streams_are_paired_and_their_clocks_compared(tmp_path, still, offse
     assert max(wrong) < (1e-4 if still else 4e-3)
 
 
-def test_standstills_are_found_and_noise_does_not_break_them():
+def test_standstills_are_found_and_noise_does_not_break_them() -> None:
     times = np.arange(0, 12, 0.008)
     arm = moving(times, np.full(times.shape, True))
     arm[:, :3, 3] += RNG.normal(0, 5e-5, (len(times), 3))
@@ -143,13 +152,13 @@ def test_standstills_are_found_and_noise_does_not_break_them():
     assert all(0.9 < s.end - s.start < 1.1 for s in spans)
 
 
-def test_signals_that_are_not_alike_give_no_offset():
+def test_signals_that_are_not_alike_give_no_offset() -> None:
     times = np.arange(0, 10, 0.02)
     arm = turning(times, moving(times, np.full(times.shape, False)))
     assert clock_offset(arm, (arm[0], RNG.normal(size=len(arm[0])))) == (0.0, 0.0)
 
 
-def test_streams_without_a_common_time_are_refused(tmp_path):
+def test_streams_without_a_common_time_are_refused(tmp_path: Path) -> None:
     rows = np.hstack([np.arange(6)[:, None], quaternions(ARM)])
     written(tmp_path / "arm.csv", ["t", *"xyzabcd"], rows)
     rows[:, 0] += 1000
@@ -178,7 +187,9 @@ def test_streams_without_a_common_time_are_refused(tmp_path):
          "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_a_table_is_one_line(tmp_path, given, message):
+def test_a_mistake_in_a_table_is_one_line(
+    tmp_path: Path, given: dict[str, Any], message: str
+) -> None:
     rows = np.hstack([quaternions(ARM), np.ones((6, 2))])
     written(tmp_path / "a.csv", [*"xyzabcd", "u", "v"], rows)
     (tmp_path / "b.csv").write_text("1,2,3\n")
@@ -191,7 +202,7 @@ def test_a_mistake_in_a_table_is_one_line(tmp_path, given, message):
     assert str(error.value).removeprefix(f"{tmp_path}/") == message
 
 
-def test_a_target_in_the_same_table_needs_its_columns():
+def test_a_target_in_the_same_table_needs_its_columns() -> None:
     with pytest.raises(ValidationError, match="give its columns, as names or numbers from 1, or"):
         params(target={"rotation": "point", "length": "m"})
 
@@ -228,7 +239,7 @@ def saved(folder, sort):
 
 
 @pytest.mark.parametrize("sort", ["npy", "npz", "mat", "yml", "xml", "text"])
-def test_arrays_of_every_program(tmp_path, sort):
+def test_arrays_of_every_program(tmp_path: Path, sort: str) -> None:
     arm, seen = saved(tmp_path, sort)
     target = {"at": seen, "length": "m"}
     found = matrices(
@@ -238,7 +249,7 @@ def test_arrays_of_every_program(tmp_path, sort):
     assert np.allclose([r.camera_T_target for r in found], SEEN, atol=1e-9)
 
 
-def test_rows_of_numbers_in_an_array_and_the_other_way_round(tmp_path):
+def test_rows_of_numbers_in_an_array_and_the_other_way_round(tmp_path: Path) -> None:
     np.savez(tmp_path / "r.npz", arm=quaternions(np.linalg.inv(ARM)), seen=1e3 * SEEN[:, :3, 3],
              second=quaternions(SECOND))  # fmt: skip
     found = matrices(tmp_path, MatricesParams.model_validate({
@@ -257,7 +268,7 @@ def visp_text(pose):
     return f"# Pose vector with 3 translations in meters\nrows: 6\ncols: 1\ndata:\n{rows}"
 
 
-def test_visps_pose_files(tmp_path):
+def test_visps_pose_files(tmp_path: Path) -> None:
     for i, (arm, seen) in enumerate(zip(ARM, SEEN, strict=True), 1):
         (tmp_path / f"pose_rPe_{i}.yaml").write_text(visp_text(arm))
         (tmp_path / f"pose_cPo_{i}.yaml").write_text(visp_text(seen))
@@ -280,7 +291,7 @@ def test_visps_pose_files(tmp_path):
         ("words.txt", "words.txt: is no table of numbers"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_arrays_is_one_line(tmp_path, place, message):
+def test_a_mistake_in_arrays_is_one_line(tmp_path: Path, place: str, message: str) -> None:
     saved(tmp_path, "npz")
     np.save(tmp_path / "odd.npy", np.ones((6, 5, 4)))
     np.savetxt(tmp_path / "rows.txt", quaternions(ARM))

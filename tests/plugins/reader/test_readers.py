@@ -1,6 +1,8 @@
 """What other tools saved, and tables of poses in any convention, become the same archive."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +57,7 @@ def both(archive):
 
 
 @pytest.mark.parametrize("kind", ["eye_in_hand", "eye_on_base"])
-def test_easy_handeye2_writes_the_robot_inverted_for_eye_on_base(tmp_path, kind):
+def test_easy_handeye2_writes_the_robot_inverted_for_eye_on_base(tmp_path: Path, kind: str) -> None:
     file = tmp_path / "cell.samples"
     written = POSES if kind == "eye_in_hand" else np.linalg.inv(POSES)
     file.write_text(samples_text(written, kind))
@@ -64,7 +66,7 @@ def test_easy_handeye2_writes_the_robot_inverted_for_eye_on_base(tmp_path, kind)
     assert np.allclose(seen, SEEN, atol=1e-12)
 
 
-def test_a_dump_of_easy_handeyes_sample_list(tmp_path):
+def test_a_dump_of_easy_handeyes_sample_list(tmp_path: Path) -> None:
     lists = {"hand_world_samples": POSES, "camera_marker_samples": SEEN}
     data = {
         name: {"transforms": [
@@ -80,7 +82,7 @@ def test_a_dump_of_easy_handeyes_sample_list(tmp_path):
     assert np.allclose(seen, SEEN)
 
 
-def test_moveit_writes_matrices_row_by_row(tmp_path):
+def test_moveit_writes_matrices_row_by_row(tmp_path: Path) -> None:
     text = "".join(
         f"- effector_wrt_world: {p.ravel().tolist()}\n  object_wrt_sensor: {s.ravel().tolist()}\n"
         for p, s in zip(POSES, SEEN, strict=True)
@@ -97,7 +99,7 @@ OPENCV = "%YAML:1.0\n---\nPoseState: !!opencv-matrix\n   rows: 4\n   cols: 4\n  
 
 @pytest.mark.parametrize("style", ["zivid", "opencv"])
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1e3), ("m", 1.0)])
-def test_a_folder_as_zivid_writes_it(tmp_path, style, unit, factor):
+def test_a_folder_as_zivid_writes_it(tmp_path: Path, style: str, unit: str, factor: float) -> None:
     cloud = PointCloud("camera", np.ones((4, 3)))
     for i, pose in enumerate(POSES, 1):
         scaled = pose.copy()
@@ -115,7 +117,7 @@ def test_a_folder_as_zivid_writes_it(tmp_path, style, unit, factor):
     assert [r.cloud.name for r in archive.recordings] == [f"img{i:02}.ply" for i in range(1, 6)]
 
 
-def test_zivids_own_scans_need_its_sdk(tmp_path):
+def test_zivids_own_scans_need_its_sdk(tmp_path: Path) -> None:
     (tmp_path / "pos01.yaml").write_text(
         ZIVID.format(rows=",\n".join(f"      {row}" for row in np.eye(4).tolist()))
     )
@@ -145,7 +147,9 @@ CASES = [
 
 @pytest.mark.parametrize("suffix", ["csv", "yaml"])
 @pytest.mark.parametrize(("rotation", "length", "angle"), CASES)
-def test_a_table_in_every_convention(tmp_path, rotation, length, angle, suffix):
+def test_a_table_in_every_convention(
+    tmp_path: Path, rotation: Any, length: Any, angle: Any, suffix: str
+) -> None:
     write_images(tmp_path)
     convention = convention_of(rotation, length, angle)
     rows = [convention.numbers(pose).tolist() for pose in POSES]
@@ -163,7 +167,7 @@ def test_a_table_in_every_convention(tmp_path, rotation, length, angle, suffix):
     assert [r.image.name for r in archive.recordings] == [f"s{i}.png" for i in range(5)]
 
 
-def test_a_table_of_the_inverse_without_names_goes_by_the_scans_order(tmp_path):
+def test_a_table_of_the_inverse_without_names_goes_by_the_scans_order(tmp_path: Path) -> None:
     write_images(tmp_path)
     convention = convention_of("wxyz", "m", "rad")
     rows = [convention.numbers(np.linalg.inv(pose)).tolist() for pose in POSES]
@@ -187,7 +191,9 @@ KUKA = TableParams(rotation="kuka", length="mm", angle="deg", pose="base_T_flang
         ("s0.png,1,2,3,4,5,nan\n", "poses.csv:1: kuka: a number is not finite"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_a_table_is_named_with_its_line(tmp_path, text, message):
+def test_a_mistake_in_a_table_is_named_with_its_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
     write_images(tmp_path)
     (tmp_path / "poses.csv").write_text(text)
     with pytest.raises(StageError) as error:
@@ -203,7 +209,7 @@ def test_a_mistake_in_a_table_is_named_with_its_line(tmp_path, text, message):
         ({"rotation": "xyzw"}, "Field required"),
     ],
 )
-def test_nothing_of_a_convention_is_guessed(values, message):
+def test_nothing_of_a_convention_is_guessed(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError) as error:
         TableParams(**values, pose="base_T_flange")
     assert message in str(error.value)
@@ -224,7 +230,9 @@ def test_nothing_of_a_convention_is_guessed(values, message):
          "x.yaml: sample 0: effector_wrt_world: expected a list of numbers"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_samples_is_named(tmp_path, read, params, text, message):
+def test_a_mistake_in_samples_is_named(
+    tmp_path: Path, read: Any, params: Any, text: Any, message: str
+) -> None:
     (tmp_path / "x.yaml").write_text(text)
     with pytest.raises(StageError) as error:
         read(tmp_path, *([params] if params else []))
@@ -236,7 +244,7 @@ def test_a_mistake_in_samples_is_named(tmp_path, read, params, text, message):
     [(easy_handeye, EasyHandeyeParams(calibration="eye_on_base")), (moveit, None), (table, KUKA),
      (zivid, ZividParams(length="mm"))],
 )  # fmt: skip
-def test_another_layout_is_not_taken(tmp_path, read, params):
+def test_another_layout_is_not_taken(tmp_path: Path, read: Any, params: Any) -> None:
     (tmp_path / "notes.yaml").write_text("hello: world\n")
     (tmp_path / "broken.yaml").write_text("a: [1,\n")
     with pytest.raises(NotThisLayout):
@@ -261,7 +269,7 @@ def observed(tmp_path, recipe):
     return list(runner.observe())
 
 
-def test_samples_become_observations_with_the_stated_noise(tmp_path):
+def test_samples_become_observations_with_the_stated_noise(tmp_path: Path) -> None:
     text = "".join(
         f"- effector_wrt_world: {p.ravel().tolist()}\n  object_wrt_sensor: {s.ravel().tolist()}\n"
         for p, s in zip(POSES, SEEN, strict=True)
@@ -273,7 +281,7 @@ def test_samples_become_observations_with_the_stated_noise(tmp_path):
     assert np.sqrt(found[0].feature.covariance[3, 3]) == pytest.approx(1e-3)
 
 
-def test_images_come_with_the_cameras_matrix(tmp_path):
+def test_images_come_with_the_cameras_matrix(tmp_path: Path) -> None:
     write_images(tmp_path)
     convention = convention_of("kuka", "mm", "deg")
     rows = [convention.numbers(pose).tolist() for pose in POSES]

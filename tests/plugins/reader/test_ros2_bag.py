@@ -1,5 +1,9 @@
 """A ROS 2 bag, read without ROS, gives what was recorded."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
@@ -60,14 +64,14 @@ def robot_in_tf(poses):
 
 
 @pytest.fixture(params=["mcap", "db3"])
-def bag(request, tmp_path):
+def bag(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., Any]:
     def write(told):
         return write_bag(tmp_path / "bag", request.param, told)
 
     return write
 
 
-def test_clouds_are_paired_with_the_standstills(bag):
+def test_clouds_are_paired_with_the_standstills(bag: Callable[..., Any]) -> None:
     told, middles = robot_in_tf(POSES)
     told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
     found = read(bag(told))
@@ -81,7 +85,7 @@ def test_clouds_are_paired_with_the_standstills(bag):
     ]
 
 
-def test_a_cameras_clock_that_is_off_is_moved_into_the_standstills(bag):
+def test_a_cameras_clock_that_is_off_is_moved_into_the_standstills(bag: Callable[..., Any]) -> None:
     told, middles = robot_in_tf(POSES)
     late = middles + 0.7
     told += [("/scan", t, point_cloud(t, c)) for t, c in zip(late, CLOUDS, strict=True)]
@@ -90,7 +94,7 @@ def test_a_cameras_clock_that_is_off_is_moved_into_the_standstills(bag):
     assert np.array_equal([read_cloud(r.cloud).xyz for r in found.recordings], CLOUDS)
 
 
-def test_an_offset_is_estimated_by_how_images_change(bag):
+def test_an_offset_is_estimated_by_how_images_change(bag: Callable[..., Any]) -> None:
     """Images at 20 Hz of something that moves with the arm, their clock 0.35 s behind."""
     told, _ = robot_in_tf(POSES)
     times, moving, _ = stops(POSES)
@@ -108,7 +112,7 @@ def test_an_offset_is_estimated_by_how_images_change(bag):
     assert found.recordings[0].camera[0][1, 1] == 901
 
 
-def test_joint_angles_give_poses_by_the_arms_model(bag):
+def test_joint_angles_give_poses_by_the_arms_model(bag: Callable[..., Any]) -> None:
     model = load_model("robots", "ur5e")
     angles = RNG.uniform(-1, 1, (5, 6))
     poses = Arm(model).flange(angles)
@@ -123,7 +127,7 @@ def test_joint_angles_give_poses_by_the_arms_model(bag):
 
 
 @pytest.mark.parametrize("way", ["topic", "frame"])
-def test_a_target_that_somebody_has_measured(bag, way):
+def test_a_target_that_somebody_has_measured(bag: Callable[..., Any], way: str) -> None:
     told, _ = robot_in_tf(POSES)
     times, moving, _ = stops(POSES)
     base_T_camera, flange_T_target = POSES[2], POSES[3]
@@ -150,7 +154,7 @@ steps:
 """
 
 
-def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag):
+def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., Any]) -> None:
     """The recipe on the sample's folder and on a bag made of it, reader and all found out."""
     recorded = folder(SAMPLE, FolderParams()).recordings
     told, middles = robot_in_tf(np.array([r.base_T_flange for r in recorded]))
@@ -182,7 +186,9 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag):
          "clock_offset"),
     ],
 )  # fmt: skip
-def test_what_a_bag_does_not_tell_is_one_line(tmp_path, topics, params, message):
+def test_what_a_bag_does_not_tell_is_one_line(
+    tmp_path: Path, topics: str, params: dict[str, Any], message: str
+) -> None:
     told = robot_in_tf(POSES)[0] if "tf" in topics else []
     told += [(f"/{name}", START, point_cloud(START, CLOUDS[0])) for name in "ab" if "two" in topics]
     late = START + 1000
@@ -193,7 +199,7 @@ def test_what_a_bag_does_not_tell_is_one_line(tmp_path, topics, params, message)
     assert str(error.value) == f"{path}: {message}"
 
 
-def test_what_is_no_bag_is_said(tmp_path):
+def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     with pytest.raises(NotThisLayout, match="holds no ROS 2 bag"):
         read(tmp_path)
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\0" * 40)
@@ -201,7 +207,9 @@ def test_what_is_no_bag_is_said(tmp_path):
         read(tmp_path)
 
 
-def test_a_bag_that_expands_too_far_is_refused_before_it_does(tmp_path, monkeypatch):
+def test_a_bag_that_expands_too_far_is_refused_before_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "bag.mcap"
     with file.open("wb") as out:
         writer = Writer(out, chunk_size=1, compression=CompressionType.ZSTD)

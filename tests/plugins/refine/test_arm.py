@@ -92,7 +92,7 @@ def rms(values):
     return float(np.sqrt((np.asarray(values) ** 2).mean()))
 
 
-def test_the_arm_found_is_better_at_poses_that_took_no_part():
+def test_the_arm_found_is_better_at_poses_that_took_no_part() -> None:
     found = refined()
     others = observed(200, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad"))[40:]
     with_it = rms(errors_on_others(found.as_corrected(), others))
@@ -101,14 +101,14 @@ def test_the_arm_found_is_better_at_poses_that_took_no_part():
     assert with_it < 0.25e-3
 
 
-def test_it_says_what_the_poses_identify():
+def test_it_says_what_the_poses_identify() -> None:
     said = " ".join(refined().notes)
     assert "parameters of the arm singly, and" in said
     assert "joint 3 zero" in said.split("identified:")[1].split("not identified")[0]
     assert "joint 1 zero" in said.split("not identified singly:")[1]  # it turns the base
 
 
-def test_one_orientation_identifies_none_and_still_predicts():
+def test_one_orientation_identifies_none_and_still_predicts() -> None:
     found = refined(only_places=True, count=30)
     (said,) = [n for n in found.notes if n.startswith("the poses identify")]
     assert said.startswith("the poses identify none of the arm's 24 parameters singly (one orient")
@@ -116,7 +116,7 @@ def test_one_orientation_identifies_none_and_still_predicts():
     assert found.corrected is not None
 
 
-def test_it_proposes_poses_that_would_tell_more():
+def test_it_proposes_poses_that_would_tell_more() -> None:
     (said,) = [
         n for n in refined(only_places=True, count=30).notes if n.startswith("poses that would")
     ]
@@ -126,14 +126,14 @@ def test_it_proposes_poses_that_would_tell_more():
     assert int(said.split("with them ")[1].split(" of ")[0]) > 0
 
 
-def test_a_perfect_arm_is_left_as_it_is():
+def test_a_perfect_arm_is_left_as_it_is() -> None:
     calibration = solved(observed(25, 1, 0.4, ArmErrors(zeros="0 mrad")))
     found = refine_arm(calibration, ArmParams(), UR5)
     assert found.corrected is None
     assert "left out, for they do not help" in found.notes[-1]
 
 
-def test_the_answer_for_the_arm_as_reported_stays():
+def test_the_answer_for_the_arm_as_reported_stays() -> None:
     calibration = solved(observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad")))
     found = refined()
     assert np.array_equal(
@@ -141,13 +141,13 @@ def test_the_answer_for_the_arm_as_reported_stays():
     )
 
 
-def test_an_arm_of_another_model_is_refused():
+def test_an_arm_of_another_model_is_refused() -> None:
     observations = observed(12, 0, 0.4, ArmErrors())
     with pytest.raises(StageError, match="the robot's model does not reach the poses"):
         refine_arm(solved(observations), ArmParams(), load_model("robots", "ur10e"))
 
 
-def test_the_corrected_arm_is_a_robot_file():
+def test_the_corrected_arm_is_a_robot_file() -> None:
     found = refined()
     pose = CalibratedPose(Transform(BASE, CAMERA, np.eye(4)), ("a remark",))
     file = export_robot(pose, found, UR5, NamedParams(name="my_ur5"))

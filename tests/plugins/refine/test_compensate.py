@@ -1,6 +1,7 @@
 """refine.compensate: equation (19), its direction, and its price."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def compensate(calibration, views=None, error=error_exact, **changes):
     return refine_compensate(calibration, Views(views or [view()]), params, FLANGE, UR5)
 
 
-def test_it_is_a_refining_stage():
+def test_it_is_a_refining_stage() -> None:
     assert refine_compensate.kind == "refine"
     assert set(refine_compensate.gives) <= set(KINDS["refine"].gives)
     assert refine_compensate.params and issubclass(refine_compensate.params, Params)
@@ -112,19 +113,19 @@ small = st.tuples(*[st.floats(-0.02, 0.02)] * 3)
 
 @settings(max_examples=50, deadline=None)
 @given(small, small)
-def test_the_direction_is_the_one_that_is_right(turn, shift):
+def test_the_direction_is_the_one_that_is_right(turn: Any, shift: Any) -> None:
     found = compensate(answer(off_by(turn, shift))).base_T_camera.transform
     assert np.abs(found.matrix - TRUTH.matrix).max() < 1e-12
 
 
-def test_icp_brings_an_answer_that_is_off_back_to_the_truth():
+def test_icp_brings_an_answer_that_is_off_back_to_the_truth() -> None:
     wrong = answer(off_by((0.004, -0.003, 0.0), (0.8e-3, -0.5e-3, 0.4e-3)))
     found = compensate(wrong, error=error_icp).base_T_camera.transform
     work = np.array([0.5, 0.0, 0.3])
     assert np.linalg.norm(found.apply(TRUTH.inverse().apply(work)) - work) < 0.05e-3
 
 
-def test_without_rotation_only_the_shift_at_the_view_is_applied():
+def test_without_rotation_only_the_shift_at_the_view_is_applied() -> None:
     wrong = off_by((0.01, 0.0, 0.0), (1e-3, 0.0, 0.0))
     found = compensate(answer(wrong), rotation=False).base_T_camera.transform
     assert np.abs(found.rotation - wrong.rotation).max() < 1e-12
@@ -134,7 +135,7 @@ def test_without_rotation_only_the_shift_at_the_view_is_applied():
     assert np.linalg.norm(wrong.apply(seen) - place) > 9e-4
 
 
-def test_at_work_is_what_the_error_does_where_it_was_measured():
+def test_at_work_is_what_the_error_does_where_it_was_measured() -> None:
     motion = rigid(rotation_exp(np.array([0.0, 0.0, 0.1])), np.array([1e-3, 0.0, 0.0]))
     error = PoseError(motion, np.array([0.0, 1.0, 0.5]), np.eye(3))
     moved = motion[:3, :3] @ error.at + motion[:3, 3]
@@ -143,7 +144,7 @@ def test_at_work_is_what_the_error_does_where_it_was_measured():
     assert shifted.apply(error.at) == pytest.approx(TRUTH.apply(moved))
 
 
-def test_residuals_notes_and_covariance_follow():
+def test_residuals_notes_and_covariance_follow() -> None:
     wrong = answer(off_by((0.0, 0.0, 0.0), (0.3e-3, 0.4e-3, 0.0)))
     found = compensate(wrong)
     assert [np.linalg.norm(p.residual) for p in found.pairs] == pytest.approx([0.0] * 12, abs=1e-12)
@@ -161,7 +162,7 @@ def test_residuals_notes_and_covariance_follow():
     assert found.base_T_camera.about.tolist() == wrong.base_T_camera.about.tolist()
 
 
-def test_it_says_what_it_costs_the_other_poses():
+def test_it_says_what_it_costs_the_other_poses() -> None:
     strayed = view()
     pose = strayed.base_T_flange
     shifted = rigid(pose.rotation, pose.translation + np.array([0.6e-3, 0.0, 0.0]))
@@ -173,7 +174,7 @@ def test_it_says_what_it_costs_the_other_poses():
     assert rms > 0.5e-3
 
 
-def test_poses_that_were_not_used_do_not_count():
+def test_poses_that_were_not_used_do_not_count() -> None:
     wrong = answer(off_by(shift=(0.5e-3, 0.0, 0.0)))
     aside = replace(wrong.pairs[0], residual=np.array([1.0, 0.0, 0.0]), used=False, reason="far")
     found = compensate(replace(wrong, pairs=(aside, *wrong.pairs[1:])))
@@ -182,7 +183,7 @@ def test_poses_that_were_not_used_do_not_count():
     assert found.pairs[0].residual[0] == pytest.approx(1.0 - 0.5e-3)
 
 
-def test_a_corrected_arm_is_where_the_view_is_expected():
+def test_a_corrected_arm_is_where_the_view_is_expected() -> None:
     offset = np.array([0.0, 0.0, 2e-3])
     seen = view()
     reported = rigid(
@@ -195,14 +196,14 @@ def test_a_corrected_arm_is_where_the_view_is_expected():
     assert np.abs(found.base_T_camera.transform.matrix - TRUTH.matrix).max() < 2e-5
 
 
-def test_the_first_view_counts():
+def test_the_first_view_counts() -> None:
     other = view(pose_at([0.4, 0.1, 0.25]), "w")
     wrong = answer(off_by(shift=(1e-3, 0.0, 0.0)))
     one, both = compensate(wrong, [view()]), compensate(wrong, [view(), other])
     assert np.array_equal(one.base_T_camera.transform.matrix, both.base_T_camera.transform.matrix)
 
 
-def test_no_view_is_said():
+def test_no_view_is_said() -> None:
     with pytest.raises(StageError) as error:
         refine_compensate(answer(TRUTH), Views(), CompensateParams(error=error_none.bind()), FLANGE)
     assert str(error.value) == (
@@ -211,7 +212,7 @@ def test_no_view_is_said():
     )
 
 
-def test_an_error_that_cannot_be_measured_is_refused():
+def test_an_error_that_cannot_be_measured_is_refused() -> None:
     with pytest.raises(CalibrationRefused) as error:
         compensate(answer(TRUTH), error=error_none)
     assert str(error.value) == (
@@ -220,7 +221,7 @@ def test_an_error_that_cannot_be_measured_is_refused():
     )
 
 
-def test_the_same_input_gives_the_same_bits():
+def test_the_same_input_gives_the_same_bits() -> None:
     wrong = answer(off_by((0.002, 0.0, 0.0), (0.5e-3, 0.0, 0.0)))
     one, two = (compensate(wrong, error=error_icp).base_T_camera for _ in range(2))
     assert one.transform.matrix.tobytes() == two.transform.matrix.tobytes()

@@ -1,6 +1,7 @@
 """What every arm must do, driven by its unmodified client library."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ class DrivesAnArm:
         """Return the driver of the arm at ``host``."""
         raise NotImplementedError
 
-    def test_the_state_is_that_of_the_arm(self, robot, controller):
+    def test_the_state_is_that_of_the_arm(self, robot: Any, controller: Any) -> None:
         state = robot.state()
         assert isinstance(robot, Robot)
         assert robot.name == f"{self.model} at {controller.host}"
@@ -39,7 +40,9 @@ class DrivesAnArm:
         assert abs(time.time_ns() - state.time_ns) < 0.1e9
         np.testing.assert_array_equal(robot.flange_T_tool.matrix, np.eye(4))
 
-    def test_a_straight_move_goes_where_it_should_on_a_line(self, robot, controller):
+    def test_a_straight_move_goes_where_it_should_on_a_line(
+        self, robot: Any, controller: Any
+    ) -> None:
         start = robot.state().base_T_flange
         target = moved(start, x=0.02, z=-0.03, turn=(0.0, 0.1, -0.2))
         with in_time(1.0):
@@ -57,25 +60,27 @@ class DrivesAnArm:
         truth = controller.control.truth()
         np.testing.assert_allclose(truth.base_T_flange, target.matrix, atol=1e-6)
 
-    def test_a_joint_move_goes_where_it_should(self, robot):
+    def test_a_joint_move_goes_where_it_should(self, robot: Any) -> None:
         target = robot.state().joints + [0.1, 0.0, -0.05, 0.0, 0.05, 0.2]
         robot.move_joints(target, speed=0.5, acceleration=2.0)
         assert robot.state().mode == "moving"
         np.testing.assert_allclose(arrived(robot).joints, target, atol=1e-9)
 
-    def test_a_move_to_where_it_is_ends_at_once(self, robot):
+    def test_a_move_to_where_it_is_ends_at_once(self, robot: Any) -> None:
         with in_time(2.0):
             robot.move_linear(robot.state().base_T_flange, 0.1, 0.5)
             assert arrived(robot).mode == "ready"
 
-    def test_a_second_move_replaces_the_first(self, robot):
+    def test_a_second_move_replaces_the_first(self, robot: Any) -> None:
         start = robot.state().base_T_flange
         robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
         until(lambda: robot.state().base_T_flange.translation[2] < start.translation[2] - 1e-3)
         robot.move_linear(start, 0.1, 0.5)
         np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
 
-    def test_velocities_are_followed_and_end_when_no_command_comes(self, robot, controller):
+    def test_velocities_are_followed_and_end_when_no_command_comes(
+        self, robot: Any, controller: Any
+    ) -> None:
         twist = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.05])
         for _ in range(100):
             robot.move_velocity(twist, acceleration=1.0)
@@ -89,7 +94,9 @@ class DrivesAnArm:
         assert time.monotonic() - began > 0.5 * GRACE
         until(lambda: robot.state().mode == "ready")
 
-    def test_a_velocity_after_a_move_begins_at_rest_and_a_move_after_a_velocity_too(self, robot):
+    def test_a_velocity_after_a_move_begins_at_rest_and_a_move_after_a_velocity_too(
+        self, robot: Any
+    ) -> None:
         start = robot.state().base_T_flange
         robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
         for _ in range(20):
@@ -101,7 +108,7 @@ class DrivesAnArm:
         np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
 
     @pytest.mark.parametrize("move", ["linear", "joints", "velocity"])
-    def test_stop_ends_every_motion_soon(self, robot, controller, move):
+    def test_stop_ends_every_motion_soon(self, robot: Any, controller: Any, move: str) -> None:
         state = robot.state()
         if move == "linear":
             robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
@@ -117,7 +124,7 @@ class DrivesAnArm:
         robot.stop()
         assert robot.state().mode in ("ready", "moving")
 
-    def test_cycles_follow_the_controllers(self, robot):
+    def test_cycles_follow_the_controllers(self, robot: Any) -> None:
         robot.wait_cycle()
         began, first = time.monotonic(), robot.state().time_ns
         for _ in range(100):
@@ -126,13 +133,13 @@ class DrivesAnArm:
         assert cycles >= 99
         assert time.monotonic() - began < 2.0
 
-    def test_what_is_touched_is_felt_at_the_flange(self, robot, controller):
+    def test_what_is_touched_is_felt_at_the_flange(self, robot: Any, controller: Any) -> None:
         start = robot.state().base_T_flange
         controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
         robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
         np.testing.assert_allclose(arrived(robot).force, [0, 0, 10, 0, 0, 0], atol=0.1)
 
-    def test_a_closed_robot_says_so(self, controller):
+    def test_a_closed_robot_says_so(self, controller: Any) -> None:
         robot = self.opened(controller.host)
         robot.close()
         robot.close()

@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,13 +30,13 @@ def open_aubo(host, **params):
 
 
 @pytest.fixture(scope="module")
-def process():
+def process() -> Iterator[Any]:
     with Process(model="aubo-i5") as running:
         yield running
 
 
 @pytest.fixture
-def controller(process):
+def controller(process: Any) -> Any:
     process.control.clear()
     process.control.set_surfaces()
     process.control.reset()
@@ -47,7 +49,7 @@ def reachable(host):
 
 
 @pytest.fixture
-def robot(controller):
+def robot(controller: Any) -> Iterator[Any]:
     with open_aubo(controller.host) as opened:
         yield opened
 
@@ -59,13 +61,15 @@ class TestAubo(DrivesAnArm):
     opened = staticmethod(open_aubo)
 
 
-def test_the_controller_says_where_it_listens(process):
+def test_the_controller_says_where_it_listens(process: Any) -> None:
     assert process.greeting == (
         f"aubo-i5 on {process.host}: JSON-RPC 30004, control 29998; Ctrl-C ends it\n"
     )
 
 
-def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(controller):
+def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(
+    controller: Any,
+) -> None:
     host = controller.host
     set_tool(host, [0.01, 0, 0.15, 0, 0, np.pi / 2])
     with pytest.raises(DeviceError) as error:
@@ -103,7 +107,7 @@ def set_tool(host, pose):
         assert robot.getRobotConfig().setTcpOffset(list(pose)) == 0
 
 
-def test_another_arm_than_the_recipes_is_refused(controller):
+def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError) as error:
         robot_aubo(load_model("robots", "ur5e"), AuboParams(host=controller.host))
     assert "is robot.model the arm that stands there?" in str(error.value)
@@ -120,7 +124,9 @@ def test_another_arm_than_the_recipes_is_refused(controller):
         ("emergency-stop", "emergency stop", "emergency stop: release the button"),
     ],
 )
-def test_an_arm_that_stops_says_why_and_takes_no_command(controller, fault, mode, message):
+def test_an_arm_that_stops_says_why_and_takes_no_command(
+    controller: Any, fault: str, mode: str, message: str
+) -> None:
     with open_aubo(controller.host) as robot:
         state = robot.state()
         robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
@@ -142,7 +148,7 @@ def test_an_arm_that_stops_says_why_and_takes_no_command(controller, fault, mode
     assert str(error.value) == f"aubo-i5 at {controller.host}: {message}"
 
 
-def test_an_arm_without_power_is_not_opened(controller):
+def test_an_arm_without_power_is_not_opened(controller: Any) -> None:
     with library(controller.host) as robot:
         assert robot.getRobotManage().poweroff() == 0
     with pytest.raises(DeviceError) as error:
@@ -154,7 +160,9 @@ def test_an_arm_without_power_is_not_opened(controller):
 
 @pytest.mark.parametrize("fault", ["drop", "die", "freeze", "latency=300 ms"])
 @pytest.mark.parametrize("times", [3])
-def test_a_controller_that_is_lost_is_an_error_in_time(controller, fault, times):
+def test_a_controller_that_is_lost_is_an_error_in_time(
+    controller: Any, fault: str, times: int
+) -> None:
     for _ in range(times):
         controller.control.clear()
         until(lambda: reachable(controller.host))
@@ -172,14 +180,14 @@ def test_a_controller_that_is_lost_is_an_error_in_time(controller, fault, times)
         controller.control.reset()
 
 
-def test_what_the_arm_cannot_do_is_a_protective_stop(robot):
+def test_what_the_arm_cannot_do_is_a_protective_stop(robot: Any) -> None:
     state = robot.state()
     robot.move_linear(moved(state.base_T_flange, x=2.0), 0.2, 1.0)
     state = until(lambda: (s := robot.state()).mode == "protective stop" and s, 10.0)
     assert state.message.startswith("protective stop")
 
 
-def test_nobody_there_is_one_line():
+def test_nobody_there_is_one_line() -> None:
     host = free_address()
     with in_time(), pytest.raises(DeviceError) as error:
         open_aubo(host)
@@ -189,7 +197,7 @@ def test_nobody_there_is_one_line():
     )
 
 
-def test_a_missing_library_is_one_line(monkeypatch):
+def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyaubo_sdk", None)
     with pytest.raises(DeviceError) as error:
         open_aubo("127.0.0.1")
@@ -199,7 +207,7 @@ def test_a_missing_library_is_one_line(monkeypatch):
     )
 
 
-def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code():
+def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code() -> None:
     code = (
         "import sys\n"
         "from tests.plugins.robot.test_aubo import open_aubo\n"
@@ -224,7 +232,7 @@ def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code(
     assert (running.returncode, errors) == (7, "")
 
 
-def test_the_wire_refuses_what_it_does_not_know(controller):
+def test_the_wire_refuses_what_it_does_not_know(controller: Any) -> None:
     with library(controller.host) as robot:
         with pytest.raises(pyaubo_sdk.AuboException, match="getControlBoxTemperature is not simul"):
             robot.getRobotState().getControlBoxTemperature()

@@ -2,6 +2,8 @@
 
 import socket
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,17 +38,17 @@ def robot_on(connection, **params):
 
 
 @pytest.fixture
-def connection():
+def connection() -> StandIn:
     return StandIn(franky)
 
 
 @pytest.fixture
-def robot(connection):
+def robot(connection: StandIn) -> Iterator[Any]:
     with robot_on(connection) as opened_robot:
         yield opened_robot
 
 
-def test_a_refused_connection_of_the_real_library_is_one_line():
+def test_a_refused_connection_of_the_real_library_is_one_line() -> None:
     host = free_address()
     with in_time(), pytest.raises(DeviceError) as error:
         robot_franky(PANDA, FrankyParams(host=host, realtime=False))
@@ -57,7 +59,7 @@ def test_a_refused_connection_of_the_real_library_is_one_line():
     )
 
 
-def test_a_silent_host_on_which_the_real_library_hangs_is_one_line_too():
+def test_a_silent_host_on_which_the_real_library_hangs_is_one_line_too() -> None:
     host = free_address()
     with socket.create_server((host, 1337)), in_time(), pytest.raises(DeviceError) as error:
         robot_franky(PANDA, FrankyParams(host=host, realtime=False))
@@ -67,7 +69,7 @@ def test_a_silent_host_on_which_the_real_library_hangs_is_one_line_too():
     )
 
 
-def test_a_missing_library_is_one_line(monkeypatch):
+def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "franky", None)
     with pytest.raises(DeviceError) as error:
         robot_franky(PANDA, FrankyParams(host="127.0.0.1"))
@@ -77,7 +79,7 @@ def test_a_missing_library_is_one_line(monkeypatch):
     )
 
 
-def test_a_straight_move_goes_where_it_should_as_fast_as_was_asked(robot):
+def test_a_straight_move_goes_where_it_should_as_fast_as_was_asked(robot: Any) -> None:
     assert isinstance(robot, Robot)
     start = robot.state().base_T_flange
     target = moved(start, x=0.05, z=-0.05, turn=(0.1, 0.0, 0.2))
@@ -90,7 +92,7 @@ def test_a_straight_move_goes_where_it_should_as_fast_as_was_asked(robot):
     assert 0.099 < speeds.max() < 0.1001
 
 
-def test_a_joint_move_goes_where_it_should(robot):
+def test_a_joint_move_goes_where_it_should(robot: Any) -> None:
     target = robot.state().joints + 0.1 * np.arange(7)
     robot.move_joints(target, speed=0.5, acceleration=2.0)
     states = [robot.state()]
@@ -100,7 +102,7 @@ def test_a_joint_move_goes_where_it_should(robot):
     assert np.abs([s.joint_speeds for s in states]).max() == pytest.approx(0.5, abs=1e-6)
 
 
-def test_a_velocity_is_followed_and_ends(robot):
+def test_a_velocity_is_followed_and_ends(robot: Any) -> None:
     twist = np.array([0.0, 0.02, 0.01, 0.0, 0.0, 0.05])
     for _ in range(200):
         robot.move_velocity(twist, acceleration=1.0)
@@ -118,7 +120,9 @@ def test_a_velocity_is_followed_and_ends(robot):
         ("velocity", "CartesianVelocityStopMotion"),
     ],
 )
-def test_every_motion_is_stopped_by_its_own_kind(robot, connection, move, stopped_by):
+def test_every_motion_is_stopped_by_its_own_kind(
+    robot: Any, connection: StandIn, move: str, stopped_by: str
+) -> None:
     state = robot.state()
     robot.stop()
     assert connection.moves == []
@@ -135,7 +139,7 @@ def test_every_motion_is_stopped_by_its_own_kind(robot, connection, move, stoppe
     assert settle(robot).mode == "ready"
 
 
-def test_a_motion_of_another_kind_waits_for_the_stop(robot, connection):
+def test_a_motion_of_another_kind_waits_for_the_stop(robot: Any, connection: StandIn) -> None:
     start = robot.state()
     robot.move_linear(moved(start.base_T_flange, z=-0.3), 0.1, 0.5)
     for _ in range(50):
@@ -145,7 +149,7 @@ def test_a_motion_of_another_kind_waits_for_the_stop(robot, connection):
     np.testing.assert_allclose(settle(robot).joints, start.joints, atol=1e-9)
 
 
-def test_what_is_touched_is_felt(robot, connection):
+def test_what_is_touched_is_felt(robot: Any, connection: StandIn) -> None:
     start = robot.state().base_T_flange
     connection.arm.surfaces.append(Surface.floor(start.translation[2] - 0.0095))
     robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
@@ -155,7 +159,7 @@ def test_what_is_touched_is_felt(robot, connection):
 HAND = rigid(rotation_exp(np.array([0, 0, -np.pi / 4])), np.array([0.0, 0.0, 0.1034]))
 
 
-def test_a_hand_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off():
+def test_a_hand_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off() -> None:
     with pytest.raises(DeviceError) as error:
         robot_on(StandIn(franky, HAND))
     assert "the controller's tool is set to X 0.00 mm  Y 0.00 mm  Z 103.40 mm" in str(error.value)
@@ -179,8 +183,8 @@ def test_a_hand_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
     ],
 )
 def test_an_arm_that_cannot_move_says_why_and_takes_no_command(
-    robot, connection, mode, said, message
-):
+    robot: Any, connection: StandIn, mode: str, said: str, message: str
+) -> None:
     joints = robot.state().joints
     connection.mode = mode
     state = robot.state()
@@ -192,14 +196,14 @@ def test_an_arm_that_cannot_move_says_why_and_takes_no_command(
         robot_on(connection)
 
 
-def test_what_ends_a_motion_is_told(robot, connection):
+def test_what_ends_a_motion_is_told(robot: Any, connection: StandIn) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
     connection.trouble = 'libfranka: Move command aborted: motion aborted by reflex! ["cartesian"]'
     state = robot.state()
     assert (state.mode, state.message) == ("protective stop", connection.trouble)
 
 
-def test_a_lost_connection_is_one_line(robot, connection):
+def test_a_lost_connection_is_one_line(robot: Any, connection: StandIn) -> None:
     connection.gone = "libfranka: UDP receive:\n Timeout"
     with pytest.raises(DeviceError) as error:
         robot.state()
@@ -209,7 +213,7 @@ def test_a_lost_connection_is_one_line(robot, connection):
     )
 
 
-def test_a_closed_robot_says_so(connection):
+def test_a_closed_robot_says_so(connection: StandIn) -> None:
     robot = robot_on(connection)
     robot.close()
     robot.close()

@@ -5,6 +5,8 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,14 +55,16 @@ class Person:
 
 
 @pytest.fixture
-def person():
+def person() -> Iterator[Person]:
     somebody = Person()
     yield somebody
     somebody.heard.close()
 
 
 @pytest.mark.parametrize("convention", PENDANTS)
-def test_a_pose_is_asked_for_and_answered_in_the_pendants_words(person, convention):
+def test_a_pose_is_asked_for_and_answered_in_the_pendants_words(
+    person: Person, convention: str
+) -> None:
     words = CONVENTIONS[convention]
     person.types(words.text(AT_HOME.matrix))
     robot = person.robot(convention)
@@ -80,7 +84,9 @@ def test_a_pose_is_asked_for_and_answered_in_the_pendants_words(person, conventi
     assert not state.joint_speeds.any()
 
 
-def test_joint_angles_are_asked_for_as_the_pose_they_make_and_stay_on_their_branch(person):
+def test_joint_angles_are_asked_for_as_the_pose_they_make_and_stay_on_their_branch(
+    person: Person,
+) -> None:
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
     robot = person.robot()
     target = HOME + [0.3, 0.1, -0.2, 0.1, 0.05, 2 * np.pi - 0.4]
@@ -89,7 +95,7 @@ def test_joint_angles_are_asked_for_as_the_pose_they_make_and_stay_on_their_bran
     np.testing.assert_allclose(robot.state().joints, target, atol=2e-4)
 
 
-def test_a_strange_pose_is_asked_about_and_kept_when_it_is_meant(person):
+def test_a_strange_pose_is_asked_about_and_kept_when_it_is_meant(person: Person) -> None:
     person.types(CONVENTIONS["kuka"].text(AT_HOME.matrix))
     robot = person.robot("kuka")
     robot.move_linear(moved(AT_HOME, z=-0.1), 0.1, 0.5)
@@ -104,14 +110,14 @@ def test_a_strange_pose_is_asked_about_and_kept_when_it_is_meant(person):
     np.testing.assert_allclose(state.base_T_flange.matrix, AT_HOME.matrix, atol=3e-5)
 
 
-def test_yes_to_nothing_is_no_pose(person):
+def test_yes_to_nothing_is_no_pose(person: Person) -> None:
     person.types("yes")
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
     person.robot()
     assert "UR has 6 numbers (X Y Z RX RY RZ), not 0; once more" in person.said.getvalue()
 
 
-def test_a_pose_out_of_reach_is_never_taken(person):
+def test_a_pose_out_of_reach_is_never_taken(person: Person) -> None:
     person.types("400 0 5000 0 3.14159 0")
     person.types("10 0 5 0 3.14159 0")
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
@@ -121,7 +127,7 @@ def test_a_pose_out_of_reach_is_never_taken(person):
     assert "no joint angles reach that pose; once more" in said
 
 
-def test_who_goes_away_is_missed(person):
+def test_who_goes_away_is_missed(person: Person) -> None:
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
     robot = person.robot()
     person.leaves()
@@ -134,7 +140,7 @@ def test_who_goes_away_is_missed(person):
     )
 
 
-def test_a_stop_is_told_and_leaves_the_pose_open(person):
+def test_a_stop_is_told_and_leaves_the_pose_open(person: Person) -> None:
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
     with person.robot() as robot:
         robot.stop()
@@ -150,7 +156,7 @@ def test_a_stop_is_told_and_leaves_the_pose_open(person):
     assert str(error.value) == "ur5e moved by hand: it goes to poses, not at velocities"
 
 
-def test_an_unknown_convention_is_refused():
+def test_an_unknown_convention_is_refused() -> None:
     with pytest.raises(ValidationError, match="no convention 'cuca'; known: ur, kuka, fanuc, abb"):
         ManualParams(convention="cuca")
 
@@ -166,14 +172,14 @@ def doubted(numbers, convention, asked=TILTED):
 
 
 @pytest.mark.parametrize("convention", PENDANTS)
-def test_a_pose_near_the_one_asked_for_is_not_doubted(convention):
+def test_a_pose_near_the_one_asked_for_is_not_doubted(convention: str) -> None:
     assert doubted(CONVENTIONS[convention].numbers(TILTED), convention) is None
     assert doubted(CONVENTIONS[convention].numbers(TILTED), convention, None) is None
 
 
 @pytest.mark.parametrize("convention", PENDANTS)
 @pytest.mark.parametrize("asked", [TILTED, None])
-def test_metres_for_millimetres_are_named(convention, asked):
+def test_metres_for_millimetres_are_named(convention: str, asked: Any) -> None:
     words = CONVENTIONS[convention]
     numbers = words.in_units("m", words.angle).numbers(TILTED)
     assert doubted(numbers, convention, asked).endswith(": is the position in m, not in mm?")
@@ -183,7 +189,7 @@ def test_metres_for_millimetres_are_named(convention, asked):
 
 
 @pytest.mark.parametrize("convention", ["kuka", "fanuc", "ur"])
-def test_radians_for_degrees_are_named(convention):
+def test_radians_for_degrees_are_named(convention: str) -> None:
     words = CONVENTIONS[convention]
     other: AngleUnit = "rad" if words.angle == "deg" else "deg"
     numbers = words.in_units("mm", other).numbers(TILTED)
@@ -205,12 +211,12 @@ def test_radians_for_degrees_are_named(convention):
         ("quaternion_xyzw", "abb", "are these numbers in the order and meaning of quaternion?"),
     ],
 )
-def test_another_makers_convention_is_named(meant, typed, said):
+def test_another_makers_convention_is_named(meant: str, typed: str, said: str) -> None:
     words = CONVENTIONS[meant].in_units(CONVENTIONS[typed].length, CONVENTIONS[meant].angle)
     assert doubted(words.numbers(TILTED), typed).endswith(said)
 
 
-def test_a_tool_is_named():
+def test_a_tool_is_named() -> None:
     tip = rigid(TILTED[:3, :3], TILTED[:3, 3] + 0.15 * TILTED[:3, 2])
     assert doubted(CONVENTIONS["fanuc"].numbers(tip), "fanuc") == (
         "that is 150.0 mm and 0.0 deg from the pose asked for: is a tool of 150 mm set; the "
@@ -218,14 +224,14 @@ def test_a_tool_is_named():
     )
 
 
-def test_a_pose_without_an_explanation_is_only_described():
+def test_a_pose_without_an_explanation_is_only_described() -> None:
     elsewhere = rigid(TILTED[:3, :3], TILTED[:3, 3] + [0.1, 0.0, 0.0])
     assert doubted(CONVENTIONS["kuka"].numbers(elsewhere), "kuka") == (
         "that is 100.0 mm and 0.0 deg from the pose asked for"
     )
 
 
-def test_piped_standard_input_works():
+def test_piped_standard_input_works() -> None:
     code = (
         "from flangeye.models.loading import load_model\n"
         "from flangeye_plugins.robot.manual.driver import ManualParams, robot_manual\n"

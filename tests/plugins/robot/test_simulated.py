@@ -1,6 +1,7 @@
 """The arm in simulated time keeps the Protocol's promises, and the same ones every time."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def robot_of(model="ur5e", **params):
 
 
 @pytest.fixture
-def robot():
+def robot() -> Any:
     return robot_of()
 
 
@@ -49,7 +50,7 @@ def speeds_along(states, period):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_arm_starts_flange_down_and_agrees_with_its_kinematics(model):
+def test_every_arm_starts_flange_down_and_agrees_with_its_kinematics(model: str) -> None:
     robot = robot_of(model)
     assert isinstance(robot, Robot)
     state = robot.state()
@@ -60,7 +61,7 @@ def test_every_arm_starts_flange_down_and_agrees_with_its_kinematics(model):
 
 
 @pytest.mark.parametrize("model", ["ur5e", "aubo-i5", "franka-panda"])
-def test_a_straight_move_arrives_within_its_limits(model):
+def test_a_straight_move_arrives_within_its_limits(model: str) -> None:
     robot = robot_of(model)
     start = robot.state().base_T_flange
     target = moved(start, x=0.05, z=0.08, turn=(0.1, -0.1, 0.2))
@@ -76,7 +77,7 @@ def test_a_straight_move_arrives_within_its_limits(model):
     assert np.linalg.norm(np.cross(way, along / np.linalg.norm(along)), axis=1).max() < 1e-9
 
 
-def test_a_joint_move_keeps_the_fastest_joint_at_speed(robot):
+def test_a_joint_move_keeps_the_fastest_joint_at_speed(robot: Any) -> None:
     target = robot.state().joints + np.array([0.3, -0.1, 0.1, 0.0, 0.05, -0.2])
     robot.move_joints(target, speed=0.5, acceleration=2.0)
     states = arrive(robot)
@@ -84,7 +85,7 @@ def test_a_joint_move_keeps_the_fastest_joint_at_speed(robot):
     assert np.abs([s.joint_speeds for s in states]).max() == pytest.approx(0.5, abs=1e-6)
 
 
-def test_a_velocity_is_reached_held_and_ends_when_no_command_comes(robot):
+def test_a_velocity_is_reached_held_and_ends_when_no_command_comes(robot: Any) -> None:
     twist = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.05])
     for _ in range(200):
         robot.move_velocity(twist, acceleration=0.5)
@@ -99,7 +100,7 @@ def test_a_velocity_is_reached_held_and_ends_when_no_command_comes(robot):
     assert not states[-1].joint_speeds.any()
 
 
-def test_stop_brakes_in_the_next_cycle(robot):
+def test_stop_brakes_in_the_next_cycle(robot: Any) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=0.2), 0.1, 0.5)
     for _ in range(300):
         robot.wait_cycle()
@@ -110,7 +111,7 @@ def test_stop_brakes_in_the_next_cycle(robot):
     assert len(arrive(robot, longest=0.1)) * robot.period < 0.1
 
 
-def test_a_new_move_begins_where_the_arm_comes_to_rest(robot):
+def test_a_new_move_begins_where_the_arm_comes_to_rest(robot: Any) -> None:
     start = robot.state().base_T_flange
     robot.move_linear(moved(start, z=0.2), 0.1, 0.5)
     for _ in range(300):
@@ -121,7 +122,7 @@ def test_a_new_move_begins_where_the_arm_comes_to_rest(robot):
     assert np.isclose([np.abs(s.joint_speeds).max() for s in states], 0.0).sum() >= 2
 
 
-def test_what_the_arm_cannot_do_is_a_protective_stop(robot):
+def test_what_the_arm_cannot_do_is_a_protective_stop(robot: Any) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, x=-1.0), 0.5, 2.0)
     state = arrive(robot)[-1]
     assert state.mode == "protective stop"
@@ -134,7 +135,7 @@ def test_what_the_arm_cannot_do_is_a_protective_stop(robot):
     assert arrive(robot)[-1].mode == "ready"
 
 
-def test_the_same_commands_give_the_same_states():
+def test_the_same_commands_give_the_same_states() -> None:
     def drive():
         with robot_of(joint_errors=3) as robot:
             robot.move_linear(moved(robot.state().base_T_flange, z=-0.05), 0.1, 0.5)
@@ -148,14 +149,14 @@ def test_the_same_commands_give_the_same_states():
     assert 1e-5 < error < 5e-3
 
 
-def test_what_it_touches_is_felt(robot):
+def test_what_it_touches_is_felt(robot: Any) -> None:
     start = robot.state().base_T_flange
     robot.arm.surfaces.append(Surface.floor(start.translation[2] - 0.0095))
     robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
     np.testing.assert_allclose(arrive(robot)[-1].force, [0, 0, 10, 0, 0, 0], atol=1e-6)
 
 
-def test_its_time_passes_faster_than_the_clock(robot):
+def test_its_time_passes_faster_than_the_clock(robot: Any) -> None:
     began = time.process_time()
     for _ in range(1000):
         robot.move_velocity(np.array([0, 0, 0.01, 0, 0, 0]), 0.5)
@@ -164,7 +165,7 @@ def test_its_time_passes_faster_than_the_clock(robot):
     assert time.process_time() - began < 1000 * robot.period
 
 
-def test_an_arm_of_another_maker_is_told_where_to_start():
+def test_an_arm_of_another_maker_is_told_where_to_start() -> None:
     model = load_model("robots", "ur5e").model_copy(update={"maker": "Acme"})
     with pytest.raises(StageError) as error:
         robot_simulated(model, SimulatedParams())

@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,20 +25,20 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture(scope="module")
-def process():
+def process() -> Iterator[Any]:
     with Process() as running:
         yield running
 
 
 @pytest.fixture
-def controller(process):
+def controller(process: Any) -> Any:
     process.control.set_surfaces()
     process.control.reset()
     return process
 
 
 @pytest.fixture
-def robot(controller):
+def robot(controller: Any) -> Iterator[Any]:
     with open_ur(controller.host) as opened:
         yield opened
 
@@ -68,14 +70,16 @@ def set_tool(host, pose):
 
 
 @pytest.fixture
-def with_tool(controller):
+def with_tool(controller: Any) -> Iterator[Any]:
     """A controller on which somebody has set a tool."""
     set_tool(controller.host, [0.01, 0, 0.15, 0, 0, np.pi / 2])
     yield controller
     set_tool(controller.host, [0] * 6)
 
 
-def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(with_tool):
+def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_off(
+    with_tool: Any,
+) -> None:
     host = with_tool.host
     with pytest.raises(DeviceError) as error:
         open_ur(host)
@@ -101,7 +105,7 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         assert np.linalg.norm(off) < 1e-4
 
 
-def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with_tool):
+def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with_tool: Any) -> None:
     host, control = with_tool.host, with_tool.control
     before = control.log()
     control.fault("remote-control-off")
@@ -119,12 +123,12 @@ def test_what_only_reads_starts_nothing_and_needs_no_arm_that_can_be_driven(with
     control.clear()
 
 
-def test_a_tool_that_the_recipe_does_not_know_is_noticed_by_reading_alone(with_tool):
+def test_a_tool_that_the_recipe_does_not_know_is_noticed_by_reading_alone(with_tool: Any) -> None:
     with pytest.raises(DeviceError, match="its flange is .* mm from where a ur5e has it"):
         robot_ur_rtde(UR5E, UrRtdeParams(host=with_tool.host), reads_only=True)
 
 
-def test_an_arm_with_more_joints_than_the_controller_is_refused(controller):
+def test_an_arm_with_more_joints_than_the_controller_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError, match="it has 6 joints and a franka-panda 7: is robot.model"):
         robot_ur_rtde(
             load_model("robots", "franka-panda"),
@@ -133,7 +137,7 @@ def test_an_arm_with_more_joints_than_the_controller_is_refused(controller):
         )
 
 
-def test_another_arm_than_the_recipes_is_refused(controller):
+def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError) as error:
         robot_ur_rtde(load_model("robots", "ur10e"), UrRtdeParams(host=controller.host))
     assert str(error.value).startswith(f"ur10e at {controller.host}: its flange is ")
@@ -143,7 +147,7 @@ def test_another_arm_than_the_recipes_is_refused(controller):
     )
 
 
-def test_a_missing_library_is_one_line(monkeypatch):
+def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rtde_control", None)
     with pytest.raises(DeviceError) as error:
         open_ur("127.0.0.1")
@@ -153,7 +157,7 @@ def test_a_missing_library_is_one_line(monkeypatch):
     )
 
 
-def test_nobody_there_is_one_line():
+def test_nobody_there_is_one_line() -> None:
     host = free_address()
     with in_time(), pytest.raises(DeviceError) as error:
         open_ur(host)
@@ -163,18 +167,18 @@ def test_nobody_there_is_one_line():
     )
 
 
-def test_a_second_driver_is_refused(robot, controller):
+def test_a_second_driver_is_refused(robot: Any, controller: Any) -> None:
     with in_time(), pytest.raises(DeviceError) as error:
         open_ur(controller.host)
     assert "One of the RTDE input registers are already in use!" in str(error.value)
     assert robot.state().mode == "ready"
 
 
-def test_the_grace_is_the_same_on_both_sides():
+def test_the_grace_is_the_same_on_both_sides() -> None:
     assert worker.GRACE == GRACE
 
 
-def test_closing_stops_the_arm_and_the_program(controller):
+def test_closing_stops_the_arm_and_the_program(controller: Any) -> None:
     with open_ur(controller.host) as robot:
         robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
         until(lambda: controller.control.truth().speed > 0.01)
@@ -206,7 +210,7 @@ def program(host, last):
     )
 
 
-def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code():
+def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code() -> None:
     with Process() as doomed:
         running = program(doomed.host, "sys.exit(7)")
         assert running.stdout.readline() == "moving\n"
@@ -216,7 +220,7 @@ def test_an_interpreter_that_ends_with_a_dead_controller_ends_with_its_own_code(
     assert (running.returncode, errors) == (7, "")
 
 
-def test_an_arm_whose_program_is_killed_stops(controller):
+def test_an_arm_whose_program_is_killed_stops(controller: Any) -> None:
     running = program(controller.host, "")
     assert running.stdout.readline() == "moving\n"
     until(lambda: controller.control.truth().speed > 0.01)
@@ -226,7 +230,9 @@ def test_an_arm_whose_program_is_killed_stops(controller):
     until(lambda: controller.control.state()["connections"] == 0)
 
 
-def test_an_arm_whose_client_process_is_killed_is_stopped_by_the_watchdog(robot, controller):
+def test_an_arm_whose_client_process_is_killed_is_stopped_by_the_watchdog(
+    robot: Any, controller: Any
+) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
     until(lambda: controller.control.truth().speed > 0.01)
     os.kill(robot._link._process.pid, signal.SIGKILL)
@@ -241,7 +247,9 @@ def test_an_arm_whose_client_process_is_killed_is_stopped_by_the_watchdog(robot,
     assert any("watchdog" in line for line in controller.control.log())
 
 
-def test_an_arm_whose_client_process_hangs_is_stopped_all_the_same(robot, controller):
+def test_an_arm_whose_client_process_hangs_is_stopped_all_the_same(
+    robot: Any, controller: Any
+) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
     until(lambda: controller.control.truth().speed > 0.01)
     os.kill(robot._link._process.pid, signal.SIGSTOP)
@@ -253,7 +261,7 @@ def test_an_arm_whose_client_process_hangs_is_stopped_all_the_same(robot, contro
         robot.state()
 
 
-def test_ctrl_c_does_not_reach_the_client_process(controller):
+def test_ctrl_c_does_not_reach_the_client_process(controller: Any) -> None:
     running = subprocess.Popen(
         [
             sys.executable,
@@ -274,7 +282,7 @@ def test_ctrl_c_does_not_reach_the_client_process(controller):
     assert words == "True\n"
 
 
-def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotten():
+def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotten() -> None:
     clock = worker.Clock()
     ahead = 1000.0
     dates = [clock.sampled(0.002 * i, ahead + 0.002 * i + 0.003 * (i % 5)) for i in range(500)]
@@ -285,7 +293,9 @@ def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotte
     assert ages[-1] < 0.001
 
 
-def test_a_program_that_is_not_let_run_for_a_while_still_reads_the_arm(robot, monkeypatch):
+def test_a_program_that_is_not_let_run_for_a_while_still_reads_the_arm(
+    robot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = robot._link.sample
 
     def read_and_be_held_up():

@@ -1,9 +1,11 @@
 """Every way a controller or its network can fail, a hundred times over, within three seconds."""
 
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ LANES = 2
 
 
 @pytest.fixture(scope="module")
-def lanes():
+def lanes() -> Iterator[Any]:
     with ExitStack() as stack, ThreadPoolExecutor(LANES) as pool:
         yield [
             stack.enter_context(process) for process in pool.map(lambda _: Process(), range(LANES))
@@ -146,7 +148,7 @@ LOCAL = "it is in local control: choose Remote Control at the top right of the p
 
 @TIMES
 @pytest.mark.parametrize("fault", ["die", "drop", "freeze", "latency=400 ms"])
-def test_a_controller_that_is_lost_is_noticed(lanes, fault, times):
+def test_a_controller_that_is_lost_is_noticed(lanes: Any, fault: str, times: Any) -> None:
     for line in fail_often(lanes, fault, times):
         assert any(words in line for words in LOST), line
 
@@ -160,7 +162,9 @@ def test_a_controller_that_is_lost_is_noticed(lanes, fault, times):
         ("remote-control-off", (LOCAL,)),
     ],
 )
-def test_a_controller_that_stops_says_why(lanes, fault, said, times):
+def test_a_controller_that_stops_says_why(
+    lanes: Any, fault: str, said: tuple[Any, ...], times: Any
+) -> None:
     for line in fail_often(lanes, fault, times):
         assert any(words in line for words in said), line
 
@@ -176,7 +180,7 @@ def test_a_controller_that_stops_says_why(lanes, fault, said, times):
         ("latency=100 ms", "ms to it and back, at most 80 ms are allowed: connect it by cable"),
     ],
 )
-def test_a_controller_that_is_not_ready_is_not_opened(lanes, fault, message):
+def test_a_controller_that_is_not_ready_is_not_opened(lanes: Any, fault: str, message: str) -> None:
     process = lanes[0]
     process.control.reset()
     process.control.fault(fault)
@@ -187,7 +191,7 @@ def test_a_controller_that_is_not_ready_is_not_opened(lanes, fault, message):
     assert message in str(error.value)
 
 
-def test_an_arm_without_power_is_not_opened(lanes):
+def test_an_arm_without_power_is_not_opened(lanes: Any) -> None:
     process = lanes[0]
     process.control.reset()
     process.control.fault("emergency-stop")
@@ -206,7 +210,7 @@ def release_emergency_stop(host):
 
 
 @pytest.mark.parametrize("move", range(3))
-def test_a_stopped_arm_takes_no_command(lanes, move):
+def test_a_stopped_arm_takes_no_command(lanes: Any, move: int) -> None:
     process = lanes[0]
     process.control.reset()
     with open_ur(process.host) as robot:
@@ -219,7 +223,7 @@ def test_a_stopped_arm_takes_no_command(lanes, move):
     )
 
 
-def test_after_every_failure_the_next_driver_finds_a_working_arm(lanes):
+def test_after_every_failure_the_next_driver_finds_a_working_arm(lanes: Any) -> None:
     process = lanes[0]
     for fault, said in (("drop", ""), ("freeze", ""), ("program-stop", "its program was stopped")):
         assert said in fail(process, fault, 0)
@@ -228,7 +232,7 @@ def test_after_every_failure_the_next_driver_finds_a_working_arm(lanes):
             assert robot.state().mode == "ready"
 
 
-def test_the_control_channel_lives_on(lanes):
+def test_the_control_channel_lives_on(lanes: Any) -> None:
     """Else the hundred times above would prove nothing."""
     with EmulatorControl(lanes[0].host) as control:
         control.fault("die")

@@ -3,7 +3,10 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +33,7 @@ def refused(params, model=None):
 
 
 @pytest.fixture(scope="session")
-def kinect(tmp_path_factory):
+def kinect(tmp_path_factory: Any) -> Iterator[Any]:
     """A Python of its own with pyk4a, as the driver's hint says, and its recorder."""
     folder = tmp_path_factory.mktemp("kinect")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
@@ -62,7 +65,7 @@ out.write(json.dumps(cloud.reshape(-1, 3).tolist()))
 
 
 @pytest.mark.slow
-def test_a_recording_is_played_in_metres(kinect, tmp_path):
+def test_a_recording_is_played_in_metres(kinect: Any, tmp_path: Path) -> None:
     path = tmp_path / "depth.mkv"
     kinect.recorder.write(path, [tilted(800 + i) for i in range(3)])
     params = AzureKinectParams(recording=path, python="pyk4a")
@@ -89,7 +92,7 @@ def test_a_recording_is_played_in_metres(kinect, tmp_path):
 
 
 @pytest.mark.slow
-def test_colour_is_given_as_the_depth_camera_sees_it(kinect, tmp_path):
+def test_colour_is_given_as_the_depth_camera_sees_it(kinect: Any, tmp_path: Path) -> None:
     colour = np.zeros((720, 1280, 4), np.uint8)
     colour[..., 0], colour[..., 1], colour[..., 2], colour[..., 3] = 10, 20, 200, 255
     kinect.recorder.write(tmp_path / "both.mkv", [tilted()], [colour])
@@ -104,7 +107,7 @@ def test_colour_is_given_as_the_depth_camera_sees_it(kinect, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_no_recording_and_no_camera_is_said(kinect, tmp_path):
+def test_what_is_no_recording_and_no_camera_is_said(kinect: Any, tmp_path: Path) -> None:
     broken = tmp_path / "broken.mkv"
     broken.write_text("no recording")
     params = AzureKinectParams(recording=broken, python="pyk4a")
@@ -121,7 +124,7 @@ def test_what_is_no_recording_and_no_camera_is_said(kinect, tmp_path):
 
 
 @pytest.fixture
-def host(tmp_path, monkeypatch):
+def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Let a few lines of Python stand for the process that holds the camera."""
 
     def stand_in(code):
@@ -134,7 +137,7 @@ def host(tmp_path, monkeypatch):
     return stand_in
 
 
-def test_a_missing_sdk_is_said_with_what_to_do():
+def test_a_missing_sdk_is_said_with_what_to_do() -> None:
     assert refused(AzureKinectParams()) == (
         "scanner.azure_kinect: ModuleNotFoundError: No module named 'pyk4a'; pyk4a-bundle needs "
         "NumPy 1: make it a Python of its own (python -m venv kinect; kinect/bin/pip install "
@@ -143,7 +146,7 @@ def test_a_missing_sdk_is_said_with_what_to_do():
     )
 
 
-def test_a_missing_recording_or_python_is_said(tmp_path):
+def test_a_missing_recording_or_python_is_said(tmp_path: Path) -> None:
     path = tmp_path / "none.mkv"
     assert refused(AzureKinectParams(recording=path)) == (
         f"scanner.azure_kinect: no recording at {path}"
@@ -154,7 +157,7 @@ def test_a_missing_recording_or_python_is_said(tmp_path):
     )
 
 
-def test_an_abort_of_the_sdk_does_not_end_the_run(host):
+def test_an_abort_of_the_sdk_does_not_end_the_run(host: Callable[..., Any]) -> None:
     host("sys.stderr.write('terminate called\\n'); sys.stderr.flush(); os.abort()")
     assert refused(AzureKinectParams()) == (
         "scanner.azure_kinect: the SDK has ended its process (exit -6: terminate called)"
@@ -169,7 +172,7 @@ def test_an_abort_of_the_sdk_does_not_end_the_run(host):
     scanner.close()
 
 
-def test_a_camera_that_falls_silent_is_said(host):
+def test_a_camera_that_falls_silent_is_said(host: Callable[..., Any]) -> None:
     host("say(facts={'serial': '7'})\nimport time; time.sleep(60)")
     scanner = scanner_azure_kinect(None, AzureKinectParams(timeout="1 ms"))
     with scanner, pytest.raises(DeviceError) as error:
@@ -179,7 +182,7 @@ def test_a_camera_that_falls_silent_is_said(host):
     )
 
 
-def test_a_capture_without_depth_is_dropped(host):
+def test_a_capture_without_depth_is_dropped(host: Callable[..., Any]) -> None:
     host(
         "say(facts={'serial': '7'})\nfor _ in sys.stdin: say(error='a capture without a depth image', dropped=True)"
     )
@@ -188,7 +191,7 @@ def test_a_capture_without_depth_is_dropped(host):
         scanner.expose()
 
 
-def test_a_camera_lost_in_the_middle_of_a_frame_is_said(host):
+def test_a_camera_lost_in_the_middle_of_a_frame_is_said(host: Callable[..., Any]) -> None:
     host("say(facts={'serial': '7'})\ninput()\nsay(depth=[4, 4], calibration={})\nprint('x')")
     scanner = scanner_azure_kinect(None, AzureKinectParams())
     with scanner, pytest.raises(DeviceError) as error:
@@ -209,7 +212,7 @@ def view(distortion):
     return DepthView([[500.0, 0, 320], [0, 500, 288], [0, 0, 1]], distortion, BESIDE)
 
 
-def test_points_fall_on_the_pixels_they_came_from():
+def test_points_fall_on_the_pixels_they_came_from() -> None:
     """Distorted as OpenCV defines it, written out here, every point returns to its pixel."""
     xyz = view(BENT).points(np.full((ROWS, COLUMNS), 800)).astype(float)
     x, y = (xyz[..., i] / xyz[..., 2] for i in (0, 1))
@@ -224,7 +227,7 @@ def test_points_fall_on_the_pixels_they_came_from():
     assert np.abs(v - rows)[middle].max() < 0.02
 
 
-def test_colour_falls_where_the_colour_camera_saw_it():
+def test_colour_falls_where_the_colour_camera_saw_it() -> None:
     """A point 1 m ahead is 32 mm aside for the colour camera: 19.2 of its pixels."""
     colour = np.zeros((720, 1280, 4), np.uint8)
     colour[..., 0] = np.arange(1280) // 8

@@ -1,5 +1,6 @@
 """The scanners' drivers go through the kit, each with its counterpart."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from tests.plugins.scanner.test_realsense import recording  # noqa: F401  a fixt
 
 
 @pytest.fixture(scope="class")
-def viky(request):
+def viky(request: pytest.FixtureRequest) -> Iterator[None]:
     genicam = pytest.importorskip("genicam", reason="pip install 'flangeye[genicam]'")
     pytest.importorskip("harvesters", reason="pip install 'flangeye[genicam]'")
     request.cls.params = {"producer": "viky", "serial": "0"}
@@ -30,7 +31,7 @@ class TestGenicam(ScannerConformance):
 
 
 @pytest.fixture
-def recorded(request, recording):  # noqa: F811
+def recorded(request: pytest.FixtureRequest, recording: Path) -> None:  # noqa: F811
     request.cls.params = {"recording": str(recording), "timeout": "1 s"}
 
 
@@ -41,7 +42,7 @@ class TestRealsense(ScannerConformance):
 
 
 @pytest.fixture(scope="class")
-def controller(request):
+def controller(request: pytest.FixtureRequest) -> Iterator[None]:
     with Process() as process:
         process.control.put(shown())
         request.cls.params = {

@@ -3,6 +3,7 @@
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ PHOXI = load_model("scanners", "phoxi-m")
 
 
 @pytest.fixture(autouse=True)
-def named(monkeypatch):
+def named(monkeypatch: pytest.MonkeyPatch) -> None:
     """This machine's user calls the simulated producer viky."""
     monkeypatch.setenv("FLANGEYE_LIBRARY_VIKY", str(VIKY))
 
@@ -38,7 +39,7 @@ def refused(*arguments):
     return str(error.value)
 
 
-def test_it_scans_organised_in_the_devices_unit():
+def test_it_scans_organised_in_the_devices_unit() -> None:
     with opened() as scanner:
         assert isinstance(scanner, Scanner)
         assert scanner.name == "Machine Vision Games Ltd. Viky 0"
@@ -63,7 +64,7 @@ def test_it_scans_organised_in_the_devices_unit():
     assert first.started_ns < first.ended_ns <= second.started_ns
 
 
-def test_the_frame_is_a_new_one():
+def test_the_frame_is_a_new_one() -> None:
     """The ball that the device shows has moved on since the exposure before."""
     with opened() as scanner:
         frames = [scanner.expose()().cloud.xyz[..., 2] for _ in range(4)]
@@ -71,7 +72,7 @@ def test_the_frame_is_a_new_one():
         assert not np.array_equal(before, after, equal_nan=True)
 
 
-def test_closing_twice_lets_another_open_it():
+def test_closing_twice_lets_another_open_it() -> None:
     for _ in range(3):
         scanner = opened("1")
         scanner.close()
@@ -81,13 +82,13 @@ def test_closing_twice_lets_another_open_it():
         assert str(error.value) == "Machine Vision Games Ltd. Viky 1: is closed"
 
 
-def test_the_producer_is_found_by_the_standards_variable(monkeypatch):
+def test_the_producer_is_found_by_the_standards_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GENICAM_GENTL64_PATH", f"/nowhere:{VIKY.parent}")
     with scanner_genicam(None, GenicamParams(serial="2")) as scanner:
         assert scanner.name.endswith("Viky 2")
 
 
-def test_a_missing_producer_is_said(monkeypatch, tmp_path):
+def test_a_missing_producer_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     assert refused(None, GenicamParams()) == (
         "scanner.genicam: no GenTL producer (.cti) in GENICAM_GENTL64_PATH; set it to the whole "
@@ -104,7 +105,7 @@ def test_a_missing_producer_is_said(monkeypatch, tmp_path):
     )
 
 
-def test_a_recipe_cannot_name_a_library_by_its_path(monkeypatch):
+def test_a_recipe_cannot_name_a_library_by_its_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GENICAM_GENTL64_PATH", ".")  # the current folder's are not loaded either
     assert "no GenTL producer" in refused(None, GenicamParams())
     for path in (str(VIKY), "../viky.cti", "./viky.cti"):
@@ -112,7 +113,7 @@ def test_a_recipe_cannot_name_a_library_by_its_path(monkeypatch):
             GenicamParams(producer=path)
 
 
-def test_which_device_is_meant_must_be_said():
+def test_which_device_is_meant_must_be_said() -> None:
     assert refused(None, GenicamParams(producer="viky")) == (
         "scanner.genicam: several devices, give serial: 0, 1, 2"
     )
@@ -121,7 +122,7 @@ def test_which_device_is_meant_must_be_said():
     )
 
 
-def test_a_device_in_use_is_said(monkeypatch):
+def test_a_device_in_use_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     from genicam import gentl
     from harvesters.core import Harvester
 
@@ -135,7 +136,7 @@ def test_a_device_in_use_is_said(monkeypatch):
     )
 
 
-def test_a_missing_sdk_is_said(monkeypatch):
+def test_a_missing_sdk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "harvesters.core", None)
     assert refused(None, GenicamParams(producer="viky")) == (
         "scanner.genicam: needs harvesters.core (import of harvesters.core halted; None in "
@@ -143,7 +144,7 @@ def test_a_missing_sdk_is_said(monkeypatch):
     )
 
 
-def test_a_frame_that_does_not_come_is_said(monkeypatch):
+def test_a_frame_that_does_not_come_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     with opened("1", timeout="1 ms") as scanner:
         with pytest.raises(DeviceError) as error:
             scanner.expose()
@@ -153,7 +154,7 @@ def test_a_frame_that_does_not_come_is_said(monkeypatch):
         )
 
 
-def test_a_frame_that_came_in_part_is_dropped(monkeypatch):
+def test_a_frame_that_came_in_part_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     from genicam.gentl import Buffer
 
     with opened("1") as scanner:
@@ -186,7 +187,7 @@ def phoxi(unit=("Millimeter",), mode=("Range", "CalibratedABC_Grid"), **changes)
     return made
 
 
-def test_a_phoxis_node_map_is_set_and_read_back():
+def test_a_phoxis_node_map_is_set_and_read_back() -> None:
     nodes, memory, _port = node_map(phoxi(("Meter", "Millimeter")))
     layout = configure(nodes)
     assert nodes.TriggerMode.value == "On"
@@ -206,7 +207,7 @@ def test_a_phoxis_node_map_is_set_and_read_back():
     assert np.isnan(xyz[1, 1:]).all()
 
 
-def test_a_unit_the_device_keeps_is_believed():
+def test_a_unit_the_device_keeps_is_believed() -> None:
     nodes, _, _port = node_map(phoxi(("Meter",)))
     assert configure(nodes).per_metre == 1
 
@@ -227,14 +228,14 @@ def test_a_unit_the_device_keeps_is_believed():
         (phoxi(formats=["Mono16"]), "PixelFormat is Mono16, Coord3D_ABC32f is needed"),
     ],
 )
-def test_what_a_device_cannot_give_is_said(description, message):
+def test_what_a_device_cannot_give_is_said(description: Any, message: str) -> None:
     nodes, _, _port = node_map(description)
     with pytest.raises(DeviceError) as error:
         configure(nodes)
     assert str(error.value) == f"scanner.genicam: {message}"
 
 
-def test_a_frame_unlike_what_the_device_said_is_refused():
+def test_a_frame_unlike_what_the_device_said_is_refused() -> None:
     nodes, _, _port = node_map(phoxi())
     layout = configure(nodes)
     with pytest.raises(DeviceError) as error:
@@ -247,7 +248,7 @@ def test_a_frame_unlike_what_the_device_said_is_refused():
     assert str(error.value) == "scanner.genicam: a frame without coordinates, only Mono8"
 
 
-def test_a_scan_out_of_the_scanners_range_is_refused():
+def test_a_scan_out_of_the_scanners_range_is_refused() -> None:
     far = PHOXI.model_copy(update={"near": 40.0, "far": 90.0})
     with opened("1", model=far) as scanner, pytest.raises(DeviceError) as error:
         scanner.expose()()

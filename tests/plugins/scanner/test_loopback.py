@@ -3,6 +3,8 @@
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ def shown():
 
 
 @pytest.fixture(scope="module")
-def controller():
+def controller() -> Iterator[Any]:
     with Process("--seed", "5") as process:
         process.control.put(shown())
         yield process
@@ -54,7 +56,7 @@ def opened(controller, **changes):
     return scanner_loopback(PHOXI, params(controller, **changes))
 
 
-def test_it_scans_the_arm_where_it_really_is(controller):
+def test_it_scans_the_arm_where_it_really_is(controller: Any) -> None:
     with opened(controller, noise=0.0) as scanner:
         assert isinstance(scanner, Scanner)
         assert isinstance(scanner, KnowsTruth)
@@ -71,7 +73,7 @@ def test_it_scans_the_arm_where_it_really_is(controller):
     assert np.linalg.norm(centre - truth.base_T_flange[:3, 3]) < 0.1e-3
 
 
-def test_equal_seeds_give_equal_scans(controller):
+def test_equal_seeds_give_equal_scans(controller: Any) -> None:
     def scans(seed):
         with opened(controller, seed=seed, resolution=0.1) as scanner:
             return [scanner.expose()().cloud.xyz for _ in range(2)]
@@ -82,7 +84,7 @@ def test_equal_seeds_give_equal_scans(controller):
     assert not np.array_equal(first[0], other[0], equal_nan=True)
 
 
-def test_the_exposure_takes_its_time_and_the_data_come_later(controller):
+def test_the_exposure_takes_its_time_and_the_data_come_later(controller: Any) -> None:
     with opened(controller, resolution=0.05, exposure=SI(0.2), latency=SI(0.3)) as scanner:
         before = time.time_ns()
         transfer = scanner.expose()
@@ -93,7 +95,7 @@ def test_the_exposure_takes_its_time_and_the_data_come_later(controller):
     assert after - scan.ended_ns >= 0.3e9
 
 
-def test_motion_during_the_exposure_smears_the_scan(controller):
+def test_motion_during_the_exposure_smears_the_scan(controller: Any) -> None:
     with opened(controller, noise=0.0, exposure=SI(0.4)) as scanner:
         still = scanner.expose()().cloud.xyz
         home = shown()
@@ -109,7 +111,7 @@ def test_motion_during_the_exposure_smears_the_scan(controller):
     assert np.median(changed) == 0.0
 
 
-def test_frames_get_lost_now_and_then(controller):
+def test_frames_get_lost_now_and_then(controller: Any) -> None:
     with opened(controller, resolution=0.02, dropped=0.5) as scanner:
         lost = 0
         for _ in range(12):
@@ -122,7 +124,7 @@ def test_frames_get_lost_now_and_then(controller):
     assert 0 < lost < 12
 
 
-def test_the_scanner_can_be_lost(controller):
+def test_the_scanner_can_be_lost(controller: Any) -> None:
     with opened(controller, resolution=0.02, lost_after=2) as scanner:
         for _ in range(2):
             scanner.expose()()
@@ -134,7 +136,7 @@ def test_the_scanner_can_be_lost(controller):
     )
 
 
-def test_the_end_of_the_controller_is_the_end_of_the_scanner():
+def test_the_end_of_the_controller_is_the_end_of_the_scanner() -> None:
     with Process() as process:
         scanner = opened(process, resolution=0.02)
         process.end(signal.SIGKILL)
@@ -163,13 +165,15 @@ def test_the_end_of_the_controller_is_the_end_of_the_scanner():
         ),
     ],
 )
-def test_what_cannot_be_opened_is_said(controller, model, changes, message):
+def test_what_cannot_be_opened_is_said(
+    controller: Any, model: Any, changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(DeviceError) as error:
         scanner_loopback(model, params(controller, **changes))
     assert str(error.value) == message.replace("HOST", controller.host)
 
 
-def test_no_controller_is_said():
+def test_no_controller_is_said() -> None:
     with pytest.raises(DeviceError) as error:
         scanner_loopback(PHOXI, LoopbackParams(host="127.0.0.253"))
     assert str(error.value) == (

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def refused(params):
     return str(error.value)
 
 
-def test_no_camera_is_found_by_the_real_library():
+def test_no_camera_is_found_by_the_real_library() -> None:
     began = time.monotonic()
     assert refused(MechEyeParams(timeout=SI(0.3))) == (
         "scanner.mech_eye: no camera found; is it on, and in this computer's network?"
@@ -28,7 +29,7 @@ def test_no_camera_is_found_by_the_real_library():
     assert time.monotonic() - began < 10
 
 
-def test_what_the_real_library_says_of_an_address_is_said():
+def test_what_the_real_library_says_of_an_address_is_said() -> None:
     assert refused(MechEyeParams(address="not an address")) == (
         "scanner.mech_eye: not an address: Failed to connect to the Mech-Eye Industrial 3D Camera. "
         "IP Address is invalid. (error -7)"
@@ -38,7 +39,7 @@ def test_what_the_real_library_says_of_an_address_is_said():
     )
 
 
-def test_a_missing_sdk_is_said(monkeypatch):
+def test_a_missing_sdk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mecheye.area_scan_3d_camera", None)
     assert refused(MechEyeParams()).endswith("; pip install 'flangeye[mech_eye]'")
 
@@ -54,7 +55,7 @@ class Status:
 
 
 @pytest.fixture
-def camera(monkeypatch):
+def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A camera in the real library's place; frames, clouds and infos are the real library's."""
 
     class Camera:
@@ -103,7 +104,7 @@ def camera(monkeypatch):
     return Camera
 
 
-def test_a_frame_of_the_real_library_becomes_an_organised_cloud(camera):
+def test_a_frame_of_the_real_library_becomes_an_organised_cloud(camera: Any) -> None:
     with scanner_mech_eye(None, MechEyeParams()) as scanner:
         assert isinstance(scanner, Scanner)
         assert scanner.name == "Mech-Eye PRO M NEM1"
@@ -114,7 +115,7 @@ def test_a_frame_of_the_real_library_becomes_an_organised_cloud(camera):
     assert camera.closed == 1
 
 
-def test_what_a_camera_does_not_do_is_said(camera):
+def test_what_a_camera_does_not_do_is_said(camera: Any) -> None:
     camera.addresses = ("10.0.0.7", "10.0.0.5")
     assert refused(MechEyeParams()) == (
         "scanner.mech_eye: several cameras, give address: 10.0.0.5, 10.0.0.7"

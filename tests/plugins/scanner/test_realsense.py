@@ -3,6 +3,7 @@
 import itertools
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,7 +55,7 @@ def ramp(at):
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("realsense") / "cell.db3"
     camera = Camera()
     recorder = rs.recorder(str(path), camera.device)
@@ -76,7 +77,7 @@ def refused(params, model=None):
     return str(error.value)
 
 
-def test_a_recording_is_played_in_metres(recording):
+def test_a_recording_is_played_in_metres(recording: Path) -> None:
     params = RealsenseParams(recording=recording, timeout=SI(1.0))
     with scanner_realsense(KINECT, params) as scanner:
         assert isinstance(scanner, Scanner)
@@ -96,7 +97,7 @@ def test_a_recording_is_played_in_metres(recording):
     assert scans[0].started_ns < scans[0].ended_ns
 
 
-def test_the_end_of_a_recording_is_said(recording):
+def test_the_end_of_a_recording_is_said(recording: Path) -> None:
     scanner = scanner_realsense(None, RealsenseParams(recording=recording, timeout=SI(0.5)))
     with scanner, pytest.raises(DeviceError) as error:
         for _ in range(9):
@@ -104,7 +105,7 @@ def test_the_end_of_a_recording_is_said(recording):
     assert str(error.value) == "RealSense cell.db3: the recording has ended"
 
 
-def test_closing_twice_is_safe_and_final(recording):
+def test_closing_twice_is_safe_and_final(recording: Path) -> None:
     scanner = scanner_realsense(None, RealsenseParams(recording=recording))
     scanner.close()
     scanner.close()
@@ -113,7 +114,7 @@ def test_closing_twice_is_safe_and_final(recording):
     assert str(error.value) == "RealSense cell.db3: is closed"
 
 
-def test_no_camera_is_said_at_once():
+def test_no_camera_is_said_at_once() -> None:
     began = time.monotonic()
     assert refused(RealsenseParams()) == (
         "scanner.realsense: no camera found; is it plugged in, and may this user use USB devices?"
@@ -121,7 +122,7 @@ def test_no_camera_is_said_at_once():
     assert time.monotonic() - began < 10
 
 
-def test_which_camera_is_meant_must_be_said(monkeypatch):
+def test_which_camera_is_meant_must_be_said(monkeypatch: pytest.MonkeyPatch) -> None:
     class Context:
         def query_devices(self):
             return [SimpleNamespace(get_info=lambda _, n=n: n) for n in ("2", "1")]
@@ -133,7 +134,7 @@ def test_which_camera_is_meant_must_be_said(monkeypatch):
     )
 
 
-def test_what_is_no_recording_is_said(tmp_path):
+def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
     path = tmp_path / "cell.db3"
     assert refused(RealsenseParams(recording=path)) == f"scanner.realsense: no recording at {path}"
     path.write_text("no recording")
@@ -142,7 +143,7 @@ def test_what_is_no_recording_is_said(tmp_path):
     )
 
 
-def test_a_missing_sdk_is_said(monkeypatch):
+def test_a_missing_sdk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     assert refused(RealsenseParams()) == (
         "scanner.realsense: needs pyrealsense2 (import of pyrealsense2 halted; None in "
@@ -150,7 +151,7 @@ def test_a_missing_sdk_is_said(monkeypatch):
     )
 
 
-def test_a_unit_that_is_not_the_sensors_is_refused(recording):
+def test_a_unit_that_is_not_the_sensors_is_refused(recording: Path) -> None:
     with scanner_realsense(None, RealsenseParams(recording=recording)) as scanner:
         scanner._unit = 1e-3
         with pytest.raises(DeviceError) as error:
@@ -160,7 +161,7 @@ def test_a_unit_that_is_not_the_sensors_is_refused(recording):
     )
 
 
-def test_the_software_devices_frames_become_clouds():
+def test_the_software_devices_frames_become_clouds() -> None:
     """What the driver does with a frame, on one that no recorder has touched."""
     camera = Camera(unit=2.5e-4)
     queue = rs.frame_queue(5)

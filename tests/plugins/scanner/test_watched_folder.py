@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def mark_of(scan):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path: Path) -> Path:
     path = tmp_path / "exports"
     path.mkdir()
     return path
@@ -57,7 +58,9 @@ def later(seconds, action, *arguments):
     return timer
 
 
-def test_each_new_file_is_a_scan_in_metres_and_old_ones_are_left(folder, tmp_path):
+def test_each_new_file_is_a_scan_in_metres_and_old_ones_are_left(
+    folder: Path, tmp_path: Path
+) -> None:
     (folder / "old.pcd").write_bytes(content(tmp_path, 0.9))
     with watch(folder) as scanner:
         assert isinstance(scanner, Scanner)
@@ -72,7 +75,7 @@ def test_each_new_file_is_a_scan_in_metres_and_old_ones_are_left(folder, tmp_pat
     assert scan.started_ns < scan.ended_ns <= time.time_ns()
 
 
-def test_files_are_taken_in_the_order_of_their_count(folder, tmp_path):
+def test_files_are_taken_in_the_order_of_their_count(folder: Path, tmp_path: Path) -> None:
     with watch(folder) as scanner:
         for count in (10, 9, 11):
             (folder / f"scan_{count}.pcd").write_bytes(content(tmp_path, count / 100))
@@ -80,7 +83,7 @@ def test_files_are_taken_in_the_order_of_their_count(folder, tmp_path):
     assert marks == pytest.approx([0.09, 0.10, 0.11])
 
 
-def test_a_file_that_came_while_the_arm_moved_says_so(folder, tmp_path):
+def test_a_file_that_came_while_the_arm_moved_says_so(folder: Path, tmp_path: Path) -> None:
     """Its exposure may have begun as early as the folder was last looked at."""
     with watch(folder) as scanner:
         (folder / "1.pcd").write_bytes(content(tmp_path, 0.1))
@@ -93,7 +96,7 @@ def test_a_file_that_came_while_the_arm_moved_says_so(folder, tmp_path):
     assert scan.started_ns <= looked < arrived
 
 
-def test_a_file_that_is_written_slowly_is_waited_for(folder, tmp_path):
+def test_a_file_that_is_written_slowly_is_waited_for(folder: Path, tmp_path: Path) -> None:
     whole = content(tmp_path, 0.3)
 
     def write():
@@ -110,7 +113,7 @@ def test_a_file_that_is_written_slowly_is_waited_for(folder, tmp_path):
     assert mark_of(scan) == pytest.approx(0.3)
 
 
-def test_a_pause_in_the_writing_is_not_taken_for_its_end(folder, tmp_path):
+def test_a_pause_in_the_writing_is_not_taken_for_its_end(folder: Path, tmp_path: Path) -> None:
     whole = content(tmp_path, 0.4)
     (half, rest), path = (whole[:-50], whole[-50:]), folder / "pause.pcd"
     with watch(folder, settle=SI(0.0)) as scanner:
@@ -126,7 +129,7 @@ def test_a_pause_in_the_writing_is_not_taken_for_its_end(folder, tmp_path):
     assert mark_of(scan) == pytest.approx(0.4)
 
 
-def test_a_later_file_waits_for_one_that_is_not_whole(folder, tmp_path):
+def test_a_later_file_waits_for_one_that_is_not_whole(folder: Path, tmp_path: Path) -> None:
     first, second = content(tmp_path, 0.5), content(tmp_path, 0.6)
     with watch(folder) as scanner:
         (folder / "1.pcd").write_bytes(first[:-20])
@@ -137,7 +140,9 @@ def test_a_later_file_waits_for_one_that_is_not_whole(folder, tmp_path):
     assert marks == pytest.approx([0.5, 0.6])
 
 
-def test_a_rename_into_place_is_seen_once_and_hidden_names_never(folder, tmp_path):
+def test_a_rename_into_place_is_seen_once_and_hidden_names_never(
+    folder: Path, tmp_path: Path
+) -> None:
     with watch(folder) as scanner:
         for name in (".part.pcd", "~lock.pcd", "part.tmp"):
             (folder / name).write_bytes(content(tmp_path, 0.9))
@@ -149,7 +154,9 @@ def test_a_rename_into_place_is_seen_once_and_hidden_names_never(folder, tmp_pat
 
 
 @pytest.mark.parametrize("moment", [0, 2_000_000_000, 4_000_000_000])
-def test_times_that_a_server_makes_up_do_not_matter(folder, tmp_path, moment):
+def test_times_that_a_server_makes_up_do_not_matter(
+    folder: Path, tmp_path: Path, moment: int
+) -> None:
     with watch(folder) as scanner:
         for mark in (0.1, 0.2):  # overwritten: the same name again
             (folder / "made.tmp").write_bytes(content(tmp_path, mark))
@@ -158,14 +165,14 @@ def test_times_that_a_server_makes_up_do_not_matter(folder, tmp_path, moment):
             assert mark_of(scanner.expose()()) == pytest.approx(mark)
 
 
-def test_a_pattern_chooses_among_names(folder, tmp_path):
+def test_a_pattern_chooses_among_names(folder: Path, tmp_path: Path) -> None:
     with watch(folder, pattern="scan_*.pcd") as scanner:
         (folder / "other.pcd").write_bytes(content(tmp_path, 0.9))
         (folder / "scan_1.pcd").write_bytes(content(tmp_path, 0.1))
         assert mark_of(scanner.expose()()) == pytest.approx(0.1)
 
 
-def test_nothing_new_in_time_is_said(folder):
+def test_nothing_new_in_time_is_said(folder: Path) -> None:
     with watch(folder, timeout=SI(0.2)) as scanner, pytest.raises(DeviceError) as error:
         scanner.expose()
     assert str(error.value) == (
@@ -174,7 +181,7 @@ def test_nothing_new_in_time_is_said(folder):
     )
 
 
-def test_a_file_that_never_becomes_whole_is_said(folder, tmp_path):
+def test_a_file_that_never_becomes_whole_is_said(folder: Path, tmp_path: Path) -> None:
     with watch(folder, timeout=SI(0.6)) as scanner:
         (folder / "torn.pcd").write_bytes(content(tmp_path, 0.1)[:-10])
         with pytest.raises(DeviceError) as error:
@@ -185,7 +192,7 @@ def test_a_file_that_never_becomes_whole_is_said(folder, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_a_wrong_unit_is_said(folder, tmp_path):
+def test_a_wrong_unit_is_said(folder: Path, tmp_path: Path) -> None:
     with watch(folder) as scanner:
         (folder / "metres.pcd").write_bytes(content(tmp_path, 0.1, "m"))
         with pytest.raises(StageError) as error:
@@ -196,7 +203,9 @@ def test_a_wrong_unit_is_said(folder, tmp_path):
     )
 
 
-def test_a_folder_that_is_missing_lost_or_closed_to_us_is_said(tmp_path, folder, monkeypatch):
+def test_a_folder_that_is_missing_lost_or_closed_to_us_is_said(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     missing = tmp_path / "nowhere"
     with pytest.raises(DeviceError) as error:
         watch(missing)
@@ -213,7 +222,7 @@ def test_a_folder_that_is_missing_lost_or_closed_to_us_is_said(tmp_path, folder,
     assert str(error.value) == f"scanner.watched_folder: {file} cannot be read (Not a directory)"
 
 
-def test_closing_ends_the_wait(folder):
+def test_closing_ends_the_wait(folder: Path) -> None:
     scanner = watch(folder)
     timer = later(0.2, scanner.close)
     began = time.monotonic()

@@ -5,7 +5,9 @@ right for a given version; they are those of the maker's public samples.
 """
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +54,7 @@ class Camera:
 
 
 @pytest.fixture
-def sdk(monkeypatch):
+def sdk(monkeypatch: pytest.MonkeyPatch) -> Any:
     xyz = np.full((3, 4, 3), 700.0, np.float32)
     xyz[0, 0] = np.nan
     made = SimpleNamespace(camera=Camera(xyz), asked=[])
@@ -87,7 +89,7 @@ def refused(params=ZividParams()):  # noqa: B008
     return str(error.value)
 
 
-def test_a_capture_is_in_metres_and_organised(sdk):
+def test_a_capture_is_in_metres_and_organised(sdk: Any) -> None:
     with scanner_zivid(PHOXI, ZividParams(serial="2020C0DE")) as scanner:
         assert isinstance(scanner, Scanner)
         assert scanner.name == "Zivid 2 M70 2020C0DE"
@@ -103,7 +105,7 @@ def test_a_capture_is_in_metres_and_organised(sdk):
         scanner.expose()
 
 
-def test_settings_and_file_cameras_are_files(sdk, tmp_path):
+def test_settings_and_file_cameras_are_files(sdk: Any, tmp_path: Path) -> None:
     missing = tmp_path / "settings.yml"
     assert refused(ZividParams(settings=missing)) == f"scanner.zivid: no file {missing}"
     camera = tmp_path / "camera.zfc"
@@ -114,7 +116,7 @@ def test_settings_and_file_cameras_are_files(sdk, tmp_path):
     assert sdk.asked == [str(camera)]
 
 
-def test_what_goes_wrong_is_one_line(sdk):
+def test_what_goes_wrong_is_one_line(sdk: Any) -> None:
     sdk.camera.fails = True
     with scanner_zivid(None, ZividParams()) as scanner, pytest.raises(DeviceError) as error:
         scanner.expose()
@@ -127,7 +129,7 @@ def test_what_goes_wrong_is_one_line(sdk):
     assert refused() == "scanner.zivid: No cameras found"
 
 
-def test_a_missing_sdk_is_said(monkeypatch):
+def test_a_missing_sdk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zivid", None)
     assert refused() == (
         "scanner.zivid: needs zivid (import of zivid halted; None in sys.modules); install the "

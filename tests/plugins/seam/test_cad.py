@@ -1,6 +1,8 @@
 """seam.cad: accuracy against the truth, robustness, refusals."""
 
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,12 +41,12 @@ def planned(scan, workpiece="v-straight", workspace=None, hand=None, **given):
         ("v-straight", {"rpy": ("15 deg", "-20 deg", "140 deg"), "seed": 2}),
     ],
 )
-def test_the_seam_is_where_it_is(workpiece, given):
+def test_the_seam_is_where_it_is(workpiece: str, given: dict[str, Any]) -> None:
     scan, truth = scanned(workpiece, **given)
     check_planned(planned(scan, workpiece), truth)
 
 
-def test_the_plain_seam_is_where_it_is():
+def test_the_plain_seam_is_where_it_is() -> None:
     check_planned(plain(), scanned("v-straight")[1])
 
 
@@ -60,11 +62,11 @@ def check_planned(seam, truth):
     assert seam.cloud.frame == "base"
 
 
-def test_the_opening_points_at_the_torch():
+def test_the_opening_points_at_the_torch() -> None:
     assert (plain().openings_in_base[:, 2] > 0.999).all()
 
 
-def test_a_plate_that_can_slide_is_held_by_its_outline(tmp_path):
+def test_a_plate_that_can_slide_is_held_by_its_outline(tmp_path: Path) -> None:
     path = write_plate(tmp_path, -0.015)
     scan, truth = scanned(path)
     seam = planned(scan, path)
@@ -74,7 +76,7 @@ def test_a_plate_that_can_slide_is_held_by_its_outline(tmp_path):
     assert tube_radii(seam).max() < 0.5 * MM  # across it
 
 
-def test_the_seam_moves_with_the_scene():
+def test_the_seam_moves_with_the_scene() -> None:
     """Another camera frame of the same scan gives the same seam in the base."""
     scan, _ = scanned("v-straight")
     motion = rigid(rotation_from_rpy(0.02, -0.03, 0.04), np.array([0.01, 0.02, -0.03]))
@@ -85,7 +87,7 @@ def test_the_seam_moves_with_the_scene():
     )
 
 
-def test_the_hand_eye_covariance_widens_the_tube_away_from_where_it_holds():
+def test_the_hand_eye_covariance_widens_the_tube_away_from_where_it_holds() -> None:
     scan, _ = scanned("v-straight")
     seam = planned(scan, hand=hand_eye(sigma=(5e-3, 1e-7)))
     arm = np.linalg.norm(seam.points_in_base - [0.6, 0.0, 0.25], axis=1)
@@ -100,7 +102,7 @@ def refused(scan, workpiece="v-straight", error=CalibrationRefused, **given):
     return str(caught.value)
 
 
-def test_a_cad_in_another_unit_is_named(tmp_path):
+def test_a_cad_in_another_unit_is_named(tmp_path: Path) -> None:
     scan, _ = scanned("v-straight")
     path = write_plate(tmp_path, -0.015, unit="m")
     told = refused(scan, path, StageError)
@@ -110,14 +112,14 @@ def test_a_cad_in_another_unit_is_named(tmp_path):
     assert "too small for the scan, whose points are about" in refused(tiny, error=StageError)
 
 
-def test_another_part_is_refused():
+def test_another_part_is_refused() -> None:
     scan, _ = scanned("v-straight")
     told = refused(scan, "v-curved")
     assert "seam.cad: poor fit: where the scanner looked at" in told
     assert told.endswith("is it 'Plate with a curved V-groove' (v-curved.yaml), and in view?")
 
 
-def test_a_part_that_is_not_there_is_refused():
+def test_a_part_that_is_not_there_is_refused() -> None:
     rng = np.random.default_rng(1)
     floor = np.column_stack([rng.uniform(-0.3, 0.3, (40_000, 2)), rng.normal(0.75, 1e-4, 40_000)])
     told = refused(WorkpieceScan(PointCloud(CAMERA, floor.astype(np.float32)), "floor"))
@@ -126,32 +128,32 @@ def test_a_part_that_is_not_there_is_refused():
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_part_that_could_lie_either_way_is_refused(tmp_path, seed):
+def test_a_part_that_could_lie_either_way_is_refused(tmp_path: Path, seed: int) -> None:
     path = write_plate(tmp_path, 0.0)
     told = refused(scanned(path, seed=seed)[0], path)
     assert told.startswith("seam.cad: ambiguous: the part turned by 180 deg about the CAD's z")
     assert "its seam would be up to 200 mm away" in told
 
 
-def test_a_seam_outside_the_workspace_is_refused():
+def test_a_seam_outside_the_workspace_is_refused() -> None:
     scan, _ = scanned("v-straight")
     told = refused(scan, workspace=Box(np.array([0.6, 0.0, 0.3]), np.array([0.15, 0.3, 0.2])))
     assert told.startswith("seam.cad: the seam leaves the workspace by ")
     assert " mm along x, at (" in told
 
 
-def test_limits_are_held():
+def test_limits_are_held() -> None:
     scan, _ = scanned("v-straight")
     assert "is needed (min_seen)" in refused(scan, min_seen=0.999)
     assert "limit 0.01 mm (max_deviation)" in refused(scan, max_deviation="0.01 mm")
 
 
-def test_too_small_a_scan_is_refused():
+def test_too_small_a_scan_is_refused() -> None:
     scan = WorkpieceScan(PointCloud(CAMERA, np.ones((5, 3), np.float32)), "few")
     assert refused(scan, error=StageError) == "seam.cad: the scan has 5 points; 300 are needed"
 
 
-def test_the_seam_is_chosen_by_name(tmp_path):
+def test_the_seam_is_chosen_by_name(tmp_path: Path) -> None:
     path = write_plate(tmp_path, -0.015)
     scan, _ = scanned("v-straight")
     told = refused(scan, path, StageError, seam="weld")
@@ -164,7 +166,7 @@ def test_the_seam_is_chosen_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
-def test_the_shipped_workpieces_are_those_the_project_makes(plate):
+def test_the_shipped_workpieces_are_those_the_project_makes(plate: Any) -> None:
     from flangeye.files.bundled import bundled
 
     path = bundled("data") / "workpieces" / f"{plate.name}.yaml"
@@ -175,7 +177,7 @@ def test_the_shipped_workpieces_are_those_the_project_makes(plate):
 
 
 @pytest.mark.parametrize("plate", PLATES, ids=lambda p: p.name)
-def test_the_sample_workpieces_are_closed_and_face_outwards(plate):
+def test_the_sample_workpieces_are_closed_and_face_outwards(plate: Any) -> None:
     mesh = plate.mesh()
     edges = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     there = {tuple(edge) for edge in edges.tolist()}
@@ -198,14 +200,16 @@ def test_the_sample_workpieces_are_closed_and_face_outwards(plate):
         (("[0, 0, 1]", "[0, 0, 0]"), "has an opening without a direction"),
     ],
 )
-def test_a_wrong_workpiece_file_is_refused(tmp_path, change, message):
+def test_a_wrong_workpiece_file_is_refused(
+    tmp_path: Path, change: tuple[Any, ...], message: str
+) -> None:
     path = write_plate(tmp_path, -0.015)
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(StageError, match=message.replace("(", r"\(")):
         load_workpiece(path)
 
 
-def test_a_file_without_triangles_is_no_cad(tmp_path):
+def test_a_file_without_triangles_is_no_cad(tmp_path: Path) -> None:
     path = write_plate(tmp_path, -0.015)
     (tmp_path / "plate.stl").write_bytes(b"solid nothing\nendsolid nothing\n")
     with pytest.raises(
@@ -215,7 +219,7 @@ def test_a_file_without_triangles_is_no_cad(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_registration_is_as_uncertain_as_it_says():
+def test_the_registration_is_as_uncertain_as_it_says() -> None:
     """Errors of the fit against its own covariance, over scans without the scanner's distortion.
 
     The mean squared Mahalanobis distance of six parameters is six; 8 scans vary it by a quarter.

@@ -38,7 +38,7 @@ def grooved(roots, half_angle=40, depth=10 * MM, spacing=0.7 * MM, noise=0.05 * 
 
 
 @pytest.mark.parametrize("workpiece", ["v-straight", "v-curved"])
-def test_the_root_is_where_it_is(workpiece):
+def test_the_root_is_where_it_is(workpiece: str) -> None:
     scan, truth = scanned(workpiece, seed=1)
     seam = planned(scan)
     errors = errors_from(seam, truth)
@@ -51,7 +51,7 @@ def test_the_root_is_where_it_is(workpiece):
 
 
 @pytest.mark.parametrize("half_angle", [25, 40, 60])
-def test_the_angle_and_the_root_of_a_plain_groove(half_angle):
+def test_the_angle_and_the_root_of_a_plain_groove(half_angle: int) -> None:
     scan, truth = grooved([0.01], half_angle, depth=6 * MM)
     seam = planned(scan, max_width="40 mm")
     assert np.degrees(seam.half_angle) == pytest.approx(half_angle, abs=1)
@@ -61,7 +61,7 @@ def test_the_angle_and_the_root_of_a_plain_groove(half_angle):
 
 
 @pytest.mark.slow
-def test_the_tube_holds_the_share_it_says():
+def test_the_tube_holds_the_share_it_says() -> None:
     """Points of 12 grooves against their standard deviations across the seam, scanner's aside."""
     squares = []
     for seed in range(12):
@@ -72,7 +72,7 @@ def test_the_tube_holds_the_share_it_says():
     assert inside > 0.93  # the tube is a circle around an ellipse: never too thin
 
 
-def test_the_seam_moves_with_the_scene():
+def test_the_seam_moves_with_the_scene() -> None:
     scan, _ = grooved([0.01])
     motion = rigid(rotation_from_rpy(0.02, -0.03, 0.04), np.array([0.01, 0.02, -0.03]))
     seam, moved = planned(scan), planned(scan, hand=hand_eye(error=motion))
@@ -80,7 +80,7 @@ def test_the_seam_moves_with_the_scene():
     assert np.allclose(moved.points_in_base, expected, atol=1e-9)
 
 
-def test_backwards_starts_at_the_other_end():
+def test_backwards_starts_at_the_other_end() -> None:
     scan, _ = grooved([0.01])
     seam, back = planned(scan), planned(scan, backwards=True)
     assert np.allclose(seam.points_in_base[::-1], back.points_in_base)
@@ -88,7 +88,7 @@ def test_backwards_starts_at_the_other_end():
     assert near < far
 
 
-def test_a_plate_without_a_groove_is_refused():
+def test_a_plate_without_a_groove_is_refused() -> None:
     with pytest.raises(CalibrationRefused) as error:
         planned(grooved([])[0])
     assert str(error.value) == (
@@ -97,7 +97,7 @@ def test_a_plate_without_a_groove_is_refused():
     )
 
 
-def test_of_two_grooves_the_recipe_must_say_which():
+def test_of_two_grooves_the_recipe_must_say_which() -> None:
     scan, truth = grooved([-0.04, 0.03])
     with pytest.raises(CalibrationRefused) as error:
         planned(scan)
@@ -109,17 +109,17 @@ def test_of_two_grooves_the_recipe_must_say_which():
         assert errors_from(planned(scan, near=near), line).max() < 0.1 * MM
 
 
-def test_a_rough_groove_is_refused():
+def test_a_rough_groove_is_refused() -> None:
     with pytest.raises(CalibrationRefused, match=r"mm rms from a smooth line, limit 0.001 mm"):
         planned(grooved([0.01])[0], max_residual="0.001 mm")
 
 
-def test_a_seam_outside_the_workspace_is_refused():
+def test_a_seam_outside_the_workspace_is_refused() -> None:
     with pytest.raises(CalibrationRefused, match="seam.groove: the seam leaves the workspace by"):
         planned(grooved([0.01])[0], Box(np.array([0.6, 0.0, 0.3]), np.array([0.1, 0.3, 0.2])))
 
 
-def test_too_small_a_scan_is_refused():
+def test_too_small_a_scan_is_refused() -> None:
     scan = WorkpieceScan(PointCloud(CAMERA, np.ones((5, 3), np.float32)), "few")
     with pytest.raises(StageError, match="seam.groove: the scan has 5 points; 1000 are needed"):
         planned(scan)

@@ -1,6 +1,7 @@
 """A seam for the arm as it reports, and for the arm corrected."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def seam():
     return Seam(points, openings, np.tile(1e-8 * np.eye(3), (5, 1, 1)), 0.7, 0.008, "test")
 
 
-def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam():
+def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam() -> None:
     planned, arm = seam(), Arm(UR5)
     told = for_the_controller(planned, calibration().as_corrected(), UR5, CORRECTED)
     moved = told.points_in_base - planned.points_in_base
@@ -48,19 +49,19 @@ def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam():
     assert "the arm's error is taken off" in told.notes[-1]
 
 
-def test_the_arm_as_reported_needs_nothing():
+def test_the_arm_as_reported_needs_nothing() -> None:
     planned, params = seam(), ArmParams()
     answer = answer_for("seam.cad", calibration(), params)
     assert answer.correction is None
     assert for_the_controller(planned, answer, UR5, params) is planned
 
 
-def test_an_arm_without_a_known_error_is_not_corrected():
+def test_an_arm_without_a_known_error_is_not_corrected() -> None:
     with pytest.raises(CalibrationRefused, match="no error of the arm that helps; write arm: as-r"):
         answer_for("seam.cad", hand_eye(), CORRECTED)
 
 
-def test_a_seam_out_of_reach_is_refused():
+def test_a_seam_out_of_reach_is_refused() -> None:
     planned = seam()
     far = replace(planned, points_in_base=planned.points_in_base + [2.0, 0, 0])
     with pytest.raises(
@@ -93,7 +94,7 @@ def checked(tmp_path, solve):
     return load_recipe(path, load_registry())
 
 
-def test_a_recipe_that_mixes_the_two_arms_fails_check(tmp_path):
+def test_a_recipe_that_mixes_the_two_arms_fails_check(tmp_path: Path) -> None:
     assert checked(tmp_path, "solve.robust: {joint_offsets: auto}")
     with pytest.raises(RecipeError, match=r"r.yaml:15: steps.6.seam.groove.arm: the corrected arm"):
         checked(tmp_path, "solve.svd")

@@ -1,5 +1,7 @@
 """Where a scan of a workpiece comes from."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -15,7 +17,7 @@ from tests.plugins.seam.scenes import BASE_T_CAMERA, scanned
 CLOUD = PointCloud(CAMERA, np.arange(12, dtype=np.float32).reshape(4, 3))
 
 
-def test_the_simulated_scan_shows_the_true_seam():
+def test_the_simulated_scan_shows_the_true_seam() -> None:
     scan, truth = scanned("v-straight")
     points = BASE_T_CAMERA.apply(scan.cloud.points())
     middle = truth.mean(axis=0)
@@ -26,7 +28,7 @@ def test_the_simulated_scan_shows_the_true_seam():
     )
 
 
-def test_without_a_simulated_cell_nothing_is_simulated():
+def test_without_a_simulated_cell_nothing_is_simulated() -> None:
     with pytest.raises(StageError) as error:
         scan_simulated(None, Seed(0), SimulatedScanParams())
     assert str(error.value) == (
@@ -35,12 +37,12 @@ def test_without_a_simulated_cell_nothing_is_simulated():
     )
 
 
-def test_an_unknown_workpiece_is_named():
+def test_an_unknown_workpiece_is_named() -> None:
     with pytest.raises(ValidationError, match="no workpiece 'v-strait'; known: v-straight, "):
         SimulatedScanParams(workpiece="v-strait")
 
 
-def test_a_file_and_a_folder_of_clouds_are_read(tmp_path):
+def test_a_file_and_a_folder_of_clouds_are_read(tmp_path: Path) -> None:
     write_cloud(tmp_path / "a.pcd", CLOUD, "mm")
     one = scan_file(FileScanParams(path=tmp_path / "a.pcd", unit="mm"))
     assert np.allclose(one.cloud.xyz, CLOUD.xyz)
@@ -50,7 +52,7 @@ def test_a_file_and_a_folder_of_clouds_are_read(tmp_path):
     assert both.notes == (f"workpiece scan: {tmp_path}, 2 files, 8 points",)
 
 
-def test_a_scan_that_is_not_there_is_named(tmp_path):
+def test_a_scan_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="none.pcd: does not exist"):
         scan_file(FileScanParams(path=tmp_path / "none.pcd", unit="m"))
     with pytest.raises(StageError, match="holds no cloud; known: .csv, .npy, .pcd"):
@@ -76,7 +78,7 @@ class Still(Scanner):
         return lambda: Scan(CLOUD, 0, 1)
 
 
-def test_a_live_scan_is_one_exposure_and_lets_go_of_the_scanner():
+def test_a_live_scan_is_one_exposure_and_lets_go_of_the_scanner() -> None:
     device = Still()
     scan = scan_live(ScannerDriver("scanner.still", lambda: device))
     assert np.array_equal(scan.cloud.xyz, CLOUD.xyz)

@@ -1,6 +1,7 @@
 """Finding the flange in simulated cells, and saying why when it cannot be found."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ steps:
 
 
 @pytest.fixture(scope="module")
-def cell():
+def cell() -> Any:
     """Six scans of a simulated cell, the flange to look for, and the camera's true pose."""
     return scans(0.0, 6)
 
@@ -45,7 +46,7 @@ def found(capture, flange, **params):
     return segment_flange(capture, flange, SegmentParams(**params))
 
 
-def test_the_flange_is_found_where_it_is(cell):
+def test_the_flange_is_found_where_it_is(cell: Any) -> None:
     captures, flange, base_T_camera = cell
     for capture in captures:
         cloud = found(capture, flange)
@@ -57,7 +58,7 @@ def test_the_flange_is_found_where_it_is(cell):
         assert reach < flange.outer + 6e-3
 
 
-def test_an_unorganised_scan_gives_the_same_disc(cell):
+def test_an_unorganised_scan_gives_the_same_disc(cell: Any) -> None:
     captures, flange, _ = cell
     capture = captures[0]
     loose = replace(capture, cloud=t.PointCloud(t.CAMERA, capture.cloud.points()))
@@ -65,7 +66,7 @@ def test_an_unorganised_scan_gives_the_same_disc(cell):
     assert np.linalg.norm(first.centre - second.centre) < 1e-3
 
 
-def test_a_segmented_flange_is_found_again(cell):
+def test_a_segmented_flange_is_found_again(cell: Any) -> None:
     captures, flange, _ = cell
     cloud = found(captures[0], flange)
     again = found(replace(captures[0], cloud=cloud.cloud), flange)
@@ -73,13 +74,13 @@ def test_a_segmented_flange_is_found_again(cell):
     assert np.linalg.norm(cloud.centre - again.centre) < 1e-3
 
 
-def test_it_is_the_same_every_time(cell):
+def test_it_is_the_same_every_time(cell: Any) -> None:
     captures, flange, _ = cell
     first, second = found(captures[1], flange), found(captures[1], flange)
     assert np.array_equal(first.cloud.xyz, second.cloud.xyz)
 
 
-def test_a_covered_flange_is_not_mistaken_for_another_disc():
+def test_a_covered_flange_is_not_mistaken_for_another_disc() -> None:
     captures, flange, base_T_camera = scans(1.0, 4)
     for capture in captures:
         cloud = found(capture, flange)
@@ -90,7 +91,7 @@ def test_a_covered_flange_is_not_mistaken_for_another_disc():
             assert cloud.reason
 
 
-def test_the_reasons(cell):
+def test_the_reasons(cell: Any) -> None:
     captures, flange, _ = cell
     capture = captures[0]
     nothing = replace(capture, cloud=t.PointCloud(t.CAMERA, np.full((50, 60, 3), np.nan)))
@@ -111,14 +112,14 @@ def test_the_reasons(cell):
     assert "mm" in found(plane, flange).reason
 
 
-def test_millimetres_are_named(cell):
+def test_millimetres_are_named(cell: Any) -> None:
     captures, flange, _ = cell
     far_off = t.PointCloud(t.CAMERA, 1e3 * captures[0].cloud.xyz)
     with pytest.raises(StageError, match="millimetres"):
         found(replace(captures[0], cloud=far_off), flange)
 
 
-def test_only_the_window_about_the_disc_is_read_and_nothing_is_missed(cell):
+def test_only_the_window_about_the_disc_is_read_and_nothing_is_missed(cell: Any) -> None:
     captures, flange, _ = cell
     for capture in captures:
         view = coarse_view(capture.cloud.xyz, flange.rim / 15)

@@ -57,7 +57,7 @@ def wall(z=0.8, rows=120, columns=160):
     return np.stack([x, y, np.full_like(x, z)], axis=-1)
 
 
-def test_it_is_found_in_the_whole_cell():
+def test_it_is_found_in_the_whole_cell() -> None:
     assert len(scanned()) >= 3
     for capture, centre in scanned():
         found = segment(capture)
@@ -68,19 +68,19 @@ def test_it_is_found_in_the_whole_cell():
         assert found.normal @ found.centre < 0
 
 
-def test_its_fit_is_good_to_a_tenth_of_a_millimetre():
+def test_its_fit_is_good_to_a_tenth_of_a_millimetre() -> None:
     for capture, centre in scanned():
         circle = fit_sphere(segment(capture), SPHERE, SphereParams())
         assert np.linalg.norm(circle.centre - centre) < 0.3e-3
 
 
-def test_a_cloud_without_order_gives_the_same_sphere():
+def test_a_cloud_without_order_gives_the_same_sphere() -> None:
     capture, _ = scanned()[0]
     loose = segment(of(capture.cloud.points()))
     assert np.linalg.norm(loose.centre - segment(capture).centre) < 0.2e-3
 
 
-def test_a_cell_without_one_has_none():
+def test_a_cell_without_one_has_none() -> None:
     capture = next(iter(acquire(sphere=None)))
     found = segment(capture)
     assert isinstance(found, Rejected)
@@ -88,14 +88,14 @@ def test_a_cell_without_one_has_none():
     assert found.reason.endswith(" is there, at least 40% is needed")
 
 
-def test_a_sphere_of_another_size_is_not_taken():
+def test_a_sphere_of_another_size_is_not_taken() -> None:
     capture, _ = scanned()[0]
     assert isinstance(
         segment(capture, Sphere(radius=0.03, centre_in_flange=(0, 0, 0.06))), Rejected
     )
 
 
-def test_two_of_them_are_told_apart_by_nobody():
+def test_two_of_them_are_told_apart_by_nobody() -> None:
     capture, centre = scanned()[0]
     points = capture.cloud.points()
     near = points[np.linalg.norm(points - centre, axis=1) < 1.1 * SPHERE.radius]
@@ -105,7 +105,7 @@ def test_two_of_them_are_told_apart_by_nobody():
     assert found.reason.endswith(" mm; hide one or narrow near and far")
 
 
-def test_nothing_between_near_and_far_is_no_sphere():
+def test_nothing_between_near_and_far_is_no_sphere() -> None:
     capture, _ = scanned()[0]
     found = segment(capture, far=SI(0.2))
     assert found.reason == (
@@ -113,20 +113,20 @@ def test_nothing_between_near_and_far_is_no_sphere():
     )
 
 
-def test_an_empty_scan_is_rejected():
+def test_an_empty_scan_is_rejected() -> None:
     assert segment(of(np.full((8, 8, 3), np.nan))).reason == "no finite point"
 
 
-def test_millimetres_are_refused():
+def test_millimetres_are_refused() -> None:
     with pytest.raises(StageError, match="millimetres read as metres"):
         segment(of(1000 * wall()))
 
 
-def test_a_wall_is_no_sphere():
+def test_a_wall_is_no_sphere() -> None:
     assert isinstance(segment(of(wall())), Rejected)
 
 
-def test_a_hollow_is_no_sphere():
+def test_a_hollow_is_no_sphere() -> None:
     xyz = wall()
     depth = np.sqrt(np.maximum(SPHERE.radius**2 - xyz[..., 0] ** 2 - xyz[..., 1] ** 2, 0.0))
     xyz[..., 2] += depth
@@ -135,13 +135,13 @@ def test_a_hollow_is_no_sphere():
     assert isinstance(segment(of(xyz)), FlangeCloud)
 
 
-def test_normals_point_to_the_scanner():
+def test_normals_point_to_the_scanner() -> None:
     normals = surface_normals(wall().astype(np.float32))
     assert np.isnan(normals[0]).all() and np.isnan(normals[:, -1]).all()
     assert normals[1:-1, 1:-1].reshape(-1, 3) == pytest.approx(np.tile([0, 0, -1], (118 * 158, 1)))
 
 
-def test_votes_are_counted_where_they_are_densest():
+def test_votes_are_counted_where_they_are_densest() -> None:
     rng = np.random.default_rng(0)
     votes = np.concatenate(
         [rng.uniform(-1, 1, (500, 3)), [0.3, 0.2, 0.1] + 0.01 * rng.standard_normal((200, 3))]
@@ -151,7 +151,7 @@ def test_votes_are_counted_where_they_are_densest():
     assert all(np.linalg.norm(a - b) > 0.15 for i, a in enumerate(places) for b in places[i + 1 :])
 
 
-def test_no_surface_gives_no_candidates():
+def test_no_surface_gives_no_candidates() -> None:
     from flangeye_plugins.segment.grid import Grid
 
     nothing = np.full((5, 5, 3), np.nan, dtype=np.float32)

@@ -1,5 +1,7 @@
 """The derivation in plugins/flangeye_plugins/weld/README.md, equation by equation."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ def torch(position, angle):
     return position - LENGTH * directions(angle)[0]
 
 
-def test_the_torch_s_velocity_is_that_of_equation_a_and_not_of_15():
+def test_the_torch_s_velocity_is_that_of_equation_a_and_not_of_15() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         position, velocity = rng.normal(size=2), rng.normal(size=2) * 5e-3
@@ -82,22 +84,22 @@ def late_rms(off):
     return float(np.sqrt(np.mean(off[len(off) // 2 :] ** 2)))
 
 
-def test_equation_b_keeps_the_torch_on_the_path():
+def test_equation_b_keeps_the_torch_on_the_path() -> None:
     assert late_rms(follow(corrected(1.0))) < 0.1e-3
 
 
-def test_without_the_cross_track_term_an_initial_error_stays():
+def test_without_the_cross_track_term_an_initial_error_stays() -> None:
     lean = 2e-3 / LENGTH
     assert late_rms(follow(corrected(0.0), lean)) > 1e-3
     assert late_rms(follow(corrected(1.0), lean)) < 0.1e-3
 
 
 @pytest.mark.parametrize("rule", [printed_16, printed_line_13])
-def test_as_printed_it_diverges(rule):
+def test_as_printed_it_diverges(rule: Any) -> None:
     assert late_rms(follow(rule)) > 5e-3
 
 
-def test_the_steering_is_equation_b_where_that_is_regular():
+def test_the_steering_is_equation_b_where_that_is_regular() -> None:
     rng = np.random.default_rng(1)
     steering = Steering(LENGTH, 1.0, rate=10.0)
     for _ in range(20):
@@ -110,7 +112,7 @@ def test_the_steering_is_equation_b_where_that_is_regular():
 
 
 @pytest.mark.parametrize("degrees", np.arange(-180, 181, 15))
-def test_the_turn_is_bounded_everywhere_and_turns_a_crooked_tool_back(degrees):
+def test_the_turn_is_bounded_everywhere_and_turns_a_crooked_tool_back(degrees: Any) -> None:
     steering = Steering(LENGTH, 1.0, rate=0.35)
     tool, _ = directions(np.deg2rad(float(degrees)))
     turn = steering.turn(np.array([5e-3, 5e-3]), tool, np.array([0.0, 1.0]), 0.0)
@@ -121,7 +123,7 @@ def test_the_turn_is_bounded_everywhere_and_turns_a_crooked_tool_back(degrees):
     assert 0.1 * 5e-3 <= pace <= 5e-3
 
 
-def test_the_tip_waits_where_the_tool_would_have_to_turn_faster_than_it_may():
+def test_the_tip_waits_where_the_tool_would_have_to_turn_faster_than_it_may() -> None:
     steering = Steering(0.04, 1.0, np.deg2rad(20.0))
     tool, normal = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     bend = np.array([np.cos(0.8), np.sin(0.8)])

@@ -14,7 +14,7 @@ def busy(seconds):
         pass
 
 
-def test_a_clock_counts_what_a_cycle_computes_and_nothing_else():
+def test_a_clock_counts_what_a_cycle_computes_and_nothing_else() -> None:
     clock = Clock()
     busy(5e-3)
     clock.start()
@@ -30,7 +30,7 @@ def test_a_clock_counts_what_a_cycle_computes_and_nothing_else():
     assert clock.period >= 40e-3
 
 
-def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it():
+def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it() -> None:
     assert gc.isenabled()
     with pytest.raises(KeyboardInterrupt), _undisturbed():
         assert not gc.isenabled()

@@ -1,5 +1,7 @@
 """The torch stays in the seam; the controller alone, against the simulated groove."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def rms(values):
 
 
 @pytest.mark.parametrize("seam", [straight, curved])
-def test_the_torch_follows_the_true_seam_and_not_the_plan(seam):
+def test_the_torch_follows_the_true_seam_and_not_the_plan(seam: Any) -> None:
     true = seam()
     done = weld(true, planning_error(true, seed=2))
     assert done.controller.phase == "done"
@@ -24,19 +26,19 @@ def test_the_torch_follows_the_true_seam_and_not_the_plan(seam):
     assert abs(done.turn).max() <= LIMIT
 
 
-def test_vision_alone_keeps_the_planning_error():
+def test_vision_alone_keeps_the_planning_error() -> None:
     true = straight()
     plan = misplaced(true, (0.0, 2e-3, 0.0))
     assert rms(weld(true, plan, "vision").deviation()) == pytest.approx(2e-3, rel=0.05)
 
 
-def test_algorithm_2_as_printed_diverges():
+def test_algorithm_2_as_printed_diverges() -> None:
     true = curved()
     done = weld(true, planning_error(true, seed=0), "as_printed", longest=40.0)
     assert rms(done.deviation(-0.03)) > 5e-3
 
 
-def test_a_plan_too_high_and_tilted_is_followed_too():
+def test_a_plan_too_high_and_tilted_is_followed_too() -> None:
     true = straight(0.08)
     plan = misplaced(true, (1e-3, 1e-3, 2e-3), tilt=np.deg2rad(1.0))
     done = weld(true, plan, above=14e-3)
@@ -44,7 +46,7 @@ def test_a_plan_too_high_and_tilted_is_followed_too():
 
 
 @pytest.mark.parametrize("degrees", [90, -90])
-def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees):
+def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees: int) -> None:
     true = curved()
     done = weld(true, planning_error(true, seed=0), angle=np.deg2rad(degrees))
     assert abs(done.turn).max() <= LIMIT
@@ -54,7 +56,7 @@ def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees):
 
 
 @pytest.mark.parametrize("seam", [straight, curved])
-def test_a_gap_in_the_wall_is_bridged(seam):
+def test_a_gap_in_the_wall_is_bridged(seam: Any) -> None:
     true = seam()
     done = weld(true, planning_error(true, seed=0), gaps=(Gap(0.055, 0.075, 1),))
     phases = list(dict.fromkeys(done.phase))
@@ -65,7 +67,7 @@ def test_a_gap_in_the_wall_is_bridged(seam):
     assert abs(done.tip).max() < 5e-3
 
 
-def test_the_end_of_the_seam_makes_no_step():
+def test_the_end_of_the_seam_makes_no_step() -> None:
     true = straight(0.08)
     done = weld(true, planning_error(true, seed=0))
     leaving = done.tip_s > true[-1, 0] - 20e-3
@@ -76,7 +78,7 @@ def test_the_end_of_the_seam_makes_no_step():
 
 
 @pytest.mark.parametrize("start", [0.085, 0.095, 0.1, 0.105])
-def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start):
+def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start: float) -> None:
     true = curved()
     length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
     blind = Following(max_error="3 mm")  # what is not felt, up to 37 mm, is known less
@@ -85,7 +87,7 @@ def test_a_wall_that_is_missing_at_the_end_does_not_lead_astray(start):
     assert abs(done.deviation()).max() < 0.4e-3
 
 
-def test_a_plan_that_starts_away_from_the_groove_is_refused():
+def test_a_plan_that_starts_away_from_the_groove_is_refused() -> None:
     true = straight(0.06)
     done = weld(true, misplaced(true, (0.0, 15e-3, 0.0)))
     assert done.controller.phase == "stopped"
@@ -93,14 +95,14 @@ def test_a_plan_that_starts_away_from_the_groove_is_refused():
     assert done.advance.max() == done.advance[0]
 
 
-def test_a_groove_that_ends_early_stops_the_weld():
+def test_a_groove_that_ends_early_stops_the_weld() -> None:
     true = straight()
     settings = Following(longest_gap="15 mm")
     done = weld(true, true, settings=settings, gaps=(Gap(0.04, 0.08, 1),))
     assert done.controller.reason == "no contact for 15 mm of the seam"
 
 
-def test_a_short_blindness_slows_down_and_a_long_one_stops():
+def test_a_short_blindness_slows_down_and_a_long_one_stops() -> None:
     true = straight(0.06)
     short = weld(true, true, hidden=(8.0, 8.35))
     assert short.controller.phase == "done"
@@ -110,7 +112,7 @@ def test_a_short_blindness_slows_down_and_a_long_one_stops():
     assert long.time[-1] == pytest.approx(8.5, abs=0.1)
 
 
-def test_another_side_of_the_groove_does_as_well():
+def test_another_side_of_the_groove_does_as_well() -> None:
     true = curved(0.08)
     done = weld(true, planning_error(true, seed=1), settings=Following(side="right"))
     assert abs(done.deviation()).max() < 0.4e-3
@@ -118,7 +120,7 @@ def test_another_side_of_the_groove_does_as_well():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seam", [straight, curved])
-def test_a_hundred_planning_errors_without_one_run_away(seam):
+def test_a_hundred_planning_errors_without_one_run_away(seam: Any) -> None:
     true = seam(0.1)
     settings = Following()
     for seed in range(50):

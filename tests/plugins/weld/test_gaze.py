@@ -16,14 +16,14 @@ def blank(height=240, width=320):
     return Image(np.zeros((height, width), np.uint8), FINGER.camera.matrix)
 
 
-def test_the_first_look_is_at_the_whole_image():
+def test_the_first_look_is_at_the_whole_image() -> None:
     whole = blank()
     (piece,) = RegionOfInterest().pieces(whole)
     assert piece.corner == (0, 0)
     assert piece.image is whole
 
 
-def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone():
+def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone() -> None:
     gaze = RegionOfInterest()
     gaze.follow(Piece(blank(), (0, 0)), CORNERS)
     near, whole = gaze.pieces(blank())
@@ -37,7 +37,7 @@ def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone():
     assert len(list(gaze.pieces(blank()))) == 1
 
 
-def test_a_tag_at_the_edge_is_cut_there():
+def test_a_tag_at_the_edge_is_cut_there() -> None:
     gaze = RegionOfInterest()
     gaze.follow(Piece(blank(), (0, 0)), CORNERS - [95.0, 55.0])
     near, _ = gaze.pieces(blank())
@@ -48,7 +48,7 @@ def test_a_tag_at_the_edge_is_cut_there():
     assert near.image.pixels.shape[0] == 240 - near.corner[1]
 
 
-def test_a_piece_keeps_its_place_in_the_camera():
+def test_a_piece_keeps_its_place_in_the_camera() -> None:
     piece = cut(blank(), (30, 20), (130, 100))
     assert piece.image.pixels.shape == (80, 100)
     np.testing.assert_allclose(
@@ -56,7 +56,7 @@ def test_a_piece_keeps_its_place_in_the_camera():
     )
 
 
-def test_what_is_felt_is_the_same_from_the_piece_as_from_the_whole():
+def test_what_is_felt_is_the_same_from_the_piece_as_from_the_whole() -> None:
     eye, reader = Eye(), Reader(FINGER)
     for i, place in enumerate(np.linspace([0, -1e-3, 0], [5e-4, 2e-3, 1e-3], 10)):
         image = eye.image(place)
@@ -65,7 +65,7 @@ def test_what_is_felt_is_the_same_from_the_piece_as_from_the_whole():
         np.testing.assert_allclose(part.feeling.displacement, whole.feeling.displacement, atol=1e-6)
 
 
-def test_a_tag_that_jumped_is_found_in_the_same_image():
+def test_a_tag_that_jumped_is_found_in_the_same_image() -> None:
     eye, reader = Eye(), Reader(FINGER)
     reader.read(SensorFrame(eye.image([0, -1.5e-3, 0]), 0))
     sight = reader.read(SensorFrame(eye.image([0, 2.5e-3, 0]), 1))
@@ -73,7 +73,7 @@ def test_a_tag_that_jumped_is_found_in_the_same_image():
     assert sight.piece.corner == (0, 0)
 
 
-def test_a_piece_is_read_again_as_it_was_read():
+def test_a_piece_is_read_again_as_it_was_read() -> None:
     eye, reader, again = Eye(), Reader(FINGER), Reader(FINGER)
     for i, place in enumerate([*displacements(5, 1e-3), [1.0, 0, 0], [0, 0, 0]]):
         sight = reader.read(SensorFrame(eye.image(place), i))

@@ -1,5 +1,7 @@
 """A weld that was stopped is gone on with: what was felt is kept, the torch overlaps."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -24,14 +26,14 @@ PLAN = WorkPlane(SEAM.points_in_base, SEAM.openings_in_base).points(SEAM.points_
 
 
 @pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Any:
     hidden = {"hidden": ("24 s", "60 s")}
     report, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
     assert report.reason == "no tag was seen for 500 ms"
     return report, logged(journal, tmp_path_factory.mktemp("stopped") / "run.mcap")
 
 
-def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped, tmp_path):
+def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped: Any, tmp_path: Any) -> None:
     before, log = stopped
     report, journal = run(SEAM, seed=4, speed="10 mm/s", resume=log)
     assert report.completed
@@ -44,13 +46,15 @@ def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped, tmp_path):
     assert redone.same
 
 
-def test_a_seam_that_has_moved_meanwhile_is_noticed(stopped):
+def test_a_seam_that_has_moved_meanwhile_is_noticed(stopped: Any) -> None:
     moved = {"position": ("600 mm", "0.6 mm", "250 mm")}
     report, _ = run(SEAM, sensor=moved, seed=4, speed="10 mm/s", resume=stopped[1])
     assert "the seam has moved by 0." in report.reason
 
 
-def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(stopped, tmp_path):
+def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(
+    stopped: Any, tmp_path: Any
+) -> None:
     torn = tmp_path / "run.mcap"
     torn.write_bytes(stopped[1].read_bytes()[:-200_000])
     whole, part = kept_of(stopped[1], PLAN), kept_of(torn, PLAN)
@@ -58,20 +62,20 @@ def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(stopped, tmp_pa
     assert len(part.samples) < len(whole.samples)
 
 
-def test_what_cannot_be_gone_on_with_is_refused(stopped, tmp_path):
+def test_what_cannot_be_gone_on_with_is_refused(stopped: Any, tmp_path: Any) -> None:
     with pytest.raises(StageError, match="was of another plan"):
         kept_of(stopped[1], PLAN + 1e-3)
     with pytest.raises(StageError, match="holds no weld by touch"):
         kept_of(logged([], tmp_path / "empty.mcap"), PLAN)
 
 
-def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path):
+def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any) -> None:
     hidden = {"hidden": ("12 s", "60 s")}
     _, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
     assert kept_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 
 
-def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it():
+def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it() -> None:
     plan = Path(curved(0.15))
     params = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
     params = set_back(params, plan, 0.04, Kept(np.zeros((0, 4)), 0.06))

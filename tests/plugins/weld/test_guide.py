@@ -31,7 +31,9 @@ def calibrated(out, *more):
     return CliRunner().invoke(app, ["tactile", "calibrate", WELD, "--out", str(out), *more])
 
 
-def test_what_the_page_shows_is_what_the_command_prints(tmp_path, monkeypatch):
+def test_what_the_page_shows_is_what_the_command_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     command = f"flangeye tactile calibrate {WELD} --yes --set {HELD}"
     (quoted,) = re.findall(
@@ -42,7 +44,7 @@ def test_what_the_page_shows_is_what_the_command_prints(tmp_path, monkeypatch):
     assert same(quoted, told.output), told.output
 
 
-def test_the_file_it_writes_says_how_the_finger_moves(tmp_path):
+def test_the_file_it_writes_says_how_the_finger_moves(tmp_path: Path) -> None:
     out = tmp_path / "finger.yaml"
     assert calibrated(out, "--yes", "--set", HELD).exit_code == 0
     finger = read_model(out, Finger)
@@ -53,7 +55,7 @@ def test_the_file_it_writes_says_how_the_finger_moves(tmp_path):
     assert finger.calibration.source == "flangeye tactile calibrate, on simulated ur10e"
 
 
-def test_it_waits_for_the_person(tmp_path):
+def test_it_waits_for_the_person(tmp_path: Path) -> None:
     arguments = ["tactile", "calibrate", WELD, "--set", HELD, "--out", str(tmp_path / "f.yaml")]
     told = CliRunner().invoke(app, arguments, input="\n\n")
     assert told.exit_code == 0
@@ -70,19 +72,19 @@ def guided(recipe, tmp_path, moves=False):
     )
 
 
-def test_a_tip_that_slides_calibrates_nothing(tmp_path):
+def test_a_tip_that_slides_calibrates_nothing(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="did the tip slide in its mark"):
         guided(loaded(), tmp_path)
     assert not (tmp_path / "finger.yaml").exists()
 
 
-def test_a_tag_out_of_view_calibrates_nothing(tmp_path):
+def test_a_tag_out_of_view_calibrates_nothing(tmp_path: Path) -> None:
     hidden = "steps.7.sensor.simulated_finger.hidden=[0 s, 999 s]"
     with pytest.raises(StageError, match="the tag was seen 0 times at rest and 0 times held"):
         guided(loaded(HELD, hidden), tmp_path)
 
 
-def test_a_recipe_without_a_weld(tmp_path):
+def test_a_recipe_without_a_weld(tmp_path: Path) -> None:
     recipe = load_recipe(find_recipe("ur10e_phoxi-m_simulated"), load_registry(), ())
     with pytest.raises(StageError) as error:
         guided(recipe, tmp_path)
@@ -104,7 +106,7 @@ class FeelingArm(SimulatedRobot):
         return replace(state, force=np.concatenate([push, np.zeros(3)]))
 
 
-def test_an_arm_that_feels_finds_the_stiffness(tmp_path):
+def test_an_arm_that_feels_finds_the_stiffness(tmp_path: Path) -> None:
     recipe = loaded(HELD)
     recipe.context[RobotDriver] = RobotDriver("robot.simulated", FeelingArm, simulated=True)
     assert "stiffness  0.80 N/mm across, 1.50 N/mm along\n" in guided(recipe, tmp_path)
@@ -112,7 +114,7 @@ def test_an_arm_that_feels_finds_the_stiffness(tmp_path):
     assert (found.lateral, found.axial) == pytest.approx((800.0, 1500.0), rel=1e-3)
 
 
-def test_a_real_arm_does_not_move_unasked(tmp_path):
+def test_a_real_arm_does_not_move_unasked(tmp_path: Path) -> None:
     def never():
         raise AssertionError("opened")
 

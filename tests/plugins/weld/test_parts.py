@@ -33,7 +33,7 @@ def circle(turns=0.5):
 
 
 @given(st.floats(0.0, np.pi * RADIUS))
-def test_a_path_knows_points_tangents_and_normals(s):
+def test_a_path_knows_points_tangents_and_normals(s: float) -> None:
     place, angle = PATH.at(s), s / RADIUS
     np.testing.assert_allclose(
         place.point, RADIUS * np.array([np.sin(angle), 1 - np.cos(angle)]), atol=2e-6
@@ -48,13 +48,13 @@ def test_a_path_knows_points_tangents_and_normals(s):
 PATH = Path(circle())
 
 
-def test_a_path_goes_on_straight_beyond_its_ends():
+def test_a_path_goes_on_straight_beyond_its_ends() -> None:
     end = PATH.at(PATH.length)
     np.testing.assert_allclose(PATH.at(PATH.length + 0.04).point, end.point + 0.04 * end.tangent)
     assert PATH.climb(-0.01) == 0.0
 
 
-def test_progress_neither_goes_back_nor_jumps_to_another_branch():
+def test_progress_neither_goes_back_nor_jumps_to_another_branch() -> None:
     eight = Path(
         np.column_stack([np.sin(t := np.linspace(0, 2 * np.pi, 800)), np.sin(2 * t) / 2, 0 * t])
         * 0.1
@@ -69,7 +69,7 @@ def test_progress_neither_goes_back_nor_jumps_to_another_branch():
     assert eight.advance(eight.at(0.0).point, s, 5e-3) >= s
 
 
-def test_the_curvature_of_a_path_is_a_circle_s_and_not_its_scatter_s():
+def test_the_curvature_of_a_path_is_a_circle_s_and_not_its_scatter_s() -> None:
     angle = np.linspace(0.0, np.pi / 2, 300)
     circle = 0.05 * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
     path = Path(circle)
@@ -82,7 +82,7 @@ def test_the_curvature_of_a_path_is_a_circle_s_and_not_its_scatter_s():
 # --- the refined path -----------------------------------------------------------------------------
 
 
-def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was():
+def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was() -> None:
     true, plan = Path(curved()), Path(misplaced(curved(), (1e-3, 2e-3, 0.0), np.deg2rad(1.0)))
     refined = RefinedPath(plan, 0.05)
     for i, s in enumerate(
@@ -105,7 +105,7 @@ def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was():
         assert normal @ true.at(foot).normal > np.cos(np.deg2rad(0.5))
 
 
-def test_what_is_not_confirmed_is_not_believed():
+def test_what_is_not_confirmed_is_not_believed() -> None:
     refined = RefinedPath(Path(straight()), 0.05)
     refined.add(1.0, 0.01, 1e-3, 0.0)
     assert refined.empty
@@ -117,7 +117,7 @@ def test_what_is_not_confirmed_is_not_believed():
     assert refined.offset(0.01) == 0.0
 
 
-def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one():
+def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one() -> None:
     refined = RefinedPath(Path(straight(5.0)), 0.05)
     for s in np.arange(0.0, 4.0, 4e-4):
         refined.add(0.0, float(s), 1e-3, 0.0)
@@ -138,7 +138,7 @@ def fed(contact, values, start=0.0, wanted=2e-3):
     return states
 
 
-def test_contact_filters_by_its_time_constant():
+def test_contact_filters_by_its_time_constant() -> None:
     contact = Contact()
     contact.update(1.0, 1e-3, 2e-3)
     assert contact.deflection == 1e-3
@@ -150,7 +150,7 @@ def test_contact_filters_by_its_time_constant():
         assert contact.deflection == pytest.approx(3e-3 + left * (before - 3e-3), rel=1e-12)
 
 
-def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels():
+def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels() -> None:
     contact = Contact()
     times = iter(np.arange(0.0, 60.0, 0.01))
 
@@ -175,7 +175,7 @@ def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels():
     assert contact.doubted(3e-3, 2e-3)
 
 
-def test_contact_has_hysteresis_in_size_and_in_time():
+def test_contact_has_hysteresis_in_size_and_in_time() -> None:
     contact = Contact()
     assert fed(contact, [1e-3] * 20)[-1] == "seeking"
     assert fed(contact, [2e-3] * 20, 1.0)[-1] == "held"
@@ -191,7 +191,7 @@ def test_contact_has_hysteresis_in_size_and_in_time():
 # --- where the tool was ---------------------------------------------------------------------------
 
 
-def test_an_image_meets_the_pose_of_its_own_time():
+def test_an_image_meets_the_pose_of_its_own_time() -> None:
     track = Track()
     for i in range(200):
         track.add(ToolPose(i * 0.01, np.array([i * 1e-3, 0.0, 0.0]), i * 0.1))
@@ -202,7 +202,7 @@ def test_an_image_meets_the_pose_of_its_own_time():
 
 
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.3, 0.3))
-def test_the_flange_moves_as_the_tip_is_told(angle, yaw, turn):
+def test_the_flange_moves_as_the_tip_is_told(angle: float, yaw: float, turn: float) -> None:
     base_T_plane = rigid(rotation_exp(np.array([0.1, -0.2, yaw])), np.array([0.5, 0.1, 0.2]))
     points = np.array([[0.0, 0, 0], [0.1, 0, 0]]) @ base_T_plane[:3, :3].T + base_T_plane[:3, 3]
     plane = WorkPlane(points, np.tile(base_T_plane[:3, 2], (2, 1)))
@@ -224,7 +224,7 @@ def test_the_flange_moves_as_the_tip_is_told(angle, yaw, turn):
     assert (after.angle - before.angle) / step == pytest.approx(turn, abs=1e-5)
 
 
-def test_turning_is_about_the_normal():
+def test_turning_is_about_the_normal() -> None:
     np.testing.assert_allclose(turned(np.array([1.0, 0.0, 2.0]), np.pi / 2), [0, 1, 2], atol=1e-12)
 
 
@@ -240,7 +240,9 @@ def energy(tip, position, rest):
 
 
 @given(st.floats(-3e-3, 3e-3), st.floats(-3e-3, 4e-3))
-def test_the_tip_takes_the_place_of_least_energy_between_the_walls(across, up):
+def test_the_tip_takes_the_place_of_least_energy_between_the_walls(
+    across: float, up: float
+) -> None:
     tip = Tip(friction=0.0)
     contact = Tip3D(Groove(Path(straight()), SECTION), tip)
     rest = np.array([0.06, across, SEAT + up])
@@ -253,7 +255,7 @@ def test_the_tip_takes_the_place_of_least_energy_between_the_walls(across, up):
     assert energy(tip, found, rest) <= least + 1e-9
 
 
-def test_the_tip_lags_by_friction_and_no_more():
+def test_the_tip_lags_by_friction_and_no_more() -> None:
     tip = Tip(friction=0.1)
     contact = Tip3D(Groove(Path(straight()), SECTION), tip)
     for x in np.arange(0.02, 0.03, 1e-4):
@@ -262,21 +264,21 @@ def test_the_tip_lags_by_friction_and_no_more():
     assert x - found[0] == pytest.approx(0.1 * normal / tip.lateral, rel=1e-6)
 
 
-def test_outside_the_workpiece_and_on_its_face_the_tip_is_free():
+def test_outside_the_workpiece_and_on_its_face_the_tip_is_free() -> None:
     contact = Tip3D(Groove(Path(straight()), SECTION), Tip())
     np.testing.assert_array_equal(contact.settle(np.array([-0.01, 0, 0.0])), [-0.01, 0, 0])
     on_top = contact.settle(np.array([0.05, 8e-3, 5e-3]))
     np.testing.assert_allclose(on_top[1:], [8e-3, 8e-3 + 1.5e-3], atol=1e-9)
 
 
-def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam():
+def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam() -> None:
     line = np.array([[0.0, 0, 0], [0.1, 0, 0]])
     points = np.array([[-0.01, 0, 0], [0.05, 2e-3, 7e-3], [0.2, 0, 0]])
     found = torch_deviation(points, line, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(found, [2e-3])
 
 
-def test_where_the_field_is_held_by_samples_an_error_of_the_plan_s_motion_does_no_harm():
+def test_where_the_field_is_held_by_samples_an_error_of_the_plan_s_motion_does_no_harm() -> None:
     plan = Path(straight(0.12))
     refined = RefinedPath(plan, 0.05)
     refined.noise = 10e-6

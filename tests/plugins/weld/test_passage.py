@@ -37,7 +37,7 @@ def task_of(name, **params):
 
 @pytest.mark.parametrize("name", ["ur10e", "ur5e", "franka-panda", "aubo-i5"])
 @pytest.mark.parametrize("angle", ["0 deg", "-90 deg"])
-def test_every_chain_of_postures_is_one_smooth_way(name, angle):
+def test_every_chain_of_postures_is_one_smooth_way(name: str, angle: str) -> None:
     task = task_of(name, start_angle=angle)
     arm, chains = Arm(task.model), SeamReach(task)._chains
     assert chains
@@ -55,7 +55,7 @@ def test_every_chain_of_postures_is_one_smooth_way(name, angle):
     assert np.linalg.norm(tip[:3] - beyond.apply(np.array(FINGER.tip))) < 15e-3
 
 
-def test_the_way_to_the_start_begins_where_the_arm_stands_by_whole_turns():
+def test_the_way_to_the_start_begins_where_the_arm_stands_by_whole_turns() -> None:
     task = task_of("ur10e")
     passage = SeamReach(task)
     above = passage._chains[0][0]

@@ -1,5 +1,7 @@
 """weld.tactile in real time: velocities through the real client to a controller on loopback."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -29,7 +31,7 @@ PATIENT = {"blind": "5 s", "stale": "1 s"}
 # Slow: 40 s where tests share two cores; a cycle's median is 1.0 ms of processor time there.
 @pytest.mark.slow
 @pytest.mark.realtime
-def test_the_torch_stays_in_the_seam_in_real_time(tmp_path):
+def test_the_torch_stays_in_the_seam_in_real_time(tmp_path: Path) -> None:
     seam = planned("v-straight", shift=(1e-3, -1.5e-3, 0.0), turn=np.deg2rad(1.0), end=0.05)
     sensor = BoundPart(sensor_simulated_finger, SimulatedFingerParams(rate=15.0))
     params = WeldTactileParams(sensor=sensor, speed="10 mm/s", **PATIENT)

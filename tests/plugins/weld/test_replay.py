@@ -1,7 +1,9 @@
 """A weld's log: decided again, and seen again."""
 
 import copy
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 
 
 @pytest.fixture(scope="module")
-def journal():
+def journal() -> Any:
     return run(planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=0.04), seed=3)[1]
 
 
@@ -35,7 +37,7 @@ def logged(journal, path):
     return path
 
 
-def test_the_same_commands_come_from_what_was_logged(journal, tmp_path):
+def test_the_same_commands_come_from_what_was_logged(journal: Any, tmp_path: Path) -> None:
     ((step, redone),) = replay_steps(logged(journal, tmp_path / "run.mcap"), load_registry())
     assert step == STEP
     assert redone.same
@@ -45,7 +47,7 @@ def test_the_same_commands_come_from_what_was_logged(journal, tmp_path):
     assert redone.what == f"{cycles} cycles from {images} images"
 
 
-def test_another_command_is_noticed(journal, tmp_path):
+def test_another_command_is_noticed(journal: Any, tmp_path: Path) -> None:
     changed = copy.deepcopy(journal)
     block = next(value for name, value in reversed(changed) if name == "cycles")
     block["turn"][0] += 1e-4
@@ -54,7 +56,7 @@ def test_another_command_is_noticed(journal, tmp_path):
     assert redone.figures["largest difference of a command [m/s, rad/s]"] == pytest.approx(1e-4)
 
 
-def test_another_image_is_noticed(journal, tmp_path):
+def test_another_image_is_noticed(journal: Any, tmp_path: Path) -> None:
     images = [i for i, (name, _) in enumerate(journal) if name == "image"]
     changed = list(journal)
     changed[images[-1]], changed[images[12]] = changed[images[12]], changed[images[-1]]
@@ -62,20 +64,20 @@ def test_another_image_is_noticed(journal, tmp_path):
     assert not redone.same
 
 
-def test_a_log_that_was_torn_is_decided_as_far_as_it_goes(journal, tmp_path):
+def test_a_log_that_was_torn_is_decided_as_far_as_it_goes(journal: Any, tmp_path: Path) -> None:
     path = logged(journal, tmp_path / "run.mcap")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     ((_, redone),) = replay_steps(path, load_registry())
     assert redone.same
 
 
-def test_a_log_without_images_says_so(journal, tmp_path):
+def test_a_log_without_images_says_so(journal: Any, tmp_path: Path) -> None:
     without = [(name, value) for name, value in journal if name != "image"]
     with pytest.raises(StageError, match="holds no images: it ran with log_images: false"):
         list(replay_steps(logged(without, tmp_path / "run.mcap"), load_registry()))
 
 
-def test_a_log_without_a_weld(tmp_path):
+def test_a_log_without_a_weld(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
     recorder.flangeye_noted(step="0.acquire.live", name="where", value={"x": 1.0})
     recorder.close()
@@ -83,7 +85,7 @@ def test_a_log_without_a_weld(tmp_path):
         list(replay_steps(tmp_path / "run.mcap", load_registry()))
 
 
-def test_the_images_of_a_log_are_a_sensor(journal, tmp_path):
+def test_the_images_of_a_log_are_a_sensor(journal: Any, tmp_path: Path) -> None:
     path = logged(journal, tmp_path / "run.mcap")
     times = [note.value["time_ns"] for note in read_notes(path) if note.name == "sight"]
     clock = SimpleNamespace(now=10**12)

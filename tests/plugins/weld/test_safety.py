@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,14 +59,14 @@ def refused(**more):
     return str(error.value)
 
 
-def test_joint_limits_hold_along_the_whole_seam():
+def test_joint_limits_hold_along_the_whole_seam() -> None:
     ranges = [["-360 deg", "360 deg"]] * 5 + [["-30 deg", "-20 deg"]]
     told = refused(limits={"joints": ranges})
     assert "along the seam" in told or "above the seam's start" in told
     assert told.endswith("its limits are -30 and -20 deg")
 
 
-def test_an_arm_too_slow_for_the_turning_tool_is_refused():
+def test_an_arm_too_slow_for_the_turning_tool_is_refused() -> None:
     told = refused(limits={"joint_speed": "10 deg/s"})
     assert told == (
         "weld.tactile: above the seam's start, a joint may have to turn at 21 deg/s, "
@@ -73,7 +74,7 @@ def test_an_arm_too_slow_for_the_turning_tool_is_refused():
     )
 
 
-def test_a_way_that_would_drag_the_finger_through_the_work_is_refused():
+def test_a_way_that_would_drag_the_finger_through_the_work_is_refused() -> None:
     low = ("180 deg", "-70 deg", "120 deg", "-140 deg", "-90 deg", "0 deg")
     arm = Arm(joints=low)
     told = refused(driver=driver_of(arm))
@@ -84,14 +85,14 @@ def test_a_way_that_would_drag_the_finger_through_the_work_is_refused():
     assert arm.cycles <= 1
 
 
-def test_an_arm_that_a_person_moves_cannot_weld():
+def test_an_arm_that_a_person_moves_cannot_weld() -> None:
     arm = Arm()
     vars(arm)["by_hand"] = True
     with pytest.raises(DeviceError, match="is moved by hand; a weld needs an arm that drives"):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm))
 
 
-def test_a_tool_that_nobody_knows_of_is_noticed():
+def test_a_tool_that_nobody_knows_of_is_noticed() -> None:
     def longer(state):
         matrix = state.base_T_flange.matrix.copy()
         matrix[2, 3] -= 0.1
@@ -124,7 +125,7 @@ DOUBTS = [
 
 
 @pytest.mark.parametrize(("change", "told"), DOUBTS)
-def test_a_doubt_stops_the_arm_on_its_way_to_the_seam(change, told):
+def test_a_doubt_stops_the_arm_on_its_way_to_the_seam(change: Any, told: str) -> None:
     arm = Arm(change, after=1.5)
     with pytest.raises(DeviceError) as error:
         run(planned("v-straight", end=SHORT), driver=driver_of(arm))
@@ -133,7 +134,7 @@ def test_a_doubt_stops_the_arm_on_its_way_to_the_seam(change, told):
 
 
 @pytest.mark.parametrize(("change", "told"), DOUBTS)
-def test_a_doubt_stops_the_weld_and_the_log_is_kept(change, told):
+def test_a_doubt_stops_the_weld_and_the_log_is_kept(change: Any, told: str) -> None:
     arm = Arm(change, after=15.0)
     report, journal = run(planned("v-straight", end=SHORT), driver=driver_of(arm))
     assert report.reason.startswith(f"simulated ur10e: {told}")
@@ -143,7 +144,7 @@ def test_a_doubt_stops_the_weld_and_the_log_is_kept(change, told):
     assert times[-1] == pytest.approx(15.0, abs=0.05)
 
 
-def test_ctrl_c_stops_the_arm_and_the_log_is_kept():
+def test_ctrl_c_stops_the_arm_and_the_log_is_kept() -> None:
     def interrupted(state):
         raise KeyboardInterrupt
 
@@ -154,7 +155,7 @@ def test_ctrl_c_stops_the_arm_and_the_log_is_kept():
     assert any(name == "cycles" for name, _ in journal)
 
 
-def test_a_tip_that_strays_from_the_plan_is_stopped():
+def test_a_tip_that_strays_from_the_plan_is_stopped() -> None:
     report, _ = run(planned("v-straight", shift=(0.0, 3e-3, 0.0), end=SHORT), astray="2.5 mm")
     assert report.reason == "the tip is 3 mm away from the plan, allowed are 2 mm"
 
@@ -168,7 +169,7 @@ def check(displacement, lateral=0.0):
     bounds.check(ToolPose(0.0, np.array([0.05, lateral, 0.0]), 0.0), 0.05, [felt])
 
 
-def test_what_a_weld_needs_is_within_the_bounds():
+def test_what_a_weld_needs_is_within_the_bounds() -> None:
     check([0.0, 2e-3, 1.5e-3], 15e-3)
 
 
@@ -180,13 +181,13 @@ def test_what_a_weld_needs_is_within_the_bounds():
         ([0, 6.1e-3, 0], 0.0, "the tip is displaced by 6.1 mm, finger srm stands 6 mm"),
     ],
 )
-def test_beyond_the_bounds(displacement, lateral, told):
+def test_beyond_the_bounds(displacement: list[Any], lateral: float, told: str) -> None:
     with pytest.raises(DeviceError) as error:
         check(displacement, lateral)
     assert str(error.value) == told
 
 
-def test_the_space_bar_stops_the_arm():
+def test_the_space_bar_stops_the_arm() -> None:
     robot, (ours, theirs) = StandIn(), os.pipe()
     drive = Executor(robot, LatestState(robot.state()), STAND_IN, LIMITS, ours)
     drive.lead()
@@ -199,7 +200,7 @@ def test_the_space_bar_stops_the_arm():
     assert "stop" in robot.commands()
 
 
-def test_an_arm_that_moves_unasked_is_stopped():
+def test_an_arm_that_moves_unasked_is_stopped() -> None:
     robot = StandIn()
     drive = Executor(robot, LatestState(robot.state()), STAND_IN, LIMITS)
     for _ in range(5):

@@ -18,7 +18,7 @@ def deviation(report, name, start=0.0):
     return torch_deviation(report.torch, line[int(start * 1e3) :], report.opening)
 
 
-def test_the_torch_stays_in_the_seam():
+def test_the_torch_stays_in_the_seam() -> None:
     report, journal = run(planning_error("v-straight", seed=4, end=SHORT), seed=4)
     assert report.completed
     errors = deviation(report, "v-straight")
@@ -29,7 +29,7 @@ def test_the_torch_stays_in_the_seam():
     assert report.loop["computing_p99"] < 0.02  # of a loaded machine; measured by tests/benchmarks
 
 
-def test_equal_runs_are_equal():
+def test_equal_runs_are_equal() -> None:
     first, _ = run(planned("v-straight", end=SHORT), seed=1)
     second, _ = run(planned("v-straight", end=SHORT), seed=1)
     np.testing.assert_array_equal(first.torch, second.torch)
@@ -37,7 +37,7 @@ def test_equal_runs_are_equal():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["v-straight", "v-curved"])
-def test_both_workpieces_with_the_planning_error_of_the_issue(name):
+def test_both_workpieces_with_the_planning_error_of_the_issue(name: str) -> None:
     seam = planning_error(name, seed=0)
     report, _ = run(seam, name, sensor={"rate": 30.0})
     errors = deviation(report, name)
@@ -49,7 +49,7 @@ def test_both_workpieces_with_the_planning_error_of_the_issue(name):
 
 
 @pytest.mark.slow
-def test_a_gap_is_bridged_with_real_images():
+def test_a_gap_is_bridged_with_real_images() -> None:
     gap = {"gaps": ({"start": "80 mm", "length": "20 mm"},)}
     report, _ = run(planning_error("v-curved", seed=0), "v-curved", sensor=gap)
     assert "bridging" in report.phases
@@ -69,33 +69,33 @@ def refused(seam=None, name="v-straight", **more):
     return str(error.value)
 
 
-def test_a_deflection_the_finger_does_not_stand():
+def test_a_deflection_the_finger_does_not_stand() -> None:
     assert refused(deflection="7 mm") == (
         "weld.tactile: a deflection of 7 mm is more than finger srm stands, 6 mm"
     )
 
 
-def test_a_force_beyond_the_limit():
+def test_a_force_beyond_the_limit() -> None:
     assert refused(force="2 N") == (
         "weld.tactile: deflection and preload press with 3.6 N, allowed are 2 N; lower them, or "
         "raise 'force'"
     )
 
 
-def test_speeds_beyond_the_limits():
+def test_speeds_beyond_the_limits() -> None:
     assert refused(limits={"speed": "6 mm/s"}) == (
         "weld.tactile: speed, lateral_speed and turn_rate together move the flange at 8.66 mm/s, "
         "robot.limits.speed allows 6 mm/s"
     )
 
 
-def test_a_seam_that_is_too_short():
+def test_a_seam_that_is_too_short() -> None:
     assert refused(planned("v-straight", end=0.015)) == (
         "weld.tactile: the seam is 14 mm long; inset, ending and release alone take 26 mm"
     )
 
 
-def test_a_seam_outside_the_workspace():
+def test_a_seam_outside_the_workspace() -> None:
     small = {"centre": ["600 mm", "0 mm", "400 mm"], "size": ["220 mm", "600 mm", "600 mm"]}
     assert refused(planned("v-straight"), box=small) == (
         "weld.tactile: 220 mm along the seam (the tip goes on beyond its end), the flange is "
@@ -103,7 +103,7 @@ def test_a_seam_outside_the_workspace():
     )
 
 
-def test_a_seam_out_of_reach():
+def test_a_seam_out_of_reach() -> None:
     far = planned("v-straight", shift=(0.9, 0.0, 0.0), end=SHORT)
     everywhere = {"centre": ["0 mm", "0 mm", "0 mm"], "size": ["9 m", "9 m", "9 m"]}
     assert "the ur10e cannot reach the seam" in refused(far, box=everywhere)
@@ -117,7 +117,7 @@ def arc(radius, turn=np.pi):
     return Seam(points, up, np.tile(np.eye(3) * 1e-8, (len(points), 1, 1)))
 
 
-def test_a_seam_too_curved_for_the_tool():
+def test_a_seam_too_curved_for_the_tool() -> None:
     told = refused(arc(0.0215, 2 * np.pi))
     assert told.startswith(
         "weld.tactile: the seam is too curved for a torch 40 mm behind the tip: the tool would "
@@ -126,7 +126,7 @@ def test_a_seam_too_curved_for_the_tool():
     assert told.endswith(" deg to it, allowed are 60")
 
 
-def test_a_seam_that_leaves_its_plane():
+def test_a_seam_that_leaves_its_plane() -> None:
     seam = planned("v-straight", end=SHORT)
     steep = np.array(seam.points_in_base)
     steep[:, 2] += np.linspace(0, 0.02, len(steep))
@@ -136,25 +136,25 @@ def test_a_seam_that_leaves_its_plane():
     )
 
 
-def test_a_plan_too_uncertain_to_search():
+def test_a_plan_too_uncertain_to_search() -> None:
     told = refused(planned("v-straight", end=SHORT, uncertainty=5e-3))
     assert told.startswith("weld.tactile: the plan's start is uncertain by 12.2 mm")
 
 
-def test_no_tag_in_view():
+def test_no_tag_in_view() -> None:
     assert refused(sensor={"hidden": ("0 s", "100 s")}) == (
         "weld.tactile: no tag is in view; is the finger's light on, the lens clean, and is the tag "
         "the one its file names?"
     )
 
 
-def test_a_camera_that_gives_nothing():
+def test_a_camera_that_gives_nothing() -> None:
     assert refused(sensor={"latency": "60 s"}).startswith(
         "weld.tactile: the camera gives no images;"
     )
 
 
-def test_a_real_arm_does_not_move_unasked():
+def test_a_real_arm_does_not_move_unasked() -> None:
     def never():
         raise AssertionError("opened")
 
@@ -165,7 +165,7 @@ def test_a_real_arm_does_not_move_unasked():
     )
 
 
-def test_algorithm_2_as_printed_does_not_run_on_a_real_arm():
+def test_algorithm_2_as_printed_does_not_run_on_a_real_arm() -> None:
     def never():
         raise AssertionError("opened")
 
@@ -174,7 +174,7 @@ def test_algorithm_2_as_printed_does_not_run_on_a_real_arm():
         run(planned("v-straight", end=SHORT), driver=real, mode="as_printed")
 
 
-def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed():
+def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() -> None:
     world = {"tool": {"torch": ["0 mm", "0.6 mm"]}}
     report, _ = run(planned("v-straight", end=SHORT), sensor={"world": world})
     assert report.completed
@@ -196,19 +196,19 @@ def stopped(seam=None, **more):
     return report.reason
 
 
-def test_a_tag_that_is_lost_for_too_long():
+def test_a_tag_that_is_lost_for_too_long() -> None:
     assert stopped(sensor={"hidden": ("10 s", "60 s")}) == "no tag was seen for 500 ms"
 
 
-def test_a_camera_that_stops():
+def test_a_camera_that_stops() -> None:
     assert stopped(sensor={"fails": "10 s"}) == "simulated finger srm: the camera is lost"
 
 
-def test_a_camera_that_is_lost_before_the_start():
+def test_a_camera_that_is_lost_before_the_start() -> None:
     with pytest.raises(DeviceError, match="the camera is lost"):
         run(planned("v-straight", end=SHORT), sensor={"fails": "0 s"})
 
 
-def test_a_plan_that_starts_away_from_the_groove():
+def test_a_plan_that_starts_away_from_the_groove() -> None:
     away = planned("v-straight", shift=(-7e-3, 19e-3, 0.0), end=SHORT)
     assert stopped(away) == "no groove within 8 mm of the plan's start"

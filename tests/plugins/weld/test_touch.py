@@ -1,6 +1,8 @@
 """The tag in the image, and what it says of the tip."""
 
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +49,7 @@ def displacements(count, size, seed=1):
     return np.random.default_rng(seed).uniform(-size, size, (count, 3))
 
 
-def test_the_noise_of_the_tip_in_the_plane_is_below_20_um():
+def test_the_noise_of_the_tip_in_the_plane_is_below_20_um() -> None:
     eye, interpreter = Eye(), Interpreter(FINGER)
     felt = [interpreter.feel(r, 0) for _ in range(60) if (r := eye.reading([2e-3, 0, 1e-3]))]
     assert len(felt) > 50
@@ -59,7 +61,7 @@ def test_the_noise_of_the_tip_in_the_plane_is_below_20_um():
     assert predicted[:2].max() < 40e-6
 
 
-def test_the_displacement_is_that_of_the_tip():
+def test_the_displacement_is_that_of_the_tip() -> None:
     eye, interpreter = Eye(), Interpreter(FINGER)
     for wanted in displacements(20, 2e-3):
         felt = interpreter.feel(eye.reading(wanted), 0)
@@ -70,7 +72,7 @@ def test_the_displacement_is_that_of_the_tip():
         assert felt.confidence > 0.7
 
 
-def test_in_the_base_all_turns_with_the_tool():
+def test_in_the_base_all_turns_with_the_tool() -> None:
     felt = Interpreter(FINGER).feel(Eye().reading([1e-3, 0, 0]), 0)
     quarter = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
     in_base = felt.turned_by(quarter)
@@ -78,14 +80,14 @@ def test_in_the_base_all_turns_with_the_tool():
     np.testing.assert_allclose(in_base.covariance[1, 1], felt.covariance[0, 0])
 
 
-def test_another_tag_or_none_is_no_reading():
+def test_another_tag_or_none_is_no_reading() -> None:
     eye = Eye()
     assert eye.reading([1.0, 0.0, 0.0]) is None
     other = FINGER.model_copy(update={"tag": FINGER.tag.model_copy(update={"id": 8})})
     assert TagDetector(other).find(eye.image([0, 0, 0])) is None
 
 
-def test_a_colour_image_reads_like_a_grey_one():
+def test_a_colour_image_reads_like_a_grey_one() -> None:
     grey = Eye().image([0, 0, 0])
     colour = Image(np.repeat(grey.pixels[..., None], 3, axis=2), grey.camera_matrix)
     same = TagDetector(FINGER).find(colour)
@@ -99,7 +101,7 @@ def test_a_colour_image_reads_like_a_grey_one():
         ({"id": 50, "side": "12 mm"}, "DICT_4X4_50 has 50 tags, there is no tag 50"),
     ],
 )
-def test_a_tag_that_does_not_exist(tag, told):
+def test_a_tag_that_does_not_exist(tag: dict[str, Any], told: str) -> None:
     data = FINGER.model_dump(mode="json", exclude={"tag", "calibration"}) | {"tag": tag}
     with pytest.raises(StageError) as error:
         TagDetector(Finger.model_validate(data))
@@ -126,7 +128,7 @@ def readings(eye, force=None):
     return rest, held
 
 
-def test_the_calibration_finds_rest_gain_noise_and_stiffness():
+def test_the_calibration_finds_rest_gain_noise_and_stiffness() -> None:
     rest, held = readings(Eye(), np.array([1000.0, 1000.0, 2000.0]))
     found = calibrate(rest, held, "a test")
     np.testing.assert_allclose(found.rest[:2], COMPLIANCE.rest[:2], atol=20e-6)
@@ -136,13 +138,13 @@ def test_the_calibration_finds_rest_gain_noise_and_stiffness():
     assert (found.lateral, found.axial) == pytest.approx((1000.0, 2000.0))
 
 
-def test_without_force_no_stiffness():
+def test_without_force_no_stiffness() -> None:
     rest, held = readings(Eye())
     found = calibrate(rest, held, "a test")
     assert found.lateral is None and found.axial is None
 
 
-def test_what_no_calibration_can_be_made_of():
+def test_what_no_calibration_can_be_made_of() -> None:
     rest, held = readings(Eye())
     with pytest.raises(StageError, match="the tag was seen 3 times at rest and 36 times held"):
         calibrate(rest[:3], held, "")
@@ -157,7 +159,7 @@ def test_what_no_calibration_can_be_made_of():
         calibrate(rest, slid, "")
 
 
-def test_a_finger_that_was_never_calibrated():
+def test_a_finger_that_was_never_calibrated() -> None:
     with pytest.raises(StageError) as error:
         Interpreter(FINGER.model_copy(update={"calibration": None}))
     assert str(error.value) == (
@@ -177,7 +179,7 @@ class Clock:
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path: Path) -> Any:
     import cv2
 
     eye = Eye()
@@ -186,7 +188,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_folder_of_images_comes_in_its_own_time(folder):
+def test_a_folder_of_images_comes_in_its_own_time(folder: Any) -> None:
     clock = Clock()
     with sensor_image_folder.function(FINGER, clock, 0, ImageFolderParams(path=folder)) as sensor:
         first = sensor.frame()
@@ -200,14 +202,14 @@ def test_a_folder_of_images_comes_in_its_own_time(folder):
             sensor.frame()
 
 
-def test_folders_without_images(tmp_path):
+def test_folders_without_images(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="holds no image; known: .png"):
         sensor_image_folder.function(FINGER, Clock(), 0, ImageFolderParams(path=tmp_path))
     with pytest.raises(StageError, match="is no folder"):
         sensor_image_folder.function(FINGER, Clock(), 0, ImageFolderParams(path=tmp_path / "x"))
 
 
-def test_images_of_another_size(folder):
+def test_images_of_another_size(folder: Any) -> None:
     lens = FINGER.camera.model_copy(update={"width": 640})
     other = FINGER.model_copy(update={"camera": lens})
     with pytest.raises(
@@ -216,7 +218,7 @@ def test_images_of_another_size(folder):
         sensor_image_folder.function(other, Clock(), 0, ImageFolderParams(path=folder)).frame()
 
 
-def test_opencv_opens_what_it_can(folder):
+def test_opencv_opens_what_it_can(folder: Any) -> None:
     # No recipe may name a file here; OpenCV reads one as it reads a camera.
     params = OpenCVParams.model_construct(device=str(folder / "%03d.png"), latency=0.015)
     with sensor_opencv.function(FINGER, Clock(), 0, params) as sensor:
@@ -227,12 +229,12 @@ def test_opencv_opens_what_it_can(folder):
         assert TagDetector(FINGER).find(frame.image) is not None
 
 
-def test_a_camera_that_is_not_there():
+def test_a_camera_that_is_not_there() -> None:
     with pytest.raises(DeviceError, match="OpenCV cannot open it; is it there, and free"):
         sensor_opencv.function(FINGER, Clock(), 0, OpenCVParams(device="/dev/video99"))
 
 
-def test_a_log_without_images(tmp_path):
+def test_a_log_without_images(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"")
     with pytest.raises(StageError, match="holds no images of a finger"):
