@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 
-import click
 import typer
+import typer.core
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from typer.main import get_command
@@ -33,7 +33,7 @@ def pages() -> dict[str, str]:
 
 def _commands() -> str:
     group = get_command(app)
-    assert isinstance(group, click.Group)
+    assert isinstance(group, typer.core.TyperGroup)
     lines = ["# Commands", "", "`flangeye COMMAND --help` says the same.", ""]
     for name, command in sorted(group.commands.items()):
         if command.hidden:
