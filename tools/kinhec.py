@@ -10,11 +10,11 @@ the motion track turn about one axis exactly: no solver can know the translation
 the references leave there is what they guess.
 """
 
-import sys
 from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from flangeye import FlangeyeError
 from flangeye.models.configuration import Configuration
@@ -65,7 +65,8 @@ def references(sequence):
     return {row["solver"]: row["X_trans_err_mm"] for row in rows}
 
 
-def main(data):
+def main(data: Path) -> None:
+    """Solve every sequence of DATA and write the page."""
     from kinhec import load_manifest, load_sequence
 
     manifest, tracks, lines, refusals = load_manifest(data), defaultdict(list), [], []
@@ -103,4 +104,4 @@ def page(tracks, lines, refusals):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    typer.run(main)

@@ -1,13 +1,14 @@
-"""Thousands of sessions in one process: python -m tools.soak [SESSIONS] [CAPTURES].
+"""Thousands of sessions in one process: python -m tools.soak.
 
 Memory and open files are looked at in the second half: they must not grow by more than 5 %.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
+
+import typer
 
 from flangeye.log.read import read_run
 from flangeye.recipe.load import load_recipe
@@ -18,11 +19,8 @@ from tests.conftest import TOY_RECIPE, toy_plugins
 ALLOWED = 0.05
 
 
-def main() -> None:
+def main(sessions: int = 1000, captures: int = 2000) -> None:
     """Run the sessions, then one of many captures, and compare."""
-    sessions, captures = (
-        int(word) for word in (sys.argv[1:] + ["1000", "2000"][len(sys.argv) - 1 :])
-    )
     seen: list[tuple[int, int]] = []
     with tempfile.TemporaryDirectory() as folder:
         recipe = Path(folder) / "toy.yaml"
@@ -35,7 +33,7 @@ def main() -> None:
     print(f"after {len(seen) // 2} sessions: {half[0]} kB, {half[1]} files")
     print(f"after {sessions} sessions and one of {captures} captures: {seen[-2][0]} then {seen[-1][0]} kB, "
           f"{seen[-1][1]} files")  # fmt: skip
-    sys.exit(seen[-2][0] > half[0] * (1 + ALLOWED) or seen[-1][1] > half[1])
+    raise typer.Exit(seen[-2][0] > half[0] * (1 + ALLOWED) or seen[-1][1] > half[1])
 
 
 def _session(recipe: Path, out: Path, captures: int) -> None:
@@ -55,4 +53,4 @@ def _held() -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
