@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -205,7 +204,7 @@ def _system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise StageError(
             f"{url}: {error.name or 'fsspec'} is not installed; install with: "
-            f"{sys.executable} -m pip install 'flangeye[cloud]'"
+            "pip install 'flangeye[cloud]'"
         ) from None
     return system, str(path)
 

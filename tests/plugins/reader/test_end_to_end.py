@@ -116,7 +116,7 @@ def test_the_doctor_tells_the_wrong_type_of_samples(
         flangeye(monkeypatch, "doctor", samples, "--recipe", recipe(tmp_path, "eye_on_base")) == 1
     )
     told = capsys.readouterr().out
-    assert "pose direction: the poses are flange_T_base" in told
+    assert "the camera is beside the robot, or the poses are flange_T_base" in told
     assert "reader: {easy_handeye: {calibration: eye_on_base}}, inverted: true" in told
 
 
