@@ -271,12 +271,13 @@ def test_ctrl_c_does_not_reach_the_client_process(controller: Any) -> None:
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )
-    assert running.stdout.readline() == "moving\n"
+    first = running.stdout.readline()
+    assert first == "moving\n", running.communicate("\n")[1]
     os.killpg(running.pid, signal.SIGINT)
     words, _ = running.communicate("\n", timeout=10)
     assert words == "True\n"
