@@ -198,7 +198,7 @@ input()
 """
 
 
-def program(host, last):
+def program(host, last, **options):
     command = [sys.executable, "-c", PROGRAM.format(last=last), host]
     return subprocess.Popen(
         command,
@@ -207,6 +207,7 @@ def program(host, last):
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(["."])},
+        **options,
     )
 
 
@@ -262,17 +263,9 @@ def test_an_arm_whose_client_process_hangs_is_stopped_all_the_same(
 
 
 def test_ctrl_c_does_not_reach_the_client_process(controller: Any) -> None:
-    running = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            PROGRAM.format(last="robot.stop(); print(robot.state().mode != 'lost')"),
-            controller.host,
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+    running = program(
+        controller.host,
+        "robot.stop(); print(robot.state().mode != 'lost')",
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )
