@@ -13,13 +13,13 @@ from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.cell import Axis, Cell
 from flangeye.models.robots import RobotModel
 from flangeye.recipe.header import (
-    AxisSection,
     CellArmSection,
     CellSection,
     Header,
     Place,
     PlaceSection,
     PositionerSection,
+    RailSection,
 )
 from flangeye.types import BASE, Floats
 
@@ -27,6 +27,8 @@ Complain = Callable[[Sequence[Hashable], str], None]
 GROUPS = ("arms", "rails", "positioners", "cameras", "targets")
 INSTEAD = ("robot", "second_robot", "scanner", "configuration", "feature")
 """Sections of a recipe with one camera and one target."""
+
+MoverSection = CellArmSection | RailSection | PositionerSection
 
 
 def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Complain) -> Cell | None:
@@ -111,20 +113,18 @@ def _entries(section: CellSection) -> Iterator[tuple[str, str, Any]]:
         yield from ((group, name, each) for name, each in getattr(section, group).items())
 
 
-def _movers(section: CellSection) -> Iterator[tuple[str, CellArmSection | AxisSection]]:
+def _movers(section: CellSection) -> Iterator[tuple[str, MoverSection]]:
     for group, name, each in _entries(section):
         if group not in ("cameras", "targets"):
             yield name, each
 
 
-def _mover(
-    section: CellArmSection | AxisSection, model: Callable[[str], RobotModel]
-) -> RobotModel | Axis:
+def _mover(section: MoverSection, model: Callable[[str], RobotModel]) -> RobotModel | Axis:
     if isinstance(section, CellArmSection):
         return model(section.model)
     direction = np.array(section.axis) / np.linalg.norm(section.axis)
     turns = isinstance(section, PositionerSection)
-    return Axis(direction, turns, section.travel)  # type: ignore[attr-defined]
+    return Axis(direction, turns, section.travel)
 
 
 def _frames(section: CellSection) -> dict[str, Frame]:

@@ -54,7 +54,7 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     context: Context = {t.Seed: header.seed}
     offer = partial(_offer, context, complain)
     if header.workspace:
-        context[t.Box] = t.Box(header.workspace.centre, header.workspace.size)  # type: ignore[arg-type]
+        context[t.Box] = t.Box(np.array(header.workspace.centre), np.array(header.workspace.size))
     if sphere := header.feature.sphere:
         context[Sphere] = Sphere(radius=sphere.diameter / 2, centre_in_flange=sphere.centre)
     if (robot := header.robot) and (robot.model or robot.urdf):

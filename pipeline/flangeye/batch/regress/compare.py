@@ -129,7 +129,9 @@ def _compared(
 
 def _near(outcome: SessionOutcome, expected: Expected) -> bool:
     found, closure, tolerance = outcome.holdout_median_m, expected.closure, expected.tolerance
-    return None not in (found, closure, tolerance) and abs(found - closure) <= tolerance  # type: ignore[operator]
+    if found is None or closure is None or tolerance is None:
+        return False
+    return abs(found - closure) <= tolerance
 
 
 def _closure(outcome: SessionOutcome, expected: Expected) -> str:
