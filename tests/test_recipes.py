@@ -97,6 +97,8 @@ CONFIGURATIONS = [name for name in NAMES if name.startswith("configurations/")]
 
 COARSER = {
     "acquire.simulated_cell": [],
+    "acquire.simulated_profiles": [],
+    "acquire.simulated_cell_scans": ["steps.0.resolution=0.3"],
     "acquire.simulated_session": ["steps.0.resolution=0.3"],
     "acquire.simulated_images": [
         "steps.0.resolution=0.3", "steps.0.lens.size=[800, 640]", "steps.0.lens.focal_length=875",

@@ -30,9 +30,11 @@ CONFIGURATIONS = {
 INPUTS = {
     "acquire.simulated": "simulated cell",
     "acquire.simulated_cell": "simulated marker",
+    "acquire.simulated_cell_scans": "simulated scans",
     "acquire.simulated_session": "simulated scans",
     "acquire.simulated_marker": "simulated marker",
     "acquire.simulated_images": "simulated images",
+    "acquire.simulated_profiles": "simulated profiles",
     "acquire.archive": "recorded clouds",
     "acquire.centres": "published centres",
     "acquire.live": "live, on loopback",

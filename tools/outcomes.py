@@ -1,9 +1,11 @@
-"""Runs every recipe of recipes/configurations and writes what came of it: python -m tools.outcomes
+"""Runs recipes of recipes/configurations and writes what came of them: python -m tools.outcomes
 
-Beside the recipes, in outcomes.csv; ``python -m tools.gallery`` then puts it into the tables.
+All of them, or those that have one of the given words in their names. The figures stand beside the
+recipes, in outcomes.csv; ``python -m tools.gallery`` then puts them into the tables.
 """
 
 import csv
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -52,6 +54,12 @@ def write(rows):
 
 
 if __name__ == "__main__":
-    names = [name for name in recipe_names() if name.startswith("configurations/")]
+    words = sys.argv[1:] or [""]
+    names = [
+        name
+        for name in recipe_names()
+        if name.startswith("configurations/") and any(word in name for word in words)
+    ]
     with TemporaryDirectory() as place:
-        write([outcome(name, run(name, Path(place) / name)) for name in names])
+        found = {name: outcome(name, run(name, Path(place) / name)) for name in names}
+    write({**outcomes(), **found}.values())

@@ -45,19 +45,20 @@ def parse_quantity(value: object, kind: str) -> float:
         ValueError: There is no unit, or it measures something else; says what is allowed.
     """
     units = _UNITS[kind]
+    a_kind = f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
     allowed = f"{', '.join(units)}, for example '{_EXAMPLES[kind]}'"
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise ValueError(f"a {kind} is a number with a unit ({allowed})")
+        raise ValueError(f"{a_kind} is a number with a unit ({allowed})")
     match = _QUANTITY.fullmatch(str(value))
     if match is None:
-        raise ValueError(f"'{value}' is not a {kind}: write a number and a unit ({allowed})")
+        raise ValueError(f"'{value}' is not {a_kind}: write a number and a unit ({allowed})")
     number, unit = match.groups()
     if unit is None:
-        raise ValueError(f"'{value}' has no unit: a {kind} needs one ({allowed})")
+        raise ValueError(f"'{value}' has no unit: {a_kind} needs one ({allowed})")
     if unit not in units:
         other = next((k for k, table in _UNITS.items() if unit in table), None)
         what = f"is no {kind}, it has a unit of {other}" if other else "has an unknown unit"
-        raise ValueError(f"'{value}' {what}: a {kind} needs {allowed}")
+        raise ValueError(f"'{value}' {what}: {a_kind} needs {allowed}")
     try:
         si = float(Decimal(number) * units[unit])
     except ArithmeticError:  # an exponent of more digits than decimals have

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import csv
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from flangeye.errors import FlangeyeError
 from flangeye.log.read import RunLog
 from flangeye.report.units import millimetres
 from flangeye.result import Result
-from flangeye_ui.layout import command_line, page
+from flangeye_ui.charts import FAINT, USED
+from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.run_page import FLANGE, SCAN
 from flangeye_ui.scene import draw_cloud
@@ -27,6 +30,8 @@ COLUMNS = [
     )
 ]  # fmt: skip
 POINTS = 5_000
+ROWS = 5_000
+"""Of a batch's table that are sent to the page."""
 
 
 def add(project: Project) -> None:
@@ -42,9 +47,16 @@ def add(project: Project) -> None:
             if not rows:
                 ui.label("There is no run in this folder yet.")
                 return
-            ui.table(columns=COLUMNS, rows=rows, row_key="run").classes("w-full").props("dense")
+            ui.table(columns=COLUMNS, rows=rows, row_key="run").classes("w-full").props(
+                "dense wrap-cells"
+            )
+            if len(rows) > 1:
+                ui.echart(comparison(rows)).classes("w-full h-48").props('aria-label="Errors"')
             _reports(project)
             Scrubber(project)
+            _watch(project)
+            for path in sorted(project.folder.glob("batches/*/sessions.csv")):
+                _batch(path)
             command_line(project.command("show", f"runs/{rows[0]['run']}/run.mcap"))
 
 
@@ -69,6 +81,61 @@ def row_of(run: Path) -> dict[str, Any]:
     }
 
 
+def comparison(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a chart of the runs' errors side by side, oldest first."""
+    ordered = rows[::-1]
+    series = [
+        {
+            "type": "bar", "name": label, "color": colour,
+            "data": [float(row[key]) if row.get(key) else None for row in ordered],
+        }
+        for key, label, colour in (
+            ("held", "held-out rms, mm", USED), ("predicted", "predicted rms, mm", "#3a7ebf")
+        )
+    ]  # fmt: skip
+    return {
+        "animation": False, "tooltip": {"trigger": "axis"}, "series": series,
+        "legend": {"top": 0, "textStyle": {"color": FAINT}},
+        "grid": {"left": 45, "right": 10, "top": 35, "bottom": 25},
+        "xAxis": {"type": "category", "data": [r["run"] for r in ordered],
+                  "axisLabel": {"color": FAINT}},
+        "yAxis": {"type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
+                  "axisLabel": {"color": FAINT}, "splitLine": {"lineStyle": {"opacity": 0.3}}},
+    }  # fmt: skip
+
+
+def _watch(project: Project) -> None:
+    """Show the charts of ``flangeye monitor``, and how to keep watch."""
+    ui.label("Keeping watch").classes("text-h6")
+    charts = sorted(project.folder.glob("runs/*/monitor.html"))
+    for path in charts:
+        where = path.relative_to(project.folder).as_posix()
+        frame = ui.element("iframe").props(f'src="/{where}" title="Checks of {path.parent.name}"')
+        frame.classes("w-full").style("height: 720px; border: 0; background: #fff")
+    if not charts:
+        ui.label("No calibration of this folder is watched yet.")
+    names = [run.name for run in project.runs() if (run / "calibration.yaml").exists()]
+    chosen = charts[-1].parent.name if charts else names[0] if names else "RUN"
+    command_line(project.command("monitor", f"runs/{chosen}", "--archive", "NEW"))
+
+
+def _batch(path: Path) -> None:
+    """Show a batch's table, its numbers in SI units."""
+    ui.label(f"Batch {path.parent.name}").classes("text-h6")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(islice(csv.DictReader(file), ROWS))
+    except (OSError, ValueError, csv.Error) as error:
+        mistake(f"batches/{path.parent.name}/{path.name}: cannot be read: {error}")
+        return
+    names = [name for name in (rows[0] if rows else {}) if any(row[name] for row in rows)]
+    columns = [
+        {"name": n, "label": n.replace("_", " "), "field": n, "align": "left", "sortable": True}
+        for n in names
+    ]
+    ui.table(columns=columns, rows=rows, pagination=10).classes("w-full").props("dense")
+
+
 def _reports(project: Project) -> None:
     pages = [*project.folder.glob("runs/*/report.html"), *project.folder.glob("batches/*/*.html")]
     with ui.row().classes("gap-4"):
@@ -83,6 +150,7 @@ class Scrubber:
     def __init__(self, project: Project) -> None:
         self._project = project
         self._log: RunLog | None = None
+        self._captures: list[str] = []
         runs = [r.name for r in project.runs()]
         ui.label("Look at a log").classes("text-h6")
         ui.select(
@@ -104,17 +172,22 @@ class Scrubber:
         except FlangeyeError as error:
             self._told.text = str(error)
             return
-        self._slider.props(f"max={max(len(self._log.poses) - 1, 0)}")
+        self._captures = [*self._log.poses] or [o.id for o in self._log.observations()]
+        self._slider.props(f"max={max(len(self._captures) - 1, 0)}")
         self._slider.value = 0
         self._at(0)
 
     def _at(self, index: int) -> None:
         """Show one capture: the flange in it, and what became of it."""
-        if self._log is None or not self._log.poses:
+        if self._log is None:
             return
-        capture = list(self._log.poses)[int(index)]
+        if not self._captures:
+            self._told.text = "this log has no captures"
+            return
+        capture = self._captures[int(index)]
         self._told.text = f"capture {capture}: {fate_of(self._log, capture)}"
         self._scene.clear()
+        self._scene.set_visibility(bool(self._log.of_kind("segment")))
         for entry in self._log.of_kind("segment"):
             if entry.capture == capture and isinstance(entry.value, t.FlangeCloud):
                 self._cloud(entry.value)
@@ -138,4 +211,6 @@ def fate_of(log: RunLog, capture: str) -> str:
         if pair.observation.id == capture:
             residual = f"residual {millimetres(float(np.linalg.norm(pair.residual)))} mm"
             return f"{'used' if pair.used else 'not used'}, {pair.reason or residual}"
-    return "kept for verification, or not solved"
+    if log.poses.get(capture, {}).get("role") == "verification":
+        return "kept for verification"
+    return "not solved"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 import yaml
@@ -33,7 +34,8 @@ class Form:
         with ui.column().classes("col-12 col-md-5 gap-2"):
             self._start_from()
             self.fields()
-        with ui.column().classes("col-12 col-md gap-2"):
+            ImportArm(project, self)
+        with ui.column().classes("col-12 col-md gap-2 md:sticky md:top-16"):
             ui.label("Recipe").classes("text-h6")
             self._yaml = ui.textarea(value=project.text, on_change=self._typed)
             self._yaml.classes("w-full").props(
@@ -98,25 +100,33 @@ class Form:
         name = next(iter(entry)) if isinstance(entry, dict) else str(entry)
         given = (entry[name] if isinstance(entry, dict) else None) or {}
         stage = self._project.registry.stages.get(name)
-        with ui.expansion(f"{index}. {name}").classes("w-full").props("dense"):
+        wrong = [m for m in mistakes if f"{m.path}.".startswith(f"steps.{index}.")]
+        with ui.expansion(f"{index}. {name}", value=bool(wrong)).classes("w-full").props("dense"):
             if stage:
                 ui.label(stage.summary).classes("text-caption")
-                self._parameters(index, name, stage, given)
+                self._parameters(index, name, stage, given, wrong)
             ui.button("Remove", on_click=lambda: self._remove(index)).props("flat dense")
-        self._mistakes(mistakes, f"steps.{index}")
+        fields = (stage.params.model_fields if stage and stage.params else {}).keys()
+        for each in wrong:
+            if not any(_within(each, index, name, field) for field in fields):
+                mistake(each.text)
 
-    def _parameters(self, index: int, name: str, stage: Stage, given: dict[str, Any]) -> None:
-        """Show a field for each parameter, as the recipe's schema has it."""
+    def _parameters(
+        self, index: int, name: str, stage: Stage, given: Any, wrong: list[Mistake]
+    ) -> None:
+        """Show a field for each parameter, as the recipe's schema has it, with what is wrong."""
+        schema = stage.params.model_json_schema()["properties"] if stage.params else {}
         for field, info in (stage.params.model_fields if stage.params else {}).items():
-            value = given.get(field)
-            shown = "" if value is None else value if isinstance(value, str) else yaml.safe_dump(
-                value, default_flow_style=True, width=1000
-            ).removesuffix("...\n").strip()  # fmt: skip
-            path = ["steps", index, name, field]
-            default = "required" if info.is_required() else f"default {info.default}"
-            ui.input(field, value=shown, placeholder=default).on(
-                "change", lambda e, path=path: self._set(path, e.args)
-            ).classes("w-full").props("dense").tooltip(info.description or "")
+            text = "; ".join(m.text for m in wrong if _within(m, index, name, field))
+            value = given.get(field) if isinstance(given, dict) else None
+            box = _field(field, schema[field], value, info.is_required())
+            box.on(_EVENTS[type(box)], self._setter(["steps", index, name, field], box))
+            box.classes("w-full").props("dense stack-label").tooltip(info.description or "")
+            if text:
+                box.props["error"], box.props["error-message"] = True, text
+
+    def _setter(self, path: list[Any], box: Any) -> Any:
+        return lambda: self._set(path, "" if box.value is None else str(box.value))
 
     def _mistakes(self, mistakes: list[Mistake], *paths: str) -> None:
         for text in at(mistakes, *paths):
@@ -144,6 +154,10 @@ class Form:
         del data["steps"][index]
         self._write(data)
 
+    def choose_arm(self, model: str) -> None:
+        """Put an arm into the recipe."""
+        self._set(["robot", "model"], model)
+
     def _write(self, data: dict[str, Any]) -> None:
         self._project.edit(data)
         self._yaml.value = self._project.text
@@ -153,6 +167,76 @@ class Form:
         self._project.text = event.value
         self.verdict.refresh()
         self.fields.refresh()
+
+
+class ImportArm:
+    """An arm that is not listed: from its URDF, or its table of joints, by ``new-robot``."""
+
+    def __init__(self, project: Project, form: Form) -> None:
+        self._project, self._form = project, form
+        with ui.expansion("Import an arm").classes("w-full").props("dense"):
+            self._name = ui.input("Its name", value="my_arm", on_change=self._changed)
+            self._urdf = ui.input("Its URDF file, in this folder", on_change=self._changed)
+            self._joints = ui.textarea(
+                "Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", on_change=self._changed
+            )
+            plate = ui.select(_standards(), label="Plate", on_change=self._changed)
+            self._plate, boxes = plate, (self._name, self._urdf, self._joints, plate)
+            for box in boxes:
+                box.classes("w-full").props("dense")
+            self._line = command_line(project.command(*self._words()))
+            ui.button("Import it", on_click=self._import).props("outline")
+            self._told = ui.column().classes("w-full")
+
+    def _words(self) -> list[str]:
+        joints = [f"--joint={line}" for line in (self._joints.value or "").splitlines() if line]
+        given = [f"--urdf={self._urdf.value}"] if self._urdf.value else joints
+        plate = [f"--standard={self._plate.value}"] if self._plate.value else []
+        return ["new-robot", self._name.value or "my_arm", *given, *plate]
+
+    def _changed(self) -> None:
+        self._line.content = self._project.command(*self._words())
+
+    async def _import(self) -> None:
+        said = await asyncio.to_thread(self._project.run_command, self._words())
+        self._told.clear()
+        with self._told:
+            if said.startswith("error: "):
+                mistake(said.removeprefix("error: "))
+                return
+            ui.label(said).props('role="status"')
+        self._form.choose_arm(f"{self._words()[1]}.yaml")
+
+
+def _within(mistake: Mistake, index: int, name: str, field: str) -> bool:
+    """Return whether a mistake is that of a parameter, or of something inside it."""
+    return f"{mistake.path}.".startswith(f"steps.{index}.{name}.{field}.")
+
+
+def _field(name: str, schema: dict[str, Any], value: Any, required: bool) -> ui.input | ui.select:
+    """Return what a parameter is given by: a list of what is allowed, or a line of YAML."""
+    default = schema.get("default")
+    told = "required" if required else "" if default is None else f"default {_shown(default)}"
+    allowed = ["false", "true"] if schema.get("type") == "boolean" else schema.get("enum")
+    if allowed:
+        shown = str(value).lower() if isinstance(value, bool) else value
+        chosen = shown if shown in allowed else None
+        return ui.select(
+            allowed, label=f"{name}, {told}" if told else name, value=chosen, clearable=True
+        )
+    return ui.input(name, value=_shown(value), placeholder=told)
+
+
+_EVENTS: dict[type, str] = {ui.input: "change", ui.select: "update:model-value"}
+"""What says that a person has chosen, or has left the box."""
+
+
+def _shown(value: Any) -> str:
+    """Return a value as it would stand in the recipe, on one line."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    text = yaml.safe_dump(value, default_flow_style=True, width=1000)
+    return text.removesuffix("...\n").strip()
 
 
 def _put_step(steps: list[Any], path: list[Any], value: Any) -> None:

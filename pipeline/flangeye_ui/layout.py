@@ -26,10 +26,15 @@ def page(title: str) -> Iterator[None]:
         yield
 
 
-def command_line(text: str) -> None:
+def command_line(text: str) -> ui.code:
     """Show a command that does the same, with a button that copies it."""
     with ui.row().classes("items-center gap-2 no-wrap w-full"):
-        ui.code(text, language="sh").classes("grow overflow-x-auto")
+        return ui.code(text, language="sh").classes("grow overflow-x-auto")
+
+
+def warning(text: str) -> ui.label:
+    """Show what a person should know or do, in one line."""
+    return ui.label(f"⚠ {text}").classes("text-warning")
 
 
 def mistake(text: str) -> ui.label:

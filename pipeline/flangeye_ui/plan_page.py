@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import re
-import subprocess
-import sys
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from nicegui import events, ui
 
+from flangeye.errors import StageError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -22,6 +21,7 @@ from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum
 
 ROW = re.compile(r"^(\d{4})\s+(\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(\d+) deg\s+(.*)$")
+TIMES = re.compile(r"^(\d+) stops, (\d+) s under way", re.MULTILINE)
 HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """How an arm of six joints is drawn that has not said where it stands."""
 
@@ -89,7 +89,10 @@ class Planner:
             draw_box(self._scene, np.array(limits.box.centre), np.array(limits.box.size), "#d68910")
         view = self._view()
         if view is not None and scanner is not None and robot is not None:
-            self._scanner(scanner, view(Arm(robot), scanner))
+            try:
+                self._scanner(scanner, view(Arm(robot), scanner))
+            except StageError as error:
+                mistake(str(error))
         self._scene.move_camera(1.5, -1.3, 1.1, 0.2, 0, 0.45)
 
     def _view(self) -> Any:
@@ -106,30 +109,44 @@ class Planner:
         self._place([f"{1e3 * v:.0f} mm" for v in (event.x, event.y, event.z)])
 
     def _guess(self) -> None:
-        """Let the person say where the scanner stands, by number or by dragging its ball."""
-        data = self._project.data()
-        view = (_first(data) or {}).get("view") or {}
-        position = (view.get("guess") or {}).get("position") if isinstance(view, dict) else None
-        if not position:
+        """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
+        view = (_first(self._project.data()) or {}).get("view")
+        if self._view() is None or not isinstance(view, dict):
             ui.label("This recipe guesses no place of the scanner, so there is nothing to drag.")
             return
-        ui.input(
+        position = (view.get("guess") or {}).get("position") or ()
+        place = ui.input(
             "Where the scanner stands (x, y, z in the base)", value=", ".join(map(str, position))
-        ).on("change", lambda e: self._place([x.strip() for x in e.args.split(",")])).classes(
-            "w-full"
         )
-        ui.label(
-            "Or drag the blue ball. A tape measure is good enough. Instead of a guess, "
-            "view: {shown: {joints: [...]}} takes three poses that face the scanner."
-        ).classes("text-caption")
+        place.on("change", lambda e: self._place([x.strip() for x in e.args.split(",")]))
+        place.classes("w-full")
+        ui.label("Drag the blue ball, or type: a tape measure is good enough.").classes(
+            "text-caption"
+        )
+        self._showing((view.get("shown") or {}).get("joints") or [])
+
+    def _showing(self, joints: list[list[Any]]) -> None:
+        """Let the person show three poses that face the scanner, instead of guessing."""
+        lines = "\n".join(", ".join(map(str, row)) for row in joints)
+        with ui.expansion("Or show three poses", value=bool(joints)).classes("w-full"):
+            ui.label(
+                "Jog the arm so that its flange faces the scanner, three times from different "
+                "places, and note the pendant's joint angles: a line each, such as "
+                "180 deg, -90 deg, 90 deg, -90 deg, -90 deg, 0 deg"
+            ).classes("text-caption")
+            box = ui.textarea("Joint angles of three poses", value=lines).classes("w-full")
+            ui.button("Use these poses", on_click=lambda: self._shown(box.value or ""))
+
+    def _shown(self, text: str) -> None:
+        rows = [[x.strip() for x in line.split(",")] for line in text.splitlines() if line.strip()]
+        self._set_view({"shown": {"joints": rows}})
 
     def _place(self, position: list[str]) -> None:
-        data = self._project.data()
-        first = _first(data) or {}
-        guess = {**(first["view"]["guess"]), "position": position}
-        name = next(iter(data["steps"][0]))
-        data["steps"][0] = {name: {**first, "view": {"guess": guess}}}
-        self._project.edit(data)
+        view = (_first(self._project.data()) or {}).get("view") or {}
+        self._set_view({"guess": {**(view.get("guess") or {}), "position": position}})
+
+    def _set_view(self, view: dict[str, Any]) -> None:
+        self._project.write_step(self._recipe.steps[0].stage.name, {"view": view})
         ui.navigate.reload()
 
     async def _plan(self) -> None:
@@ -140,7 +157,8 @@ class Planner:
         if self._recipe.steps[0].stage.name != "acquire.live":
             text = "this recipe drives no arm: its poses are those of its recordings or simulation"
         else:
-            text = await asyncio.to_thread(_planned, self._project)
+            words = ["run", self._project.recipe_path.name]
+            text = await asyncio.to_thread(self._project.run_command, words)
         self._told.clear()
         with self._told:
             self._show(text)
@@ -150,6 +168,10 @@ class Planner:
         for line in text.splitlines():
             if line.startswith("error: "):
                 mistake(line.removeprefix("error: "))
+        if found := TIMES.search(text):
+            ui.label(f"{found[1]} poses, {found[2]} s under way").classes("text-subtitle1").props(
+                'role="status"'
+            )
         ui.code(text, language="text").classes("w-full overflow-x-auto")
         for stop in stops:
             with self._scene:
@@ -163,18 +185,6 @@ def stops_of(text: str) -> list[Stop]:
     """Return the stops in a plan as the command prints it."""
     rows = filter(None, map(ROW.match, text.splitlines()))
     return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[7]) for r in rows]
-
-
-def _planned(project: Project) -> str:
-    command = [sys.executable, "-P", "-m", "flangeye.cli", "run", project.recipe_path.name]
-    try:
-        done = subprocess.run(
-            command, cwd=project.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            timeout=300,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return "error: the plan took longer than five minutes"
-    return done.stdout + done.stderr
 
 
 def _first(data: dict[str, Any]) -> dict[str, Any] | None:

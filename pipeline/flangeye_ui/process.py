@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,12 @@ import numpy as np
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log import foxglove
+from flangeye.log.read import RunLog, read_run, take
 from flangeye.log.watch.tail import Message, follow
 from flangeye.log.watch.view import View
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.run.outlook import Outlook, outlook
 from flangeye.types import Floats
 
 POINTS = 20_000
@@ -33,33 +38,35 @@ class RunProcess:
         path: The run's folder.
         moves: Whether it may move an arm.
         view: What its log has said so far.
+        log: The same as values, clouds of whole scans aside.
+        outlook: What its poses so far are worth; None before the first was judged.
         cloud: (N, 3) the newest scan, thinned, in the camera [m]; and the flange in it.
         places: (3,) of the flange in the base [m], by capture; those set aside are named.
         stopped: Why it was stopped from here; empty where it was not.
     """
 
-    def __init__(
-        self, folder: Path, recipe: str | None, move: bool, resume: Path | None = None
-    ) -> None:
+    def __init__(self, folder: Path, words: Sequence[str], move: bool, registry: Registry) -> None:
+        """Start ``flangeye run`` in a folder with words of its command line."""
         self.path = folder / "runs" / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
         self.moves, self.stopped = move, ""
-        self.view = View(self.path.name)
+        self.view, self.log = View(self.path.name), RunLog(self.path / "run.mcap")
+        self.outlook: Outlook | None = None
         self.cloud: Floats = np.zeros((0, 3))
         self.flange: Floats = np.zeros((0, 3))
         self.arrived = 0
         self.places: dict[str, list[float]] = {}
         self.set_aside: set[str] = set()
-        what = ["--resume", str(resume)] if resume else [str(recipe)]
         out = str(self.path.relative_to(folder))
-        self.words = ["run", *what, "--out", out, *(["--move"] if move else [])]
+        self.words = ["run", *words, "--out", out, *(["--move"] if move else [])]
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "flangeye.cli", *self.words],
             cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             text=True, start_new_session=True, preexec_fn=_die_with_parent,
         )  # fmt: skip
         self.said: list[str] = []
-        threading.Thread(target=self._listen, daemon=True).start()
-        threading.Thread(target=self._follow, daemon=True).start()
+        self._registry, self._fitted = registry, threading.Event()
+        for work in (self._listen, self._follow, self._judge):
+            threading.Thread(target=work, daemon=True).start()
 
     @property
     def code(self) -> int | None:
@@ -79,17 +86,20 @@ class RunProcess:
                 self.said.append(line.rstrip())
 
     def _follow(self) -> None:
-        log = self.path / "run.mcap"
-        while not log.exists() and self.code is None:
+        held: dict[str, t.PointCloud] = {}
+        while not self.log.path.exists() and self.code is None:
             time.sleep(0.05)
         try:
-            for message in follow(log, self._wait):
+            for message in follow(self.log.path, self._wait):
                 self.view.take(message)
+                take(self.log, message, held)
                 self._mark(message)
                 self._show(message)
             self.view.ended = True
         except (FlangeyeError, _EndedError):
             return
+        finally:
+            self._fitted.set()
 
     def _wait(self) -> None:
         if self.code is not None:
@@ -102,6 +112,28 @@ class RunProcess:
             self.places[json.loads(message.data)["id"]] = self.view.arm[0]
         elif message.channel.topic == "/rejection":
             self.set_aside.add(json.loads(message.data)["id"])
+        elif message.channel.topic.partition(".")[2].startswith("fit."):
+            self._fitted.set()
+
+    def _judge(self) -> None:
+        """Say what the poses so far are worth, again and again, the newest first."""
+        recipe, judged = None, 0
+        while self.code is None or len(self.log.observations()) > judged:
+            if not self._fitted.wait(0.2):
+                continue
+            self._fitted.clear()
+            seen = self.log.observations()
+            judged = len(seen)
+            try:
+                recipe = recipe or self._recipe()
+                source = self.log.source or t.Source(fingerprint="")
+                self.outlook = outlook(recipe, self._registry, seen, source)
+            except FlangeyeError:
+                return  # what the run itself says of its recipe stands on the page already
+
+    def _recipe(self) -> Recipe:
+        text = read_run(self.log.path).text("recipe.resolved.yaml") or ""
+        return parse_recipe(text, self.path.name, self._registry)
 
     def _show(self, message: Message) -> None:
         """Keep the newest scan and the flange in it, thin enough for a page."""

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,8 @@ from flangeye.recipe.load import Recipe, load_recipe
 from flangeye.report.facts import Facts, facts_of
 from flangeye_ui.process import RunProcess
 
+QUIET = 10.0
+"""A log that did not grow for so long is not being written any more [s]."""
 NEW = """title: My cell
 robot: {model: ur5e}
 scanner: {model: phoxi-m}
@@ -113,15 +119,59 @@ class Project:
 
     def command(self, *words: str) -> str:
         """Return a command line of flangeye, to copy."""
-        return " ".join(["flangeye", *words])
+        return shlex.join(["flangeye", *words])
 
-    def start(self, move: bool, owner: str) -> None:
-        """Start the recipe as the command line does."""
-        self.run, self.owner = RunProcess(self.folder, self.recipe_path.name, move), owner
+    def run_command(self, words: Sequence[str], patience: float = 300.0) -> str:
+        """Return what a command of flangeye prints, in the folder; it moves nothing."""
+        line = [sys.executable, "-P", "-m", "flangeye.cli", *words]
+        try:
+            done = subprocess.run(
+                line, cwd=self.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+                timeout=patience,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return f"error: flangeye {words[0]} took longer than {patience:.0f} s"
+        return (done.stdout + done.stderr).strip()
 
-    def resume(self, run: Path, move: bool, owner: str) -> None:
-        """Go on with a run that ended early."""
-        self.run, self.owner = RunProcess(self.folder, None, move, run), owner
+    def write_line(self, name: str, params: Mapping[str, Any]) -> None:
+        """Put parameters into a step, or what is no step into a section of the header."""
+        if "." in name:
+            self.write_step(name, params)
+        else:
+            data = {**self.data(), name: dict(params)}
+            self.edit({**{k: v for k, v in data.items() if k != "steps"}, "steps": data["steps"]})
+
+    def write_step(self, name: str, params: Mapping[str, Any]) -> None:
+        """Put parameters into a step of the recipe; where it has none such, into the first."""
+        data = self.data()
+        steps = data.get("steps") or [name]
+        names = [next(iter(s)) if isinstance(s, dict) else s for s in steps]
+        at = names.index(name) if name in names else 0
+        given = (steps[at][name] if isinstance(steps[at], dict) and name in names else None) or {}
+        steps[at] = {name: {**given, **params}}
+        self.edit({**data, "steps": steps})
+
+    def unfinished(self) -> Path | None:
+        """Return the newest run, if it ended before its result; nothing while one goes."""
+        runs = self.runs()
+        going = self.run is not None and self.run.code is None
+        if going or self.elsewhere() or not runs or (runs[0] / "result.json").exists():
+            return None
+        return runs[0]
+
+    def elsewhere(self) -> Path | None:
+        """Return a run that another program is writing, if there is one."""
+        ours = self.run.path if self.run else None
+        now = time.time()
+        for run in self.runs()[:1]:
+            fresh = now - (run / "run.mcap").stat().st_mtime < QUIET
+            if fresh and run != ours and not (run / "result.json").exists():
+                return run
+        return None
+
+    def begin(self, words: Sequence[str], move: bool, owner: str) -> None:
+        """Start ``flangeye run`` with words of its command line, for a page."""
+        self.run, self.owner = RunProcess(self.folder, words, move, self.registry), owner
 
     def page_gone(self, page: str, why: str = "the page was closed") -> None:
         """Stop an arm that moves for a page that is not there any more."""

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from nicegui import Client, ui
 
+from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.layout import command_line, confirmed, mistake, page
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
-from flangeye_ui.scene import draw_cloud
+from flangeye_ui.scene import draw_cloud, outline_of
 
 EVERY = 0.25
 """Between two looks at the run [s]."""
 SILENCE = 5.0
 """A page that is not heard of for so long is taken for dead, and its arm is stopped [s]."""
-SCAN, FLANGE = (0.12, 0.14, 0.18), (0.02, 0.20, 0.75)
+SCAN, FLANGE, RIM, EARLIER = (
+    (0.12, 0.14, 0.18),
+    (0.02, 0.20, 0.75),
+    (0.85, 0.1, 0.1),
+    (0.5, 0.6, 0.5),
+)
 BEAT = "setInterval(() => emitEvent('beat'), 500)"
 
 
@@ -36,29 +45,41 @@ class Panel:
         self._project, self._me, self._heard, self._shown = project, client.id, time.monotonic(), -1
         recipe, mistakes = project.check()
         self._said: list[Any] = []
+        self._recipe = recipe
         self._live = bool(recipe) and recipe.steps[0].stage.name == "acquire.live"  # type: ignore[union-attr]
         if mistakes:
             mistake(f"The recipe has {len(mistakes)} mistakes; see the page Cell.")
+        self._buttons(sound=not mistakes)
+        self._state = ui.label().props('role="status"').classes("text-subtitle1")
+        with ui.row().classes("w-full gap-4 items-start"):
+            with ui.column().classes("col-12 col-md-5 gap-1"):
+                self._worth = ui.column().classes("gap-1 w-full")
+                self._rows = ui.column().classes("gap-1 w-full")
+            with ui.column().classes("col-12 col-md gap-1"):
+                self._pictures()
+        command_line(project.command("run", *self._words()))
+        self._pose = OnePose(self)
+        self._watch(client)
+
+    def _buttons(self, sound: bool) -> None:
         with ui.row().classes("items-center gap-3"):
             self._start = ui.button("Start", on_click=self._begin)
-            self._start.set_enabled(not mistakes)
+            self._start.set_enabled(sound)
             stop = ui.button("Stop (space bar)", on_click=self._stop, color="negative")
             stop.props('aria-keyshortcuts="Space"').classes("text-h6")
             self._go_on = ui.button("Go on with it", on_click=self._resume).props("outline")
         ui.keyboard(on_key=self._key)
-        self._state = ui.label().props('role="status"').classes("text-subtitle1")
-        with ui.row().classes("w-full gap-4"):
-            with ui.column().classes("col-12 col-md-4 gap-1"):
-                self._rows = ui.column().classes("gap-1")
-                ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")
-                self._map = ui.echart(_map({}, set())).classes("w-full h-64")
-            with ui.column().classes("col-12 col-md"):
-                self._scene = ui.scene(width=600, height=400, fps=5, background_color="#eef1f5")
-                self._scene.classes("w-full").move_camera(0.1, -0.3, 0.1, 0, 0, 0.75, 0, -1, 0)
-                self._leave_out()
-        move = ["--move"] if self._live else []
-        command_line(project.command("run", project.recipe_path.name, *move))
-        self._watch(client)
+
+    def _pictures(self) -> None:
+        self._scene = ui.scene(width=600, height=330, fps=5, background_color="#eef1f5")
+        self._scene.classes("w-full").move_camera(0.0, -0.15, 0.25, 0, 0, 0.8, 0, -1, 0)
+        ui.label("Residual of each pose so far").classes("text-caption")
+        self._bars = ui.echart(residual_chart(None)).classes("w-full h-40")
+        ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")
+        self._map = ui.echart(place_chart({}, set())).classes("w-full h-48")
+
+    def _words(self) -> list[str]:
+        return [self._project.recipe_path.name, *(["--move"] if self._live else [])]
 
     def _watch(self, client: Client) -> None:
         """Look at the run, and at whether this page still lives."""
@@ -79,22 +100,37 @@ class Panel:
             self._project.run.stop("stopped on this page")
 
     async def _begin(self) -> None:
-        if self._running:
-            ui.notify("a run is under way; stop it first", type="warning")
-        elif await self._agreed():
-            self._project.start(self._live, self._me)
-            self._shown = -1
+        await self.begin([self._project.recipe_path.name], self._live)
 
     async def _resume(self) -> None:
-        runs = self._project.runs()
-        if runs and not self._running and await self._agreed():
-            self._project.resume(runs[0], self._live, self._me)
+        if (run := self._project.unfinished()) is not None:
+            await self.begin(["--resume", f"runs/{run.name}"], self._live)
 
-    async def _agreed(self) -> bool:
-        """Ask, where an arm would move."""
-        if not self._live:
-            return True
-        return await confirmed("The arm will move. Is its space free of people?", "Move the arm")
+    async def begin(self, words: Sequence[str], moves: bool) -> None:
+        """Start ``flangeye run`` with these words; ask first, where an arm would move."""
+        if self._running or self._project.elsewhere():
+            ui.notify("a run is under way; stop it first", type="warning")
+            return
+        question = "The arm will move. Is its space free of people?"
+        if not moves or await confirmed(question, "Move the arm"):
+            self._project.begin(words, moves, self._me)
+            self._shown = -1
+
+    @property
+    def project(self) -> Project:
+        """What the page is about."""
+        return self._project
+
+    @property
+    def live(self) -> bool:
+        """Whether the recipe drives an arm."""
+        return self._live
+
+    @property
+    def solver(self) -> str:
+        """Name of the recipe's solve step."""
+        steps = self._recipe.steps if self._recipe else ()
+        return next((s.stage.name for s in steps if s.stage.kind == "solve"), "solve.robust")
 
     @property
     def _running(self) -> bool:
@@ -104,18 +140,21 @@ class Panel:
         run = self._project.run
         if self._running and time.monotonic() - self._heard > SILENCE:
             self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
-        self._go_on.set_visibility(bool(run and run.code not in (None, 0)))
-        self._state.text = (
-            "Nothing runs." if run is None else told(run, self._project.owner == self._me)
-        )
-        if run is not None:
-            self._show(run)
+        left = self._project.unfinished()
+        self._go_on.set_visibility(left is not None)
+        other = self._project.elsewhere()
+        if run is None or (other and run.code is not None):
+            self._state.text = _nothing(left, other)
+            return
+        self._state.text = told(run, self._project.owner == self._me)
+        self._show(run)
 
     def _show(self, run: RunProcess) -> None:
-        said = [*run.view.rows(), *run.view.events, run.code]
+        said = [*run.view.rows(), *run.view.events, run.code, run.outlook]
         if said != self._said:
             self._said = said
             self._tell(run)
+            self._judge(run)
         if run.arrived != self._shown:
             self._shown = run.arrived
             self._draw(run)
@@ -124,48 +163,91 @@ class Panel:
         self._rows.clear()
         with self._rows:
             for label, text in run.view.rows():
-                ui.label(f"{label}: {text}")
+                if label != "error so far" or run.view.progress or not run.outlook:
+                    ui.label(f"{label}: {text}")
             for line in run.view.events:
                 ui.label(line).classes("text-caption")
             if run.code:
                 for line in [x for x in run.said if x.startswith("error: ")]:
                     mistake(line.removeprefix("error: "))
 
+    def _judge(self, run: RunProcess) -> None:
+        """Show what the poses so far are worth."""
+        found = run.outlook
+        self._bars.options.update(residual_chart(found))
+        self._bars.update()
+        self._worth.clear()
+        if found is None:
+            return
+        with self._worth:
+            for line in found.lines()[len(found.residuals) + len(found.set_aside) :]:
+                ui.label(line).classes("text-warning" if line.startswith("missing") else "")
+            if found.coverage:
+                ui.html(coverage_drawing(found.coverage), sanitize=False).classes("w-full")
+            command_line(self._project.command("outlook", f"runs/{run.path.name}"))
+        self._pose.offer([*found.residuals, *found.set_aside, *sorted(run.set_aside)])
+
     def _draw(self, run: RunProcess) -> None:
-        self._map.options.update(_map(run.places, run.set_aside))
+        self._map.options.update(place_chart(run.places, run.set_aside))
         self._map.update()
         self._scene.clear()
         draw_cloud(self._scene, run.cloud[::4], SCAN, 0.006)
         draw_cloud(self._scene, run.flange, FLANGE, 0.004)
+        rims = [outline_of(entry.value) for entry in run.log.of_kind("fit")]
+        if rims:
+            draw_cloud(self._scene, rims[-1], RIM, 0.006)
+            draw_cloud(self._scene, np.vstack([np.zeros((0, 3)), *rims[:-1]]), EARLIER, 0.003)
 
-    def _leave_out(self) -> None:
-        """Let a pose of an archive be left out, as the recipe's line has it."""
-        data = self._project.data()
-        steps = data.get("steps") or [{}]
-        name = next(iter(steps[0])) if isinstance(steps[0], dict) else steps[0]
-        if name not in ("acquire.archive", "acquire.centres"):
+
+class OnePose:
+    """A pose of the run that ended: take it again, or do without it, by a command that is shown."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self._box = ui.column().classes("w-full gap-1")
+        with self._box:
+            ui.label("Mend a pose").classes("text-h6")
+            self._which = ui.select([], label="Pose", on_change=self._chosen).classes("w-40")
+            self._does = ui.column().classes("w-full gap-1")
+        self._box.set_visibility(False)
+
+    def offer(self, poses: list[str]) -> None:
+        """Let one of these be chosen, once the run has ended."""
+        run = self._panel.project.run
+        ended = run is not None and run.code is not None
+        self._box.set_visibility(ended and bool(poses))
+        if sorted(poses) != self._which.options:
+            self._which.set_options(sorted(poses), value=None)
+
+    def _chosen(self) -> None:
+        self._does.clear()
+        run, pose = self._panel.project.run, self._which.value
+        if run is None or pose is None:
             return
-        box = ui.input("Leave out a pose: its id")
+        where = f"runs/{run.path.name}"
+        recipe = self._panel.project.recipe_path.name
+        without = [recipe, "--from", f"{where}/run.mcap", "--at", self._panel.solver]
+        with self._does:
+            self._offer("Do without it", [*without, "--leave-out", pose], False)
+            if self._panel.live:
+                self._offer("Take it again", ["--resume", where, "--retake", pose], True)
 
-        def leave_out() -> None:
-            given = dict((steps[0][name] if isinstance(steps[0], dict) else None) or {})
-            given["leave_out"] = [*given.get("leave_out", []), box.value]
-            steps[0] = {name: given}
-            self._project.edit(data)
-            ui.notify(f"{box.value} is in leave_out; start again")
+    def _offer(self, label: str, words: list[str], moves: bool) -> None:
+        async def go() -> None:
+            await self._panel.begin(words, moves)
 
-        ui.button("Leave it out", on_click=leave_out).props("outline")
+        with ui.row().classes("items-center w-full gap-2"):
+            ui.button(label, on_click=go).props("outline")
+            command_line(self._panel.project.command("run", *words, *["--move"] * moves))
 
 
-def _map(places: dict[str, list[float]], set_aside: set[str]) -> dict[str, Any]:
-    """Return a chart of the flange's places: used ones green, those set aside red."""
-    axis = {"type": "value", "scale": True}
-    series = []
-    for name, colour, wanted in (("used", "#1a7f45", False), ("set aside", "#c02626", True)):
-        at = [[1e3 * p[0], 1e3 * p[1]] for k, p in places.items() if (k in set_aside) is wanted]
-        series.append({"type": "scatter", "name": name, "data": at, "color": colour})
-    grid = {"left": 50, "right": 10, "top": 10, "bottom": 30}
-    return {"xAxis": axis, "yAxis": axis, "grid": grid, "series": series, "animation": False}
+def _nothing(left: Path | None, other: Path | None) -> str:
+    """Return what is so while no run of this page's server goes."""
+    if other:
+        return f"{other.name} runs elsewhere: flangeye watch runs/{other.name}"
+    if left:
+        return f"Nothing runs. {left.name} ended before its result; it can be gone on with."
+    return "Nothing runs."
 
 
 def told(run: RunProcess, mine: bool) -> str:

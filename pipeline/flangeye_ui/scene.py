@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
+from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import Floats
+from flangeye.types import CircleFeature, Feature, Floats
 
 BALLS = 5
 """A capsule is drawn as so many balls."""
+ROUND = 90
+"""Points that a circle is drawn with."""
 
 
 def draw_arm(scene: ui.scene, robot: RobotModel, joints: Floats) -> None:
@@ -59,6 +62,16 @@ def draw_lines(scene: ui.scene, points: Floats, colour: str) -> None:
     with scene:
         for start, end in pairwise(np.asarray(points).tolist()):
             scene.line(start, end).material(colour)
+
+
+def outline_of(feature: Feature) -> Floats:
+    """Return (N, 3) points of a fitted circle in the camera; of what is no circle, its centre."""
+    if not isinstance(feature, CircleFeature) or feature.normal is None or not feature.radii:
+        return np.asarray(feature.centre)[None]
+    angles = np.linspace(0, 2 * np.pi, ROUND)
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    radius = max(feature.radii.values())
+    return np.asarray(feature.centre + radius * ring @ basis_of_plane(feature.normal)[:2])
 
 
 def draw_cloud(

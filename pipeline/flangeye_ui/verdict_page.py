@@ -1,22 +1,24 @@
-"""Verdict: the matrix with what it is worth, warnings first, and what would make it better."""
+"""Verdict: warnings first, the matrix with what it is worth, and what would make it better."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Hashable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import yaml
 from nicegui import ui
 from nicegui.events import ValueChangeEventArguments
 
 from flangeye.doctor import examine, open_session
+from flangeye.doctor.diagnosis import Finding
 from flangeye.errors import FlangeyeError
-from flangeye.recipe.overrides import apply_override
+from flangeye.report.account import set_aside_of
 from flangeye.report.facts import Facts
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
-from flangeye_ui.layout import command_line, mistake, page
+from flangeye.run.outlook import Outlook, outlook_of_log
+from flangeye_ui.charts import coverage_drawing
+from flangeye_ui.layout import command_line, mistake, page, warning
 from flangeye_ui.project import Project
 
 TONES = {"verified": "text-positive", "unverified": "text-warning"}
@@ -57,8 +59,37 @@ def _show(project: Project, run: Path, facts: Facts) -> None:
     found = verdict_of(facts)
     tone = TONES.get(found.kind, "text-negative")
     ui.label(f"{found.label}: {found.sentence}").classes(f"text-h6 {tone}").props('role="status"')
-    for note in facts.result.provenance.notes:
-        ui.label(note).classes("text-caption")
+    for line in warnings_of(facts):
+        warning(line)
+    names = ["Verdict", "Doctor", *(["Certificate", "Export"] if facts.result.transforms else [])]
+    with ui.tabs().props("dense align=left").classes("w-full") as tabs:
+        for name in names:
+            ui.tab(name)
+    with ui.tab_panels(tabs, value="Verdict").classes("w-full").props("keep-alive"):
+        for name in names:
+            with ui.tab_panel(name).classes("q-px-none gap-3"):
+                _tab(name, project, run, facts)
+
+
+def _tab(name: str, project: Project, run: Path, facts: Facts) -> None:
+    if name == "Verdict":
+        _matrix(facts)
+        Better(project, run, facts)
+    elif name == "Doctor":
+        Doctor(project, run)
+    elif name == "Certificate":
+        _certificate(project, run)
+    else:
+        _exports(project, run)
+
+
+def warnings_of(facts: Facts) -> list[str]:
+    """Return what whoever uses the matrix has to know first."""
+    aside = [f"{count} set aside: {why}" for count, _, why in set_aside_of(facts).counts]
+    return [*facts.log.notes, *aside]
+
+
+def _matrix(facts: Facts) -> None:
     with ui.row().classes("gap-6"):
         for figure in headlines_of(facts):
             with ui.column().classes("gap-0"):
@@ -69,120 +100,130 @@ def _show(project: Project, run: Path, facts: Facts) -> None:
         text = transform_text(name, estimate)
         ui.label(f"{text.name} {text.meaning}")
         ui.code(text.matrix, language="text").classes("w-full overflow-x-auto")
-    Doctor(project, run)
-    if facts.result.transforms:
-        _exports(project, run)
-    command_line(project.command("certificate", str(run.relative_to(project.folder))))
+    for note in facts.result.provenance.notes:
+        ui.label(note).classes("text-caption")
+
+
+class Better:
+    """What would make the calibration better: the motion that is missing."""
+
+    def __init__(self, project: Project, run: Path, facts: Facts) -> None:
+        ui.label("What would make it better").classes("text-h6")
+        self._place = ui.column().classes("w-full gap-1")
+        command_line(project.command("outlook", str(run.relative_to(project.folder))))
+        self._log, self._registry = facts.log, project.registry
+        ui.timer(0.05, self._load, once=True)
+
+    async def _load(self) -> None:
+        try:
+            found = await asyncio.to_thread(outlook_of_log, self._log, self._registry)
+        except FlangeyeError as error:
+            found = Outlook(missing=str(error))
+        with self._place:
+            for line in filter(None, [found.missing, *found.better]):
+                warning(line)
+            if not found.missing and not found.better:
+                ui.label("The poses reach every side of the work, turned both ways.")
+            if found.coverage:
+                ui.html(coverage_drawing(found.coverage), sanitize=False).classes("w-full")
 
 
 class Doctor:
-    """The doctor's findings, with a button that writes the line it gives into the recipe."""
+    """The doctor's findings, each with a button that writes the line it gives into the recipe."""
 
     def __init__(self, project: Project, run: Path) -> None:
         self._project, self._run = project, run
         ui.button("Ask the doctor", on_click=self._ask).props("outline")
         self._told = ui.column().classes("w-full gap-1")
+        command_line(project.command("doctor", str(run.relative_to(project.folder))))
 
     async def _ask(self) -> None:
         self._told.clear()
         with self._told:
             ui.spinner()
-        findings = await asyncio.to_thread(lambda: list(self._findings()))
+        try:
+            findings, error = await asyncio.to_thread(self._findings), ""
+        except FlangeyeError as refused:
+            findings, error = (), str(refused)
         self._told.clear()
         with self._told:
-            if not findings:
+            if error:
+                mistake(error)
+            elif not findings:
                 ui.label("The doctor found nothing.").props('role="status"')
-            for what, fix in findings:
-                ui.label(what)
-                ui.code(fix).classes("w-full overflow-x-auto")
-                ui.button("Write this line", on_click=lambda _, fix=fix: self._apply(fix))
+            for found in findings:
+                self._show(found)
 
-    def _findings(self) -> Iterator[tuple[str, str]]:
+    def _findings(self) -> tuple[Finding, ...]:
         registry = self._project.registry
-        try:
-            session = open_session(self._run / "run.mcap", registry)
-            checks = [part for part in registry.parts.values() if part.kind == "check"]
-            for found in examine(session, checks).findings:
-                yield found.what, found.fix
-        except FlangeyeError as error:
-            yield str(error), ""
+        session = open_session(self._run / "run.mcap", registry)
+        checks = [part for part in registry.parts.values() if part.kind == "check"]
+        return examine(session, checks).findings
 
-    def _apply(self, fix: str) -> None:
-        """Write the finding's line into the first step, if it is a line of a recipe."""
-        try:
-            line: Any = yaml.safe_load(fix)
-        except yaml.YAMLError:
-            line = None
-        data = self._project.data()
-        if not isinstance(line, dict) or not data.get("steps"):
-            ui.notify("this is for a person to do, not a line of the recipe", type="warning")
+    def _show(self, found: Finding) -> None:
+        warning(f"{found.name}: {found.what}")
+        ui.code(found.fix, language="yaml").classes("w-full overflow-x-auto")
+        with ui.row().classes("gap-2"):
+            for line in found.lines:
+                label = f"Write {next(iter(line))} into the recipe"
+                ui.button(label, on_click=partial(self._apply, line)).props("no-caps")
+
+    def _apply(self, line: dict[str, Any]) -> None:
+        for name, params in line.items():
+            self._project.write_line(name, params)
+        ui.notify("written into the recipe; look at the page Cell, then run it again")
+
+
+def _certificate(project: Project, run: Path) -> None:
+    """Let the certificate be written, with what only a person knows of the place."""
+    where = run.relative_to(project.folder)
+    asked = {
+        "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
+        "place": "Where it was done", "operator": "Who did it",
+    }  # fmt: skip
+    boxes: dict[str, ui.input] = {}
+
+    def words() -> list[str]:
+        given = {key: box.value for key, box in boxes.items() if box.value}
+        options = [f"--{key}={value}" for key, value in given.items()]
+        return ["certificate", str(where), *options]
+
+    async def write() -> None:
+        said = await asyncio.to_thread(project.run_command, [*words(), "--no-pdf"])
+        if said.startswith("error: "):
+            mistake(said.removeprefix("error: "))
             return
-        for name, value in line.items():
-            _write(data, str(name), value)
-        self._project.edit(data)
-        ui.notify("written; look at the page Cell")
+        line.content = project.command(*words())
+        link.set_visibility(True)
 
-
-def _write(data: dict[str, Any], name: str, value: Any) -> None:
-    """Put a stage's parameters into its step, or a parameter into the first step."""
-    for index, entry in enumerate(data["steps"]):
-        step = next(iter(entry)) if isinstance(entry, dict) else entry
-        if step == name:
-            given = (entry[step] if isinstance(entry, dict) else None) or {}
-            data["steps"][index] = {step: {**given, **(value or {})}}
-            return
-    apply_override(
-        cast("dict[Hashable, Any]", data),
-        f"{name}={yaml.safe_dump(value, default_flow_style=True)}",
-    )
+    with ui.row().classes("w-full gap-4"):
+        for key, label in asked.items():
+            boxes[key] = ui.input(label).classes("w-64")
+    ui.button("Write the certificate", on_click=write)
+    link = ui.link("Open the certificate", f"/{where}/certificate.html", new_tab=True)
+    link.set_visibility((run / "certificate.html").exists())
+    line = command_line(project.command(*words()))
 
 
 def _exports(project: Project, run: Path) -> None:
     """Show the calibration in every program's words, a tab each."""
     names = sorted(n.removeprefix("export.") for n in project.registry.stages if n[:7] == "export.")
-    where = run.relative_to(project.folder)
-    ui.label("Export").classes("text-h6")
+    where = str(run.relative_to(project.folder))
 
-    place = ui.column().classes("w-full gap-1")
-    with place:
-        code = ui.code("", language="text").classes("w-full overflow-x-auto")
-        line = ui.label().classes("font-mono text-caption")
+    async def show(event: ValueChangeEventArguments[Any]) -> None:
+        words = ["export", where, "--to", str(event.value)]
+        code.content = await asyncio.to_thread(project.run_command, [*words, "--out", "-"])
+        line.content = project.command(*words)
 
-    async def show(name: str) -> None:
-        words = ["export", str(where), "--to", name]
-        code.content = await asyncio.to_thread(_exported, project.folder, words)
-        line.text = project.command(*words)
+    async def save() -> None:
+        if tabs.value:
+            words = ["export", where, "--to", str(tabs.value)]
+            ui.notify(await asyncio.to_thread(project.run_command, words))
 
-    async def chosen(event: ValueChangeEventArguments[Any]) -> None:
-        await show(str(event.value))
-
-    with (
-        ui.tabs(on_change=chosen)
-        .classes("w-full")
-        .props("dense outside-arrows mobile-arrows") as tabs
-    ):
+    tabs = ui.tabs(on_change=show).classes("w-full").props("dense outside-arrows mobile-arrows")
+    with tabs:
         for name in names:
             ui.tab(name)
-    with ui.row().classes("items-center"):
-
-        async def save() -> None:
-            if tabs.value:
-                words = ["export", str(where), "--to", str(tabs.value)]
-                ui.notify(await asyncio.to_thread(_command, project.folder, words))
-
-        ui.button("Write the file", on_click=save)
-    place.move(target_index=-1)
-
-
-def _exported(folder: Path, words: list[str]) -> str:
-    return _command(folder, [*words, "--out", "-"])
-
-
-def _command(folder: Path, words: list[str]) -> str:
-    """Return what a command of flangeye prints."""
-    import subprocess
-    import sys
-
-    command = [sys.executable, "-P", "-m", "flangeye.cli", *words]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-    return (done.stdout or done.stderr).strip()
+    code = ui.code("choose a program above", language="text").classes("w-full overflow-x-auto")
+    ui.button("Write the file", on_click=save)
+    line = command_line(project.command("export", where, "--to", "PROGRAM"))

@@ -14,12 +14,16 @@ if TYPE_CHECKING:
 STAGES = {
     "acquire.simulated": "flangeye_emulators.acquire.simulated:acquire_simulated",
     "acquire.simulated_cell": "flangeye_emulators.acquire.simulated_cell:acquire_simulated_cell",
+    "acquire.simulated_cell_scans": "flangeye_emulators.acquire.simulated_cell:"
+    "acquire_simulated_cell_scans",
     "acquire.simulated_marker": "flangeye_emulators.acquire.simulated_session:"
     "acquire_simulated_marker",
     "acquire.simulated_session": "flangeye_emulators.acquire.simulated_session:"
     "acquire_simulated_session",
     "acquire.simulated_images": "flangeye_emulators.acquire.simulated_images:"
     "acquire_simulated_images",
+    "acquire.simulated_profiles": "flangeye_emulators.acquire.simulated_profiles:"
+    "acquire_simulated_profiles",
     "scan.simulated": "flangeye_emulators.scan.simulated:scan_simulated",
 }
 

@@ -22,6 +22,7 @@ STAGES = {
     "fit.aruco": "flangeye_plugins.fit.boards:fit_aruco",
     "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
     "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",
+    "fit.sphere_profile": "flangeye_plugins.fit.sphere_profile:fit_sphere_profile",
     "solve.cell": "flangeye_plugins.solve.cell:solve_cell",
     "solve.robust": "flangeye_plugins.solve.robust:solve_robust",
     "solve.svd": "flangeye_plugins.solve.svd:solve_svd",
@@ -75,6 +76,7 @@ STAGES = {
 PARTS = {
     "reader.ancorasir": "flangeye_plugins.reader.ancorasir:ancorasir",
     "reader.auto": "flangeye_plugins.reader.auto:auto",
+    "reader.cell": "flangeye_plugins.reader.cell:cell",
     "reader.corrected": "flangeye_plugins.reader.corrected:corrected",
     "reader.easy_handeye": "flangeye_plugins.reader.easy_handeye:easy_handeye",
     "reader.folder": "flangeye_plugins.reader.folder:folder",
@@ -118,6 +120,7 @@ PARTS = {
     "scanner.watched_folder": "flangeye_plugins.scanner.watched_folder:scanner_watched_folder",
     "replay.tactile": "flangeye_plugins.replay.tactile:replay_tactile",
     "guide.tactile": "flangeye_plugins.guide.tactile:guide_tactile",
+    "guide.tool": "flangeye_plugins.guide.tactile:guide_tool",
     "sensor.opencv": "flangeye_plugins.sensor.opencv:sensor_opencv",
     "sensor.image_folder": "flangeye_plugins.sensor.recorded:sensor_image_folder",
     "sensor.mcap": "flangeye_plugins.sensor.recorded:sensor_mcap",

@@ -285,7 +285,7 @@ def cycle() -> tuple[Work, Work]:
 
     x = np.linspace(0.0, 2.0, 2000)
     plan = Plan(np.column_stack([x, 0.02 * np.sin(x / 0.1), 0.0 * x]))
-    follower, clock = Follower(plan, Belief(40e-3), Following()), itertools.count()
+    follower, clock = Follower(plan, Belief(40e-3), Following(probing=False)), itertools.count()
 
     def turn() -> None:
         time = next(clock) * 2e-3
@@ -293,7 +293,8 @@ def cycle() -> tuple[Work, Work]:
         position = np.array([*(at.point + 2e-3 * at.normal), at.height - 1.5e-3])
         angle = float(np.arctan2(at.tangent[1], at.tangent[0]))
         assert follower.phase in ("seeking", "following"), follower.reason
-        follower.step(ToolPose(time, position, angle), [Touch(time, np.array([0, -2e-3, 1.5e-3]))])
+        bent = np.array([0, -2e-3, 1.5e-3]) if time > 0.5 else np.zeros(3)  # free at first
+        follower.step(ToolPose(time, position, angle), [Touch(time, bent)])
 
     for _ in range(6000):  # until the torch has what was felt on both of its sides
         turn()

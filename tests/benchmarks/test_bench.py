@@ -24,3 +24,13 @@ def test_a_ratio_is_held_against_the_kept_one(ratio: float, kept: float | None, 
 def test_goals_and_kept_figures_are_of_cases_there_are() -> None:
     assert set(GOALS) <= set(CASES)
     assert set(json.loads(KEPT.read_text())) <= set(CASES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_every_case_can_be_measured(name: str) -> None:
+    pair = CASES[name]()
+    if pair is None:
+        pytest.skip("its recordings are not here")
+    for work in pair:
+        work.call()

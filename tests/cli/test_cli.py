@@ -238,7 +238,8 @@ def test_ctrl_c_keeps_what_was_gathered(
          "error: --set and --resume: a run goes on with the recipe it began with"),
         (("--resume", "nowhere"), "error: nowhere: cannot be read: No such file or directory"),
         (("--resume", "done"),
-         "error: done/run.mcap: this run came to its end; there is nothing to go on with"),
+         "error: done/run.mcap: this run came to its end; there is nothing to go on with "
+         "(--retake ID takes a capture again)"),
         (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
     ],
 )  # fmt: skip

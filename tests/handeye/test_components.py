@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from flangeye.handeye.components import FINEST, LARGEST, Noise, Residuals, noise_of
+from flangeye.handeye.components import (
+    FINEST,
+    LARGEST,
+    Noise,
+    Residuals,
+    noise_of,
+    with_depth,
+    without_arms,
+)
 from flangeye.maths.statistics import chi2_quantile
 
 N = 50
@@ -85,9 +93,11 @@ def test_what_the_arms_do_not_explain_is_added_evenly() -> None:
     assert (found.centre_scale, found.normal_scale) == (1.0, 1.0)
 
 
-@pytest.mark.parametrize("name", ["pose", "tilt", "centre_scale", "normal_scale", "arms"])
+@pytest.mark.parametrize("name", ["pose", "tilt", "centre_scale", "normal_scale", "arms", "depth"])
 def test_noises_are_close_to_a_thousandth(name: str) -> None:
-    base = dict(pose=1e-4, tilt=1e-4, centre_scale=0.5, normal_scale=0.5, arms=0.5, size=0.5)
+    base = dict(
+        pose=1e-4, tilt=1e-4, centre_scale=0.5, normal_scale=0.5, arms=0.5, size=0.5, depth=1e-4
+    )
     noise = Noise(**base)
     assert noise.is_close(Noise(**{**base, name: base[name] * 1.0009}))
     assert not noise.is_close(Noise(**{**base, name: base[name] * 1.0012}))
@@ -102,3 +112,18 @@ def test_a_nuisances_size_is_compared_by_its_variance() -> None:
     noise = Noise(0.0, 0.0, size=0.5)
     assert noise.is_close(Noise(0.0, 0.0, size=0.5 * 1.00049))
     assert not noise.is_close(Noise(0.0, 0.0, size=0.5 * 1.0006))
+
+
+def test_what_is_along_the_axis_alone_is_depth() -> None:
+    own, axis = six(turned=1e-8, shifted=1e-8), np.diag([0.0, 0.0, 1.0])
+    along = Residuals(np.tile([0.0, 0.0, 9e-4], (N, 1)), np.tile(axis, (N, 1, 1)), 1.0 * N)
+    found = with_depth(Noise(3e-8, 0.0), along, own, 0 * own)
+    assert found.depth == pytest.approx(81e-8 - 4e-8 - FINEST**2, rel=1e-6)
+    assert with_depth(Noise(81e-8, 0.0), along, own, 0 * own).depth == 0.0
+
+
+def test_noise_that_is_none_of_the_arms_has_no_share_of_theirs() -> None:
+    own = six(turned=1e-8, shifted=1e-8)
+    found = without_arms(residuals(4e-8), residuals(9e-8), own)
+    assert found.arms == 0.0
+    assert found.pose == pytest.approx(8e-8 - FINEST**2, rel=1e-5)

@@ -158,6 +158,25 @@ def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands() -> None:
         solve_graph(given, seen(frames, pairs, np.random.default_rng(0)))
 
 
+def test_the_link_between_two_parts_that_is_missing_is_named() -> None:
+    """Two arms, each with a camera and a marker on its own table: nothing ties the second's."""
+    frames, _, _ = CELLS["two arms with a scanner each and one between"]
+    frames = {
+        **{name: frames[name] for name in ("flange", "base2", "flange2", "hand", "hand2")},
+        "table": Frame("base", pose(0, 0, 0.4, 0.5, 0.2, 0)),
+        "table2": Frame("base2", pose(0, 0, 0.4, 0.5, 0.2, 0)),
+    }
+    unknown = ("base2", "hand", "hand2", "table", "table2")
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    pairs = [("hand", "table"), ("hand2", "table2")]
+    told = (
+        "do not tell where base2 is: .* no sighting ties hand2 and table2 to hand and table: let a "
+        "camera of the one see a target of the other"
+    )
+    with pytest.raises(CalibrationRefused, match=told):
+        solve_graph(given, seen(frames, pairs, np.random.default_rng(0)))
+
+
 def test_frames_that_lead_to_two_roots_are_refused() -> None:
     with pytest.raises(StageError, match="stand on base and floor, which nothing ties"):
         solve_graph({"a": Frame("base"), "b": Frame("floor")}, [])

@@ -244,6 +244,44 @@ def test_noise_that_is_not_stated_is_found() -> None:
     assert 0.4 < beyond < 0.65
 
 
+def shaken(made, turn, shift, deeper, seed):
+    """The session with a camera's noise of its own: rotation, and place across and in depth."""
+    rng, seen = np.random.default_rng(seed), []
+    for o in made.observations:
+        pose = o.feature.camera_T_target.matrix.copy()
+        pose[:3, :3] = rotation_exp(turn * rng.standard_normal(3)) @ pose[:3, :3]
+        pose[:3, 3] += np.array([shift, shift, deeper]) * rng.standard_normal(3)
+        moved = replace(o.feature, camera_T_target=Transform(CAMERA, TARGET, pose))
+        seen.append(replace(o, feature=moved))
+    return replace(made, observations=seen)  # fmt: skip
+
+
+def test_a_camera_that_is_worse_in_depth_is_believed_across() -> None:
+    """Its places are three times as noisy along its axis: what is across tells more."""
+    even, deep = [], []
+    for seed in range(6):
+        made = session(MARKER, np.random.default_rng(seed), n=30)
+        made = shaken(made, 2e-3, 1e-3, 3e-3, seed)
+        known = solve(made).camera
+        deep.append(errors(known, made.truth["flange_T_camera"])[3:])
+        isotropic = np.diag([2e-3**2] * 3 + [11e-6 / 3] * 3)
+        alike = [
+            replace(o, feature=replace(o.feature, covariance=isotropic)) for o in made.observations
+        ]
+        stated = solve(replace(made, observations=alike), robot_noise=STATED.robot_noise).camera
+        even.append(errors(stated, made.truth["flange_T_camera"])[3:])
+    assert np.square(deep).mean() < 0.8 * np.square(even).mean()
+
+
+def test_noise_of_the_camera_alone_costs_no_good_pose() -> None:
+    """Its rotations and places are noisy apart, which no arm makes: nothing is an outlier."""
+    used = []
+    for seed in range(2):
+        made = shaken(session(MARKER, np.random.default_rng(seed), n=60), 1e-2, 6e-3, 2e-2, seed)
+        used += [pair.used for pair in solve(made).pairs]
+    assert np.mean(used) > 0.99
+
+
 def resized(made, factor):
     """The session as a camera would see it that takes all distances for longer."""
     seen = []

@@ -79,7 +79,9 @@ def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(
     recorder.flangeye_captured("0.acquire.toy", replace(CAPTURE, id="b"), 0.1)
     recorder.close()
     log = read_run(tmp_path / "r.mcap")
-    assert set(log.poses["a"]["image"]) == {"camera_matrix", "distortion"}
+    assert set(log.poses["a"]["image"]) == {
+        "camera_matrix", "distortion", "camera_covariance"
+    }  # fmt: skip
     assert log.poses["a"]["full"]  # an image without a cloud is whole
     first, other = log.captures()
     assert np.array_equal(first.image.pixels, pixels)

@@ -117,6 +117,16 @@ def test_a_journal_and_a_solvers_progress_are_shown(log: Any) -> None:
     assert rows["error so far"] == "95 % below 0.400 mm after 7 poses, 0.350 mm required"
 
 
+def test_the_next_pose_is_shown_with_what_it_promises(log: Any) -> None:
+    path, _ = log
+    recorder = Recorder(path, {}, False)
+    recorder.flangeye_noted("0.acquire.live", "next", {"id": "0004", "why": "tells most"})
+    recorder.flangeye_run_finished({})
+    assert (
+        dict(watch_run(path, None, plain(), patience=5).rows())["next pose"] == "0004: tells most"
+    )
+
+
 def test_foxglove_is_served_the_same_messages(log: Any) -> None:
     websockets = pytest.importorskip("websockets.sync.client")
     path, run = log

@@ -14,6 +14,7 @@ from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
 from flangeye.motion.arm import watched
 from flangeye.motion.route import Router
+from flangeye.motion.supervision import Sample
 from flangeye.motion.watchdog import Charge, Watchdog
 from tests.motion.stand_in import (
     LIMITS,
@@ -41,7 +42,9 @@ def test_it_drives_there_and_has_settled() -> None:
     assert np.abs(state.joint_speeds).max() < 1e-3
     assert robot.closed
     assert len(told) > 2
-    assert all(a.time_ns < b.time_ns for a, b in pairwise(told))
+    # Every fifth of a second, at the next of its cycles.
+    late = [b.time_ns - a.time_ns - 200_000_000 for a, b in pairwise(told[:-1])]
+    assert all(0 < each <= 10_000_000 for each in late)
 
 
 def test_it_knows_where_the_arm_was() -> None:
@@ -52,6 +55,33 @@ def test_it_knows_where_the_arm_was() -> None:
     assert samples[0].time_ns <= end // 2 < samples[1].time_ns
     assert samples[-1].time_ns >= end
     assert np.abs(np.diff([s.time_ns for s in samples])).max() < 5_000_000
+
+
+def test_the_samples_of_an_interval_are_those_in_it_and_one_to_each_side() -> None:
+    samples = [Sample(t, np.eye(4), np.zeros(6)) for t in (10, 20, 30, 40)]
+
+    def during(start: int, end: int) -> list[int]:
+        return [sample.time_ns for sample in guard_module._during(samples, start, end)]
+
+    assert during(21, 29) == [20, 30]
+    assert during(20, 30) == [20, 30]
+    assert during(5, 35) == [10, 20, 30, 40]
+    assert during(31, 99) == [30, 40]
+
+
+@pytest.mark.parametrize(("asked", "cycle"), [(0, 1), (30, 31)])
+def test_samples_are_told_once_their_interval_is_over(asked: int, cycle: int) -> None:
+    robot = StandIn()
+    period = round(robot.period * 1e9)
+    start = robot.state().time_ns
+    wanted = (start, start + asked * period)
+    wire: Any = Wire(robot, [(0, ("samples", wanted)), (60, ("close", None))])
+    told: list[tuple[int, Any]] = []
+    wire.send = lambda report: told.append((robot.cycles, report))
+    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    ((when, report),) = [each for each in told if each[1].what == "samples"]
+    assert when <= cycle
+    assert report.content[-1].time_ns >= wanted[1]
 
 
 def under_way(change):

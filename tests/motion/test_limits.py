@@ -28,6 +28,9 @@ def test_a_place_outside_the_box_is_named() -> None:
         "outside the box: y is -1200 mm, allowed -1000 to 1000 mm"
     )
     assert LIMITS.outside(np.array([0.0, -1.001, 0.0]), slack=0.002) is None
+    assert LIMITS.outside(np.array([0.0, -1.002, 1.102]), slack=0.002) is None
+    assert LIMITS.outside(np.array([0.0, 0.0, 1.103]), slack=0.002) is not None
+    assert LIMITS.outside(np.array([-1.003, 0.0, 0.0]), slack=0.002) is not None
 
 
 def test_the_joint_nearest_to_its_limit_is_named() -> None:
@@ -38,6 +41,12 @@ def test_the_joint_nearest_to_its_limit_is_named() -> None:
     assert limits.beyond(joints, np.radians(5.0)) == (
         "joint 3 at 88 deg, its limits are -90 and 90 deg"
     )
+    assert limits.beyond(-joints, np.radians(5.0)) == (
+        "joint 3 at -88 deg, its limits are -90 and 90 deg"
+    )
+    on_it = np.r_[limits.upper[:1], np.zeros(5)]
+    assert limits.beyond(on_it, 0.0) is None
+    assert limits.beyond(on_it, 1e-9) is not None
 
 
 def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:

@@ -1,4 +1,7 @@
-"""When an arm is doubted: to the sample, on either side of each bound."""
+"""When an arm is stopped: to the sample, on either side of each bound.
+
+The bounds stand here as numbers: a test that took them from the code would follow any change of it.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -6,11 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.motion import supervision
+from flangeye.devices import RobotState
+from flangeye.motion.route import Leg
 from flangeye.motion.supervision import SafetyFault, Watch
-from tests.motion.stand_in import LIMITS, MODEL, StandIn
+from tests.motion.stand_in import LIMITS, MODEL, StandIn, elsewhere, turned
 
 SECOND = 1_000_000_000
+MILLISECOND = 1_000_000
+BRAKING = 2 * SECOND
+DEGREE = float(np.radians(1.0))
 
 
 def moving(at, speed=1.0):
@@ -27,7 +34,7 @@ def halted_at(at):
 
 @pytest.mark.parametrize("start", [SECOND, 7 * SECOND])
 def test_an_arm_may_brake_for_its_time_and_no_longer(start: Any) -> None:
-    braking = int(supervision.BRAKING * SECOND)
+    braking = BRAKING
     watch = halted_at(start)
     assert not watch.judge(moving(start + braking))
     with pytest.raises(SafetyFault, match="the arm moves, and was not told to"):
@@ -35,7 +42,7 @@ def test_an_arm_may_brake_for_its_time_and_no_longer(start: Any) -> None:
 
 
 def test_the_time_to_brake_begins_anew_with_every_halt() -> None:
-    braking = int(supervision.BRAKING * SECOND)
+    braking = BRAKING
     watch = halted_at(SECOND)
     watch.judge(moving(SECOND + braking, 0.0))
     watch.halted()
@@ -46,7 +53,7 @@ def test_the_time_to_brake_begins_anew_with_every_halt() -> None:
 
 def test_an_arm_that_stands_is_never_doubted() -> None:
     watch = halted_at(SECOND)
-    slow = 10 * supervision.STANDING
+    slow = 10e-3
     assert not watch.judge(moving(100 * SECOND, slow))
     with pytest.raises(SafetyFault):
         watch.judge(moving(101 * SECOND, slow * 1.01))
@@ -61,8 +68,165 @@ def test_who_else_moves_it_and_that_it_goes_on_is_said() -> None:
 def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
     watch = Watch(MODEL, LIMITS)
     watch.led()
-    fast = supervision.FAST * LIMITS.joint_speed
+    fast = 1.3 * LIMITS.joint_speed
     state = moving(SECOND, 0.0)
     assert not watch.judge(replace(state, joint_speeds=np.r_[fast * 0.999, np.zeros(5)]))
     with pytest.raises(SafetyFault, match="a joint turns at"):
         watch.judge(replace(state, joint_speeds=np.r_[-fast * 1.001, np.zeros(5)]))
+
+
+AT_HOME = moving(5 * SECOND, 0.0)
+GOAL = turned(AT_HOME.joints, j2=0.4)
+
+
+def sent(goal: Any = GOAL, seconds: float = 4.0) -> Watch:
+    """Return a watch on an arm that was sent on a leg at 5 s."""
+    watch = Watch(MODEL, LIMITS)
+    watch.judge(AT_HOME)
+    watch.set_off(Leg(goal, 0.1, 0.1, seconds))
+    return watch
+
+
+def at(seconds: float, joints: Any, speed: float = 0.0) -> RobotState:
+    """Return a state so long after the arm was sent."""
+    time_ns = AT_HOME.time_ns + round(seconds * SECOND)
+    return replace(AT_HOME, time_ns=time_ns, joints=joints, joint_speeds=np.full(6, speed))
+
+
+@pytest.mark.parametrize("share", [-0.0, 0.5, 1.0])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_three_degrees_beside_the_way_are_allowed_and_no_more(share: float, side: int) -> None:
+    on_way = turned(AT_HOME.joints, j2=0.4 * share)
+    sent().judge(at(0.5, turned(on_way, j3=side * 2.99 * DEGREE), 0.1))
+    with pytest.raises(SafetyFault, match=r"the arm is 3.0 deg away from the way it was sent"):
+        sent().judge(at(0.5, turned(on_way, j3=side * 3.01 * DEGREE), 0.1))
+
+
+@pytest.mark.parametrize("end", [0.0, 0.4])
+def test_beyond_either_end_of_the_way_is_beside_it(end: float) -> None:
+    outwards = 1 if end else -1
+    there = turned(AT_HOME.joints, j2=end)
+    sent().judge(at(0.5, turned(there, j2=outwards * 2.99 * DEGREE), 0.1))
+    with pytest.raises(SafetyFault, match="away from the way it was sent"):
+        sent().judge(at(0.5, turned(there, j2=outwards * 3.01 * DEGREE), 0.1))
+
+
+def test_a_second_to_set_off_and_no_longer() -> None:
+    sent().judge(at(1.0, AT_HOME.joints))
+    sent().judge(at(1.001, turned(AT_HOME.joints, j2=0.051 * DEGREE)))
+    for still in (AT_HOME.joints, turned(AT_HOME.joints, j2=0.049 * DEGREE)):
+        with pytest.raises(SafetyFault, match="the arm has not set off 1 s after it was told to"):
+            sent().judge(at(1.001, still))
+
+
+def test_a_way_too_short_to_see_has_not_to_be_set_off_on() -> None:
+    sent(turned(AT_HOME.joints, j2=0.099 * DEGREE)).judge(at(1.5, AT_HOME.joints))
+    with pytest.raises(SafetyFault, match="has not set off"):
+        sent(turned(AT_HOME.joints, j2=0.101 * DEGREE)).judge(at(1.5, AT_HOME.joints))
+
+
+def test_twice_the_time_and_two_seconds_to_arrive_and_no_longer() -> None:
+    half_way = turned(AT_HOME.joints, j2=0.2)
+    sent().judge(at(10.0, half_way))
+    with pytest.raises(SafetyFault, match=r"not there after 10.0 s; 4.0 s were expected"):
+        sent().judge(at(10.001, half_way))
+
+
+def test_it_has_arrived_when_it_stood_near_the_goal_for_a_tenth_of_a_second() -> None:
+    watch, near = sent(), turned(GOAL, j1=0.049 * DEGREE)
+    assert not watch.judge(at(3.0, near, 0.99e-3))
+    assert not watch.judge(at(3.099, near, 0.99e-3))
+    assert watch.judge(at(3.1, near, 0.99e-3))
+
+
+@pytest.mark.parametrize("change", ["far", "fast"])
+def test_what_stands_not_yet_or_not_there_has_not_arrived(change: str) -> None:
+    off = turned(GOAL, j1=0.051 * DEGREE) if change == "far" else GOAL
+    speed = 1.01e-3 if change == "fast" else 0.0
+    watch = sent()
+    watch.judge(at(3.0, GOAL))
+    assert not watch.judge(at(3.05, off, speed))
+    assert not watch.judge(at(3.12, GOAL))
+    assert not watch.judge(at(3.2, GOAL))
+    assert watch.judge(at(3.22, GOAL))
+
+
+def test_the_next_leg_begins_where_and_when_the_arm_is() -> None:
+    watch = sent()
+    watch.judge(at(3.0, GOAL))
+    assert watch.judge(at(3.1, GOAL))
+    watch.set_off(Leg(turned(GOAL, j1=0.2), 0.1, 0.1, 4.0))
+    watch.judge(at(4.1, GOAL))
+    with pytest.raises(SafetyFault, match="has not set off"):
+        watch.judge(at(4.102, GOAL))
+
+
+def test_after_a_halt_there_is_no_way_to_be_beside_of() -> None:
+    watch = sent()
+    watch.halted()
+    assert watch.leg is None
+    assert not watch.judge(at(0.5, turned(AT_HOME.joints, j3=0.3), 1.0))
+    with pytest.raises(SafetyFault, match="was not told to"):
+        watch.judge(at(2.001, AT_HOME.joints, 1.0))
+
+
+def test_three_millimetres_outside_the_box_are_allowed_and_no_more() -> None:
+    top = LIMITS.high[2] - AT_HOME.base_T_flange.translation[2]
+    above = [replace(at(0.5, AT_HOME.joints, 0.1),
+                     base_T_flange=elsewhere(AT_HOME, [0.0, 0.0, top + by]))
+             for by in (2.9e-3, 3.1e-3)]  # fmt: skip
+    sent().judge(above[0])
+    with pytest.raises(SafetyFault, match="the arm is outside the box: z is 1103 mm"):
+        sent().judge(above[1])
+
+
+def test_a_joint_may_be_a_twentieth_of_a_degree_beyond_its_limit() -> None:
+    limits = replace(LIMITS, upper=AT_HOME.joints + 0.1)
+    watch = Watch(MODEL, limits)
+    watch.judge(AT_HOME)
+    watch.led()
+    watch.judge(at(0.1, turned(AT_HOME.joints, j4=0.1 + 0.049 * DEGREE)))
+    with pytest.raises(SafetyFault, match="joint 4 at"):
+        watch.judge(at(0.2, turned(AT_HOME.joints, j4=0.1 + 0.051 * DEGREE)))
+
+
+def test_who_is_led_may_move_and_has_never_arrived() -> None:
+    watch = Watch(MODEL, LIMITS)
+    watch.judge(AT_HOME)
+    watch.led()
+    assert not watch.judge(at(9.0, AT_HOME.joints, 0.3))
+    watch.halted()
+    with pytest.raises(SafetyFault, match="was not told to"):
+        watch.judge(at(11.001, AT_HOME.joints, 0.3))
+
+
+@pytest.mark.parametrize("mode", ["protective stop", "emergency stop", "not ready"])
+def test_a_controller_that_is_not_ready_is_a_fault(mode: Any) -> None:
+    with pytest.raises(SafetyFault, match=f"the controller reports {mode}: no reason"):
+        sent().judge(replace(at(0.1, AT_HOME.joints), mode=mode))
+
+
+def test_an_arm_moved_by_hand_is_there_when_the_person_says_so() -> None:
+    watch = Watch(MODEL, LIMITS, by_hand=True)
+    far = turned(AT_HOME.joints, j2=1.0)
+    assert not watch.judge(at(0.1, far, 2.0))
+    watch.set_off(Leg(GOAL, 0.1, 0.1, 4.0))
+    assert not watch.judge(replace(at(0.2, far, 2.0), mode="moving"))
+    assert watch.judge(at(0.3, far, 0.0))
+
+
+def test_a_centimetre_from_the_model_is_allowed_and_no_more() -> None:
+    watch = Watch(MODEL, LIMITS)
+    watch.check_model(replace(AT_HOME, base_T_flange=elsewhere(AT_HOME, [9.9e-3, 0.0, 0.0])))
+    with pytest.raises(SafetyFault, match="the controller's flange is 10 mm from"):
+        watch.check_model(replace(AT_HOME, base_T_flange=elsewhere(AT_HOME, [0.0, 10.1e-3, 0.0])))
+
+
+def test_twenty_seconds_are_remembered() -> None:
+    watch = Watch(MODEL, LIMITS)
+    for seconds in (0.0, 0.1, 20.0, 20.1):
+        watch.judge(at(seconds, AT_HOME.joints))
+    assert len(watch.samples) == 3
+    newest = watch.samples[-1]
+    assert newest.time_ns == at(20.1, GOAL).time_ns
+    assert newest.joints.tolist() == AT_HOME.joints.tolist()

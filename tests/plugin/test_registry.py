@@ -175,6 +175,16 @@ def test_finding_plugins_imports_none_of_their_modules() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_exports_are_found_without_the_other_stages() -> None:
+    code = (
+        "import sys; from flangeye.plugin.registry import load_registry; "
+        "print(len(load_registry().exports()) > 10); "
+        "print([m for m in sys.modules if m.startswith(('flangeye_plugins.weld', 'scipy.signal'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n") == ["True", "[]", ""]
+
+
 def test_help_waits_for_no_arrays() -> None:
     code = "import sys; import flangeye.cli; print({'numpy', 'pydantic'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -94,10 +94,12 @@ def test_steps_for_one_camera_are_refused_in_a_cell() -> None:
     )
     assert found == [
         "r.yaml:3: steps.0.acquire.simulated_marker: acquire.simulated_marker serves no cell; use "
+        "acquire.samples, acquire.centres or acquire.archive with reader: cell, or "
         "acquire.simulated_cell",
         "r.yaml:3: steps.1.solve.robust: solve.robust serves no cell; use solve.cell",
         "r.yaml:3: steps.3.export.matrix: export.matrix serves no cell; leave it out: "
-        "calibration.yaml carries every transform of the cell",
+        "calibration.yaml carries every transform of the cell, and after the run flangeye export RUN "
+        "--to NAME --camera CAMERA writes one",
     ]
 
 

@@ -7,13 +7,13 @@ import time
 import pytest
 
 from flangeye import types as t
-from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import parse_recipe
+from flangeye.plugin.registry import Registry, load_registry
+from flangeye.recipe.load import find_recipe, load_recipe, parse_recipe
 from flangeye.run import runner
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.runner import Runner
 from tests import toy
-from tests.conftest import TOY_RECIPE
+from tests.conftest import TOY_RECIPE, replaced
 
 
 def test_results_come_in_order_whatever_finishes_first() -> None:
@@ -93,3 +93,32 @@ def test_a_run_on_one_core_and_on_many_is_the_same(
     many, other, _ = run(3)
     assert one == many
     assert timing.keys() == other.keys() and acquired
+
+
+def test_simulated_scans_are_made_ahead_and_give_the_same_calibration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    registry = load_registry()
+    small = ["steps.0.resolution=0.25", "steps.0.poses={grid: {counts: [2, 2, 2]}}"]
+    recipe = load_recipe(find_recipe("ur5_phoxi-m_simulated"), registry, small)
+    threads: set[str] = set()
+    segment = recipe.steps[1].stage
+
+    def watched(**given):
+        threads.add(threading.current_thread().name)
+        return segment_of(**given)
+
+    segment_of = segment.function
+
+    def run(cores):
+        monkeypatch.setattr(runner, "cores", lambda: cores)
+        threads.clear()
+        with replaced(segment, watched):
+            result = Runner(recipe, registry, t.ArchivePath()).run().model_dump(mode="json")
+        result.pop("timing")
+        return json.dumps(result), threads.copy()
+
+    one, here = run(1)
+    two, elsewhere = run(2)
+    assert one == two
+    assert here == {"MainThread"} and "MainThread" not in elsewhere

@@ -72,14 +72,16 @@ def ended(served: Served) -> None:
         served.process.wait(10)
     except subprocess.TimeoutExpired:
         served.process.kill()
+        served.process.wait(10)
     if served.process.stdout:
         served.process.stdout.close()
 
 
-@pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """One server for the module, in a folder that is empty at first."""
     pytest.importorskip("nicegui", reason="nicegui is not installed")
-    running = serve(tmp_path)
+    running = serve(tmp_path_factory.mktemp("cell"))
     yield running
     ended(running)
 

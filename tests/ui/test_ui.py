@@ -5,7 +5,9 @@ With FLANGEYE_PICTURES=1 the pictures in docs/images are made again.
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -17,14 +19,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
+from flangeye import cli
 from flangeye.errors import StageError
+from flangeye.maths.pose_corrections import inverted
+from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.load import find_recipe
+from flangeye_ui import archive_page, cell_page, plan_page, run_page, server, verdict_page
 from flangeye_ui.plan_page import stops_of
-from flangeye_ui.project import _mistake
+from flangeye_ui.project import Project, _mistake
 from flangeye_ui.server import require_free
+from tests.doctor.sessions import clean
+from tests.doctor.test_cures import write
 from tests.ui.conftest import Served, ended, serve
 
 PICTURES = Path(__file__).parents[2] / "docs" / "images"
@@ -32,12 +41,27 @@ SMALL = """title: A small cell
 robot: {model: ur5}
 scanner: {model: phoxi-m}
 steps:
-  - acquire.simulated: {resolution: 0.25, poses: {grid: {counts: [2, 2, 2]}}}
+  - acquire.simulated: {resolution: 0.25, poses: {next_best: {count: 7, candidates: 60}}}
   - segment.flange
   - fit.rim
   - solve.robust
   - verify.holdout: {max_rms: 3 mm}
 """
+SAMPLES = """title: Samples
+robot: {model: ur5e}
+configuration: {name: eye-on-base, place: unknown}
+steps:
+  - acquire.samples: {path: samples, reader: moveit, position_noise: 0.3 mm}
+  - solve.maximum_likelihood
+"""
+SHOWN = """180 deg, -90 deg, 90 deg, -90 deg, -90 deg, 0 deg
+185 deg, -90 deg, 95 deg, -95 deg, -90 deg, 0 deg
+175 deg, -80 deg, 90 deg, -100 deg, -90 deg, 0 deg"""
+URDF = """<robot name="kr6"> <link name="base_link"/> <link name="l1"/> <link name="tool0"/>
+<joint name="a1" type="revolute"> <parent link="base_link"/> <child link="l1"/>
+<origin xyz="0 0 0.4"/> <axis xyz="0 0 -1"/> <limit lower="-2" upper="2"/> </joint>
+<joint name="a2" type="revolute"> <parent link="l1"/> <child link="tool0"/>
+<origin xyz="0.5 0 0"/> <axis xyz="0 1 0"/> <limit lower="-2" upper="2"/> </joint> </robot>"""
 
 
 def shot(page: Any, name: str) -> None:
@@ -74,16 +98,110 @@ def write_recipe(page: Any, text: str) -> None:
     page.get_by_label("Recipe in YAML").fill(text)
 
 
+@pytest.fixture(scope="module")
+def finished(served: Served) -> Path:
+    """A run of the small cell that is done, in the server's folder; any that is there will do."""
+    for run in sorted(served.folder.glob("runs/*")):
+        if (run / "calibration.yaml").exists():
+            return run
+    path = served.folder / "small.yaml"
+    path.write_text(SMALL)
+    run = served.folder / "runs" / "2026-01-01T00-00-00_small"
+    command = [sys.executable, "-P", "-m", "flangeye.cli", "run", str(path), "--out", str(run)]
+    subprocess.run(command, check=True, capture_output=True)
+    return run
+
+
 @pytest.mark.slow
 def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     write_recipe(page, SMALL.replace("0.25", "quarter"))
-    page.get_by_role("alert").first.wait_for()
-    assert "resolution" in page.get_by_role("alert").all_inner_texts()[-1]
+    wrong = page.locator(".q-field--error", has_text="resolution")
+    wrong.get_by_text("quarter").wait_for()  # it stands at its field
+    wrong.evaluate("box => box.scrollIntoView({block: 'center'})")
     shot(page, "cell_mistake")
+    page.evaluate("window.scrollTo(0, 0)")
     write_recipe(page, SMALL)
     page.get_by_text("The recipe is sound.").wait_for()
     shot(page, "cell")
+    go(page, "Run")
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_text("runs.").wait_for()
+    page.get_by_text("expected error at the work").wait_for(timeout=120_000)
+    assert slowest_answer(served) < 0.1
+    page.get_by_text("error to expect: 95 % below").wait_for(timeout=120_000)
+    page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
+    page.get_by_text("fitted 0007").wait_for()
+    page.get_by_role("img").get_by_text("turned about, ±30°").wait_for()
+    shot(page, "run")
+    go(page, "Verdict")
+    page.get_by_text("Verified: ").wait_for()
+    page.get_by_text("What would make it better").wait_for()
+    page.get_by_text("cells of the work; turned").wait_for(state="attached")
+    shot(page, "verdict")
+    page.get_by_role("tab", name="Certificate").click()
+    page.get_by_label("Who did it").fill("a person")
+    page.get_by_role("button", name="Write the certificate").click()
+    page.get_by_role("link", name="Open the certificate").wait_for()
+    page.get_by_role("tab", name="Export").click()
+    page.get_by_role("tab", name="ur", exact=True).click()
+    page.get_by_text("--to ur", exact=False).wait_for()
+    page.get_by_role("button", name="Write the file").click()
+    page.get_by_text("exports/").first.wait_for()
+    assert list(served.folder.glob("runs/*/exports/*"))
+    assert "a person" in next(served.folder.glob("runs/*/certificate.html")).read_text()
+    assert page.problems == []
+
+
+@pytest.mark.slow
+def test_a_pose_is_left_out_by_the_command_that_is_shown(browser: Any, served: Served) -> None:
+    page = opened(browser, served)
+    write_recipe(page, SMALL)
+    page.get_by_text("The recipe is sound.").wait_for()
+    go(page, "Run")
+    if not page.get_by_text("done (exit code 0)").count():
+        page.get_by_role("button", name="Start", exact=True).click()
+        page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
+    page.get_by_label("Pose", exact=True).click()
+    page.get_by_role("option", name="0004").click()
+    page.get_by_text("--at solve.robust --leave-out").wait_for()
+    page.get_by_role("button", name="Do without it").click()
+    page.get_by_text("set aside 0004: acquire: left out by --leave-out").wait_for()
+    page.get_by_text("done (exit code 0)").wait_for()
+    newest = max(served.folder.glob("runs/*/result.json"), key=lambda p: p.stat().st_mtime)
+    aside = [o["id"] for o in json.loads(newest.read_text())["observations"] if not o["used"]]
+    assert "0004" in aside
+
+
+@pytest.mark.slow
+def test_the_doctors_button_mends_the_recipe(browser: Any, served: Served) -> None:
+    session = clean(np.random.default_rng(5), 24, "marker", turn=0.4)
+    write(served.folder / "samples", session.with_poses(inverted(session.poses)))
+    page = opened(browser, served)
+    write_recipe(page, SAMPLES)
+    page.get_by_text("The recipe is sound.").wait_for()
+    go(page, "Run")
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_text("refused (exit code 1)").wait_for()
+    go(page, "Verdict")
+    page.get_by_role("tab", name="Doctor").click()
+    page.get_by_role("button", name="Ask the doctor").click()
+    page.get_by_text("pose direction").wait_for()
+    shot(page, "doctor")
+    page.get_by_role("button", name="Write configuration into the recipe").wait_for()
+    page.get_by_role("button", name="Write acquire.samples into the recipe").click()
+    page.get_by_text("written into the recipe").wait_for()
+    step = yaml.safe_load((served.folder / "cell.yaml").read_text())["steps"][0]["acquire.samples"]
+    assert step["path"] == "samples"
+    assert step["reader"] != "moveit" or set(step) > {"path", "reader", "position_noise"}
+    go(page, "Run")
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_text("done (exit code 0)").wait_for()
+
+
+@pytest.mark.slow
+def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
+    page = opened(browser, served)
     write_recipe(page, find_recipe("ur5e_phoxi-m_loopback").read_text())
     page.get_by_text("The recipe is sound.").wait_for()
     go(page, "Plan")
@@ -94,28 +212,55 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     page.get_by_role("heading", name="Plan").wait_for()
     shot(page, "plan")
     assert "600 mm" in (served.folder / "cell.yaml").read_text()
-    go(page, "Cell")
+    page.get_by_text("Or show three poses").click()
+    page.get_by_label("Joint angles of three poses").fill(SHOWN)
+    page.get_by_role("button", name="Use these poses").click()
+    page.get_by_label("Joint angles of three poses").wait_for()
+    page.wait_for_function("document.querySelector('textarea').value.includes('-80')")
+    step = yaml.safe_load((served.folder / "cell.yaml").read_text())["steps"][0]["acquire.live"]
+    assert [len(row) for row in step["view"]["shown"]["joints"]] == [6, 6, 6]
+    assert page.get_by_role("alert").count() == 0
+    page.get_by_label("Joint angles of three poses").fill("1 deg\n2 deg\n3 deg")
+    page.get_by_role("button", name="Use these poses").click()
+    page.get_by_text("view.shown: a pose has 1 joint angles, the arm 6 joints").wait_for()
+
+
+def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
+    (served.folder / "kr6.urdf").write_text(URDF)
+    page = opened(browser, served)
     write_recipe(page, SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
-    go(page, "Run")
-    page.get_by_role("button", name="Start", exact=True).click()
-    page.get_by_text("runs.").wait_for()
-    assert slowest_answer(served) < 0.1
-    page.get_by_text("fitted 0003").wait_for(timeout=120_000)
-    shot(page, "run")
-    page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
-    go(page, "Verdict")
-    page.get_by_text("Verified: ").wait_for()
-    page.get_by_role("tab", name="ur", exact=True).click()
-    page.get_by_text("flangeye export runs/").wait_for()
-    page.get_by_role("button", name="Write the file").click()
-    page.get_by_text("exports/").first.wait_for()
-    page.get_by_role("heading", name="Verdict").scroll_into_view_if_needed()
-    shot(page, "verdict")
+    page.get_by_text("Import an arm").click()
+    page.get_by_label("Its name").fill("kr6")
+    page.get_by_label("Its URDF file, in this folder").fill("nowhere.urdf")
+    page.get_by_role("button", name="Import it").click()
+    page.get_by_role("alert").get_by_text("nowhere.urdf").wait_for()
+    page.get_by_label("Its URDF file, in this folder").fill("kr6.urdf")
+    page.get_by_text("flangeye new-robot kr6 --urdf=kr6.urdf").wait_for()
+    page.get_by_role("button", name="Import it").click()
+    page.get_by_text("compare with the pendant").wait_for()
+    recipe = yaml.safe_load((served.folder / "cell.yaml").read_text())
+    assert recipe["robot"]["model"] == "kr6.yaml"
+
+
+def test_the_archive_compares_runs_batches_and_checks(
+    browser: Any, served: Served, finished: Path
+) -> None:
+    batch = served.folder / "batches" / "nights"
+    batch.mkdir(exist_ok=True)
+    (batch / "sessions.csv").write_text("session,status,held_out_rms\nmonday,verified,0.0004\n")
+    (finished / "monitor.html").write_text("<h1>OK</h1>")
+    page = opened(browser, served)
     go(page, "Archive")
-    page.get_by_text("capture 0000").wait_for()
+    page.get_by_role("cell", name=finished.name).wait_for()
+    page.get_by_role("cell", name="monday").wait_for()
+    page.frame_locator("iframe").get_by_role("heading", name="OK").wait_for()
+    page.get_by_text(f"flangeye monitor runs/{finished.name} --archive NEW").wait_for()
+    page.get_by_label("Run", exact=True).click()
+    page.get_by_role("option", name=finished.name).click()
+    page.get_by_text(re.compile(r"^capture 0000: ")).wait_for()
+    page.locator(".q-slider__track-container").press("ArrowRight")
+    page.get_by_text(re.compile(r"^capture 0001: used, residual ")).wait_for()
     shot(page, "archive")
-    assert list(served.folder.glob("runs/*/exports/*"))
     assert page.problems == []
 
 
@@ -134,6 +279,8 @@ def _answer(served: Served) -> float:
 
 def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None:
     page = opened(browser, served, color_scheme="dark")
+    write_recipe(page, SMALL)
+    page.get_by_text("The recipe is sound.").wait_for()
     page.set_viewport_size({"width": 390, "height": 800})
     for name in ("Cell", "Plan", "Run"):
         go(page, name)
@@ -153,6 +300,7 @@ def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None
 @pytest.mark.slow
 def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, served: Served) -> None:
     page = opened(browser, served)
+    before = len(list(served.folder.glob("runs/*")))
     write_recipe(page, SMALL.replace("0.25", "1.0"))
     page.get_by_text("The recipe is sound.").wait_for()
     go(page, "Run")
@@ -165,7 +313,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     page.get_by_text("another page started it").wait_for()
     page.locator("body").press(" ")
     page.get_by_text("stopped on this page").wait_for()
-    assert len(list(served.folder.glob("runs/*"))) <= 1
+    assert len(list(served.folder.glob("runs/*"))) <= before + 1
 
 
 def test_without_the_token_nobody_gets_in(served: Served) -> None:
@@ -200,20 +348,63 @@ def test_a_port_that_is_taken_is_one_line() -> None:
             require_free("127.0.0.1", port)
 
 
-def test_a_folder_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "flangeye.cli", "ui", str(tmp_path / "nowhere")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr == f"error: {tmp_path / 'nowhere'}: is not a folder\n"
+def test_a_folder_that_is_not_there_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["flangeye", "ui", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'nowhere'}: is not a folder\n"
+
+
+def test_without_a_browser_the_address_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("flangeye_ui.server.webbrowser.open", lambda address: False)
+    monkeypatch.setattr(server, "require_free", lambda host, port: None)
+    monkeypatch.setattr("flangeye_ui.server.ui.run", lambda **options: None)
+    monkeypatch.setattr("flangeye_ui.server.app.add_middleware", lambda *a, **k: None)
+    for each in (cell_page, plan_page, run_page, verdict_page, archive_page):
+        monkeypatch.setattr(each, "add", lambda project: None)
+    server.serve(tmp_path, Registry(None), "127.0.0.1", 8090, browser=True)  # type: ignore[arg-type]
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("open http://127.0.0.1:8090/?token=")
+    assert second == "no browser was found here; open the address yourself"
+
+
+def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path) -> None:
+    project = Project(tmp_path, Registry(None))  # type: ignore[arg-type]
+    log = tmp_path / "runs" / "monday" / "run.mcap"
+    log.parent.mkdir(parents=True)
+    log.write_bytes(b"")
+    assert project.elsewhere() == log.parent
+    assert project.unfinished() is None
+    said = run_page._nothing(None, log.parent)
+    assert said == "monday runs elsewhere: flangeye watch runs/monday"
+    os.utime(log, (0, 0))  # it did not grow for long: whoever wrote it is gone
+    assert project.elsewhere() is None
+    assert project.unfinished() == log.parent
+    said = run_page._nothing(log.parent, None)
+    assert said == "Nothing runs. monday ended before its result; it can be gone on with."
+    (log.parent / "result.json").write_text("{}")
+    assert project.unfinished() is None
+
+
+def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> None:
+    project = Project(tmp_path, load_registry())
+    project.text = SMALL.replace("0.25", "1.0")
+    project.begin(["cell.yaml"], move=False, owner="page")
+    assert project.run is not None
+    project.run._process.kill()
+    project.run._process.wait(10)
+    assert run_page.told(project.run, True).endswith("_ui: ended early (exit code -9).")
 
 
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
-    from flangeye.plugin.registry import load_registry
-    from flangeye_ui.project import Project
-
     project = Project(tmp_path, load_registry())
     project.text = SMALL.replace("0.25", "1.0")
-    project.start(move=False, owner="page")
+    project.begin([project.recipe_path.name], move=False, owner="page")
     assert project.run is not None and project.run.code is None
     project.page_gone("page")
     assert not project.run.stopped  # nothing moves, so nothing is stopped
@@ -251,17 +442,20 @@ def test_thinning_a_large_scan_costs_less_than_making_its_message() -> None:
     from flangeye_ui.process import POINTS, thinned
 
     xyz = np.random.default_rng(0).normal(size=(3_200_000, 3)).astype(np.float32)
-    began = time.process_time()
-    data = foxglove.point_cloud(PointCloud("camera", xyz), xyz, 0).SerializeToString()
-    made = time.process_time()
-    thin = thinned(data)
-    assert time.process_time() - made < made - began
+    shares = []
+    for _ in range(3):  # the best of three: other work on the machine costs cache
+        began = time.process_time()
+        data = foxglove.point_cloud(PointCloud("camera", xyz), xyz, 0).SerializeToString()
+        made = time.process_time()
+        thin = thinned(data)
+        shares.append((time.process_time() - made) / (made - began))
+    assert min(shares) < 1
     assert POINTS <= len(thin) <= 2 * POINTS
 
 
 @pytest.mark.realtime
 @pytest.mark.slow
-def test_the_pages_death_stops_the_arm(browser: Any, tmp_path: Path) -> None:
+def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_path: Path) -> None:
     from tests.live.cell import Cell
 
     with Cell(tmp_path) as cell:
@@ -274,10 +468,21 @@ def test_the_pages_death_stops_the_arm(browser: Any, tmp_path: Path) -> None:
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
             page.get_by_role("button", name="Move the arm").click()
-            cell.wait_until(cell.moving, patience=120)
+            page.get_by_text("fitted 0000").wait_for(timeout=120_000)
+            cell.wait_until(cell.moving, patience=60)
             page.close()
             cell.wait_until(cell.standing, patience=5)
             time.sleep(2)
             assert cell.standing()
+            page = opened(browser, served)
+            go(page, "Run")
+            page.get_by_text("the page was closed").wait_for()
+            page.reload()
+            page.get_by_role("button", name="Go on with it").click()
+            page.get_by_text("The arm will move.").wait_for()
+            assert cell.standing()
+            page.get_by_role("button", name="Move the arm").click()
+            cell.wait_until(cell.moving, patience=60)
+            page.get_by_text("done (exit code 0)").wait_for(timeout=120_000)
         finally:
             ended(served)

@@ -101,6 +101,8 @@ def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None =
 def main() -> None:
     """Run the command line; every foreseen mistake is one line and an exit code."""
     keep_current_folder_out()
+    # Ours are no plugins of pydantic; it would look for one in every installed distribution.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     _open_streams()
     try:
         try:

@@ -25,6 +25,9 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="File to write, - to print; default RUN/exports/.")
     ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Of a cell: which camera, for formats that carry one.")
+    ] = None,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Export a refused calibration too; the file says so.")
     ] = False,
@@ -33,7 +36,8 @@ def export(
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
-    file = _exported(run, f"export.{to.removeprefix('export.')}", values or [], anyway)
+    name = f"export.{to.removeprefix('export.')}"
+    file = _exported(run, name, values or [], anyway, camera)
     if out == Path("-"):
         typer.echo(file.text, nl=False)
         return
@@ -42,11 +46,29 @@ def export(
     say(f"{path}: {file.use}")
 
 
-def _exported(run: Path, name: str, values: list[str], anyway: bool) -> ExportedFile:
+@app.command()
+def tables(
+    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap; of a cell.")],
+    out: Annotated[Path | None, typer.Option(help="Folder; default RUN/tables.")] = None,
+) -> None:
+    """Write a cell's session as tables: of each arm and camera, with a recipe that reads them."""
+    from flangeye.log.read import read_run
+    from flangeye.run.tables import write_tables
+
+    log = read_run(run)
+    *files, recipe = write_tables(log, out or log.path.parent / "tables", load_plugins())
+    log.require_sound()
+    say(f"{recipe}: calibrates from {', '.join(file.name for file in files)}")
+
+
+def _exported(
+    run: Path, name: str, values: list[str], anyway: bool, camera: str | None
+) -> ExportedFile:
     from flangeye.errors import StageError
     from flangeye.log.read import read_run
+    from flangeye.models.configuration import CELL
     from flangeye.recipe.given import params_given
-    from flangeye.result import calibrated_pose, logged_result
+    from flangeye.result import calibrated_pose, logged_result, require_one
 
     registry = load_plugins()
     stage = registry.stage(name)
@@ -54,12 +76,16 @@ def _exported(run: Path, name: str, values: list[str], anyway: bool) -> Exported
         raise StageError(
             f"{name}: needs more of a run than the camera's pose; add it to the recipe"
         )
+    if camera and stage.params and "name" in stage.params.model_fields:
+        values = [f"name={camera}", *values]  # else the files of all cameras have one name
     params = params_given(stage, values, registry)
     log = read_run(run)
     result = logged_result(log)
     log.require_sound()
     if result is None:
         raise StageError(f"{log.path}: the run did not come to its end; there is nothing to export")
-    pose = calibrated_pose(result, anyway)
+    pose = calibrated_pose(result, anyway, camera)
+    if CELL not in stage.serves:
+        require_one(name, pose, result)
     file: ExportedFile = stage.function(pose=pose, **({"params": params} if params else {}))
     return file

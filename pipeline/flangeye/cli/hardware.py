@@ -25,6 +25,14 @@ def tactile_calibrate(
     overrides: Overrides = None,
     move: Annotated[bool, typer.Option("--move", help="Move the arm, by millimetres.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
+    body: Annotated[
+        bool,
+        typer.Option(
+            "--body",
+            help="Then find tip and torch in the flange, and how well: you bring each to a mark, "
+            "the tool in seven attitudes.",
+        ),
+    ] = False,
 ) -> None:
     """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
     from flangeye.devices import MotionAllowed
@@ -37,8 +45,43 @@ def tactile_calibrate(
         if not yes:
             typer.prompt("then press Enter", default="", show_default=False)
 
-    guide = registry.part("guide.tactile")
+    guide = registry.part("guide.tool" if body else "guide.tactile")
     say(guide(checked, MotionAllowed(move), ask, out))
+
+
+@app.command()
+def touch(
+    run: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
+    seen: Annotated[
+        list[str],
+        typer.Option(metavar="X,Y,Z", help="A point in the camera: '12 mm, -40 mm, 702 mm'."),
+    ],
+    tip: Annotated[
+        str, typer.Option(metavar="X,Y,Z", help="Of the tool in the flange: '0 mm, 0 mm, 152 mm'.")
+    ],
+    move: Annotated[
+        bool,
+        typer.Option(
+            "--move", help="Let the arm go to 5 mm before each; without it: jog it there."
+        ),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
+    out: Annotated[Path, typer.Option(help="The step to write.")] = Path("touch.yaml"),
+) -> None:
+    """Touch points that the scanner saw, and compare: predicted and actual, as verify.touch does.
+
+    The arm, if it goes, goes at 20 mm/s, in the orientation that it has.
+    """
+    from flangeye.cli.touching import touch_points
+
+    def ask(text: str) -> None:
+        say(text)
+        if not yes:
+            typer.prompt("then press Enter", default="", show_default=False)
+
+    registry = load_plugins()
+    for line in touch_points(run, registry, (seen, tip), move, ask, out):
+        say(line)
 
 
 @app.command()

@@ -29,6 +29,26 @@ def show(log: LogFile) -> None:
 
 
 @app.command()
+def outlook(log: LogFile) -> None:
+    """Say what the poses so far are worth: residuals, error to expect, coverage, what is missing.
+
+    Of a run that goes, was killed, or is done, by its own recipe.
+    """
+    from flangeye.log.read import read_run
+    from flangeye.run.outlook import outlook_of_log
+
+    read = read_run(log)
+    _require_gathered(read)
+    registry = load_plugins()
+    with of_foreign(read.path, "it cannot be judged"):
+        found = outlook_of_log(read, registry)
+    for line in found.lines():
+        say(line)
+    for note in read.notes:
+        say(f"note: {note}", err=True)
+
+
+@app.command()
 def report(
     log: LogFile,
     out: Annotated[Path | None, typer.Option(help="Default: report.html beside the log.")] = None,
@@ -62,13 +82,14 @@ def certificate(  # noqa: PLR0913  one argument an option
     ] = None,
     place: Annotated[str, typer.Option(help="Where it was done.")] = "",
     operator: Annotated[str, typer.Option(help="Who did it.")] = "",
+    camera: Annotated[str | None, typer.Option(help="Of a cell: which camera.")] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Print it with Chromium.")] = True,
 ) -> None:
     """State a calibration and its uncertainty after the GUM, on a page to print and sign."""
     from flangeye.report.certificate import Conditions, print_pdf, write_certificate
 
     conditions = Conditions(temperature, spread, place, operator)
-    page = write_certificate(run, out, conditions)
+    page = write_certificate(run, out, conditions, camera)
     say(page)
     if pdf and (printed := print_pdf(page)):
         say(printed)

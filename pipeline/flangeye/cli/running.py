@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,67 +23,90 @@ if TYPE_CHECKING:
     from flangeye.run.session import Start
 
 
+RecipeOrNone = Annotated[
+    str | None,
+    typer.Argument(help="A recipe file, or the name of a bundled recipe."),
+]
+Recordings = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATH|URL",
+        help="Recordings to run on, for recipes that start with acquire.archive; "
+        "s3://, gs://, az://, https:// and zip:// are streamed.",
+    ),
+]
+Results = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATH|URL",
+        help="Folder for the run's files; default runs/<time>_<recipe>.",
+    ),
+]
+FromLog = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."),
+]
+AtStep = Annotated[
+    str | None,
+    typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
+]
+Move = Annotated[
+    bool,
+    typer.Option(
+        "--move",
+        help="Move the arm; without it the arm is only read, the plan checked and shown.",
+    ),
+]
+Offline = Annotated[
+    bool, typer.Option("--offline", help="Without --move: plan without asking the arm at all.")
+]
+Resume = Annotated[
+    str | None,
+    typer.Option(
+        metavar="RUN", help="Go on with a run that ended early: its folder or log, or a URL."
+    ),
+]
+Retake = Annotated[
+    list[str] | None,
+    typer.Option(metavar="ID", help="With --resume: take this capture again."),
+]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(metavar="ID", help="With --from: do without this capture."),
+]
+
+
 @app.command()
 def run(  # noqa: PLR0913  one for each option
-    recipe: Annotated[
-        str | None,
-        typer.Argument(help="A recipe file, or the name of a bundled recipe."),
-    ] = None,
-    archive: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|URL",
-            help="Recordings to run on, for recipes that start with acquire.archive; "
-            "s3://, gs://, az://, https:// and zip:// are streamed.",
-        ),
-    ] = None,
+    recipe: RecipeOrNone = None,
+    archive: Recordings = None,
     overrides: Overrides = None,
-    out: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|URL",
-            help="Folder for the run's files; default runs/<time>_<recipe>.",
-        ),
-    ] = None,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."
-        ),
-    ] = None,
-    at: Annotated[
-        str | None,
-        typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
-    ] = None,
-    move: Annotated[
-        bool,
-        typer.Option(
-            "--move",
-            help="Move the arm; without it the arm is only read, the plan checked and shown.",
-        ),
-    ] = False,
-    offline: Annotated[
-        bool, typer.Option("--offline", help="Without --move: plan without asking the arm at all.")
-    ] = False,
-    resume: Annotated[
-        Path | None,
-        typer.Option(metavar="RUN", help="Go on with a run that ended early: its folder or log."),
-    ] = None,
+    out: Results = None,
+    source: FromLog = None,
+    at: AtStep = None,
+    move: Move = False,
+    offline: Offline = False,
+    resume: Resume = None,
+    retake: Retake = None,
+    leave_out: LeaveOut = None,
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
-    from flangeye.errors import StageError
     from flangeye.files.elsewhere import archive_at, results_at
     from flangeye.run.folder import RunFolder
     from flangeye.run.session import Start
     from flangeye.types import ArchivePath
 
-    if move and offline:
-        raise StageError("--move and --offline: an arm that is not asked cannot be moved")
+    _refuse(move and offline, "--move and --offline: an arm that is not asked cannot be moved")
+    lonely = (retake and not resume) or (leave_out and not source)
+    _refuse(lonely, "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP")
     registry = load_plugins()
-    checked, point = _recipe_of(recipe, resume, registry, overrides or ())
-    point = point or _point(checked, source, at)
-    with results_at(out) as results, archive_at(archive) as recordings:
+    with ExitStack() as stack:
+        earlier = stack.enter_context(archive_at(resume))
+        checked, point = _recipe_of(recipe, (earlier, retake or ()), registry, overrides or ())
+        point = point or _point(checked, source, at, leave_out or ())
+        results = stack.enter_context(results_at(out))
+        recordings = stack.enter_context(archive_at(archive))
         start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline))
         folder = RunFolder.create(checked.name, results)
         result = _record(checked, registry, folder, start)
@@ -90,6 +114,13 @@ def run(  # noqa: PLR0913  one for each option
             _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
+
+
+def _refuse(options: object, why: str) -> None:
+    from flangeye.errors import StageError
+
+    if options:
+        raise StageError(why)
 
 
 def _advise(log: Path, registry: Registry) -> None:
@@ -114,22 +145,28 @@ def _advise(log: Path, registry: Registry) -> None:
 
 
 def _recipe_of(
-    name: str | None, resume: Path | None, registry: Registry, overrides: Sequence[str]
+    name: str | None,
+    going_on: tuple[Path | None, Sequence[str]],
+    registry: Registry,
+    overrides: Sequence[str],
 ) -> tuple[Recipe, FromNothing | None]:
     """Return the checked recipe, named or of the run to go on with; and that run."""
     from flangeye.errors import StageError
     from flangeye.run.restart import earlier_run
 
+    resume, retake = going_on
     if (name is None) == (resume is None):
         raise StageError("name a recipe, or --resume RUN, which brings its own")
     if resume is not None:
         if overrides:
             raise StageError("--set and --resume: a run goes on with the recipe it began with")
-        return earlier_run(resume, registry)
+        return earlier_run(resume, registry, retake)
     return read_recipe(str(name), registry, overrides), None
 
 
-def _point(recipe: Recipe, source: Path | None, at: str | None) -> FromNothing:
+def _point(
+    recipe: Recipe, source: Path | None, at: str | None, leave_out: Sequence[str]
+) -> FromNothing:
     from flangeye.errors import StageError
     from flangeye.log.read import read_run
     from flangeye.run.restart import FromNothing, restart_at
@@ -143,7 +180,7 @@ def _point(recipe: Recipe, source: Path | None, at: str | None) -> FromNothing:
         say(f"note: {note}", err=True)
     if not log.gathered:
         raise StageError(f"{log.path}: nothing was gathered in it; there is nothing to run on")
-    return restart_at(log, recipe, at)
+    return restart_at(log, recipe, at, leave_out)
 
 
 def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start) -> Result:

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from flangeye.files.yaml_lines import parse_value
 from flangeye.types import Floats, Mask
 
 Reader = str | Mapping[str, Any]
@@ -221,6 +222,16 @@ class Finding:
         certain = self.gain == CERTAIN and bool(self.samples)
         return certain and self.corrected_session is None and not self.note
 
+    @property
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of a recipe to choose from, a step or section each, by its name.
+
+        Empty where a person has something to do that is no line.
+        """
+        choices = self.fix.split(OR_ELSE)
+        lines = [choice.removeprefix("- ") for choice in choices if _LINE.fullmatch(choice)]
+        return [dict(parse_value(line, "the doctor's line")) for line in lines]
+
 
 Findings = Iterable[Finding]
 Change = Callable[[Floats], Floats]
@@ -228,6 +239,9 @@ Change = Callable[[Floats], Floats]
 
 _DEFAULT = ("arms", "both")
 
+OR_ELSE = "  # or, if it is not: "
+"""Between two lines of which a person has to choose one."""
+_LINE = re.compile(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}")
 _NAME = re.compile(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*")
 _QUANTITY = re.compile(r"-?[\d.]+ [A-Za-z]+")
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.elsewhere import digest_elsewhere
-from flangeye.types import FLANGE, Floats, Role
+from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Role
 
 MIN_CAPTURES = 3
 MIN_SPREAD = 1e-3
@@ -57,6 +57,9 @@ class Recording:
         image: The camera's image; None when the archive has none for this pose.
         camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
         camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if it has them.
+        axes: Of a cell, where each rail and positioner was [m or rad].
+        seen_by: Which camera of a cell looked.
+        saw: Which target of a cell it saw.
     """
 
     id: str
@@ -69,6 +72,9 @@ class Recording:
     image: Path | None = None
     camera_T_target: Floats | None = None
     camera: tuple[Floats, Floats] | None = None
+    axes: Mapping[str, float] = field(default_factory=dict)
+    seen_by: str = CAMERA
+    saw: str = TARGET
 
     @property
     def base_T_flange(self) -> Floats:

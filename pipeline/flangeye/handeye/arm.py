@@ -9,8 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flangeye.handeye.candidates import Model, better, rms, with_nuisance
-from flangeye.handeye.likelihood import Problem, Solution, weigh
+from flangeye.handeye.candidates import Model, better, considered, rms, weighed_with, with_nuisance
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.maths.arm_correction import follow
 from flangeye.maths.kinematics import Arm
@@ -109,7 +108,8 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
         size=found.noise.size,
     )
     size = rms(moves[found.inliers] @ field.weights) * 1e3
-    tool = np.zeros(3) if model.correction is None else found.at.nuisance[:3]
+    before = len(model.problem.nuisance)
+    tool = np.zeros(3) if model.correction is None else found.at.nuisance[before - 3 : before]
     what = f"the arm is off by a smooth error over the workspace, {size:.3f} mm rms"
     chosen = better(model, replace(candidate, correction=ArmCorrection(tool, field=field)), what)
     return model if chosen.found is model.found else chosen
@@ -125,8 +125,8 @@ def with_tool_offset(model: Model, flange: MovedFlange) -> Model:
     moves = np.zeros((len(flange.poses), 6, 3))
     moves[:, 3:] = np.eye(3)
     offset = nuisance_of(np.zeros_like(moves), moves, np.inf)
-    for considered in (False, True):
-        zeros = flange.zeros(flange.deviation) if considered and flange.deviation else None
+    for with_zeros in (False, True):
+        zeros = flange.zeros(flange.deviation) if with_zeros and flange.deviation else None
         others = offset if zeros is None else zeros.and_also(offset)
         covariance = _covariance_of_last(model, others, 3)
         known = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
@@ -171,18 +171,9 @@ def unknown_zeros(model: Model, flange: MovedFlange) -> Floats | None:
     """Return what unknown joint zeros add to the (18, 18) covariance of the transforms.
 
     None when the arm's model does not reach the poses.
-
-    They move neighbouring poses alike, so that the answer follows them where independent noise
-    would average out; residuals do not show that. ("Consider" covariance, Schmidt 1966.)
     """
-    zeros = flange.zeros(np.inf)
-    if zeros is None:
-        return None
-    k, bare = len(zeros), replace(model.problem, nuisance=_without_sized(model.problem.nuisance))
-    fit = _weighed(bare, model, zeros)
-    followed = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
-    moved = fit.basis[:18, :-k] @ followed
-    return np.asarray(flange.deviation**2 * moved @ moved.T)
+    zeros = flange.zeros(flange.deviation)
+    return None if zeros is None else considered(model, zeros)
 
 
 def _with_offsets(model: Model, flange: MovedFlange, joints: Floats, prior: float) -> Model | None:
@@ -216,29 +207,9 @@ def _about(
         model.consensus, problem=replace(model.problem, measurements=s))), remainder)  # fmt: skip
 
 
-def _without_sized(nuisance: Nuisance) -> Nuisance:
-    kept = ~nuisance.sized
-    return Nuisance(
-        nuisance.camera[:, :, kept],
-        nuisance.target[:, :, kept],
-        nuisance.seen[:, :, kept],
-        nuisance.prior[kept],
-        nuisance.mean[kept],
-        nuisance.sized[kept],
-    )
-
-
-def _weighed(problem: Problem, model: Model, further: Nuisance) -> Solution:
-    """Return what the agreeing measurements say of a model with further nuisances."""
-    joined = problem.nuisance.and_also(further) if len(problem.nuisance) else further
-    found = model.found
-    at = replace(found.at, nuisance=np.zeros(len(joined)))
-    return weigh(replace(problem, nuisance=joined), at, found.noise, found.inliers.astype(float))
-
-
 def _covariance_of_last(model: Model, nuisance: Nuisance, k: int) -> Floats:
     """Return the (k, k) covariance that the last k of the nuisances would have."""
-    information = _weighed(model.problem, model, nuisance).information
+    information = weighed_with(model.problem, model.found, nuisance).information
     rest, cross = information[:-k, :-k], information[:-k, -k:]
     own = information[-k:, -k:] - cross.T @ np.linalg.solve(rest, cross)
     values, vectors = np.linalg.eigh(own)

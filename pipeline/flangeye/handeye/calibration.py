@@ -16,8 +16,10 @@ from flangeye.handeye.arm import (
     with_joint_offsets,
     with_tool_offset,
 )
-from flangeye.handeye.candidates import Model, understated, with_nuisance
+from flangeye.handeye.candidates import Model, considered, understated, with_nuisance
+from flangeye.handeye.certificate import told_of
 from flangeye.handeye.consensus import find_consensus
+from flangeye.handeye.distortion import distortion_of
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
@@ -27,8 +29,8 @@ from flangeye.handeye.estimates import (
 from flangeye.handeye.flange_roll import roll_note
 from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.loop import ArmNoise, meaningless_turns
-from flangeye.handeye.measurements import loop_of, measurements_of
-from flangeye.handeye.nuisance import nuisance_of
+from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
+from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.handeye.observability import (
     ObservabilityLimits,
     require_enough,
@@ -42,6 +44,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
     FLANGE,
     CorrectedArm,
@@ -76,8 +79,10 @@ class Options:
         joint_prior: Standard deviation of one [rad].
         joint_zeros: Whether the covariance includes what zeros may be off by.
         smooth_error: Whether a smooth error of the arm is looked for.
+        scanner_distortion: Whether the scanner's smooth distortion is part of the model.
         size_limit: Share by which a marker may be of another size.
         finds_size: Whether its size is found instead, from the arm's motion.
+        certify: Whether to say if the answer is the best of all.
     """
 
     normals: bool
@@ -90,8 +95,10 @@ class Options:
     joint_prior: float
     joint_zeros: bool
     smooth_error: bool
+    scanner_distortion: bool
     size_limit: float
     finds_size: bool
+    certify: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +109,13 @@ class Cell:
         observations: N of them.
         configuration: Who carries what.
         robot: The arm's model, where it is known.
+        scanner: The scanner's, where it is known.
     """
 
     observations: Sequence[Observation]
     configuration: Configuration
     robot: RobotModel | None
+    scanner: ScannerModel | None = None
 
     @cached_property
     def arm(self) -> Arm | None:
@@ -160,15 +169,21 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     require_turns(problem)
     model = Model(find_consensus(problem, options.limits.rotation))
     weak = unobservable(model.problem, model.found, options.limits)
+    model, weak = _with_shared(model, cell, weak)
     if options.finds_size and model.problem.measurements.are_poses:
         cell, model = _with_size(cell, model, options)
     else:
         require_size(model.problem, model.found, options.size_limit)
+    model = _with_depth(model)
     reported, model = (
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
     )
     camera, *others = _estimates(reported, cell, options, weak)
     notes = (*_noise_notes(model, cell, weak), *_note_of_zeros(cell, options))
+    if not weak.shape[1]:
+        notes = (*notes, *_note_of_distortion(model, cell, options))
+    if options.certify:
+        notes = (*notes, told_of(reported.problem, reported.found))
     return HandEye(
         camera,
         _pairs(reported, model, cell),
@@ -202,6 +217,27 @@ def _with_size(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]
         f"by the arm's own motion the target is {size:.4f} +- {size * told.sigma:.4f} times as "
         "large as was said where it was fitted, and is taken to be"
     )
+
+
+def _with_shared(model: Model, cell: Cell, weak: Floats) -> tuple[Model, Floats]:
+    """Return the model with the errors that all features share; the weak moves get as many more."""
+    seen = shared_errors(cell.observations)
+    still = np.zeros_like(seen)
+    moved = with_nuisance(model, nuisance_of(still, still, 1.0, seen=seen)) if seen.any() else None
+    if moved is None:
+        return model, weak
+    return moved, np.pad(weak, ((0, seen.shape[2]), (0, 0)))
+
+
+def _with_depth(model: Model) -> Model:
+    """Return the model with as much noise in depth as whole poses show: most cameras have more.
+
+    Only now, when most agree: before, one that is mistaken in depth alone would agree as well.
+    """
+    problem = model.problem
+    if problem.stated or not problem.measurements.are_poses:
+        return model
+    return model.with_problem(replace(problem, in_depth=True)) or model
 
 
 def _problem(cell: Cell, options: Options) -> Problem:
@@ -257,6 +293,9 @@ def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list
     if _considers_zeros(cell, options):
         added = unknown_zeros(model, cell.flange) if cell.flange else None
         covariance = covariance if added is None else covariance + added
+    distortion = None if weak.shape[1] else _distortion(model, cell, options)
+    if distortion is not None:
+        covariance = covariance + considered(model, distortion)
     turns = meaningless_turns(model.problem.measurements, model.problem.loop, at)
     arbitrary = np.hstack([weak[:18], turns[:18]])
     columns = {name: columns_of(name, configuration) for name in transforms}
@@ -269,6 +308,24 @@ def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list
         )
         for name, transform in transforms.items()
     ]
+
+
+def _distortion(model: Model, cell: Cell, options: Options) -> Nuisance | None:
+    """Return the scanner's distortion; None where nothing is known of it, or none is seen."""
+    seen = np.array([by_depth(o.feature) for o in cell.observations])
+    if cell.scanner is None or not options.scanner_distortion or not seen.any():
+        return None
+    return distortion_of(cell.scanner, model.problem.measurements, seen)
+
+
+def _note_of_distortion(model: Model, cell: Cell, options: Options) -> tuple[str, ...]:
+    if cell.scanner is None or _distortion(model, cell, options) is None:
+        return ()
+    return (
+        f"the scanner's smooth distortion ({cell.scanner.calibration_error * 1e3:g} mm rms over "
+        "its volume, by its file) is in the covariance: it is the same at every pose, which "
+        "held-out errors do not show",
+    )
 
 
 def _considers_zeros(cell: Cell, options: Options) -> bool:
@@ -293,7 +350,7 @@ def _note_of_zeros(cell: Cell, options: Options) -> tuple[str, ...]:
 def _scatter(found: Solution) -> ScatterNoise:
     """Return what differs from pose to pose, at the place where the target is seen."""
     of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2)[:, 3:].mean() * found.noise.arms
-    arm = float(of_arms + found.noise.pose)
+    arm = float(of_arms + found.noise.pose + found.noise.depth / 3)
     unknown = covariance_inflation(found.freedom, 3) if np.isfinite(found.freedom) else 1.0
     return ScatterNoise(arm, found.noise.centre_scale, unknown * understated(found))
 
@@ -351,7 +408,7 @@ def _noise_notes(model: Model, cell: Cell, weak: Floats) -> tuple[str, ...]:
 def _beyond(found: Solution, problem: Problem) -> list[str]:
     """Say what noise there is beyond the features' own."""
     of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
-    shift = np.sqrt(of_arms[3:].mean() + found.noise.pose) * 1e3
+    shift = np.sqrt(of_arms[3:].mean() + found.noise.pose + found.noise.depth / 3) * 1e3
     turn = np.degrees(np.sqrt(of_arms[:3].mean() + found.noise.tilt))
     if problem.measurements.are_poses or problem.arms is not None:
         return [f"noise beyond the features' own: {shift:.3f} mm and {turn:.3f} deg per axis"]

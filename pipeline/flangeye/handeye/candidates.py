@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.consensus import Consensus, again
-from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.likelihood import Problem, Solution, weigh
 from flangeye.handeye.loop import COLUMNS
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import ArmCorrection, Floats
@@ -83,6 +83,31 @@ def with_nuisance(model: Model, nuisance: Nuisance) -> Model | None:
     noise = replace(found.noise, size=size) if nuisance.sized.any() else found.noise
     started = replace(model.consensus, found=replace(found, noise=noise))
     return replace(model, consensus=started).with_problem(replace(problem, nuisance=joined))
+
+
+def considered(model: Model, further: Nuisance) -> Floats:
+    """Return what unknown common errors add to the (18, 18) covariance of the transforms.
+
+    They move neighbouring poses alike, so that the answer follows them where independent noise
+    would average out; residuals do not show that. ("Consider" covariance, Schmidt 1966.)
+
+    Args:
+        model: What was found without them; it stays.
+        further: The errors, with what is known of their sizes.
+    """
+    k, bare = len(further), replace(model.problem, nuisance=model.problem.nuisance.without_sized())
+    fit = weighed_with(bare, model.found, further)
+    followed = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
+    moved = fit.basis[:18, :-k] @ followed * further.prior
+    return np.asarray(moved @ moved.T)
+
+
+def weighed_with(problem: Problem, found: Solution, further: Nuisance) -> Solution:
+    """Return what the agreeing measurements of a fit say of a model with further nuisances."""
+    joined = problem.nuisance.and_also(further) if len(problem.nuisance) else further
+    at = replace(found.at, nuisance=np.zeros(len(joined)))
+    shares = found.inliers.astype(float)
+    return weigh(replace(problem, nuisance=joined), at, found.noise, shares)
 
 
 def better(model: Model, candidate: Model, what: str) -> Model:

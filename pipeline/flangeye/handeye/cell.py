@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
-from flangeye.errors import CalibrationRefused, StageError
+from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
+from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.estimates import estimate_at
-from flangeye.handeye.graph import Sighting, Solved, solve_graph
+from flangeye.handeye.graph import Sighting, Solved, rows_of, solve_graph
 from flangeye.handeye.measurements import measured
 from flangeye.maths.geometry import rigid
-from flangeye.models.cell import Cell
+from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Axis, Cell
 from flangeye.models.configuration import mapped_and_expected
-from flangeye.types import HandEye, Observation, Pair, Transform, TransformEstimate
+from flangeye.models.robots import RobotModel
+from flangeye.types import Floats, HandEye, Observation, Pair, Transform, TransformEstimate
 
 NOWHERE = np.zeros((6, 0))
 
 
 def calibrate_cell(
-    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float], method: str
+    observations: Sequence[Observation],
+    cell: Cell,
+    limits: tuple[float, float],
+    method: str,
 ) -> HandEye:
     """Return every unknown of a cell with its covariance; the first camera's pose comes first.
 
@@ -36,6 +44,7 @@ def calibrate_cell(
     """
     found = solve_cell(observations, cell, limits)
     _require_agreement(found, len(observations))
+    found = _considering_zeros(found, observations, cell)
     transforms = {
         cell.name_of(name): Transform.named(cell.name_of(name), found.places[name])
         for name in cell.unknown_frames
@@ -48,9 +57,18 @@ def calibrate_cell(
 
 
 def solve_cell(
-    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float]
+    observations: Sequence[Observation],
+    cell: Cell,
+    limits: tuple[float, float],
+    start: Mapping[str, Floats] | None = None,
 ) -> Solved:
     """Return the places of a cell's unknown frames, as its graph has them.
+
+    Args:
+        observations: The sightings.
+        cell: What stands on what.
+        limits: Largest standard deviations of a rotation [rad] and of a translation [m].
+        start: The places, where most of the sightings were solved already.
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
@@ -58,12 +76,65 @@ def solve_cell(
     """
     if not observations:
         raise StageError("no sighting to solve with: every capture was set aside, for its reason")
-    noise = {name: TYPICAL_ARM.covariance for name in cell.movers}
-    sightings = [_sighting(i, o) for i, o in enumerate(observations)]
-    return solve_graph(cell.graph(observations), sightings, noise, limits)
+    sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
+    return solve_graph(cell.graph(observations), sightings, mover_noise(cell), limits, start)
 
 
-def _sighting(i: int, observation: Observation) -> Sighting:
+def solve_so_far(
+    observations: Sequence[Observation],
+    cell: Cell,
+    limits: tuple[float, float],
+    before: Solved | None,
+) -> Solved | None:
+    """Return the solution, begun at that before; None as long as something stays unknown."""
+    start = None if before is None else before.places
+    with suppress(FlangeyeError, np.linalg.LinAlgError):
+        return solve_cell(observations, cell, limits, start)
+    return None
+
+
+def _considering_zeros(found: Solved, observations: Sequence[Observation], cell: Cell) -> Solved:
+    """Return the solution with what the zeros of the arms' joints may be off by in its covariance.
+
+    They move neighbouring poses alike, so that the answer follows them where independent noise
+    would average out; residuals do not show that. ("Consider" covariance, Schmidt 1966.)
+    """
+    sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
+    noise = {name: found.movers * covariance for name, covariance in mover_noise(cell).items()}
+    graph = cell.graph(observations), sightings, found.places, noise
+    rows, _ = rows_of(*graph)
+    joint = found.joint
+    for name, mover in cell.movers.items():
+        zeros = _zeros(mover, np.asarray(graph[0][name].place))
+        if zeros is not None:
+            moves = rows_of(*graph, moved=[name])[0] @ zeros
+            kept = found.inliers
+            told = np.einsum("nij,nik->jk", rows[kept], moves[kept])
+            followed = found.joint @ told
+            joint = joint + followed @ followed.T
+    blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(found.places)}
+    return replace(found, joint=joint, covariances=blocks)
+
+
+def _zeros(mover: RobotModel | Axis, poses: Floats) -> Floats | None:
+    """Return (N, 6, n - 1) what zeros of one deviation do to the flange; None for what has none.
+
+    The first joint's is right by definition: it fixes the base's x axis.
+    """
+    if isinstance(mover, Axis):
+        return None
+    arm = Arm(mover)
+    joints = next(MovedFlange(poses, None, False, arm).branches(starts=12), None)
+    return None if joints is None else mover.joint_accuracy * arm.jacobian(joints)[:, :, 1:]
+
+
+def mover_noise(cell: Cell) -> dict[str, Floats]:
+    """Return the (6, 6) covariance of what moves that is believed before anything is seen."""
+    return {name: TYPICAL_ARM.covariance for name in cell.movers}
+
+
+def sighting_of(i: int, observation: Observation) -> Sighting:
+    """Return an observation as the graph takes it, at the i-th of its times."""
     rotation, covariance, projector = measured(observation, normals=True)
     pose = rigid(rotation, observation.feature.centre)
     return Sighting(i, observation.camera, observation.target, pose, covariance, projector)

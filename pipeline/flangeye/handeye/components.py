@@ -6,7 +6,7 @@ numbers, less those that the fit took up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Noise:
         normal_scale: Factor on the normals' covariances, at most 1.
         arms: Factor on the covariances that are taken for the arms' poses.
         size: Standard deviation of the nuisances whose size is estimated.
+        depth: Variance along the camera's axis beyond that of each coordinate [m^2].
     """
 
     pose: float
@@ -42,6 +43,7 @@ class Noise:
     normal_scale: float = 1.0
     arms: float = 1.0
     size: float = 1.0
+    depth: float = 0.0
 
     def is_close(self, other: Noise) -> bool:
         """Whether nothing differs by more than a thousandth."""
@@ -50,7 +52,7 @@ class Noise:
 
     def _variances(self) -> tuple[float, ...]:
         scales = self.centre_scale, self.normal_scale, self.arms, self.size**2
-        return (self.pose + FINEST**2, self.tilt + FINEST**2, *scales)
+        return (self.pose + FINEST**2, self.tilt + FINEST**2, self.depth + FINEST**2, *scales)
 
 
 def noise_of(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -> Noise:
@@ -70,6 +72,24 @@ def noise_of(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -
     tilt, normal_scale = turned.extra(own[:, :3, :3])
     pose, centre_scale = shifted.extra(own[:, 3:, 3:])
     return Noise(pose, tilt, centre_scale, normal_scale, share)
+
+
+def with_depth(noise: Noise, along: Residuals, own: Floats, arms: Floats) -> Noise:
+    """Return the noise with what residuals along the camera's axis show beyond it.
+
+    Args:
+        noise: As residuals across the axis show it.
+        along: Residuals along it.
+        own: (N, 6, 6) covariances of the features.
+        arms: (N, 6, 6) those of typical arms' poses.
+    """
+    known = noise.centre_scale * (own + noise.arms * arms)[:, 3:, 3:] + noise.pose * np.eye(3)
+    return replace(noise, depth=along.extra(known)[0])
+
+
+def without_arms(turned: Residuals, shifted: Residuals, own: Floats) -> Noise:
+    """Return the noise that residuals show if none of it is the arms'; see :func:`noise_of`."""
+    return replace(noise_of(turned, shifted, own, np.zeros_like(own)), arms=0.0)
 
 
 def _share_of_arms(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -> float:

@@ -13,7 +13,8 @@ Jacobians). Cameras that never see the same thing are tied by the arms between t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -120,6 +121,7 @@ def solve_graph(
     sightings: Sequence[Sighting],
     noise: Mapping[str, Floats] | None = None,
     limits: tuple[float, float] = LIMITS,
+    start: Mapping[str, Floats] | None = None,
 ) -> Solved:
     """Find every frame whose place is unknown.
 
@@ -131,6 +133,8 @@ def solve_graph(
             from the residuals, and what then lies beyond is set aside. Without it the sightings'
             own covariances are all there is, and all count.
         limits: Largest standard deviations of an unknown's rotation [rad] and translation [m].
+        start: (4, 4) of every unknown, where a solution of most of the sightings is known already;
+            without it none is needed.
 
     Raises:
         StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
@@ -139,7 +143,7 @@ def solve_graph(
     root_of(frames)
     graph = _Graph.of(frames, sightings)
     own = _whiteners(graph.covariances, graph.projectors)
-    places = _best(graph, own)
+    places = _descend(graph, start, own, robust=True) if start else _best(graph, own)
     every = np.ones(len(sightings), bool)
     if noise is None:
         return _solved(graph, _descend(graph, places, own), (own, every, 1.0), limits)
@@ -159,7 +163,7 @@ def _solved(
     whiteners, kept, size = weighed
     residuals, jacobian = graph.linearised(places)
     information = information_of(whiteners[kept] @ jacobian[kept])
-    _refuse_unknown(information, list(places), limits)
+    _refuse_unknown(graph, information, list(places), limits)
     freedom = float(graph.freedoms[kept].sum()) - len(information)
     wider = covariance_inflation(max(freedom, 1.0), 6)
     joint = np.asarray(np.linalg.inv(information) * wider, dtype=np.float64)
@@ -171,6 +175,29 @@ def _solved(
 def information_of(jacobian: Floats) -> Floats:
     """Return J^T J of (N, 6, P) rows of unit covariance."""
     return np.asarray(np.einsum("nij,nik->jk", jacobian, jacobian))
+
+
+def rows_of(
+    frames: Mapping[str, Frame],
+    sightings: Sequence[Sighting],
+    places: Mapping[str, Floats],
+    noise: Mapping[str, Floats],
+    moved: Sequence[str] | None = None,
+) -> tuple[Floats, Floats]:
+    """Return (N, 6, 6 K) what sightings tell of K unknowns, and their (N, 6) errors, whitened.
+
+    Args:
+        frames: As for :func:`solve_graph`, with the movers' places at the sightings' times.
+        sightings: N of them, which need not have taken part.
+        places: (4, 4) of the unknowns.
+        noise: (6, 6) covariance of the movers' places, by frame.
+        moved: Other frames to tell of than the unknowns, such as what moves.
+    """
+    graph = _Graph.of(frames, sightings)
+    residuals, jacobian = graph.linearised(places, moved)
+    spread = graph.covariances + graph.carried(places, noise)
+    whiteners = _whiteners(spread, graph.projectors)
+    return whiteners @ jacobian, (whiteners @ residuals[..., None])[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,9 +230,12 @@ class _Graph:
             out[pair.rows] = _residuals(self._at(pair, places), pair)
         return np.asarray((self.projectors @ out[..., None])[..., 0])
 
-    def linearised(self, places: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-        """Return (N, 6) residuals and their (N, 6, 6 K) Jacobian."""
-        return self.residuals(places), self.projectors @ self._effects(places, list(places))
+    def linearised(
+        self, places: Mapping[str, Floats], moved: Sequence[str] | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return (N, 6) residuals and their (N, 6, 6 K) Jacobian, by the unknowns or others."""
+        effects = self._effects(places, list(places) if moved is None else moved)
+        return self.residuals(places), self.projectors @ effects
 
     def carried(self, places: Mapping[str, Floats], noise: Mapping[str, Floats]) -> Floats:
         """Return the (N, 6, 6) covariance that the movers' noise has in the camera."""
@@ -301,13 +331,17 @@ def _weighed(graph: _Graph, residuals: Floats, carried: Floats) -> tuple[float, 
     freedoms = graph.freedoms
     half = np.array([chi2_quantile(0.5, int(f)) for f in freedoms])
     gates = np.array([chi2_quantile(GATE, int(f)) for f in freedoms])
-    each = [_whiteners(graph.covariances + size * carried, graph.projectors) for size in SIZES]
-    squares = np.array([_squares(whiteners, residuals) for whiteners in each])
-    rough = _first_below(np.array([_middles(graph, s / half).max() for s in squares]), 1.0)
-    kept = squares[rough] < gates
+
+    def weighed(size: float) -> tuple[Floats, Floats]:
+        whiteners = _whiteners(graph.covariances + size * carried, graph.projectors)
+        return whiteners, _squares(whiteners, residuals)
+
+    rough = _first_below(lambda size: _middles(graph, weighed(size)[1] / half).max(), 1.0)
+    kept = weighed(rough)[1] < gates
     wanted = max(freedoms[kept].sum() - 6 * len(graph.unknown), 1.0)
-    best = _first_below((squares * kept).sum(axis=1), wanted)
-    return float(SIZES[best]), squares[best] < gates, each[best]
+    best = _first_below(lambda size: weighed(size)[1][kept].sum(), wanted)
+    whiteners, squares = weighed(best)
+    return best, squares < gates, whiteners
 
 
 def _middles(graph: _Graph, squares: Floats) -> Floats:
@@ -318,9 +352,10 @@ def _middles(graph: _Graph, squares: Floats) -> Floats:
     return out
 
 
-def _first_below(falling: Floats, level: float) -> int:
-    below = np.flatnonzero(falling <= level)
-    return int(below[0]) if len(below) else len(falling) - 1
+def _first_below(falling: Callable[[float], float], level: float) -> float:
+    """Return the smallest of :data:`SIZES` at which a falling function is below a level."""
+    first = bisect_left(SIZES, True, key=lambda size: bool(falling(float(size)) <= level))
+    return float(SIZES[min(first, len(SIZES) - 1)])
 
 
 # --- descent -------------------------------------------------------------------------------------
@@ -392,7 +427,7 @@ def _moved(places: Mapping[str, Floats], step: Floats) -> dict[str, Floats]:
 
 
 def _refuse_unknown(
-    information: Floats, unknown: Sequence[str], limits: tuple[float, float]
+    graph: _Graph, information: Floats, unknown: Sequence[str], limits: tuple[float, float]
 ) -> None:
     """Refuse when a common move of the unknowns hardly changes the sightings; name what moves."""
     scale = np.tile(np.repeat(limits, 3), len(unknown))
@@ -404,6 +439,19 @@ def _refuse_unknown(
     turns = share[:, :3].max() > share[:, 3:].max()
     raise CalibrationRefused(
         f"the sightings do not tell where {' and '.join(named)} {'are' if len(named) > 1 else 'is'}"
-        f": a common {'turn' if turns else 'shift'} hardly changes them; move the arms about more "
-        "axes, or let a camera see what ties them"
+        f": a common {'turn' if turns else 'shift'} hardly changes them; {_cure(graph, named)}"
+    )
+
+
+def _cure(graph: _Graph, named: Sequence[str]) -> str:
+    """Return what would tell: another motion, or the sighting that ties two parts of the graph."""
+    ends = dict.fromkeys(end for pair in graph.pairs for end in (pair.camera, pair.target))
+    moved = [end for end in ends if {*chain(graph.frames, end)} & {*named}]
+    still = [end for end in ends if end not in moved]
+    tied = any((pair.camera in moved) != (pair.target in moved) for pair in graph.pairs)
+    if tied or not still:
+        return "move the arms about more axes, or let a camera see what ties them"
+    return (
+        f"no sighting ties {' and '.join(moved)} to {' and '.join(still)}: let a camera of the one "
+        "see a target of the other"
     )

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.handeye.components import FINEST, Noise, Residuals, noise_of
+from flangeye.handeye.components import FINEST, Noise, Residuals, noise_of, with_depth, without_arms
 from flangeye.handeye.inliers import gate, truncated_weights
 from flangeye.handeye.loop import (
     COLUMNS,
@@ -54,6 +54,7 @@ class Problem:
             estimated, or all of it scaled down.
         nuisance: Errors of the arms that are estimated along.
         pose_noise: Variance of each coordinate beyond the features' own [m^2], where it is known.
+        in_depth: Whether there may be more noise along the camera's axis than across it.
     """
 
     measurements: Measurements
@@ -63,6 +64,7 @@ class Problem:
     stated: bool = False
     nuisance: Nuisance = field(default_factory=lambda: no_nuisance(0))
     pose_noise: float | None = None
+    in_depth: bool = False
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
         """Return the problem of some of the measurements."""
@@ -313,13 +315,42 @@ def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]
     if problem.pose_noise is not None:
         shifted = replace(shifted, freedom=np.inf)
     own, arms = problem.measurements.covariances[kept], found.linear.of_arms[kept]
-    noise = noise_of(turned, shifted, own, arms)
+    noises = [noise_of(turned, shifted, own, arms)]
     if problem.pose_noise is not None:
-        noise = replace(noise, pose=problem.pose_noise)
+        noises = [replace(noises[0], pose=problem.pose_noise)]
+    elif problem.measurements.are_poses:
+        noises.append(without_arms(turned, shifted, own))
+        if problem.in_depth:
+            noises += _in_depth(found, covariance, turned, (own, arms))
+    noise = max(noises, key=lambda each: _likelihood(problem, found, each))
     size = _size(problem, found, covariance)
     freedoms = [f for f in (turned.freedom, shifted.freedom) if np.isfinite(f)]
     fewer, both = min(freedoms, default=np.inf), sum(freedoms) if freedoms else np.inf
     return replace(noise, size=size), max(fewer, 1.0), max(both, 1.0)
+
+
+def _in_depth(
+    found: Solution, covariance: Floats, turned: Residuals, known: tuple[Floats, Floats]
+) -> list[Noise]:
+    """Return what noise there is if there is more along the camera's axis: the arms', or none."""
+    own, arms = known
+    axis = np.broadcast_to(np.diag([0.0, 0.0, 1.0]), (len(own), 3, 3))
+    along, across = (_onto(p, found, covariance, slice(3, 6)) for p in (axis, np.eye(3) - axis))
+    noises = noise_of(turned, across, own, arms), without_arms(turned, across, own)
+    return [with_depth(noise, along, own, arms) for noise in noises]
+
+
+def _likelihood(problem: Problem, found: Solution, noise: Noise) -> float:
+    """Return twice the log of the likelihood of whole poses' residuals, but for a constant.
+
+    A rotation and a translation that have one cause go together: that tells causes apart which
+    explain either alone as well.
+    """
+    kept = found.inliers
+    linear = found.linear.where(kept)
+    weights = weights_of(problem.measurements.where(kept), linear, noise)
+    squares = np.einsum("na,nab,nb->", linear.residuals, weights, linear.residuals)
+    return float(np.linalg.slogdet(weights)[1].sum() - squares)
 
 
 def _size(problem: Problem, found: Solution, covariance: Floats) -> float:
@@ -334,11 +365,17 @@ def _size(problem: Problem, found: Solution, covariance: Floats) -> float:
 
 def _residuals(problem: Problem, found: Solution, covariance: Floats, at: slice) -> Residuals:
     """Return the rotations', or the translations', of those that agree."""
-    kept, p = found.inliers, problem.measurements.projectors[found.inliers]
-    jacobian = found.linear.jacobian[kept]
+    p = problem.measurements.projectors[found.inliers]
+    return _onto(p[:, at, at], found, covariance, at)
+
+
+def _onto(p: Floats, found: Solution, covariance: Floats, at: slice) -> Residuals:
+    """Return rotations or translations of those that agree, as projected."""
+    jacobian = found.linear.jacobian[found.inliers]
     # Numbers less their share in the fit.
-    told = found.weights[kept][:, at] @ jacobian @ covariance
+    told = p @ found.weights[found.inliers][:, at] @ jacobian @ covariance
     shares = (told * jacobian[:, at]).sum()
-    measured = np.diagonal(p, axis1=1, axis2=2)[:, at].sum()
+    measured = np.trace(p, axis1=1, axis2=2).sum()
     freedom = float(measured - shares) if measured else np.inf
-    return Residuals(found.linear.residuals[kept][:, at], p[:, at, at], freedom)
+    errors = (p @ found.linear.residuals[found.inliers][:, at, None])[..., 0]
+    return Residuals(errors, p, freedom)

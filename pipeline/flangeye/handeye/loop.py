@@ -212,6 +212,7 @@ def weights_of(measurements: Measurements, linear: Linear, noise: Noise) -> Floa
     scale = np.repeat(np.sqrt([noise.normal_scale, noise.centre_scale]), 3)
     extra = np.diag(np.repeat([noise.tilt + FINEST**2, noise.pose + FINEST**2], 3))
     own = measurements.covariances + noise.arms * linear.of_arms
+    extra[5, 5] += noise.depth
     covariance = own * np.outer(scale, scale) + extra
     p = measurements.projectors
     return np.asarray(p @ np.linalg.inv(p @ covariance @ p + (np.eye(6) - p)) @ p)

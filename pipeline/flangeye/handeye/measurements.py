@@ -12,7 +12,7 @@ from flangeye.errors import StageError
 from flangeye.maths.geometry import basis_of_plane, hat
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Configuration, carriers_of
-from flangeye.types import BASE, Floats, Mask, Observation, PoseFeature
+from flangeye.types import BASE, Feature, Floats, Mask, Observation, PoseFeature
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +149,14 @@ def measurements_of(
     )
 
 
+def shared_errors(observations: Sequence[Observation]) -> Floats:
+    """Return (N, 6, k) how each of k errors that all share moves what was seen, in ``camera``."""
+    each = [o.feature.shared if isinstance(o.feature, PoseFeature) else np.zeros((6, 0))
+            for o in observations]  # fmt: skip
+    most = max(moved.shape[1] for moved in each)
+    return np.array([np.pad(moved, ((0, 0), (0, most - moved.shape[1]))) for moved in each])
+
+
 def measured(observation: Observation, normals: bool) -> tuple[Floats, Floats, Floats]:
     """Return (3, 3) rotation, (6, 6) covariance and (6, 6) projector of one feature."""
     feature = observation.feature
@@ -162,3 +170,8 @@ def measured(observation: Observation, normals: bool) -> tuple[Floats, Floats, F
     covariance[:3, :3] = turn @ feature.normal_covariance @ turn.T
     projector[:3, :3] = np.eye(3) - np.outer(feature.normal, feature.normal)
     return basis_of_plane(feature.normal).T, covariance, projector
+
+
+def by_depth(feature: Feature) -> bool:
+    """Whether a feature was measured in a cloud, and not in the pixels of an image."""
+    return not (isinstance(feature, PoseFeature) and len(feature.corners))

@@ -49,6 +49,18 @@ class Nuisance:
             np.concatenate([self.sized, other.sized]),
         )
 
+    def without_sized(self) -> Nuisance:
+        """Return those whose size is known."""
+        kept = ~self.sized
+        return Nuisance(
+            self.camera[:, :, kept],
+            self.target[:, :, kept],
+            self.seen[:, :, kept],
+            self.prior[kept],
+            self.mean[kept],
+            self.sized[kept],
+        )
+
     def of_size(self, size: float) -> Nuisance:
         """Return the same, its sized numbers expected to be of a size."""
         return replace(self, prior=np.where(self.sized, size, self.prior))

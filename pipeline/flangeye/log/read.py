@@ -8,7 +8,7 @@ is read (:mod:`flangeye.log.records`).
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypeVar
@@ -65,6 +65,8 @@ class _CaptureFacts(TypedDict):
     step: str
     seconds: float
     image: NotRequired[dict[str, Any] | None]
+    camera: NotRequired[str]
+    target: NotRequired[str]
 
 
 class _StepFacts(TypedDict):
@@ -133,6 +135,7 @@ class RunLog:
         rejections: Captures set aside.
         finished: Ids of the captures that went through.
         messages: Log lines for people.
+        noted: Steps that wrote into their journals, by label; see :func:`read_notes`.
         damage: What could not be read, and why, a sentence each.
     """
 
@@ -146,6 +149,7 @@ class RunLog:
     rejections: list[t.Rejection] = field(default_factory=list)
     finished: list[str] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
+    noted: set[str] = field(default_factory=set)
     damage: list[str] = field(default_factory=list)
 
     @property
@@ -190,7 +194,9 @@ class RunLog:
         """Return one observation for each feature that was fitted, in order."""
         given = [e.value for e in self.of_kind("acquire") if isinstance(e.value, t.Observation)]
         fitted = [
-            t.Observation(str(e.capture), e.value, *self._pose(str(e.capture)))
+            t.Observation(
+                str(e.capture), e.value, *self._pose(str(e.capture)), *self._ends(str(e.capture))
+            )
             for e in self.of_kind("fit")
             if e.capture in self.poses
         ]
@@ -277,7 +283,13 @@ class RunLog:
         meta = self.poses[capture]
         poses, joints = self._pose(capture)
         image = None if pixels is None else t.Image(pixels, **meta["image"])
-        return t.Capture(capture, cloud, poses, joints, meta["time_ns"], meta["role"], image)
+        ends = self._ends(capture)
+        return t.Capture(capture, cloud, poses, joints, meta["time_ns"], meta["role"], image, *ends)
+
+    def _ends(self, capture: str) -> tuple[str, str]:
+        """Return which camera looked at which target; logs of one camera may not say."""
+        meta = self.poses[capture]
+        return meta.get("camera", t.CAMERA), meta.get("target", t.TARGET)
 
 
 def log_of(path: Path) -> Path:
@@ -303,23 +315,26 @@ def read_run(path: Path) -> RunLog:
     log = RunLog(log_of(path))
     clouds: dict[str, t.PointCloud] = {}
     for message in _messages(log.path, log):
-        try:
-            _take(log, message, clouds)
-        except Exception as error:  # what a foreign log holds can be wrong in any way
-            log.damage.append(_told(message, error))
+        take(log, message, clouds)
     _check_texts(log)
     return log
 
 
-def read_notes(path: Path) -> Iterator[Note]:
+def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[Note]:
     """Yield what steps wrote into their journals, in order, as far as the log goes.
+
+    Args:
+        path: The log.
+        steps: Labels of those to read, of all when not given.
 
     Raises:
         StageError: The file is missing, no MCAP file, or damaged: decisions without what was
             noted would be others.
     """
     for message in _messages(path, strict=True):
-        if message.channel.topic.startswith("/note/"):
+        topic = message.channel.topic
+        of = topic.removeprefix("/note/").rpartition("/")[0]
+        if topic.startswith("/note/") and (steps is None or of in steps):
             try:
                 yield _note(message)
             except Exception as error:  # what a foreign log holds can be wrong in any way
@@ -333,10 +348,25 @@ def _note(message: Message) -> Note:
     return Note(step, name, decode_json(message.data)["value"])
 
 
+def take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
+    """Take one message into what is known of a run; what cannot be read is named in its damage.
+
+    Args:
+        log: What is known so far.
+        message: The next one.
+        clouds: What messages before it left for the values to come, by topic.
+    """
+    try:
+        _take(log, message, clouds)
+    except Exception as error:  # what a foreign log holds can be wrong in any way
+        log.damage.append(_told(message, error))
+
+
 def _take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
-    """Take in one message; whatever it raises is damage."""
     topic, schema = message.channel.topic, message.channel.schema
-    if schema == "foxglove.PointCloud" and topic.startswith("/step/"):
+    if topic.startswith("/note/"):
+        log.noted.add(topic.removeprefix("/note/").rpartition("/")[0])
+    elif schema == "foxglove.PointCloud" and topic.startswith("/step/"):
         clouds[topic] = _decode_cloud(message.data)
     elif topic == "/log":
         log.messages.append(_decode_log(message.data))
@@ -347,8 +377,6 @@ def _take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> Non
 def _take_json(
     log: RunLog, topic: str, schema: str, raw: bytes, clouds: dict[str, t.PointCloud]
 ) -> None:
-    if topic.startswith("/note/"):
-        return
     data = decode_json(raw)
     if topic == "/source":
         total = adapter(int | None).validate_python(data.pop("total"), strict=True)

@@ -108,6 +108,7 @@ class Recorder:
         self._full = full_clouds
         self._channels: dict[str, int] = {}
         self._poses: dict[str, t.Transform] = {}
+        self._cameras: dict[str, str] = {}
         self._flanges: dict[str, t.PointCloud] = {}
         try:
             self._file = path.open("wb")
@@ -146,8 +147,10 @@ class Recorder:
         if self._full and cloud.xyz.size:
             self._write("/capture/scan", "Scan", "application/x-flangeye-scan", pack(cloud.xyz))
         self._proto("/capture/cloud", foxglove.point_cloud(cloud, _thinned(cloud), now))
-        self._poses[capture.id] = capture.base_T_flange
-        self._proto("/pose", foxglove.pose_in_frame(capture.base_T_flange, now))
+        self._cameras[capture.id] = capture.camera
+        if t.FLANGE in capture.poses:
+            self._poses[capture.id] = capture.base_T_flange
+            self._proto("/pose", foxglove.pose_in_frame(capture.base_T_flange, now))
         for pose in capture.poses.values():
             self._proto("/tf", foxglove.frame_transform(pose, now))
 
@@ -240,9 +243,10 @@ class Recorder:
 
     def _in_base(self, calibration: t.HandEye, now: int) -> None:
         """Log every flange where the calibration puts it: apart, they show what is wrong."""
-        camera = calibration.camera.transform
+        found = {x.transform.child: x.transform for x in calibration.transforms.values()}
         for capture, cloud in self._flanges.items():
-            pose = self._poses.get(capture)
+            place, pose = found[self._cameras.get(capture, t.CAMERA)], self._poses.get(capture)
+            camera = t.Transform(place.parent, t.CAMERA, place.matrix)
             moved = pose @ camera if pose is not None and camera.parent == t.FLANGE else camera
             if moved.parent == t.BASE:
                 flange = moved.apply_cloud(cloud)

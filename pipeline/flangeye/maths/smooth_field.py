@@ -14,6 +14,7 @@ reported (restricted spatial regression, Hodges & Reich 2010).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from math import factorial, prod
@@ -37,19 +38,23 @@ def field_over(places: Floats) -> SmoothField:
     bare = SmoothField(
         about, RADII * max(radius, 1e-3), np.zeros((6, k)), np.zeros(k), np.zeros((k, k)), 0.0
     )
-    motions, features = _motions(bare, places).reshape(-1, 6), effects(bare, places)
-    nearest = np.linalg.pinv(motions, rcond=1e-9) @ features.reshape(-1, k)
+    motions, moved = _motions(bare, places).reshape(-1, 6), effects(bare, places)
+    nearest = np.linalg.pinv(motions, rcond=1e-9) @ moved.reshape(-1, k)
     return replace(bare, rigid=nearest)
 
 
 def effects(field: SmoothField, places: Floats) -> Floats:
     """Return (..., 3, K): how each weight moves a flange at (..., 3) places [m], in ``base``."""
-    scaled = (places - field.about) / field.length
-    bell = np.exp(-0.5 * (scaled**2).sum(axis=-1))
-    features = np.stack([_power(scaled, p) for p in POWERS], axis=-1) * bell[..., None]
-    along = features[..., None, :, None] * np.eye(3)[:, None, :]
+    of_place = features((places - field.about) / field.length, POWERS)
+    along = of_place[..., None, :, None] * np.eye(3)[:, None, :]
     along = along.reshape(*places.shape[:-1], 3, -1)
     return np.asarray(along - _motions(field, places) @ field.rigid)
+
+
+def features(scaled: Floats, powers: Sequence[tuple[int, ...]]) -> Floats:
+    """Return (..., K) values of the kernel's features at (..., 3) places in units of its length."""
+    bell = np.exp(-0.5 * (scaled**2).sum(axis=-1))
+    return np.asarray(np.stack([_power(scaled, p) for p in powers], axis=-1) * bell[..., None])
 
 
 def displacement(field: SmoothField, places: Floats) -> Floats:

@@ -71,6 +71,8 @@ class Finger(Model):
         "0 deg", description="From the flange's x to the direction from the torch to the tip."
     )
     torch: Length = param(gt=0, description="How far the torch is behind the tip (||d||).")
+    torch_aside: Length = param("0 mm", description="How far the torch is left of the tool's x.")
+    torch_up: Length = param("0 mm", description="How far the torch's end is above the tip.")
     torch_sigma: Length = param(
         "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."
     )
@@ -90,6 +92,11 @@ class Finger(Model):
         """(3, 3) the tool's axes in the flange's: z out of the work is back to the robot."""
         c, s = np.cos(self.direction), np.sin(self.direction)
         return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+    @property
+    def torch_from_tip(self) -> Floats:
+        """(3,) from the tip to the torch, in the tool's axes [m]."""
+        return np.array([-self.torch, self.torch_aside, self.torch_up])
 
     def force(self, displacement: Floats) -> float | None:
         """Return the force of a tip displaced by (3,) in the tool's axes [N], if it is known."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from flangeye.errors import RecipeError
+from flangeye.errors import RecipeError, StageError
 from flangeye.models.robots import FlangeDetails, RobotModel
 from flangeye.models.standards import FlangeStandard, load_standard
 
@@ -95,14 +95,27 @@ def wrist_circle_of(details: FlangeDetails, diameter: float) -> Flange:
 
 
 class Sphere(BaseModel):
-    """A calibration sphere that the flange carries. All SI.
+    """A calibration sphere. All SI.
 
     Attributes:
-        radius: Radius of the sphere.
-        centre_in_flange: Its centre in ``flange``.
+        size: Radius of the sphere, None where it is to be found.
+        centre_in_flange: Its centre in the frame that carries it, mostly ``flange``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
-    radius: float
+    size: float | None
     centre_in_flange: tuple[float, float, float]
+
+    @property
+    def radius(self) -> float:
+        """The radius [m].
+
+        Raises:
+            StageError: It is not known.
+        """
+        if self.size is None:
+            raise StageError(
+                "feature.sphere.diameter is unknown, and this step needs it: write the diameter"
+            )
+        return self.size

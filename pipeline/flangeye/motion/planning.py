@@ -43,10 +43,14 @@ class Site:
 
 
 class PlannedPose(NamedTuple):
-    """Where to send the flange: (4, 4) ``base_T_flange``, and (n,) joint angles that do it."""
+    """Where to send the flange: (4, 4) ``base_T_flange``, and (n,) joint angles that do it.
+
+    ``why`` tells people what it is expected to be good for, where the plan knows.
+    """
 
     base_T_flange: Floats
     joints: Floats
+    why: str = ""
 
 
 class Plan(NamedTuple):

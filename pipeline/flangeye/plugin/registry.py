@@ -135,7 +135,7 @@ class Registry:
 
         An export that asks for more, such as the robot, is a step of a recipe only.
         """
-        exports = [stage for stage in self.stages.values() if stage.kind == "export"]
+        exports = [self.stages[name] for name in self.stages if name.startswith("export.")]
         return [stage for stage in exports if set(stage.needs) == {"pose"}]
 
     def siblings(self, part: Part) -> Siblings:

@@ -25,7 +25,7 @@ from flangeye.types import BASE, Floats
 
 Complain = Callable[[Sequence[Hashable], str], None]
 GROUPS = ("arms", "rails", "positioners", "cameras", "targets")
-INSTEAD = ("robot", "second_robot", "scanner", "configuration", "feature")
+INSTEAD = ("robot", "second_robot", "configuration")
 """Sections of a recipe with one camera and one target."""
 
 MoverSection = CellArmSection | RailSection | PositionerSection

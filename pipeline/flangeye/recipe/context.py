@@ -56,7 +56,8 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
     if header.workspace:
         context[t.Box] = t.Box(np.array(header.workspace.centre), np.array(header.workspace.size))
     if sphere := header.feature.sphere:
-        context[Sphere] = Sphere(radius=sphere.diameter / 2, centre_in_flange=sphere.centre)
+        size = None if sphere.diameter == "unknown" else sphere.diameter / 2
+        context[Sphere] = Sphere(size=size, centre_in_flange=sphere.centre)
     if (robot := header.robot) and (robot.model or robot.urdf):
         place = ("robot", "model" if robot.model else "urdf")
         offer(RobotModel, place, lambda: _arm(robot, header.feature.standard, folder))
@@ -71,8 +72,9 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
         context[Cell] = cell_of(header, partial(_model, folder=folder), complain)
     else:
         offer(Configuration, ("configuration",), lambda: _configuration(header, context))
-    if _plate_named(header, context):
-        offer(Flange, ("feature",), lambda: _flange(header, context.get(RobotModel), folder))
+    carries = context.get(RobotModel) or _carrier(context.get(Cell))
+    if _plate_named(header, carries):
+        offer(Flange, ("feature",), lambda: _flange(header, carries, folder))
     _devices(header, context, complain)
     return context
 
@@ -114,8 +116,15 @@ def _scanner(section: ScannerSection, folder: Path) -> ScannerData:
     return ScannerData(model=str(section.name), near=near, far=far)
 
 
-def _plate_named(header: Header, context: Context) -> bool:
-    feature, robot = header.feature, context.get(RobotModel)
+def _carrier(cell: Cell | None) -> RobotModel | None:
+    """Return the arm of a cell whose flange is looked for: the first that carries a target."""
+    carriers = [cell.frames[target].parent for target in cell.targets] if cell else []
+    arms = [cell.movers.get(carrier) for carrier in carriers] if cell else []
+    return next((arm for arm in arms if isinstance(arm, RobotModel)), None)
+
+
+def _plate_named(header: Header, robot: RobotModel | None) -> bool:
+    feature = header.feature
     asked = _plate(header)
     return any((feature.standard, feature.wrist_circle, asked, robot and robot.flange.standard))
 

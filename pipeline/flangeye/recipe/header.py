@@ -154,11 +154,14 @@ class ScannerSection(NamedSection):
 
 
 class SphereSection(Section):
-    """A calibration sphere that the flange carries."""
+    """A calibration sphere."""
 
-    diameter: Length = Field(gt=0)
+    diameter: Annotated[Length, Field(gt=0)] | Literal["unknown"] = Field(
+        description="unknown costs the depth of its centre most of its accuracy."
+    )
     centre: tuple[Length, Length, Length] = Field(
-        description="Where its centre is in the flange frame: origin in the face, z outwards."
+        description="Where its centre is in the frame that carries it; in the flange frame the "
+        "origin is in the face and z points outwards."
     )
 
 

@@ -123,9 +123,9 @@ def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -
     )
 
 
-def parse_recipe(text: str, name: str, registry: Registry) -> Recipe:
+def parse_recipe(text: str, name: str, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
     """Check a recipe given as text, as a log holds it; see :func:`load_recipe`."""
-    return _Checker(parse_yaml(text, name), registry, Path()).check(name, text, ())
+    return _Checker(parse_yaml(text, name), registry, Path()).check(name, text, overrides)
 
 
 class _Checker:

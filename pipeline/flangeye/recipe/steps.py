@@ -97,10 +97,12 @@ WHAT_FOR = {
 }
 """Why a stage needs kinematics, by the longest start of its name."""
 IN_A_CELL = {
-    "acquire": "use acquire.simulated_cell",
+    "acquire": "use acquire.samples, acquire.centres or acquire.archive with reader: cell, or "
+    "acquire.simulated_cell",
     "solve": "use solve.cell",
     "verify": "use verify.holdout",
-    "export": "leave it out: calibration.yaml carries every transform of the cell",
+    "export": "leave it out: calibration.yaml carries every transform of the cell, and after the "
+    "run flangeye export RUN --to NAME --camera CAMERA writes one",
 }
 """What to do instead of a step that serves one camera and one target alone."""
 

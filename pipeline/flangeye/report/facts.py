@@ -94,7 +94,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
         method=calibration.method if calibration else None,
         transforms=r.transforms_result(calibration),
         observations=r.observations_result(pairs, log.rejections),
-        workspace=r.workspace_result(calibration, box) if calibration and box else None,
+        workspace=r.workspace_result(calibration.camera, box) if calibration and box else None,
         holdout=r.holdout_result(verifications),
         verifications={step: _verification(found) for step, found in verifications.items()},
         truth=_truth(source, calibration, box),

@@ -53,7 +53,7 @@ def missed_view(facts: Facts) -> ImageView | None:
             summary = f"Capture {capture.id}, set aside: {why[capture.id]}.{more}"
             box = (-0.5, -0.5, float(width), float(height))
             return ImageView(
-                capture.id, _data(capture.image.pixels), box, [], [], width / 110, summary
+                capture.id, data_uri(capture.image.pixels), box, [], [], width / 110, summary
             )
     return None
 
@@ -90,7 +90,7 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
     # The middle of the first pixel is (0, 0), and its corner that of the picture.
     return ImageView(
         name,
-        _data(image.pixels[y : y + height, x : x + width]),
+        data_uri(image.pixels[y : y + height, x : x + width]),
         (x - 0.5, y - 0.5, width, height),
         [(float(u), float(v)) for u, v in at],
         [tuple(line) for line in np.hstack([at, ends]).tolist()],
@@ -114,7 +114,7 @@ def _around(at: Floats, image: t.Image) -> tuple[int, int, int, int]:
     return x, y, width, height
 
 
-def _data(pixels: t.Pixels) -> str:
+def data_uri(pixels: t.Pixels) -> str:
     """Return a picture as a data URI, not wider than a page."""
     import cv2
 

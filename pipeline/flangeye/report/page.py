@@ -16,6 +16,7 @@ from flangeye.log.read import RunLog
 from flangeye.plugin.stage import Stage
 from flangeye.report.account import provenance_of, set_aside_of, timings_of
 from flangeye.report.cell import cell_drawing
+from flangeye.report.checks import drawings_of
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
@@ -87,6 +88,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "image": image_view(facts),
         "missed": missed_view(facts),
         "cell": cell_drawing(facts),
+        "drawings": drawings_of(facts),
         "seam": seam_view(facts),
         "weld": weld_drawing(facts),
         "set_aside": set_aside_of(facts),

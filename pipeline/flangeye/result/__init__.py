@@ -33,7 +33,7 @@ from flangeye.result.contract import (
     WeldTruthResult,
     WorkspaceResult,
 )
-from flangeye.result.exported import calibrated_pose
+from flangeye.result.exported import calibrated_pose, require_one, result_of_camera
 from flangeye.result.logged import logged_result
 from flangeye.result.provenance import library_versions, sha256
 from flangeye.result.welding import seam_result, weld_result
@@ -63,6 +63,8 @@ __all__ = [
     "library_versions",
     "logged_result",
     "observations_result",
+    "require_one",
+    "result_of_camera",
     "seam_result",
     "sha256",
     "transforms_result",

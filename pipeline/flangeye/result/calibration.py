@@ -152,9 +152,8 @@ def _observation(pair: t.Pair) -> ObservationResult:
     )
 
 
-def workspace_result(calibration: t.HandEye, box: t.Box) -> WorkspaceResult:
+def workspace_result(estimate: t.TransformEstimate, box: t.Box) -> WorkspaceResult:
     """Return the error to expect over ``box``, from the estimate's covariance alone."""
-    estimate = calibration.camera
     covariances = covariance_at(estimate.covariance, estimate.about, box.grid())
     return WorkspaceResult(
         centre=box.centre.tolist(),

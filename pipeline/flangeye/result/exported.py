@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from flangeye import types as t
 from flangeye.errors import CalibrationRefused, StageError
-from flangeye.result.contract import Result
+from flangeye.result.calibration import workspace_result
+from flangeye.result.contract import ObservationResult, Result, TransformResult, WorkspaceResult
 
 
-def calibrated_pose(result: Result, anyway: bool = False) -> t.CalibratedPose:
-    """Return the camera's pose with what has to be said of it.
+def calibrated_pose(
+    result: Result, anyway: bool = False, camera: str | None = None
+) -> t.CalibratedPose:
+    """Return the camera's pose with what has to be said of it; of a cell, all that was found.
 
     Args:
         result: Result of a run.
         anyway: Give a refused one too; its remarks say so.
+        camera: Of a cell, the one camera to give.
 
     Raises:
-        StageError: There is no calibration.
+        StageError: There is no calibration, or no such camera.
         CalibrationRefused: It was refused, and ``anyway`` is not given.
     """
     if not result.transforms:
@@ -27,16 +33,90 @@ def calibrated_pose(result: Result, anyway: bool = False) -> t.CalibratedPose:
             f"the calibration was refused, so nothing is exported: {result.refused}; --anyway "
             "writes it all the same, and says so in the file"
         )
-    name, estimate = next(iter(result.transforms.items()))
-    remarks = _remarks(name, result, bool(estimate.unobservable))
-    return t.CalibratedPose(t.Transform.named(name, np.array(estimate.matrix)), remarks)
+    names = [_of_camera(result, camera)] if camera else [*result.transforms]
+    if not cameras_of(result):
+        del names[1:]
+    first, *others = (
+        t.Transform.named(name, np.array(result.transforms[name].matrix)) for name in names
+    )
+    return t.CalibratedPose(first, _remarks(names, result), tuple(others))
 
 
-def _remarks(name: str, result: Result, partly: bool) -> tuple[str, ...]:
-    parent, _, child = name.partition("_T_")
+def cameras_of(result: Result) -> dict[str, str]:
+    """Return the transform of each camera that was found, by the camera's name in its cell."""
+    looked = {o.camera for o in result.observations}
+    children = {name.partition("_T_")[2]: name for name in result.transforms}
+    return {child: name for child, name in children.items() if child in looked}
+
+
+def result_of_camera(result: Result, camera: str | None) -> Result:
+    """Return the part of a result that one camera of a cell has: its pose, sightings and work.
+
+    Args:
+        result: Of a run; returned as it is where that had one camera.
+        camera: Which.
+
+    Raises:
+        StageError: The run is of a cell and no camera is chosen, or there is no such camera.
+    """
+    cameras = cameras_of(result)
+    if not cameras and camera is None:
+        return result
+    if camera is None:
+        names = " or ".join(f"--camera {name}" for name in cameras)
+        raise StageError(f"the run is of a cell, and a certificate is of one camera: add {names}")
+    name = _of_camera(result, camera)
+    seen = [o for o in result.observations if o.camera == camera]
+    return result.model_copy(
+        update={
+            "transforms": {name: result.transforms[name]},
+            "observations": seen,
+            "workspace": _work_of_camera(name, result.transforms[name], seen),
+        }
+    )
+
+
+def _work_of_camera(
+    name: str, found: TransformResult, seen: Sequence[ObservationResult]
+) -> WorkspaceResult:
+    """Return the error to expect where a camera saw something, in the frame that carries it."""
+    pose = t.Transform.named(name, np.array(found.matrix))
+    estimate = t.TransformEstimate(pose, np.array(found.covariance), np.array(found.about))
+    points = pose.apply(np.array([o.centre_in_camera for o in seen if o.centre_in_camera]))
+    low, high = points.min(axis=0), points.max(axis=0)
+    return workspace_result(estimate, t.Box((low + high) / 2, high - low))
+
+
+def _of_camera(result: Result, camera: str) -> str:
+    cameras = cameras_of(result)
+    if camera not in cameras:
+        known = ", ".join(cameras) or "one alone; leave --camera out"
+        raise StageError(f"--camera {camera}: no such camera was found; the run has {known}")
+    return cameras[camera]
+
+
+def require_one(format_name: str, pose: t.CalibratedPose, result: Result) -> None:
+    """Refuse to write several transforms into a format that carries one.
+
+    Raises:
+        StageError: Says how to choose.
+    """
+    if pose.others:
+        names = " or ".join(f"--camera {camera}" for camera in cameras_of(result))
+        raise StageError(
+            f"{format_name}: carries one transform, and the cell has "
+            f"{1 + len(pose.others)}: add {names}"
+        )
+
+
+def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
     run = result.provenance
+    partly = any(result.transforms[name].unobservable for name in names)
+    told = (
+        f"{name}, maps {name.partition('_T_')[2]} to {name.partition('_T_')[0]}" for name in names
+    )
     said = [
-        f"flangeye: {name}, maps {child} to {parent}; {result.status}",
+        f"flangeye: {'; '.join(told)}; {result.status}",
         f"recipe {run.recipe}, sha256 {run.recipe_hash[:16]}; input sha256 {run.input_hash[:16]}",
     ]
     if result.refused:

@@ -58,8 +58,13 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
 
 
 def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
-    """Compare with the true seam that is nearest, where the torch was between its ends."""
+    """Compare with the true seam that is nearest, where the torch was between its ends.
+
+    Not while the tip still feels for the groove: the torch of a weld that is gone on with is above
+    the seam then, and does not weld.
+    """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
+    torch = torch[~np.isin(weld.phases, ("seeking", "probing"))]
     found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
     return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))

@@ -59,15 +59,15 @@ def worked_ahead(
     """Yield each item in order with what gives its result, or raises what the work raised.
 
     Items are pulled in this thread and worked on in others, as many as there are workers and one
-    that waits: what is held in memory does not grow with the number of items. Whoever stops
-    pulling has no work begun beyond that.
+    that waits, fewer where the work is done sooner than the next is there: what is held in memory
+    does not grow with the number of items. Whoever stops pulling has no work begun beyond that.
     """
     pool = ThreadPoolExecutor(workers, thread_name_prefix="flangeye")
     waiting: deque[tuple[T, Future[R]]] = deque()
     try:
         while (pulled := Done.of(partial(next, items))).error is None:
             waiting.append((pulled.value, pool.submit(work, pulled.value)))
-            if len(waiting) > workers:
+            while waiting and (len(waiting) > workers or waiting[0][1].done()):
                 yield _first(waiting)
         while waiting:
             yield _first(waiting)

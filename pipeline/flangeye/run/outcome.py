@@ -108,7 +108,7 @@ def result_of(
     box = work_of(calibration, outcome.source, given) if calibration else None
     if calibration and box:
         result.method = calibration.method
-        result.workspace = r.workspace_result(calibration, box)
+        result.workspace = r.workspace_result(calibration.camera, box)
         if truth := truths.cell:
             result.truth = r.truth_result(calibration, truth, box, _robots(recipe))
     return result

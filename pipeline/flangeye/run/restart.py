@@ -6,24 +6,35 @@ any other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, Protocol, TypeVar, get_args
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.log.read import RunLog, read_run
+from flangeye.log.read import RunLog, read_notes, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
 from flangeye.recipe.load import Recipe, parse_recipe
 from flangeye.recipe.steps import Step
 
 _ORDER = list(KINDS)
+LEFT_OUT = "left out by --leave-out"
+MOST_NAMED = 12
+"""Captures that a message names."""
 
 Acquire = Callable[[], Any]
 """Does the recipe's acquire step."""
+
+
+class _Named(Protocol):
+    @property
+    def id(self) -> str: ...
+
+
+Each = TypeVar("Each", bound=_Named)
 
 
 class Gathered(NamedTuple):
@@ -46,6 +57,11 @@ class FromNothing:
     def resumed(self) -> t.Resumed | None:
         """The captures an earlier run took, whatever became of them."""
         return None
+
+    @property
+    def first(self) -> int:
+        """How many captures are taken before what an earlier run gathered is counted."""
+        return 0
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
         """Return what the steps work on."""
@@ -85,11 +101,13 @@ class FromLog(FromNothing):
         log: The log.
         at: Index of the first step to do again.
         kind: Kind of that step.
+        left_out: Captures that take no part.
     """
 
     log: RunLog
     at: int
     kind: str
+    left_out: frozenset[str] = frozenset()
 
     @property
     def simulated(self) -> bool:
@@ -113,12 +131,15 @@ class FromLog(FromNothing):
         if self.kind == "acquire":
             raise StageError("--at the acquire step: that is the whole recipe; leave out --from")
         if self._reads_flanges:
-            captures = [capture for capture, _ in self.log.flange_clouds()]
+            captures = list(self._kept(capture for capture, _ in self.log.flange_clouds()))
             return t.Captures(captures, self._source, len(captures))
         if self.kind in ("segment", "fit"):
             return self._scans()
-        observations = self.log.observations()
+        observations = list(self._kept(self.log.observations()))
         return t.Observations(observations, self._source, len(observations))
+
+    def _kept(self, taken: Iterable[Each]) -> Iterator[Each]:
+        return (each for each in taken if each.id not in self.left_out)
 
     def _scans(self) -> t.Captures:
         if not self.log.has_full_clouds:
@@ -126,7 +147,8 @@ class FromLog(FromNothing):
                 f"{self.log.path}: holds thinned scans only, which cannot be segmented again; "
                 "start --at a later step, or record with log: {clouds: full}"
             )
-        return t.Captures(self.log.readings(), self._source, len(self.log.poses))
+        readings = self._kept(self.log.readings())
+        return t.Captures(readings, self._source, len(self.log.poses) - len(self.left_out))
 
     def does(self, step: Step) -> bool:
         """Return whether a step is done, rather than read back."""
@@ -155,12 +177,14 @@ class FromLog(FromNothing):
     def views(self) -> t.Views:
         """Return the verification views, when they are not segmented again."""
         again = self.kind in ("segment", "fit")
-        return t.Views() if again else self.log.views()
+        return t.Views() if again else t.Views(self._kept(self.log.views()))
 
     def rejections(self) -> list[t.Rejection]:
         """Return the captures that were set aside by the steps that are not done again."""
         earlier = _ORDER[: _ORDER.index(self.kind)]
-        return [r for r in self.log.rejections if r.stage.partition(".")[0] in earlier]
+        named = [t.Rejection(each, "acquire", LEFT_OUT) for each in sorted(self.left_out)]
+        found = [r for r in self.log.rejections if r.stage.partition(".")[0] in earlier]
+        return [*self._kept(found), *named]
 
 
 @dataclass(frozen=True)
@@ -170,81 +194,133 @@ class FromEarlierRun(FromNothing):
     Attributes:
         log: Its log.
         segments: Whether the recipe segments.
+        retaken: Captures that are taken again; what it had of them is left out.
     """
 
     log: RunLog
     segments: bool
+    retaken: frozenset[str] = frozenset()
 
     @property
     def resumed(self) -> t.Resumed:
-        """The captures it took, whatever became of them."""
+        """The captures it took and that are kept, whatever became of them."""
         aside = {rejection.id for rejection in self.log.rejections}
-        return t.Resumed(frozenset({*self.log.finished, *aside}), self.log.last_joints)
+        done = frozenset({*self.log.finished, *aside}) - self.retaken
+        return t.Resumed(done, self.log.last_joints)
+
+    @property
+    def first(self) -> int:
+        """How many captures are taken again; before the rest, or a solver might have enough."""
+        return len(self.retaken)
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
         """Return what is left to take, told what became of the rest."""
         stream: t.Captures | t.Observations = acquire()
         if isinstance(stream, t.Captures):
             stream.outcomes.update(dict.fromkeys(sorted(self.resumed.done)))
-            stream.outcomes.update({o.id: o for o in self.log.observations()})
+            kept = [o for o in self.log.observations() if o.id not in self.retaken]
+            stream.outcomes.update({o.id: o for o in kept})
         return stream
 
     def views(self) -> t.Views:
         """Return the verification views of that run."""
-        return self.log.views()
+        return t.Views(view for view in self.log.views() if view.id not in self.retaken)
 
     def rejections(self) -> list[t.Rejection]:
         """Return the captures that run set aside."""
-        return list(self.log.rejections)
+        return [r for r in self.log.rejections if r.id not in self.retaken]
 
     def gathered(self) -> Iterator[Gathered]:
         """Return what that run gathered, so that the new log stands by itself."""
         fitted = {o.id: o for o in self.log.observations()}
         unsegmented = ((capture, None) for capture in self.log.captures())
         for capture, flange in self.log.flange_clouds() if self.segments else unsegmented:
-            yield Gathered(capture, flange, fitted.get(capture.id))
+            if capture.id not in self.retaken:
+                yield Gathered(capture, flange, fitted.get(capture.id))
 
 
-def restart_at(log: RunLog, recipe: Recipe, at: str) -> FromLog:
+def restart_at(log: RunLog, recipe: Recipe, at: str, left_out: Collection[str] = ()) -> FromLog:
     """Return the starting point that does the step ``at``, and those after it.
 
     Args:
         log: Holds what the steps before gave.
         recipe: The recipe.
         at: A step's index, name or label.
+        left_out: Captures that take no part.
 
     Raises:
-        StageError: There is no such step; names those there are.
+        StageError: There is no such step, or no such capture; names those there are.
     """
     for step in recipe.steps:
         if at in (str(step.index), step.stage.name, step.label):
-            return FromLog(log, step.index, step.stage.kind)
+            found = _named("--leave-out", left_out, log)
+            return FromLog(log, step.index, step.stage.kind, found)
     known = ", ".join(step.stage.name for step in recipe.steps)
     raise StageError(f"--at {at}: the recipe has no such step; its steps are {known}")
 
 
-def earlier_run(path: Path, registry: Registry) -> tuple[Recipe, FromEarlierRun]:
+def _named(option: str, wanted: Collection[str], log: RunLog) -> frozenset[str]:
+    """Return captures that were named.
+
+    Raises:
+        StageError: The log has no such capture.
+    """
+    known = {*log.poses, *(o.id for o in log.observations()), *(r.id for r in log.rejections)}
+    for each in wanted:
+        if each not in known:
+            near = ", ".join(sorted(known)[:MOST_NAMED]) + (" …" if len(known) > MOST_NAMED else "")
+            raise StageError(f"{option} {each}: {log.path} has no such capture; it has {near}")
+    return frozenset(wanted)
+
+
+def earlier_run(
+    path: Path, registry: Registry, retaken: Collection[str] = ()
+) -> tuple[Recipe, FromNothing]:
     """Return the recipe of a run that ended early, and what it gathered.
+
+    A run that was stopped in its weld is gone on with at the weld, which goes back and overlaps.
 
     Args:
         path: The run's folder, or its log.
         registry: The plugins on offer.
+        retaken: Captures to take again; then the run may have come to its end.
 
     Raises:
-        StageError: There is no such log, it holds no recipe, or the run came to its end.
+        StageError: There is no such log, it holds no recipe, or the run came to its end; or it has
+            no such capture.
     """
     log = read_run(path / "run.mcap" if path.is_dir() else path)
-    if log.result is not None:
-        raise StageError(f"{log.path}: this run came to its end; there is nothing to go on with")
+    ended = log.result is not None and not _stopped_in_weld(log.result)
+    if ended and not retaken:
+        raise StageError(
+            f"{log.path}: this run came to its end; there is nothing to go on with "
+            "(--retake ID takes a capture again)"
+        )
     text = log.text("recipe.resolved.yaml")
     if text is None:
         raise StageError(f"{log.path}: holds no recipe; it cannot be gone on with")
     name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
     recipe = parse_recipe(text, name, registry)
+    weld = None if retaken else _begun_weld(log, recipe)
+    if weld is not None:
+        going_on = [f"steps.{weld.index}.resume={log.path.absolute()}"]
+        return parse_recipe(text, name, registry, going_on), restart_at(log, recipe, weld.label)
     if not resumable(recipe):
         raise StageError(f"{log.path}: {recipe.steps[0].stage.name} begins anew each time")
     segments = any(step.stage.kind == "segment" for step in recipe.steps)
-    return recipe, FromEarlierRun(log, segments)
+    return recipe, FromEarlierRun(log, segments, _named("--retake", retaken, log))
+
+
+def _stopped_in_weld(result: Mapping[str, Any]) -> bool:
+    weld = result.get("weld") or {}
+    return not weld.get("completed", True)
+
+
+def _begun_weld(log: RunLog, recipe: Recipe) -> Step | None:
+    """Return the last weld that a run began, if it can be gone on with."""
+    welds = [s for s in recipe.steps if s.params and "resume" in type(s.params).model_fields]
+    begun = {note.step for note in read_notes(log.path, {s.label for s in welds})}
+    return next((step for step in reversed(welds) if step.label in begun), None)
 
 
 def resumable(recipe: Recipe) -> bool:

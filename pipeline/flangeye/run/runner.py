@@ -18,10 +18,11 @@ import pluggy
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
 from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
+from flangeye.models.configuration import CELL
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step, bare
-from flangeye.result import Result, calibrated_pose
+from flangeye.result import Result, calibrated_pose, require_one
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.outcome import Outcome, Truths, result_of
 from flangeye.run.restart import FromNothing
@@ -91,6 +92,12 @@ class Runner:
         finally:
             self._finish_acquiring()
 
+    def solve(self, observations: Sequence[t.Observation], source: t.Source) -> t.HandEye:
+        """Return what the recipe's solve step makes of observations that are there."""
+        self._outcome.source = source
+        self._values[t.Box] = self._values[t.Box] or source.workspace
+        return self._solve_subset(observations)
+
     # --- acquire, segment, fit: one capture at a time ------------------------------------------
 
     def _observe(self, start: FromNothing) -> t.Truth | None:
@@ -105,8 +112,9 @@ class Runner:
         self._values[t.Box] = self._values[t.Box] or stream.source.workspace
         for rejection in start.rejections():
             self._reject(rejection)
+        taken = self._taken(stream)
         solvable = t.Observations(
-            chain(self._gathered(), self._taken(stream)), stream.source, stream.total
+            chain(islice(taken, start.first), self._gathered(), taken), stream.source, stream.total
         )
         self._outcome.seen = solvable.seen
         self._values[t.Observations] = solvable
@@ -215,7 +223,9 @@ class Runner:
         feature = self._per_capture("fit", capture.id, given)
         if feature is None:
             return None
-        return t.Observation(capture.id, feature, capture.poses, capture.joints)
+        return t.Observation(
+            capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target
+        )
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
         if flange := self._start.segmented(capture.id):
@@ -287,8 +297,10 @@ class Runner:
         steps = self._steps("export")
         if steps:
             so_far = result_of(self._outcome, self._recipe, self._registry, self._watch)
-            self._values[t.CalibratedPose] = calibrated_pose(so_far)
+            pose = self._values[t.CalibratedPose] = calibrated_pose(so_far)
         for step in steps:
+            if CELL not in step.stage.serves:
+                require_one(step.label, pose, so_far)
             file = self._call(step)
             if file.name in {other.name for other in self._outcome.exports}:
                 raise StageError(

@@ -39,7 +39,7 @@ from flangeye.types import (
     Rejected,
 )
 
-BALL = Sphere(radius=0.03, centre_in_flange=(0.0, 0.0, 0.1))
+BALL = Sphere(size=0.03, centre_in_flange=(0.0, 0.0, 0.1))
 
 
 class PerCaptureConformance(Conformance):

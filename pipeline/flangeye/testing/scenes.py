@@ -162,4 +162,4 @@ def scaled_flange(flange: Flange, scale: float) -> Flange:
 def scaled_sphere(sphere: Sphere, scale: float) -> Sphere:
     """Return a sphere with every length scaled."""
     x, y, z = (scale * v for v in sphere.centre_in_flange)
-    return Sphere(radius=scale * sphere.radius, centre_in_flange=(x, y, z))
+    return Sphere(size=scale * sphere.radius, centre_in_flange=(x, y, z))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flangeye.types.frames import BASE, Transform
 
@@ -16,10 +16,18 @@ class CalibratedPose:
             ``flange_T_camera``, translation in [m].
         remarks: Lines that have to stand in the file: what it is, how it was judged, and, for one
             that was refused, that it must not be used. ASCII, no line breaks.
+        others: Of a cell of which no camera was chosen, every other transform that was found; only
+            formats that declare to serve cells are given them.
     """
 
     transform: Transform
     remarks: tuple[str, ...] = ()
+    others: tuple[Transform, ...] = ()
+
+    @property
+    def each(self) -> tuple[CalibratedPose, ...]:
+        """Every transform by itself."""
+        return tuple(replace(self, transform=x, others=()) for x in (self.transform, *self.others))
 
     @property
     def stands(self) -> bool:

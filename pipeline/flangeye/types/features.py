@@ -60,17 +60,22 @@ class PoseFeature:
         figures: What the fit has to tell of its quality, by name, in SI units and pixels.
         corners: (N, 4) the target's corners in the image, right and down, and what has to be
             added to come to where the pose has them [px]; none where it was found otherwise.
+        shared: (6, k) what one standard deviation of each of k errors that all captures of a
+            session share, such as the camera's, does to the pose, in the covariance's order.
     """
 
     camera_T_target: Transform
     covariance: Array
     figures: Mapping[str, float] = field(default_factory=dict)
     corners: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    shared: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     def __post_init__(self) -> None:
         corners = np.reshape(self.corners, (-1, 4))  # JSON does not tell (0, 4) from (0,)
         object.__setattr__(self, "corners", corners)
-        freeze(self, covariance=(6, 6), corners=corners.shape)
+        shared = np.reshape(self.shared, (6, -1))
+        object.__setattr__(self, "shared", shared)
+        freeze(self, covariance=(6, 6), corners=corners.shape, shared=shared.shape)
 
     @property
     def centre(self) -> NDArray[np.float64]:

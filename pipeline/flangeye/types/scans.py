@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye.types.arrays import Array, Pixels, freeze
 from flangeye.types.clouds import PointCloud
-from flangeye.types.frames import Placed, Poses
+from flangeye.types.frames import CAMERA, TARGET, Placed, Poses
 
 Role = Literal["calibration", "verification"]
 
@@ -23,11 +23,14 @@ class Image:
         pixels: (H, W) grey or (H, W, 3) RGB, uint8.
         camera_matrix: (3, 3) pinhole matrix [px].
         distortion: (k,) OpenCV's distortion coefficients; empty for an undistorted image.
+        camera_covariance: (8, 8) of fx, fy, cx, cy [px], k1, k2, p1, p2, the same for all images
+            of a session; (0, 0) where the camera counts as known.
     """
 
     pixels: Pixels
     camera_matrix: Array
     distortion: Array = field(default_factory=lambda: np.zeros(0))
+    camera_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         pixels = np.asarray(self.pixels)
@@ -38,7 +41,11 @@ class Image:
         view = pixels.view()
         view.setflags(write=False)
         object.__setattr__(self, "pixels", view)
-        freeze(self, camera_matrix=(3, 3), distortion=np.shape(self.distortion))
+        known = np.size(self.camera_covariance) == 0  # JSON does not tell (0, 0) from (0,)
+        object.__setattr__(self, "camera_covariance", np.reshape(
+            self.camera_covariance, (0, 0) if known else (8, 8)))  # fmt: skip
+        freeze(self, camera_matrix=(3, 3), distortion=np.shape(self.distortion),
+               camera_covariance=np.shape(self.camera_covariance))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +60,8 @@ class Capture(Placed):
         time_ns: When the exposure ended.
         role: ``verification`` captures are kept from every solver.
         image: What a camera in the scanner saw, in the same frame, if one looked.
+        camera: Frame of the scanner that took it; a cell has several.
+        target: Frame of what it looked at.
     """
 
     id: str
@@ -62,6 +71,8 @@ class Capture(Placed):
     time_ns: int = 0
     role: Role = "calibration"
     image: Image | None = None
+    camera: str = CAMERA
+    target: str = TARGET
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ class Stream(Generic[T]):
         source: What is known of where the values come from.
         total: How many there will be, when known.
         seen: The values pulled so far.
+        whole: Whether all values were there from the start: pulling acquires nothing.
     """
 
     def __init__(self, items: Iterable[T], source: Source, total: int | None = None) -> None:
@@ -34,6 +35,7 @@ class Stream(Generic[T]):
         self.source = source
         self.total = total
         self.seen: list[T] = []
+        self.whole = isinstance(items, Sequence)
 
     def __iter__(self) -> Iterator[T]:
         yield from list(self.seen)
@@ -51,8 +53,8 @@ class Captures(Stream[Capture | Rejection]):
         outcomes: What became of each capture, by id: its observation, or None if it was set aside
             or kept for verifying. A source that chooses its next pose may look here.
         look: Simulation only: scans other things with the same scanner, see :data:`Look`.
-        recorded: Whether the captures are there already, as in an archive: the next may be pulled
-            before it is known what became of the last.
+        recorded: Whether the captures wait for nobody, as those of an archive or a simulation do:
+            the next may be pulled before it is known what became of the last.
     """
 
     def __init__(

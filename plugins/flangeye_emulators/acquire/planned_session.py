@@ -179,7 +179,7 @@ def plan_session(
     if configuration.other_base and second is None:
         raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
     other = Arm(second.model) if second and configuration.other_base else None
-    cast = Cast(configuration, Arm(robot), other, params.four_axes, params.in_turns)
+    cast = Cast(configuration, Arm(robot), other, params.four_axes, params.in_turns, view.draws)
     known = configuration.place
     place = params.place.matrix if known is None else np.asarray(known)
     camera = params.camera.matrix if params.camera else None

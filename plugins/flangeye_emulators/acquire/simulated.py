@@ -28,6 +28,7 @@ from flangeye.types import (
     Capture,
     Captures,
     Floats,
+    Journal,
     Observation,
     PointCloud,
     Role,
@@ -88,13 +89,14 @@ class SimulatedParams(Params):
 
 
 @stage("acquire.simulated")
-def acquire_simulated(
+def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     robot: RobotModel,
     scanner: ScannerModel,
     flange: Flange,
     seed: Seed,
     params: SimulatedParams,
     sphere: Sphere | None = None,
+    journal: Journal | None = None,
 ) -> Captures:
     """Scan a simulated arm that moves its flange through the scanner's view.
 
@@ -109,6 +111,7 @@ def acquire_simulated(
         seed: Decides poses, errors and noise.
         params: See :class:`SimulatedParams`.
         sphere: A calibration sphere on the flange, where the recipe's feature has one.
+        journal: Hears what a plan that chooses its poses expects of the next one.
 
     Raises:
         StageError: Fewer than three poses are possible.
@@ -141,7 +144,20 @@ def acquire_simulated(
         ),
     )
     look = partial(session.look, rng=_rng(later))
-    return Captures(session.captures(noise), source, len(session.joints), look)
+    whys = [*([""] * len(checks)), *(pose.why for pose in poses)]
+    captures = _explained(session.captures(noise), whys, journal)
+    # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
+    return Captures(captures, source, len(session.joints), look, recorded=not any(whys))
+
+
+def _explained(
+    captures: Iterator[Capture], whys: Sequence[str], journal: Journal | None
+) -> Iterator[Capture]:
+    """Yield the captures; before each, say what the plan expects of it, where it does."""
+    for index, why in enumerate(whys):
+        if why and journal:
+            journal("next", {"id": f"{index:04d}", "why": why})
+        yield next(captures)
 
 
 def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:

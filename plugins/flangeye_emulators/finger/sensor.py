@@ -13,7 +13,7 @@ from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger
 from flangeye.models.workpiece import CadSeam, WorkpiecePath, load_workpiece
 from flangeye.plugin.stage import Params, part
-from flangeye.types import Floats, Image, Seed
+from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Angle, Duration, Length, param
 from flangeye_emulators.finger.render import FingerCamera, Optics, typical_compliance
 from flangeye_emulators.weld_world.clock import Shutter
@@ -21,8 +21,17 @@ from flangeye_emulators.weld_world.groove import Section, Tip
 from flangeye_emulators.weld_world.settings import GapParams, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_emulators.world import room
+from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.motion import ToolPose, turned
+from flangeye_plugins.weld.motion import ToolPose
+
+
+class SectionParams(Params):
+    """A joint's cross-section, as it really is."""
+
+    left: Angle = param(ge=0, le=np.pi / 2, description="The left wall, from the opening.")
+    right: Angle = param(ge=0, le=np.pi / 2, description="The right wall, from the opening.")
+    depth: Length = param(gt=0, description="From the walls' upper edge to the root.")
 
 
 class SimulatedFingerParams(Params):
@@ -38,6 +47,12 @@ class SimulatedFingerParams(Params):
     )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
+    )
+    leg: int | None = Field(
+        None, ge=1, description="Of a seam with sharp corners, the leg that is felt."
+    )
+    section: SectionParams | None = Field(
+        None, description="The joint's true cross-section, where it is not the file's groove."
     )
     gaps: tuple[GapParams, ...] = Field((), description="Pieces of a wall that are missing.")
     rate: float = Field(30.0, gt=0, le=200, description="Images per second.")
@@ -109,7 +124,7 @@ class SimulatedFinger:
         if self._params.fails is not None and age >= self._params.fails:
             raise DeviceError(f"{self.name}: the camera is lost")
         pose = self.tool.pose(room.true_flange(state), now)
-        shown = self._shown(pose)
+        shown = self._shown(pose, room.true_flange(state))
         self._torch.append((now, self.world.torch))
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.
@@ -122,8 +137,9 @@ class SimulatedFinger:
 
     def true_torch(self) -> tuple[Floats, Floats]:
         """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
-        times = np.array([time for time, _ in self._torch])
-        torch = np.array([place for _, place in self._torch]).reshape(-1, 3)
+        known = list(self._torch)  # in one go: a thread that reads images may add to it
+        times = np.array([time for time, _ in known])
+        torch = np.array([place for _, place in known]).reshape(-1, 3)
         return times, self._plane.base_T_plane.apply(torch)
 
     def close(self) -> None:
@@ -135,12 +151,18 @@ class SimulatedFinger:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _shown(self, pose: ToolPose) -> Floats:
+    def _shown(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
         """Return what the tag shows of the tip's displacement (3,), along the tool's axes."""
         if not self._params.held:
-            return self.world.settle(pose)
-        self._mark = pose.position if self._mark is None else self._mark
-        return turned(self._mark - pose.position, -pose.angle)
+            return self.world.settle(pose, self._stands(pose, base_T_flange))
+        axes, tip = self.world.held(pose, self._stands(pose, base_T_flange))
+        self._mark = tip if self._mark is None else self._mark
+        return np.asarray(axes.T @ (self._mark - tip))
+
+    def _stands(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
+        """Return how the tool stands (3, 3): its axes, turned back by its heading."""
+        axes = self._plane.base_T_plane.rotation.T @ self.tool.base_R_tool(base_T_flange)
+        return np.asarray(rotation_from_rpy(0.0, 0.0, -pose.angle) @ axes)
 
     def _image(self, displacement: Floats) -> Image:
         return self._camera.image(*self._compliance.tag(displacement))
@@ -176,11 +198,21 @@ def _as_planned(finger: Finger, params: SimulatedFingerParams) -> tuple[WorkPlan
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
     openings = np.tile(pose[:3, :3] @ seam.opening, (len(points), 1))
     plane = WorkPlane(points, openings)
+    if params.leg is not None:
+        corners = [corner.point for corner in corners_of(plane.points(points))]
+        bounds = [0, *corners, len(points) - 1]
+        kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
+        points = points[kept]
+        plane = WorkPlane(points, openings[kept])
     tip = Tip(radius=finger.radius)
-    return plane, Nominal(plane.points(points), _section(seam, params), tip, finger.torch)
+    return plane, Nominal(
+        plane.points(points), _section(seam, params), tip, finger.torch_from_tip, np.eye(3)
+    )
 
 
 def _section(seam: CadSeam, params: SimulatedFingerParams) -> Section:
+    if (told := params.section) is not None:
+        return Section((told.left + told.right) / 2, told.depth, (told.left - told.right) / 2)
     if seam.half_angle is None or seam.half_width is None:
         raise StageError(
             f"{params.workpiece}: seam '{params.seam}' needs half_angle and half_width to be felt"

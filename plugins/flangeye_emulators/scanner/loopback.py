@@ -104,7 +104,7 @@ class LoopbackScanner(OpenScanner):
         """
         faults, distortion = np.random.default_rng(params.seed).spawn(2)
         eye = scanner_of(model, params.resolution, params.noise, distortion)
-        rows, columns = eye.pixels.directions.shape[:2]
+        rows, columns = eye.pixels.shape
         facts = {"unit": "m", "layout": f"organised, {columns} x {rows}", "simulated": "yes"}
         super().__init__(f"simulated {model.model}, seed {params.seed}", facts)
         base_T_camera = params.camera.base_T_camera

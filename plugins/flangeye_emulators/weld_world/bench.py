@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
+from flangeye.models.finger import Finger
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.conditions import Condition
 from flangeye_emulators.weld_world.groove import Section, Tip
 from flangeye_emulators.weld_world.trial import Start, Trial, run_trial
 from flangeye_emulators.weld_world.world import Nominal
-from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.checks import check_belief
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.belief import Belief, belief_of
+from flangeye_plugins.weld.body import Body, body_from
+from flangeye_plugins.weld.checks import check_tool
+from flangeye_plugins.weld.controller import Controller
+from flangeye_plugins.weld.going_on import controller_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 
 DISTANCE = 40e-3
 SECTION = Section(np.deg2rad(40.0), 10e-3)
+FINGER = {
+    "model": "bench", "tag": {"side": "12 mm"},
+    "camera": {"width": 320, "height": 240, "focal": [400, 400], "centre": [159.5, 119.5]},
+    "tip": ["0 mm", "0 mm", "180 mm"], "torch": f"{DISTANCE * 1e3} mm", "radius": "1.5 mm",
+    "source": "bench",
+}  # fmt: skip
 ABOVE = 12e-3
 """Height of the tip above the planned start [m]."""
 
@@ -38,9 +50,13 @@ def misplanned(points: Floats, seed: int, shift: float, turn: float) -> Floats:
 
 
 def try_condition(
-    condition: Condition, seed: int, length: float = 0.15, period: float = 8e-3
+    condition: Condition,
+    seed: int,
+    length: float = 0.15,
+    period: float = 8e-3,
+    watch: Callable[[Controller], None] = lambda _: None,
 ) -> Trial:
-    """Weld the bench's seam under a condition.
+    """Weld the bench's seam under a condition; ``watch`` sees the controller before it begins.
 
     Raises:
         StageError: It is refused beforehand.
@@ -48,16 +64,38 @@ def try_condition(
     true = curved(length)
     plan = Path(misplanned(true, seed, *condition.planned))
     settings = Following.model_validate(condition.settings)
-    section = SECTION
-    if condition.half_angle is not None:
-        section = Section(condition.half_angle, SECTION.depth)
-    belief = Belief(DISTANCE, half_angle=section.half_angle, **condition.belief)
-    check_belief(belief, settings)
-    controller = Follower(plan, belief, settings)
+    body = built_for(settings)
+    section, belief = known(condition, body, settings)
+    check_tool(body, belief, settings)
+    passes = 1 + len(settings.passes)
+    controller = controller_of(plan, belief, settings, "tactile")
+    watch(controller)
+    nominal = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
+    start = replace(start_at(plan, belief, settings, period), longest=120.0 * passes)
+    return run_trial(controller, nominal, condition.truth, start, seed)
+
+
+def built_for(settings: Following) -> Body:
+    """Return a tool whose torch's end is as high as its tip when it leans as it is told to."""
+    side = 1.0 if settings.side == "left" else -1.0
+    up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
+    torch = np.array([-DISTANCE, 0.0, float(up)])
+    return body_from(torch, side * settings.work_angle, settings.travel_angle)
+
+
+def known(condition: Condition, body: Body, settings: Following) -> tuple[Section, Belief]:
+    """Return the joint as it is planned, and what the controller is told of tool and joint."""
+    section, half_angle = condition.section, None
+    if section is None:
+        half_angle = condition.half_angle or SECTION.half_angle
+        section = Section(half_angle, SECTION.depth)
+    belief = belief_of(Finger.model_validate(FINGER), body, half_angle, settings)
+    return section, replace(belief, **condition.belief)
+
+
+def start_at(plan: Path, belief: Belief, settings: Following, period: float) -> Start:
+    """Return where a weld begins: above the plan's start."""
     first = plan.at(settings.inset)
-    x, y = first.point.tolist()
+    x, y = (first.point + belief.set_down(settings) * first.normal).tolist()
     angle = float(np.arctan2(first.tangent[1], first.tangent[0]))
-    start = Start((x, y, first.height + ABOVE), angle, period)
-    return run_trial(
-        controller, Nominal(true, section, Tip(), DISTANCE), condition.truth, start, seed
-    )
+    return Start((x, y, first.height + ABOVE), angle, period)

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from flangeye_emulators.weld_world.groove import Section, square_butt
 from flangeye_emulators.weld_world.settings import WorldParams
 
 
@@ -17,6 +20,7 @@ class Condition(NamedTuple):
         planned: Shift [m] and turn [rad] of the plan.
         belief: What the files say of the tool, beside its defaults.
         half_angle: Half angle of the groove [rad], as planned too, where it is not the usual one.
+        section: Cross-section of another joint; the controller knows its kind alone.
     """
 
     world: Mapping[str, Mapping[str, Any]] = {}
@@ -24,12 +28,18 @@ class Condition(NamedTuple):
     planned: tuple[float, float] = (3e-3, 0.01745)
     belief: Mapping[str, Any] = {}
     half_angle: float | None = None
+    section: Section | None = None
 
     @property
     def truth(self) -> WorldParams:
         """The world's parameters."""
         return WorldParams.model_validate(self.world)
 
+
+FILLET = Section(np.pi / 4, 30e-3, -np.pi / 4)
+LAP = Section(np.pi / 4, 5e-3, -np.pi / 4)
+CORNER = Section(np.pi / 4, 6e-3)
+BUTT = square_butt(2.2e-3, 1.5e-3)
 
 CONDITIONS: Mapping[str, Condition] = {
     "nothing wrong": Condition(),
@@ -88,5 +98,44 @@ CONDITIONS: Mapping[str, Condition] = {
         {"finger": {"axial": 0.5, "friction": 0.0}}
     ),
     "tag hidden 0.6 s": Condition({"clock": {"hidden": ["12 s", "12.6 s"]}}),
+    "T-fillet, upright tool": Condition({}, {"joint": "fillet"}, section=FILLET),
+    "T-fillet, pressed on the right, upright tool": Condition(
+        {}, {"joint": "fillet", "side": "right"}, section=Section(np.pi / 4, 30e-3, np.pi / 4)
+    ),
+    "T-fillet, tool leans 40 deg away, 10 deg forwards": Condition(
+        {}, {"joint": "fillet", "work_angle": "40 deg", "travel_angle": "10 deg"}, section=FILLET
+    ),
+    "T-fillet, plates at 91 deg, tool leans 1 deg more than set": Condition(
+        {"workpiece": {"half_angle": "0.5 deg", "lean": "0.5 deg"}, "tool": {"work": "1 deg"}},
+        {"joint": "fillet", "work_angle": "30 deg"}, section=FILLET,
+    ),
+    "lap joint, plate of 5 mm, upright tool": Condition({}, {"joint": "lap"}, section=LAP),
+    "lap joint, plate of 5 mm, tool leans 20 deg away": Condition(
+        {}, {"joint": "lap", "work_angle": "20 deg"}, section=LAP
+    ),
+    "butt joint, square edges, root gap 2.2 mm": Condition(
+        {}, {"joint": "butt", "root_gap": "2.2 mm", "deflection": "1.5 mm"}, section=BUTT
+    ),
+    "butt joint, square edges, root gap 1 mm": Condition(
+        {}, {"joint": "butt", "root_gap": "1 mm"}, section=BUTT
+    ),
+    "butt joint, square edges, no root gap": Condition({}, {"joint": "butt"}, section=BUTT),
+    "corner joint, open, tool leans 10 deg forwards": Condition(
+        {}, {"joint": "corner", "travel_angle": "10 deg", "deflection": "1.8 mm"}, section=CORNER
+    ),
+    "weave 3 mm at 0.8 Hz": Condition({}, {"weave_width": "3 mm", "weave_frequency": 0.8}),
+    "weave 2 mm at 1 Hz, arm lag 100 ms + dead time 60 ms": Condition(
+        {"arm": {"lag": "100 ms", "dead_time": "60 ms"}},
+        {"weave_width": "2 mm", "weave_frequency": 1.0, "max_error": "1.2 mm"},
+    ),
+    "weave 3 mm at 3 Hz": Condition({}, {"weave_width": "3 mm", "weave_frequency": 3.0}),
+    "three passes, 2 mm to the left, 2 mm to the right, weave 3 mm": Condition({}, {
+        "passes": [{"across": "2 mm"}, {"across": "-2 mm", "along": "10 mm"},
+                   {"up": "5 mm", "weave_width": "3 mm", "weave_frequency": 0.8}],
+    }),
+    "two passes, arm lag 200 ms + dead time 100 ms": Condition(
+        {"arm": {"lag": "200 ms", "dead_time": "100 ms"}}, {"passes": [{"across": "2 mm"}]}
+    ),
+    "torch led 1 mm to the left": Condition({}, {"offset_across": "1 mm"}),
 }  # fmt: skip
 """By name, as the table shows them."""

@@ -1,4 +1,4 @@
-"""A V-groove milled into a plate, and where a compliant ball-ended tip comes to rest in it.
+"""A joint between two walls, and where a compliant ball-ended tip comes to rest in it.
 
 Quasi-static: the tip takes the place of least elastic energy that the walls leave it, as far as
 friction lets it go there. Lengths [m].
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.joint import Joint, edges_half_angle
+from flangeye_plugins.weld.path import Path, Place
 
 
 @dataclass(frozen=True)
@@ -32,15 +33,27 @@ class Gap:
 
 @dataclass(frozen=True)
 class Section:
-    """The groove's cross-section.
+    """The joint's cross-section.
 
     Attributes:
-        half_angle: Half angle of each wall from the vertical [rad].
+        half_angle: Of each wall from their bisector [rad].
         depth: From the plate's face to the root [m].
+        lean: Of the bisector from the vertical, to the left [rad]; a fillet's is 45 degrees.
     """
 
     half_angle: float
     depth: float
+    lean: float = 0.0
+
+
+def square_butt(gap: float, radius: float) -> Section:
+    """Return the groove that a ball of a radius meets in a gap between two square edges [m].
+
+    Its walls are the tangents at the edges; the ball is out of it where it lies on the plates.
+    """
+    half_angle = edges_half_angle(gap, radius)
+    rise = radius - math.sqrt(radius**2 - gap**2 / 4.0)
+    return Section(half_angle, radius / math.sin(half_angle) + rise - radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +85,7 @@ EVEN = Relief((0.0,), (0.0,), (0.0,))
 
 @dataclass(frozen=True, eq=False)
 class Groove:
-    """A groove: its root is the seam.
+    """A joint: its root is the seam.
 
     Attributes:
         root: The seam, in the plane of the work, with its height.
@@ -131,18 +144,22 @@ class Contact:
         self._in_groove = False
         self._stuck: float | None = None
         self._across: float | None = None
+        self._wall = (0, 0.0)
 
     @property
     def s(self) -> float:
         """Arc length of the tip's foot on the seam [m]."""
         return self._s
 
-    def settle(self, rest: Floats, moved: float = 0.0) -> Floats:
+    def settle(
+        self, rest: Floats, moved: float = 0.0, plane_R_tool: Floats | None = None
+    ) -> Floats:
         """Return where the tip is (3,), when without any contact it would be at ``rest`` (3,).
 
         Args:
             rest: In the plane of the work [m].
             moved: How far the seam has moved to the left [m].
+            plane_R_tool: (3, 3) the finger's axes; upright when not given.
         """
         root = self._groove.root
         self._s = root.foot(rest[:2], self._s)
@@ -152,33 +169,57 @@ class Contact:
         fill, aside, wider = self._groove.relief.at(self._s)
         across = float((rest[:2] - place.point) @ place.normal) - moved - aside
         up = float(rest[2]) - place.height - fill
-        y, z = self._cross_section(across, up, self._groove.section.half_angle + wider)
-        push_y, push_z = self._tip.lateral * (y - across), self._tip.axial * (z - up)
-        along = self._drag(math.hypot(push_y, push_z))
+        stiff, slides = self._springs(place, plane_R_tool)
+        y, z = self._cross_section(across, up, self._section(wider), stiff)
+        moved_by = np.array([y - across, z - up])
+        push_y, push_z = (stiff @ moved_by).tolist()
+        along = self._drag(math.hypot(push_y, push_z)) + float(slides @ moved_by)
         place = root.at(self._s + along)
         self.force = np.array([self._tip.lateral * along, push_y, push_z])
         side = y + moved + aside
         self.position = np.array([*(place.point + side * place.normal), place.height + fill + z])
         return self.position
 
+    def _section(self, wider: float) -> Joint:
+        section = self._groove.section
+        return Joint(section.half_angle + wider, section.lean)
+
+    def _springs(self, place: Place, plane_R_tool: Floats | None) -> tuple[Floats, Floats]:
+        """Return stiffness across and up (2, 2), and how the tip then slides along (2,).
+
+        Along the seam nothing but friction holds a finger that leans.
+        """
+        tip = self._tip
+        if plane_R_tool is None:
+            return np.diag([tip.lateral, tip.axial]), np.zeros(2)
+        (tx, ty), (nx, ny) = place.tangent.tolist(), place.normal.tolist()
+        axes = np.array([[tx, ty, 0.0], [nx, ny, 0.0], [0.0, 0.0, 1.0]]) @ plane_R_tool
+        stiff = (axes * [tip.lateral, tip.lateral, tip.axial]) @ axes.T
+        slides = -stiff[0, 1:] / stiff[0, 0]
+        return stiff[1:, 1:] + np.outer(stiff[1:, 0], slides), slides
+
     def _free(self, rest: Floats) -> Floats:
         self._stuck, self._across, self._in_groove = None, None, False
+        self._wall = (0, 0.0)
         self.position, self.force = rest.copy(), np.zeros(3)
         return self.position
 
-    def _cross_section(self, across: float, up: float, half_angle: float) -> tuple[float, float]:
+    def _cross_section(
+        self, across: float, up: float, joint: Joint, stiff: Floats
+    ) -> tuple[float, float]:
         """Return where the ball rests: across, and above the root."""
-        radius = self._tip.radius
-        seat, top = radius / math.sin(half_angle), self._groove.section.depth + radius
-        edge = (top - seat) * math.tan(half_angle)
-        if not self._in_groove and abs(across) > edge:
+        beside, seat = joint.seat(self._tip.radius)
+        top = self._groove.section.depth + self._tip.radius
+        wall = joint.left if across >= beside else joint.right
+        edge = (top - seat) * math.tan(wall) if wall < FLAT else math.inf
+        if not self._in_groove and abs(across - beside) > edge:
             return self._on_face(across, up, top)
-        y, z = self._between_walls(across, up - seat, 1.0 / math.tan(half_angle))
+        y, z = self._between_walls(across - beside, up - seat, joint, stiff)
         self._in_groove = z + seat <= top
         if not self._in_groove:
             return self._on_face(across, up, top)
-        self._across = y if z > up - seat else None
-        return y, z + seat
+        self._across = y + beside if z > up - seat else None
+        return y + beside, z + seat
 
     def _on_face(self, across: float, up: float, top: float) -> tuple[float, float]:
         """Return where the ball is on the plate: friction holds it back."""
@@ -190,29 +231,48 @@ class Contact:
         self._across = min(max(held, across - most), across + most)
         return self._across, top
 
-    def _between_walls(self, across: float, up: float, slope: float) -> tuple[float, float]:
-        """Return the ball's place above the walls, heights from the seated ball's.
+    def _between_walls(
+        self, across: float, up: float, joint: Joint, stiff: Floats
+    ) -> tuple[float, float]:
+        """Return the ball's place from where it touches both walls.
 
-        On a wall it moves when the springs overcome friction: uphill the wall seems steeper by the
-        angle of friction, downhill less steep; between the two it stays.
+        On a wall it moves when the springs overcome friction, and stays where they do not.
         """
         gone, room = self._groove.missing(self._s, self._tip.radius)
         side = 1 if across >= 0 else -1
+        before, self._wall = self._wall, (0, 0.0)
         if gone == side:
             return side * min(abs(across), room), max(up, 0.0)
-        if up >= abs(across) * slope:
+        away = np.array([across, up])
+        walls = {1: _wall(1, joint.left), -1: _wall(-1, joint.right)}
+        if all(float(inward @ away) >= 0.0 for _, inward in walls.values()):
             return across, up
-        wall, friction = math.atan(slope), math.atan(self._tip.friction)
-        low = self._climbed(abs(across), up, slope, min(wall + friction, 1.55))
-        high = self._climbed(abs(across), up, slope, max(wall - friction, 0.0))
-        before = 0.0 if self._across is None else max(side * self._across, 0.0)
-        on_wall = min(max(before, low), high)
-        return side * on_wall, on_wall * slope
+        for which in (side, -side):
+            along, inward = walls[which]
+            low, high = self._held(away, along, inward, stiff)
+            was = before[1] if before[0] == which else 0.0
+            on_wall = min(max(was, low), high)
+            if on_wall > 0.0:
+                self._wall = (which, on_wall)
+                return float(on_wall * along[0]), float(on_wall * along[1])
+        return 0.0, 0.0
 
-    def _climbed(self, across: float, up: float, slope: float, angle: float) -> float:
-        """Return where the springs balance on a wall of a slope that seems to have an angle."""
-        stiff, axial, seems = self._tip.lateral, self._tip.axial, math.tan(angle)
-        return max((stiff * across + axial * seems * up) / (stiff + axial * seems * slope), 0.0)
+    def _held(
+        self, away: Floats, along: Floats, inward: Floats, stiff: Floats
+    ) -> tuple[float, float]:
+        """Return between which places on a wall friction holds the ball [m], none below its foot.
+
+        Force along the wall, and onto it, are linear in the place: T(t) = along K (away - t along)
+        and N(t) = -inward K (away - t along); it moves up where T > mu N, down where T < -mu N.
+        """
+        friction = self._tip.friction
+        pulled, pushed = float(along @ stiff @ away), float(inward @ stiff @ away)
+        back, off = float(along @ stiff @ along), float(inward @ stiff @ along)
+        if pushed >= pulled * off / back:  # without friction it would be lifted off this wall
+            return 0.0, 0.0
+        low = (pulled + friction * pushed) / max(back + friction * off, 1e-9)
+        high = (pulled - friction * pushed) / max(back - friction * off, 1e-9)
+        return max(low, 0.0), max(high, 0.0)
 
     def _drag(self, normal_force: float) -> float:
         """Return how far the tip lags along the seam: it sticks until friction gives way."""
@@ -224,3 +284,13 @@ class Contact:
         lag = min(max(self._stuck - self._s, -most), most)
         self._stuck = self._s + lag
         return lag
+
+
+FLAT = math.radians(80.0)
+"""A wall that leans by more has no end: it is the plate itself."""
+
+
+def _wall(side: int, angle: float) -> tuple[Floats, Floats]:
+    """Return unit vectors (2,) up a wall and into the joint: across, up."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return np.array([side * sine, cosine]), np.array([-side * cosine, sine])

@@ -29,6 +29,12 @@ class ToolTruth(Params):
     )
     torch: tuple[Length, Length] = param(("0 mm", "0 mm"), description="Torch: ahead, to the left.")
     yaw: Angle = param("0 deg", description="Turn of finger and torch about the tool's axis.")
+    work: Angle = param(
+        "0 deg", description="Its upper end leans to the right by this about its tip."
+    )
+    travel: Angle = param(
+        "0 deg", description="Its upper end leans forwards by this about its tip."
+    )
 
 
 class FingerTruth(Params):
@@ -88,6 +94,7 @@ class WorkpieceTruth(Params):
     wave_length: Length = param("10 mm", gt=0)
     bow: Length = param("0 mm", description="How far its middle is aside of the CAD's curve.")
     half_angle: Angle = param("0 deg", description="Added to the CAD's half angle of its walls.")
+    lean: Angle = param("0 deg", description="How far its walls lean to the left of the CAD's.")
     half_angle_wave: Angle = param("0 deg", ge=0, description="Amplitude of its variation.")
     root_gap: Length = param("0 mm", ge=0, description="Between the plates.")
     tacks: tuple[Tack, ...] = ()

@@ -29,6 +29,8 @@ class Row(NamedTuple):
         advance: The tip's progress, as the controller has it.
         bound: The controller's bound of the torch's error.
         band: The same for 95 % of the seam.
+        aim: How far to the left of the seam the torch is to be.
+        lit: 1 where the torch could weld: after it first was within ``max_error``.
     """
 
     time: float
@@ -40,6 +42,8 @@ class Row(NamedTuple):
     advance: float
     bound: float
     band: float
+    aim: float
+    lit: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class Trial:
 
     Attributes:
         controller: As it ended.
-        rows: (K, 9) columns as :class:`Row` has them.
+        rows: (K, 11) columns as :class:`Row` has them.
         phases: K names.
         length: Length of the true seam [m].
     """
@@ -65,13 +69,13 @@ class Trial:
     @property
     def beside(self) -> Floats:
         """(K,) whether the torch was between the ends of the seam, and could weld."""
-        s, lit = self.column("torch_s"), getattr(self.controller, "lit", 0.0)
-        return np.asarray((s > (0.0 if lit is None else lit)) & (s < self.length))
+        s, welds = self.column("torch_s"), np.array(self.phases) != "returning"
+        return np.asarray((self.column("lit") > 0.0) & welds & (s > 0.0) & (s < self.length))
 
     @property
     def errors(self) -> Floats:
-        """(M,) the torch's distances from the true seam, where it was beside it [m]."""
-        return np.asarray(np.abs(self.column("torch")[self.beside]))
+        """(M,) the torch's distances from where it was to be, where it was beside the seam [m]."""
+        return np.asarray(np.abs(self.column("torch") - self.column("aim"))[self.beside])
 
     @property
     def done(self) -> bool:
@@ -128,5 +132,6 @@ def _row(world: WeldWorld, pose: ToolPose, controller: Controller, command: Comm
     robot = float((pose.position[:2] - place.point) @ place.normal)
     return Row(
         pose.time, world.torch_s, world.off, tip, robot, command.turn, controller.tip,
-        controller.bound, controller.band,
+        controller.bound, controller.band, getattr(controller, "aim", 0.0),
+        getattr(controller, "lit", 0.0) is not None,
     )  # fmt: skip

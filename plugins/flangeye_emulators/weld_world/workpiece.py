@@ -28,7 +28,7 @@ def true_groove(
         rng: Draws spatter, and where waves begin.
     """
     root = _wandered(Path(points), truth, rng.uniform(0.0, 2 * np.pi))
-    real = Section(section.half_angle + truth.half_angle, section.depth)
+    real = Section(section.half_angle + truth.half_angle, section.depth, section.lean + truth.lean)
     gaps = tuple(Gap(gap.start, gap.start + gap.length, gap.side) for gap in truth.gaps)
     return Groove(root, real, gaps, _relief(root.length, real, truth, rng))
 

@@ -14,7 +14,7 @@ from flangeye_emulators.weld_world.heat import Distortion
 from flangeye_emulators.weld_world.settings import WorldParams
 from flangeye_emulators.weld_world.tool import TrueTool
 from flangeye_emulators.weld_world.workpiece import true_groove
-from flangeye_plugins.weld.motion import ToolPose, turned
+from flangeye_plugins.weld.motion import ToolPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,13 +25,15 @@ class Nominal:
         seam: (N, 3) the CAD's, in the plane of the work [m].
         section: The CAD's.
         tip: The finger's.
-        distance: From the torch to the tip [m].
+        torch: (3,) from the tip to the torch, in the tool's axes [m].
+        level_R_tool: (3, 3) how the tool stands: its axes in level ones.
     """
 
     seam: Floats
     section: Section
     tip: Tip
-    distance: float
+    torch: Floats
+    level_R_tool: Floats
 
 
 class WeldWorld:
@@ -50,28 +52,35 @@ class WeldWorld:
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
         self.contact = Contact(self.groove, _true_tip(nominal.tip, truth))
         self._arm = ArmError(truth.arm, rng)
-        self._tool = TrueTool(truth.tool, nominal.distance)
+        self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
         self._heat = Distortion(truth.heat, self.groove.root.length)
         self.tip, self.torch = np.zeros(3), np.zeros(3)
-        self.torch_s, self.off = -nominal.distance, 0.0
+        self.torch_s, self.off = float(nominal.torch[0]), 0.0
 
-    def settle(self, reported: ToolPose) -> Floats:
+    def held(self, pose: ToolPose, level_R_tool: Floats) -> tuple[Floats, Floats]:
+        """Return the finger's axes (3, 3) in the plane's and where its tip would rest (3,)."""
+        return self._tool.axes(pose, level_R_tool), self._tool.rest(pose, level_R_tool)
+
+    def settle(self, reported: ToolPose, level_R_tool: Floats | None = None) -> Floats:
         """Let the tip come to rest; return what its tag shows of its displacement (3,) [m].
 
         Args:
             reported: The tool, as arm and files have it.
+            level_R_tool: (3, 3) how it really stands now, where that is known.
         """
+        stands = self._stands if level_R_tool is None else level_R_tool
         pose = self._arm.true_pose(reported)
-        self.torch = self._tool.torch(pose)
+        self.torch = self._tool.torch(pose, stands)
         root = self.groove.root
         self.torch_s = root.foot(self.torch[:2], self.torch_s)
         place = root.at(self.torch_s)
         moved = self._heat.at(self.torch_s, self.torch_s)
         self.off = float((self.torch[:2] - place.point) @ place.normal) - moved
-        rest = self._tool.rest(pose)
-        self.tip = self.contact.settle(rest, self._heat.at(self.contact.s, self.torch_s))
-        return self._finger.shown(pose.time, turned(self.tip - rest, -pose.angle))
+        rest, axes = self._tool.rest(pose, stands), self._tool.axes(pose, stands)
+        moved = self._heat.at(self.contact.s, self.torch_s)
+        self.tip = self.contact.settle(rest, moved, axes)
+        return self._finger.shown(pose.time, axes.T @ (self.tip - rest))
 
 
 def _true_tip(tip: Tip, truth: WorldParams) -> Tip:

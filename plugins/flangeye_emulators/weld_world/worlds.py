@@ -52,8 +52,13 @@ class Verdict:
 
     @property
     def silent(self) -> bool:
-        """Whether it was reported done with the torch beyond its stated bound."""
-        return self.done and self.outside > 1.0
+        """Whether the torch was beyond its stated bound, in a weld that was done or stopped."""
+        return self.outside > 1.0
+
+    @property
+    def welded(self) -> bool:
+        """Whether the torch came to weld at all."""
+        return self.largest > 0.0
 
 
 class _Draw:

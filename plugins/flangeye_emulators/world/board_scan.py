@@ -20,10 +20,9 @@ THICKNESS = 4e-3
 
 def camera_of(pixels: Pixels, camera: BoardCamera) -> BoardCamera:
     """Return a camera whose pixels are those of a scanner."""
-    height, width = pixels.directions.shape[:2]
+    height, width = pixels.shape
     focal = 1 / pixels.size
-    low = pixels.directions[0, 0].astype(np.float64)
-    focal_y = (height - 1) / (2 * abs(low[1]))
+    focal_y = (height - 1) / (2 * abs(float(pixels.y[0])))
     matrix = np.array([[focal, 0, width / 2 - 0.5], [0, focal_y, height / 2 - 0.5], [0, 0, 1]])
     return replace(camera, camera_matrix=matrix, size=(width, height), distortion=np.zeros(0))
 

@@ -31,7 +31,7 @@ class Distortion:
         self, scanner: ScannerModel, pixels: Pixels, rms: float, rng: np.random.Generator
     ) -> None:
         """Draw a field whose depth error has this root mean square over the volume [m]."""
-        rows, columns = pixels.directions.shape[:2]
+        rows, columns = pixels.shape
         self._middle = (scanner.near + scanner.far) / 2
         self._half = (scanner.far - scanner.near) / 2
         down = np.polynomial.legendre.legvander(np.linspace(-1, 1, rows), DEGREE)
@@ -43,14 +43,14 @@ class Distortion:
             (down @ coefficients[:, :, k] @ across.T).astype(np.float32) for k in range(DEGREE + 1)
         ]
         sideways = [_drawn(rms * SIDEWAYS / self._middle, rng, depth=False) for _ in "xy"]
-        for axis, flat in enumerate(sideways):
+        for flat, direction in zip(sideways, (pixels.x, pixels.y[:, None]), strict=True):
             shift = down @ flat[:, :, 0] @ across.T
-            self._terms.append((pixels.directions[..., axis] + shift).astype(np.float32))
+            self._terms.append((direction + shift).astype(np.float32))
 
-    def depth_error(self, depth: Image) -> Image:
-        """Return the (H, W) error of depths [m]."""
+    def depth_error(self, depth: Image, rows: slice = slice(None)) -> Image:
+        """Return the (R, W) error of the depths of some rows [m]."""
         w = (depth - np.float32(self._middle)) / np.float32(self._half)
-        first, second, third, fourth = self._terms[: DEGREE + 1]
+        first, second, third, fourth = (term[rows] for term in self._terms[: DEGREE + 1])
         # Legendre's P2 and P3 by Horner's rule.
         cubic = fourth * (np.float32(2.5) * w * w - np.float32(1.5))
         return np.asarray(first + w * (second + cubic) + third * (np.float32(1.5) * w * w - 0.5))

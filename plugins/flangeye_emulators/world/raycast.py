@@ -1,16 +1,21 @@
-"""What each pixel of a camera sees: rays, their first hits, and what is hidden from a light."""
+"""What each pixel of a camera sees: rays, their first hits, and what is hidden from a light.
+
+Rays are followed through every second pixel of every second row; the pixels of the four phases,
+``SQUARES``, stand for each other where nothing changes between them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats, Indices, Mask
 from flangeye_emulators.world.materials import Material
 from flangeye_emulators.world.mesh import Mesh
 
@@ -19,6 +24,9 @@ Image = NDArray[np.float32]
 FLAT = 2e-6
 """Largest difference of two planes that are one, of their distance [m] and of their normal: what
 single precision leaves of it."""
+
+SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""Row and column of the pixels that a sample stands for, itself first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +46,31 @@ class Pixels:
     """The rays of a pinhole camera, in ``camera``: z along the view, x along the rows.
 
     Attributes:
-        directions: (H, W, 3), with z = 1, so that the distance along a ray is the depth itself.
+        x: (W,) of the directions through the columns, with z = 1, so that the distance along a
+            ray is the depth itself.
+        y: (H,) of those through the rows.
         size: Width of a pixel at unit depth [rad].
     """
 
-    directions: Image
+    x: Image
+    y: Image
     size: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        return len(self.y), len(self.x)
+
+    @property
+    def directions(self) -> Image:
+        """(H, W, 3) directions of all rays, with z = 1."""
+        x, y = np.meshgrid(self.x, self.y)
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    @cached_property
+    def samples(self) -> Any:
+        """Open3D's rays (h, w, 6) through every second pixel of every second row."""
+        return _rays(np.zeros(3), self.x[::2], self.y[::2, None], 1)
 
 
 def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
@@ -58,10 +85,25 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
     half_x, half_y = np.tan(np.asarray(scanner.field_of_view) / 2)
     x = (np.arange(columns) + 0.5) / columns * 2 - 1
     y = (np.arange(rows) + 0.5) / rows * 2 - 1
-    directions = np.ones((rows, columns, 3), dtype=np.float32)
-    directions[..., 0] = (x * half_x).astype(np.float32)
-    directions[..., 1] = (y * half_y).astype(np.float32)[:, None]
-    return Pixels(directions, float(2 * half_x / columns))
+    return Pixels(
+        (x * half_x).astype(np.float32),
+        (y * half_y).astype(np.float32),
+        float(2 * half_x / columns),
+    )
+
+
+class _Met(NamedTuple):
+    """What rays (...) meet.
+
+    Attributes:
+        depth: (...) distances, in units of the directions' lengths; infinite where nothing is met.
+        body: (...) numbers of the bodies.
+        normals: (3, ...) unit normals, zero where nothing is met.
+    """
+
+    depth: Image
+    body: NDArray[np.uint8]
+    normals: Image
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +112,23 @@ class Hits:
 
     Attributes:
         depth: (H, W) z in ``camera`` [m]; infinite where there is nothing.
-        body: (H, W) index of the body that was hit; larger than any where there is none.
-        normals: (H, W, 3) unit normals, on either side.
+        body: (H, W) number of the body that was hit; one more than the last where there is none.
+        slant: (H, W) product of the ray's direction and the surface's unit normal, of either sign.
     """
 
     depth: Image
-    body: NDArray[np.uint32]
-    normals: Image
+    body: NDArray[np.uint8]
+    slant: Image
+    _samples: Image
+    _between: Indices
+    _normals: Image
+
+    def facing(self, vector: Floats) -> Image:
+        """Return the (H, W) product of the surface's unit normal, as in ``slant``, and a vector."""
+        x, y, z = (np.float32(v) for v in vector)
+        out = _spread(_dot(self._samples, x, y, z), self.depth.shape)
+        out.ravel()[self._between] = _dot(self._normals, x, y, z)
+        return out
 
 
 class Scene:
@@ -101,87 +153,149 @@ class Scene:
         one plane, so do the pixels between, and their depth is computed; the others are followed
         too. Half the time, and a thing has to be narrower than two pixels to be missed.
         """
-        directions = pixels.directions
-        rows, columns = directions.shape[:2]
-        sparse = self._cast(directions[::2, ::2])
-        slant = np.einsum("ijk,ijk->ij", sparse.normals, directions[::2, ::2])
-        away = np.where(slant != 0, sparse.depth, 0) * slant
-        flat = _doubled(_is_flat(sparse, away), rows, columns)
-        normals = _doubled(sparse.normals, rows, columns)
-        slant = np.einsum("ijk,ijk->ij", normals, directions)
-        depth = np.full((rows, columns), np.inf, dtype=np.float32)
-        np.divide(_doubled(away, rows, columns), slant, out=depth, where=slant != 0)
-        out = Hits(depth, _doubled(sparse.body, rows, columns), normals)
-        at = np.nonzero(~flat)
-        exact = self._cast(directions[at])
-        out.depth[at], out.body[at], out.normals[at] = exact.depth, exact.body, exact.normals
-        return out
+        met = self._cast(pixels.samples)
+        slant = _dot(met.normals, pixels.x[::2], pixels.y[::2, None], 1)
+        away = np.where(slant != 0, met.depth, 0) * slant
+        bent = ~_is_flat(met, away)
+        depth, slants = _in_planes(pixels, met.normals, np.where(slant != 0, away, np.inf))
+        depth[::2, ::2][bent] = met.depth[bent]
+        between = _between(bent, pixels.shape)
+        row, column = np.divmod(between, len(pixels.x))
+        x, y = pixels.x[column], pixels.y[row]
+        exact = self._cast(_rays(np.zeros(3), x, y, 1))
+        body = _spread(met.body, pixels.shape)
+        depth.ravel()[between], body.ravel()[between] = exact.depth, exact.body
+        slants.ravel()[between] = _dot(exact.normals, x, y, 1)
+        return Hits(depth, body, slants, met.normals, between, exact.normals)
 
-    def _cast(self, directions: Image) -> Hits:
-        found = self._scene.cast_rays(_rays(np.zeros(3), directions), nthreads=1)
-        names = ("t_hit", "geometry_ids", "primitive_normals")
-        return Hits(*(found[name].numpy() for name in names))
+    def _cast(self, rays: Any) -> _Met:
+        found = self._scene.cast_rays(rays, nthreads=1)
+        body = np.minimum(found["geometry_ids"].numpy(), len(self.materials)).astype(np.uint8)
+        normals = np.moveaxis(found["primitive_normals"].numpy(), -1, 0)
+        return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
-    def hidden(self, light: Floats, beams: Image) -> Mask:
-        """Return which beams meet something before they end.
+    def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
+        """Return the (H, W) pixels whose points something hides from a light; right where wanted.
 
         Every second row and column is followed, and the others only where those around them
         disagree: a shadow has to be narrower than two pixels to be missed.
 
         Args:
-            light: (3,) where the beams come from.
-            beams: (H, W, 3) from there to the points they light, organised as the image is.
+            light: (3,) where it is, in ``camera``.
+            pixels: The camera's.
+            depth: (H, W) of the points [m].
+            wanted: (H, W) pixels that matter.
         """
         import cv2
 
-        sparse = self._blocked(light, beams[::2, ::2]).astype(np.uint8)
+        cells = _any_of_square(wanted)
         square = np.ones((3, 3), np.uint8)
-        border = cv2.dilate(sparse, square) != cv2.erode(sparse, square)
-        rows, columns = beams.shape[:2]
-        out = _doubled(sparse, rows, columns).astype(bool)
-        at = np.nonzero(_doubled(border, rows, columns))
-        out[at] = self._blocked(light, beams[at])
+        dark = np.zeros_like(cells)
+        row, column = np.nonzero(cv2.dilate(cells, square))
+        dark[row, column] = self._blocked(_beams(light, pixels, depth, (2 * row, 2 * column)))
+        border = (cv2.dilate(dark, square) != cv2.erode(dark, square)) & (cells > 0)
+        out = _spread(dark, pixels.shape).astype(bool)
+        between = _between(border, pixels.shape)
+        at = np.divmod(between, len(pixels.x))
+        out.ravel()[between] = self._blocked(_beams(light, pixels, depth, at))
         return out
 
-    def _blocked(self, light: Floats, beams: Image) -> Mask:
-        rays = _rays(light, beams)
+    def _blocked(self, rays: Any) -> Mask:
+        """Return which of Open3D's rays (N, 6) meet something before they are as long as one."""
         # The last thousandth is not looked at: the point it leads to must not hide itself.
         hit = self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0 - 1e-3, nthreads=1)
         return np.asarray(hit.numpy())
 
-    def figure(self, name: str, body: NDArray[np.uint32]) -> Image:
+    def figure(self, name: str, body: NDArray[np.uint8]) -> Image:
         """Return one figure of the material of the bodies that were hit; zero for nothing."""
-        values = [*(getattr(material, name) for material in self.materials), 0.0]
-        return np.array(values, dtype=np.float32)[np.minimum(body, len(self.materials))]
+        import cv2
+
+        table = np.zeros(256, dtype=np.float32)
+        table[: len(self.materials)] = [getattr(material, name) for material in self.materials]
+        return np.asarray(cv2.LUT(body, table))
 
 
-def _is_flat(hits: Hits, away: Image) -> Mask:
+def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
+    """Return the product of (3, ...) vectors and others, given by their coordinates."""
+    return np.asarray(vectors[0] * x + vectors[1] * y + vectors[2] * z)
+
+
+def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Image]:
+    """Return (H, W) depth and slant of pixels in the planes of their samples.
+
+    Args:
+        pixels: The camera's.
+        normals: (3, h, w) of the samples.
+        away: (h, w) distance of their planes from the camera [m]; infinite where there is none.
+    """
+    depth = np.empty(pixels.shape, dtype=np.float32)
+    slant = np.empty_like(depth)
+    for r, c in SQUARES:
+        x, y = pixels.x[c::2], pixels.y[r::2, None]
+        part = np.s_[..., : len(y), : len(x)]
+        slant[r::2, c::2] = _dot(normals[part], x, y, 1)
+        np.divide(away[part], slant[r::2, c::2], out=depth[r::2, c::2])
+    return depth, slant
+
+
+def _beams(light: Floats, pixels: Pixels, depth: Image, at: tuple[Indices, Indices]) -> Any:
+    """Return Open3D's rays (N, 6) from a light to the points that pixels at (row, column) see."""
+    row, column = at
+    z = depth[at]
+    x, y = pixels.x[column] * z, pixels.y[row] * z
+    return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
+
+
+def _is_flat(met: _Met, away: Image) -> Mask:
     """Return which samples and their eight neighbours lie in one plane of one body.
 
     Args:
-        hits: (H, W) samples.
-        away: (H, W) distance of each sample's plane from the camera [m].
+        met: (h, w) samples.
+        away: (h, w) distance of each sample's plane from the camera [m].
     """
     import cv2
 
     square = np.ones((3, 3), np.uint8)
     out = np.ones(away.shape, dtype=bool)
-    body = np.minimum(hits.body, 0xFFFF).astype(np.float32)
-    traits = [(body, 0.5), (away, FLAT), (hits.normals[..., 0], FLAT), (hits.normals[..., 1], FLAT)]
+    traits = [(met.body, 1), (away, FLAT), (met.normals[0], FLAT), (met.normals[1], FLAT)]
     for trait, tolerance in traits:
-        image = np.ascontiguousarray(trait)
-        out &= cv2.dilate(image, square) - cv2.erode(image, square) < tolerance
+        out &= cv2.dilate(trait, square) - cv2.erode(trait, square) < tolerance
     return out
 
 
-def _doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
-    return image.repeat(2, axis=0).repeat(2, axis=1)[:rows, :columns]
+def _spread(samples: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return an image in which every sample stands for its square of pixels."""
+    out = np.empty(shape, dtype=samples.dtype)
+    for r, c in SQUARES:
+        part = out[r::2, c::2]
+        part[:] = samples[: part.shape[0], : part.shape[1]]
+    return out
 
 
-def _rays(origin: Floats, directions: Image) -> Any:
-    """Return Open3D's rays (..., 6) from one origin (3,)."""
+def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
+    """Return which samples stand for a pixel that is marked."""
+    out = marked[::2, ::2].astype(np.uint8)
+    for r, c in SQUARES[1:]:
+        part = marked[r::2, c::2]
+        out[: part.shape[0], : part.shape[1]] |= part
+    return out
+
+
+def _between(marked: Mask, shape: tuple[int, ...]) -> Indices:
+    """Return the flat indices of the pixels that marked samples stand for, but for themselves."""
+    row, column = np.nonzero(marked)
+    found = []
+    for r, c in SQUARES[1:]:
+        inside = (2 * row + r < shape[0]) & (2 * column + c < shape[1])
+        found.append(((2 * row + r) * shape[1] + 2 * column + c)[inside])
+    return np.concatenate(found)
+
+
+def _rays(origin: Floats, *directions: Any) -> Any:
+    """Return Open3D's rays (..., 6) from one origin (3,), given the x, y and z of directions."""
     import open3d as o3d
 
-    rays = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
-    rays[..., :3], rays[..., 3:] = origin, directions
+    rays = np.empty((*np.broadcast_shapes(*map(np.shape, directions)), 6), dtype=np.float32)
+    for column, values in enumerate((*origin, *directions)):
+        rays[..., column] = values
     return o3d.core.Tensor.from_numpy(rays)

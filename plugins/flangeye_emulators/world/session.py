@@ -20,7 +20,7 @@ from flangeye.types import BASE, FLANGE, FLANGE2, Floats
 from flangeye_emulators.world.arm import ImperfectArm
 
 DRAWS = 4000
-"""Joint vectors tried."""
+"""Joint vectors tried, unless the view is a narrow one."""
 FIELD = 0.75
 """Share of the field of view, to either side, in which the target's centre stays."""
 
@@ -35,6 +35,7 @@ class View:
         far: Largest distance [m].
         field: Full angles of view, horizontal and vertical [rad].
         facing: Largest angle between the target's z and the line to the camera [rad].
+        draws: Joint vectors to try.
     """
 
     distance: float
@@ -42,6 +43,7 @@ class View:
     far: float
     field: tuple[float, float]
     facing: float
+    draws: int = DRAWS
 
     def first(self) -> Floats:
         """Return (4, 4) camera_T_target at the first pose: ahead, and facing the camera."""
@@ -103,6 +105,7 @@ class Cast:
         second: The second one, where there is one.
         four_axes: Whether the first arm's flange only moves and turns about the base's z.
         in_turns: Whether of two arms one rests at its first pose while the other moves.
+        draws: Joint vectors to try.
     """
 
     configuration: Configuration
@@ -110,6 +113,7 @@ class Cast:
     second: Arm | None
     four_axes: bool = False
     in_turns: bool = False
+    draws: int = DRAWS
 
 
 def draw_stands(
@@ -123,16 +127,16 @@ def draw_stands(
         spread: Largest change of any joint [rad].
         rng: Draws the joints.
     """
-    joints = _around(home[0], spread, rng)
+    joints = _around(home[0], spread, cast.draws, rng)
     if cast.in_turns:
         joints[::2] = home[0]
     frames, flange = cast.first.frames(joints), cast.first.flange(joints)
     if cast.four_axes:
-        flange = _of_four_axes(flange[0], spread, rng)
-    second = None if cast.second is None else _around(home[1], spread, rng)
+        flange = _of_four_axes(flange[0], spread, cast.draws, rng)
+    second = None if cast.second is None else _around(home[1], spread, cast.draws, rng)
     if cast.in_turns and second is not None:
         second[1::2] = home[1]
-    carried: dict[str, Floats] = {BASE: np.tile(np.eye(4), (DRAWS, 1, 1)), FLANGE: flange}
+    carried: dict[str, Floats] = {BASE: np.tile(np.eye(4), (cast.draws, 1, 1)), FLANGE: flange}
     if cast.second is not None and second is not None:
         carried[FLANGE2] = cast.second.flange(second)
     camera = cast.configuration.camera
@@ -142,18 +146,18 @@ def draw_stands(
     return Stands(known, second, carried[camera], flange, carried[cast.configuration.target])
 
 
-def _around(home: Floats, spread: float, rng: np.random.Generator) -> Floats:
-    changes = rng.uniform(-spread, spread, (DRAWS, len(home)))
+def _around(home: Floats, spread: float, draws: int, rng: np.random.Generator) -> Floats:
+    changes = rng.uniform(-spread, spread, (draws, len(home)))
     changes[0] = 0.0
     return np.asarray(home + changes)
 
 
-def _of_four_axes(first: Floats, spread: float, rng: np.random.Generator) -> Floats:
+def _of_four_axes(first: Floats, spread: float, draws: int, rng: np.random.Generator) -> Floats:
     """Return poses of an arm whose flange moves in space and turns about the vertical."""
-    turns = rotation_exp(np.outer(rng.uniform(-spread, spread, DRAWS), [0.0, 0.0, 1.0]))
-    out = np.tile(first, (DRAWS, 1, 1))
+    turns = rotation_exp(np.outer(rng.uniform(-spread, spread, draws), [0.0, 0.0, 1.0]))
+    out = np.tile(first, (draws, 1, 1))
     out[1:, :3, :3] = turns[1:] @ first[:3, :3]
-    out[1:, :3, 3] += rng.uniform(-0.15, 0.15, (DRAWS - 1, 3))
+    out[1:, :3, 3] += rng.uniform(-0.15, 0.15, (draws - 1, 3))
     return out
 
 
@@ -208,8 +212,8 @@ def visible(stands: Stands, places: Places, view: View, count: int) -> Stands:
     found = np.flatnonzero(view.sees(seen_from(stands, places)))
     if len(found) < count:
         raise StageError(
-            f"the camera sees the target at {len(found)} of {DRAWS} poses drawn, and {count} are "
-            "needed; make spread smaller, or move home, camera or place"
+            f"the camera sees the target at {len(found)} of {view.draws} poses drawn, and {count} "
+            "are needed; make spread smaller, or move home, camera or place"
         )
     return stands.where(found)
 

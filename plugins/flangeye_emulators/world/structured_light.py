@@ -29,21 +29,21 @@ EDGE_NOISE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What the camera and the projector see of the scene, before any error.
+    """What the camera and the projector see in some rows, before any error.
 
     Attributes:
-        depth: (H, W) z of the first surface [m]; far beyond the range where there is none.
-        seen: (H, W) whether it is in range and both camera and projector see it.
-        cosine: (H, W) of the incidence of the camera's ray.
-        strength: (H, W) share of the light that returns, see ``FAINTEST``.
-        dazzled: (H, W) probability that a highlight spoils it.
+        depth: (R, W) z of the first surface [m].
+        cosine: (R, W) of the incidence of the camera's ray.
+        strength: (R, W) share of the light that returns, see ``FAINTEST``.
+        dazzled: (R, W) probability that a highlight spoils it.
+        grain: (R, W) what the surface makes of the noise, see ``Material``.
     """
 
     depth: Image
-    seen: Mask
     cosine: Image
     strength: Image
     dazzled: Image
+    grain: Image
 
 
 class StructuredLight:
@@ -83,76 +83,105 @@ class StructuredLight:
             rng: Draws this scan's noise.
         """
         hits = scene.look(self.pixels)
-        view = self._view(scene, hits)
-        grain = correlated_normal(view.depth.shape, self._grain, rng)
-        width = view.depth * np.float32(self.pixels.size)
-        beside = edges.steps(view.depth, width)
+        np.minimum(hits.depth, np.float32(2 * self.scanner.far), out=hits.depth)
+        measured = self._lit(scene, hits.depth)
+        grain = correlated_normal(hits.depth.shape, self._grain, rng)
+        width = hits.depth * np.float32(self.pixels.size)
+        beside = edges.steps(hits.depth, width)
         distance = edges.distance_to(beside)
-        measured = self._decoded(view, distance, grain)
-        depth = edges.rounded(view.depth, width, self._grain)
-        depth += self._depth_noise(view, scene.figure("grain", hits.body), distance) * grain
-        depth += self._distortion.depth_error(depth)
+        depth = edges.rounded(hits.depth, width, self._grain)
+        to_light = hits.facing(self.projector)
+        for rows in edges.bands(depth.shape):
+            view = self._view(scene, hits, to_light, rows)
+            self._decode(
+                view, distance[rows], (grain[::-1][rows], grain[rows, ::-1]), measured[rows]
+            )
+            sigma = self._depth_noise(view, distance[rows])
+            depth[rows] += sigma * grain[rows]
+            depth[rows] += self._distortion.depth_error(depth[rows], rows)
         edges.fly(depth, beside & measured, rng)
-        points = self._distortion.points(depth)
-        points[~measured] = np.nan
-        return points
+        depth[~measured] = np.nan
+        return self._distortion.points(depth)
 
-    def _view(self, scene: Scene, hits: Hits) -> _View:
-        scanner, pixels = self.scanner, self.pixels
-        depth = np.minimum(hits.depth, np.float32(2 * scanner.far))
-        seen = (depth >= scanner.near) & (depth <= scanner.far)
-        beams = pixels.directions * depth[..., None]
-        beams -= self.projector.astype(np.float32)
-        seen &= self._in_projection(beams) & ~scene.hidden(self.projector, beams)
-        cosine = np.abs(np.einsum("ijk,ijk->ij", hits.normals, pixels.directions))
-        cosine *= self._inverse_length
-        from_beam = np.abs(np.einsum("ijk,ijk->ij", hits.normals, beams))
-        from_beam /= np.sqrt(np.einsum("ijk,ijk->ij", beams, beams))
-        strength = scene.figure("albedo", hits.body) * cosine * from_beam
-        strength *= (self._middle / depth) ** 2
-        dazzled = self._dazzled(scene.figure("gloss", hits.body), hits.normals, beams, seen)
-        return _View(depth, seen, cosine, strength, dazzled)
+    def _lit(self, scene: Scene, depth: Image) -> Mask:
+        """Return which points (H, W) are in range and see the projector's light."""
+        seen = np.empty(depth.shape, dtype=bool)
+        for rows in edges.bands(depth.shape):
+            near, far = self.scanner.near, self.scanner.far
+            seen[rows] = (depth[rows] >= near) & (depth[rows] <= far)
+            seen[rows] &= self._in_projection(*self._beams(depth, rows))
+        return np.asarray(seen & ~scene.hidden(self.projector, self.pixels, depth, seen))
 
-    def _in_projection(self, beams: Image) -> Mask:
+    def _beams(self, depth: Image, rows: slice) -> tuple[Image, Image, Image]:
+        """Return x, y and z (R, W) of the beams from the projector to the points of some rows."""
+        x, y, z = self.projector.astype(np.float32)
+        pixels, depth = self.pixels, depth[rows]
+        return pixels.x * depth - x, pixels.y[rows, None] * depth - y, depth - z
+
+    def _in_projection(self, x: Image, y: Image, z: Image) -> Mask:
         if self.scanner.projection is None:
-            return np.ones(beams.shape[:2], dtype=bool)
+            return np.ones(x.shape, dtype=bool)
         # The projector leans towards the camera as much as the camera leans towards it.
         turn = 2 * self.scanner.convergence
         cos, sin = np.float32(np.cos(turn)), np.float32(np.sin(turn))
-        x, y, z = beams[..., 0], beams[..., 1], beams[..., 2]
         ahead, aside = cos * z - sin * x, cos * x + sin * z
         half_x, half_y = np.tan(np.asarray(self.scanner.projection, dtype=np.float32) / 2)
         return np.asarray((np.abs(aside) <= half_x * ahead) & (np.abs(y) <= half_y * ahead))
 
-    def _dazzled(self, gloss: Image, normals: Image, beams: Image, seen: Mask) -> Image:
-        """Return the probability of a lost point: highest where the surface mirrors the beam."""
-        out = np.zeros_like(gloss)
-        shiny = np.nonzero((gloss > 0) & seen)
-        to_camera = -_unit(self.pixels.directions[shiny])
-        halfway = _unit(to_camera - _unit(beams[shiny]))
-        cosine = np.minimum(np.abs((normals[shiny] * halfway).sum(axis=-1)), 1.0)
-        out[shiny] = gloss[shiny] * np.exp(-((np.arccos(cosine) / HIGHLIGHT) ** 2))
-        return out
+    def _view(self, scene: Scene, hits: Hits, to_light: Image, rows: slice) -> _View:
+        """Return what is seen in some rows.
 
-    def _decoded(self, view: _View, distance: Image, grain: Image) -> Mask:
-        """Return which points the scanner measures at all."""
+        Args:
+            scene: What stands before the scanner.
+            hits: What the camera's rays meet there.
+            to_light: (H, W) product of the surface's normal and the projector's position.
+            rows: Which rows.
+        """
+        depth, slant, body = hits.depth[rows], hits.slant[rows], hits.body[rows]
+        x, y, z = self._beams(hits.depth, rows)
+        length = np.sqrt(x * x + y * y + z * z)
+        to_camera = slant * self._inverse_length[rows]
+        to_projector = (depth * slant - to_light[rows]) / length
+        cosine = np.abs(to_camera)
+        strength = scene.figure("albedo", body) * cosine * np.abs(to_projector)
+        strength *= (self._middle / depth) ** 2
+        gloss = scene.figure("gloss", body)
+        shiny = gloss > 0
+        along = self.pixels.x * x + self.pixels.y[rows, None] * y + z
+        dazzled = np.zeros_like(gloss)
+        dazzled[shiny] = gloss[shiny] * _highlight(
+            (to_camera + to_projector)[shiny], (along * self._inverse_length[rows] / length)[shiny]
+        )
+        return _View(depth, cosine, strength, dazzled, scene.figure("grain", body))
+
+    def _decode(
+        self, view: _View, distance: Image, grains: tuple[Image, Image], measured: Mask
+    ) -> None:
+        """Forget, in place, the points that the scanner does not measure after all."""
         # Turned images of the grain are as good as new ones, and cost nothing.
-        patchy, ragged = grain[::-1], grain[:, ::-1]
-        out = view.seen & (view.cosine > GRAZING)
-        out &= view.strength * (1 + np.float32(0.3) * patchy) > FAINTEST
-        out &= ~edges.lost(distance, self.scanner.edge_loss, ragged)
-        at = np.nonzero(out & (view.dazzled > 0.01))
-        out[at] = patchy[at] > normal_quantile(view.dazzled[at])
-        return out
+        patchy, ragged = grains
+        measured &= view.cosine > GRAZING
+        measured &= view.strength * (1 + np.float32(0.3) * patchy) > FAINTEST
+        measured &= ~edges.lost(distance, self.scanner.edge_loss, ragged)
+        at = np.nonzero(measured & (view.dazzled > 0.01))
+        measured[at] = patchy[at] > normal_quantile(view.dazzled[at])
 
-    def _depth_noise(self, view: _View, surface: Image, distance: Image) -> Image:
-        """Return the standard deviation of the depth (H, W) [m]."""
-        sigma = np.float32(self.noise * self.scanner.temporal_noise) * surface
+    def _depth_noise(self, view: _View, distance: Image) -> Image:
+        """Return the standard deviation of the depth (R, W) [m]."""
+        sigma = np.float32(self.noise * self.scanner.temporal_noise) * view.grain
         sigma *= (view.depth / self._middle) ** 2 / np.maximum(view.cosine, np.float32(0.1))
         close = np.nonzero(distance < 3)
         sigma[close] *= 1 + np.float32(EDGE_NOISE) * np.exp(-distance[close])
         return np.asarray(sigma)
 
 
-def _unit(vectors: Image) -> Image:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+def _highlight(cosines: Image, between: Image) -> Image:
+    """Return the strength of a highlight: one where the surface mirrors the beam to the camera.
+
+    Args:
+        cosines: (N,) sum of the cosines between the normal and the camera's ray and the beam.
+        between: (N,) cosine between the ray and the beam.
+    """
+    # The halfway vector is the sum of two unit vectors, of length sqrt(2 + 2 cos).
+    halfway = np.minimum(np.abs(cosines) / np.sqrt(2 + 2 * between), np.float32(1.0))
+    return np.asarray(np.exp(-((np.arccos(halfway) / HIGHLIGHT) ** 2)))

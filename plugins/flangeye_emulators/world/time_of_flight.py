@@ -62,8 +62,7 @@ class TimeOfFlight:
         """
         hits = scene.look(self.pixels)
         depth = np.minimum(hits.depth, np.float32(2 * self.scanner.far))
-        cosine = np.abs(np.einsum("ijk,ijk->ij", hits.normals, self.pixels.directions))
-        cosine /= self._length
+        cosine = np.abs(hits.slant) / self._length
         strength = scene.figure("albedo", hits.body) * cosine * (self._middle / depth) ** 2
         grain = correlated_normal(depth.shape, self._grain, rng)
         distance = edges.distance_to(edges.steps(depth, depth * np.float32(self.pixels.size)))

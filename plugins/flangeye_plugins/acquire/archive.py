@@ -16,12 +16,12 @@ from flangeye.files.recording import (
     Archive,
     Recording,
     check_distinct_clouds,
-    check_poses,
     digests_of,
     fingerprint_of,
 )
 from flangeye.log.read import is_log, read_run
 from flangeye.log.record import adapter
+from flangeye.models.cell import Cell
 from flangeye.models.cloud_unit import (
     check_unit,
     detect_unit,
@@ -30,7 +30,8 @@ from flangeye.models.cloud_unit import (
 )
 from flangeye.models.scanners import ScannerData
 from flangeye.types import (
-    FLANGE,
+    CAMERA,
+    TARGET,
     ArchivePath,
     Capture,
     Captures,
@@ -44,6 +45,7 @@ from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_note,
     archive_path,
+    check_usable,
     log_source,
     open_archive,
     poses_of,
@@ -75,19 +77,23 @@ class ArchiveParams(OpeningParams):
 
 @stage("acquire.archive")
 def acquire_archive(
-    scanner: ScannerData | None, archive: ArchivePath, params: ArchiveParams
+    scanner: ScannerData | None,
+    archive: ArchivePath,
+    params: ArchiveParams,
+    cell: Cell | None = None,
 ) -> Captures:
     """Replay recorded scans and robot poses: a folder in a known layout, or a run.mcap.
 
     Everything but the inside of the clouds is checked before the first capture is given; the
-    clouds are read one at a time as they are asked for, verification first.
+    clouds are read one at a time as they are asked for, verification first. Those of a cell are
+    read by ``reader: cell``.
     """
     path = archive_path("acquire.archive", archive, params)
     if is_log(path):
-        return _replay(path)
+        return _replay(path, cell)
     recorded = open_archive(path, params)
     usable, notes = _usable(recorded, params.unreadable)
-    check_poses(recorded.root, usable)
+    check_usable(recorded.root, usable, cell)
     digests = digests_of(r.cloud for r in usable if r.cloud)
     check_distinct_clouds(usable, digests)
     scanner = scanner or ScannerData(model="the scanner")
@@ -105,7 +111,10 @@ def acquire_archive(
         ),
     )
     return Captures(
-        _captures(usable, unit, scanner, params.camera), source, total=len(usable), recorded=True
+        _captures(usable, unit, scanner, params.camera, cell),
+        source,
+        total=len(usable),
+        recorded=True,
     )
 
 
@@ -174,6 +183,7 @@ def _captures(
     unit: LengthUnit,
     scanner: ScannerData,
     camera: CameraParams | None,
+    cell: Cell | None,
 ) -> Iterator[Capture]:
     """Read one cloud at a time, and the image beside it."""
     for recording, path in _clouds(usable):
@@ -182,11 +192,13 @@ def _captures(
         yield Capture(
             recording.id,
             cloud,
-            poses_of(recording),
+            poses_of(recording, cell),
             recording.joints,
             recording.time_ns,
             recording.role,
             _image(recording, cloud, camera),
+            recording.seen_by,
+            recording.saw,
         )
 
 
@@ -215,7 +227,7 @@ def _image(recording: Recording, cloud: PointCloud, camera: CameraParams | None)
     return image_of_cloud(pixels, cloud)
 
 
-def _replay(path: Path) -> Captures:
+def _replay(path: Path, cell: Cell | None) -> Captures:
     """Return the captures of a log of ours."""
     log = read_run(path)
     if not log.has_full_clouds:
@@ -225,10 +237,12 @@ def _replay(path: Path) -> Captures:
         )
     recordings = [_of_log(name, meta) for name, meta in log.poses.items()]
     return Captures(
-        log.readings(), log_source(log, recordings), total=len(recordings), recorded=True
+        log.readings(), log_source(log, recordings, cell), total=len(recordings), recorded=True
     )
 
 
 def _of_log(name: str, meta: Mapping[str, Any]) -> Recording:
-    pose: Transform = adapter(Transform).validate_python(meta["poses"][FLANGE])
-    return Recording(name, {FLANGE: pose.matrix}, role=meta["role"])
+    poses = adapter(dict[str, Transform]).validate_python(meta["poses"])
+    matrices = {frame: pose.matrix for frame, pose in poses.items()}
+    ends = meta.get("camera", CAMERA), meta.get("target", TARGET)
+    return Recording(name, matrices, role=meta["role"], seen_by=ends[0], saw=ends[1])

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.recording import Archive, Recording, check_poses, digests_of, fingerprint_of
+from flangeye.files.recording import Archive, Recording, digests_of, fingerprint_of
 from flangeye.log.read import is_log, read_run
+from flangeye.models.cell import Cell
 from flangeye.models.targets import Flange
 from flangeye.types import (
-    FLANGE,
     ArchivePath,
     CircleFeature,
     Floats,
-    Observation,
     Observations,
     Source,
 )
@@ -24,6 +21,7 @@ from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_note,
     archive_path,
+    check_usable,
     log_source,
     observation_of,
     open_archive,
@@ -43,28 +41,41 @@ class CentresParams(OpeningParams):
 
 @stage("acquire.centres")
 def acquire_centres(
-    archive: ArchivePath, params: CentresParams, flange: Flange | None = None
+    archive: ArchivePath,
+    params: CentresParams,
+    flange: Flange | None = None,
+    cell: Cell | None = None,
 ) -> Observations:
     """Take ready-made circle centres and robot poses: an archive's, or those of a run.mcap.
 
     The centres go straight to the solver: no normals and no clouds come with them, so steps
     that need those cannot follow. Centres of verification poses are kept from it. Where the
     recipe's feature is the wrist's circle, its centres are taken to lie as far behind the flange
-    as the robot's file says.
+    as the robot's file says. Those of a cell are read by ``reader: cell``.
     """
     path = archive_path("acquire.centres", archive, params)
     if is_log(path):
         log = read_run(path)
         fitted = log.observations()
-        recordings = [Recording(o.id, {FLANGE: o.base_T_flange.matrix}) for o in fitted]
-        return Observations(fitted, log_source(log, recordings), total=len(fitted))
+        recordings = [
+            Recording(
+                o.id, {n: x.matrix for n, x in o.poses.items()}, seen_by=o.camera, saw=o.target
+            )
+            for o in fitted
+        ]
+        return Observations(fitted, log_source(log, recordings, cell), total=len(fitted))
     recorded = open_archive(path, params)
     usable = _usable(recorded)
-    check_poses(recorded.root, usable)
+    check_usable(recorded.root, usable, cell)
     fingerprint = fingerprint_of(recorded.root, digests_of(recorded.files))
     behind = flange.behind if flange else 0.0
     source = Source(fingerprint, _notes(recorded, len(usable), params.centre_noise, behind))
-    observations = _observations(usable, params.centre_noise, behind)
+    circles = (
+        (r, _circle(r.centre_in_camera, params.centre_noise, behind))
+        for r in usable
+        if r.centre_in_camera is not None
+    )
+    observations = (observation_of(r, circle, cell) for r, circle in circles)
     return Observations(observations, source, total=len(usable))
 
 
@@ -88,15 +99,6 @@ def _notes(archive: Archive, used: int, noise: float, behind: float) -> tuple[st
         f"{used} ready-made centres, each taken to be good to {noise * 1e3:g} mm along each axis"
         + where,
     )
-
-
-def _observations(
-    usable: Sequence[Recording], noise: float, behind: float
-) -> Iterator[Observation]:
-    for recording in usable:
-        if recording.centre_in_camera is not None:
-            circle = _circle(recording.centre_in_camera, noise, behind)
-            yield observation_of(recording, circle)
 
 
 def _circle(centre: Floats, noise: float, behind: float) -> CircleFeature:

@@ -23,8 +23,8 @@ from flangeye_plugins.acquire.opening import (
     skipped_note,
 )
 
-Camera = tuple[Floats, Floats]
-"""Matrix (3, 3) [px] and OpenCV's distortion."""
+Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
+"""Matrix (3, 3) [px], OpenCV's distortion and, where it was found, their covariance (8, 8)."""
 
 
 class ImagesParams(OpeningParams):
@@ -97,12 +97,12 @@ def _cameras(
         return cameras, []
     images = {r.id: read_image(r.image) for r in usable if r.image is not None}
     known = params.camera(usable[0])
-    start = None if known is None else Image(images[usable[0].id], *known)
+    start = None if known is None else Image(images[usable[0].id], *known[:2])
     try:
         lens = lens_of(images, params.board.board, start)
     except StageError as error:
         raise StageError(f"{root}: {error}") from None
-    return dict.fromkeys(images, (lens.matrix, lens.distortion)), [lens.note()]
+    return dict.fromkeys(images, (lens.matrix, lens.distortion, lens.covariance)), [lens.note()]
 
 
 def _captures(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple, Self
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Lens(NamedTuple):
     Attributes:
         matrix: (3, 3) [px].
         distortion: (4,) k1, k2, p1, p2.
-        deviations: (8,) standard deviations of fx, fy, cx, cy [px] and of the coefficients.
+        covariance: (8, 8) of fx, fy, cx, cy [px] and of the coefficients.
         error: Root mean square of a corner's reprojection error [px].
         views: How many were used.
         left_out: Those that were not: no board in them, or beside the others.
@@ -73,10 +73,15 @@ class Lens(NamedTuple):
 
     matrix: Floats
     distortion: Floats
-    deviations: Floats
+    covariance: Floats
     error: float
     views: int
     left_out: tuple[str, ...]
+
+    @property
+    def deviations(self) -> Floats:
+        """(8,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
 
     def note(self) -> str:
         """Return what to tell of it."""
@@ -110,13 +115,13 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     seen = {name: corners for name, pixels in images.items() if (corners := _seen(board, pixels))}
     _require_views(len(seen), len(images))
     _require_tilted(seen)
-    lens = _fitted(seen, size, start)
+    lens = camera_of(seen, size, start)
     kept = {
         n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if not _outlies(e, lens[1])
     }
     if len(kept) < len(seen):
         _require_views(len(kept), len(images))
-        lens = _fitted(kept, size, start)
+        lens = camera_of(kept, size, start)
     left_out = tuple(name for name in images if name not in kept)
     found = lens[0]._replace(left_out=left_out)
     _require_certain(found)
@@ -140,7 +145,7 @@ def _outlies(error: float, errors: Floats) -> bool:
     return error > OUTLYING * float(np.median(errors))
 
 
-def _fitted(
+def camera_of(
     seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
 ) -> tuple[Lens, Floats]:
     """Return the camera, and each view's reprojection error, rms [px]."""
@@ -151,19 +156,35 @@ def _fitted(
     flags = cv2.CALIB_FIX_K3 | (cv2.CALIB_USE_INTRINSIC_GUESS if start else 0)
     matrix = np.eye(3) if start is None else np.array(start.camera_matrix)
     lens = np.zeros(5) if start is None else np.resize(np.append(start.distortion, np.zeros(5)), 5)
-    _, found_matrix, found_lens, _, _, sigmas, _, errors = cv2.calibrateCameraExtended(
+    _, found_matrix, found_lens, turns, moves, _, _, errors = cv2.calibrateCameraExtended(
         points, pixels, size, matrix, lens, flags=flags
     )
     errors = np.asarray(errors, dtype=np.float64).ravel()
     counts = np.array([len(each) for each in pixels])
+    squares = (errors**2 * counts).sum()
     # OpenCV's errors are of points, ours of a coordinate.
-    total = float(np.sqrt((errors**2 * counts).sum() / counts.sum() / 2))
+    total = float(np.sqrt(squares / counts.sum() / 2))
+    freedom = max(2 * counts.sum() - 6 * len(points) - 8, 1)
+    views = zip(points, turns, moves, strict=True)
     found = Lens(
         np.asarray(found_matrix, dtype=np.float64),
         np.asarray(found_lens, dtype=np.float64).ravel()[:4],
-        np.asarray(sigmas, dtype=np.float64).ravel()[:8], total, len(seen), (),
+        squares / freedom * _spread(views, found_matrix, found_lens), total, len(seen), (),
     )  # fmt: skip
     return found, errors
+
+
+def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Floats:
+    """Return the (8, 8) covariance of the camera for corners known to a pixel, all poses free."""
+    import cv2
+
+    information = np.zeros((8, 8))
+    for points, turn, move in views:
+        jacobian = np.asarray(cv2.projectPoints(points, turn, move, matrix, lens)[1])
+        pose, camera = jacobian[:, :6], jacobian[:, 6:14]
+        told = camera - pose @ np.linalg.lstsq(pose, camera, rcond=None)[0]
+        information += told.T @ told
+    return np.asarray(np.linalg.inv(information))
 
 
 def _require_tilted(seen: Mapping[str, Corners]) -> None:

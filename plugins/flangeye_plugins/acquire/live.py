@@ -146,7 +146,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         itinerary = planned(guard.state.joints)
         release = opening.pop_all()
     done = resumed.done if resumed else frozenset()
-    session = LiveSession(itinerary, guard, opened, params.moved, done)
+    session = LiveSession(itinerary, guard, opened, params.moved, done, journal)
     return LiveCaptures(session, _source(session, arm, eye), release)
 
 
@@ -235,6 +235,7 @@ class LiveSession:
         scanner: What looks at the flange.
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
+        journal: Hears where the arm goes next, and why there.
     """
 
     itinerary: Itinerary
@@ -242,6 +243,7 @@ class LiveSession:
     scanner: Scanner
     moved: float
     done: frozenset[str]
+    journal: Journal
 
     def captures(self) -> Iterator[Capture | Rejection]:
         """Take the captures; while one is transferred and fitted the arm is under way again."""
@@ -253,6 +255,7 @@ class LiveSession:
             if isinstance(way, Barred):
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
+            self.journal("next", {"id": stop.id, "why": stop.pose.why})
             self.arm.go(way)
             if taken:
                 yield taken()

@@ -21,9 +21,11 @@ from flangeye.files.recording import (
 )
 from flangeye.files.scans import with_companion
 from flangeye.log.read import RunLog
+from flangeye.models.cell import Cell
 from flangeye.types import (
     BASE,
     BASE2,
+    FLANGE,
     FLANGE2,
     ArchivePath,
     Feature,
@@ -33,6 +35,7 @@ from flangeye.types import (
     Transform,
 )
 from flangeye.units import param
+from flangeye_plugins.acquire.cells import cell_poses, check_cell
 
 NAMED_AT_MOST = 12
 """Ids a note lists in full; of more, the rest is counted."""
@@ -109,34 +112,63 @@ _BASES = {FLANGE2: BASE2}
 """Frames that are not placed from the first arm's base."""
 
 
-def poses_of(recording: Recording) -> Poses:
+def poses_of(recording: Recording, cell: Cell | None = None) -> Poses:
     """Return the recording's poses as the values stages see."""
+    if cell is not None:
+        return cell_poses(recording, cell)
     return {
         frame: Transform(_BASES.get(frame, BASE), frame, m) for frame, m in recording.poses.items()
     }
 
 
-def observation_of(recording: Recording, feature: Feature) -> Observation:
+def observation_of(recording: Recording, feature: Feature, cell: Cell | None = None) -> Observation:
     """Return a ready-made feature with all that the recording says of the arms."""
     return Observation(
         recording.id,
         feature,
-        poses_of(recording),
+        poses_of(recording, cell),
         recording.joints,
+        recording.seen_by,
+        recording.saw,
     )
 
 
-def log_source(log: RunLog, recordings: Sequence[Recording]) -> Source:
+def check_usable(
+    root: Path, recordings: Sequence[Recording], cell: Cell | None, whole: bool = False
+) -> None:
+    """Refuse recordings that no calibration of one camera, or of a cell, can be made from.
+
+    Args:
+        root: What messages begin with.
+        recordings: Those that are to be used, verification included.
+        cell: The recipe's, where it has one.
+        whole: Whether the target's whole pose was seen: then turning alone is motion too.
+
+    Raises:
+        StageError: See :func:`check_poses` and :func:`check_cell`.
+    """
+    if cell is not None:
+        check_cell(root, recordings, cell)
+        return
+    if any(FLANGE not in recording.poses for recording in recordings):
+        raise StageError(
+            f"{root}: holds recordings of a cell; describe it in the recipe: cell: {{arms: …}}"
+        )
+    check_poses(root, recordings, whole)
+
+
+def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None = None) -> Source:
     """Return where what a log of ours holds comes from: the log, and what it says of itself.
 
     Args:
         log: The log.
         recordings: The poses that are taken from it.
+        cell: The recipe's, where it has one.
 
     Raises:
         StageError: No calibration can be made from these poses.
     """
-    check_poses(log.path, recordings)
+    check_usable(log.path, recordings, cell)
     source = log.source or Source(fingerprint="")
     note = f"archive: {log.path}, a log of flangeye"
     fingerprint = fingerprint_of(log.path.parent, digests_of([log.path]))

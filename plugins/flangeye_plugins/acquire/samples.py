@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.recording import Recording, check_poses, digests_of, fingerprint_of
+from flangeye.files.recording import Recording, digests_of, fingerprint_of
+from flangeye.models.cell import Cell
 from flangeye.types import (
     CAMERA,
     TARGET,
@@ -23,6 +24,7 @@ from flangeye_plugins.acquire.opening import (
     OpeningParams,
     archive_note,
     archive_path,
+    check_usable,
     observation_of,
     open_archive,
     skipped_note,
@@ -41,10 +43,13 @@ class SamplesParams(OpeningParams):
 
 
 @stage("acquire.samples")
-def acquire_samples(archive: ArchivePath, params: SamplesParams) -> Observations:
+def acquire_samples(
+    archive: ArchivePath, params: SamplesParams, cell: Cell | None = None
+) -> Observations:
     """Take ready-made poses of a marker with robot poses: samples of another calibration tool.
 
     They go straight to the solver. Files of samples do not say how good they are: the recipe does.
+    Those of a cell are read by ``reader: cell``.
     """
     recorded = open_archive(archive_path("acquire.samples", archive, params), params)
     usable = [
@@ -52,21 +57,23 @@ def acquire_samples(archive: ArchivePath, params: SamplesParams) -> Observations
     ]
     if not usable:
         raise StageError(f"{recorded.root}: holds no poses of a marker ({recorded.layout})")
-    check_poses(recorded.root, usable, whole=True)
+    check_usable(recorded.root, usable, cell, whole=True)
     notes = (
         archive_note(recorded),
         *recorded.notes,
         *skipped_note(recorded, lambda r: r.camera_T_target is not None, "marker"),
     )
     source = Source(fingerprint_of(recorded.root, digests_of(recorded.files)), notes)
-    return Observations(_observations(usable, params), source, total=len(usable))
+    return Observations(_observations(usable, params, cell), source, total=len(usable))
 
 
-def _observations(usable: Sequence[Recording], params: SamplesParams) -> Iterator[Observation]:
+def _observations(
+    usable: Sequence[Recording], params: SamplesParams, cell: Cell | None
+) -> Iterator[Observation]:
     deviations = [params.angle_noise] * 3 + [params.position_noise] * 3
     covariance = np.diag(np.square(deviations))
     for recording in usable:
         if recording.camera_T_target is not None:
             seen = Transform(CAMERA, TARGET, recording.camera_T_target)
             feature = PoseFeature(seen, covariance)
-            yield observation_of(recording, feature)
+            yield observation_of(recording, feature, cell)

@@ -26,7 +26,7 @@ def _document(pose: CalibratedPose, params: FramesParams) -> dict[str, object]:
             "calibration_type": "eye_on_base" if pose.stands else "eye_in_hand",
             "robot_base_frame": carrier if pose.stands else "base",
             "robot_effector_frame": "flange" if pose.stands else carrier,
-            "tracking_base_frame": params.child,
+            "tracking_base_frame": params.carried(pose),
             "tracking_marker_frame": "target",
             "freehand_robot_movement": True,
             "move_group_namespace": "/",

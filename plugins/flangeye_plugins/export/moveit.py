@@ -15,7 +15,7 @@ from flangeye_plugins.export.writing import FramesParams
 def export_moveit(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     """Write the launch file that MoveIt's hand-eye calibration panel would save."""
     sort = "EYE-TO-HAND" if pose.stands else "EYE-IN-HAND"
-    title = f"Static transform publisher, {sort}: {params.carrier(pose)} -> {params.child}."
+    title = f"Static transform publisher, {sort}: {params.carrier(pose)} -> {params.carried(pose)}."
     name = f"{params.name}_moveit.launch.py"
     use = "include it in your MoveIt launch file; sensors_3d.yaml then needs the topic only"
     return ExportedFile(name, launch_file(pose, params, title), use)

@@ -17,7 +17,8 @@ from flangeye import Params, StageError, stage
 from flangeye.files.paths import RecipePath
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.pose_formats import CONVENTIONS
-from flangeye.types import CalibratedPose, ExportedFile, Floats
+from flangeye.models.configuration import CELL
+from flangeye.types import CAMERA, CalibratedPose, ExportedFile, Floats
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.export.writing import FRAME, FramesParams, fixed
 
@@ -43,9 +44,14 @@ class OpticalParams(Params):
 class UrdfParams(FramesParams):
     """The frames, and how the camera's mount link and its optical frame lie to each other."""
 
-    mount: str = Field("camera_link", pattern=FRAME, description="The camera's mount link.")
-    child: str = Field(
-        "camera_optical_frame", pattern=FRAME, description="The camera's optical frame."
+    mount: str | None = Field(
+        None, pattern=FRAME, description="The camera's mount link; camera_link if not given."
+    )
+    child: str | None = Field(
+        None,
+        pattern=FRAME,
+        description="The camera's optical frame; camera_optical_frame if not given, and in a cell "
+        "the frame's own name.",
     )
     mount_T_optical: OpticalParams | None = Field(
         None, description="Where the optical frame is in the mount link, if that is known."
@@ -55,20 +61,28 @@ class UrdfParams(FramesParams):
     )
 
 
-@stage("export.urdf")
+@stage("export.urdf", serves=(CELL,))
 def export_urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
     """Write URDF joints: the mount link's, where the camera's URDF is known, and the optical's."""
-    mount_T_optical = _mount_T_optical(params)
-    carrier, found = params.carrier(pose), pose.transform.matrix
-    if mount_T_optical is None:
-        joints = _joint(carrier, params.child, found)
-    else:
-        joints = _joint(carrier, params.mount, found @ np.linalg.inv(mount_T_optical))
-        if params.camera_urdf is None:  # which has the second joint itself
-            joints += _joint(params.mount, params.child, mount_T_optical)
+    params.require_unnamed(pose)
+    joints = "".join(_joints(each, params) for each in pose.each)
     remarks = "".join(f"  <!-- {line.replace('--', '- -')} -->\n" for line in pose.remarks)
     text = f'<?xml version="1.0"?>\n<robot name="{params.name}">\n{remarks}{joints}</robot>\n'
     return ExportedFile(f"{params.name}.urdf", text, "copy the joints, or include the file")
+
+
+def _joints(pose: CalibratedPose, params: UrdfParams) -> str:
+    alone = pose.transform.child == CAMERA
+    optical = params.child or (f"{CAMERA}_optical_frame" if alone else pose.transform.child)
+    mount = params.mount or f"{pose.transform.child}_link"
+    mount_T_optical = _mount_T_optical(params, mount, optical)
+    carrier, found = params.carrier(pose), pose.transform.matrix
+    if mount_T_optical is None:
+        return _joint(carrier, optical, found)
+    joints = _joint(carrier, mount, found @ np.linalg.inv(mount_T_optical))
+    if params.camera_urdf is None:  # which has the second joint itself
+        joints += _joint(mount, optical, mount_T_optical)
+    return joints
 
 
 def _joint(parent: str, child: str, matrix: Floats) -> str:
@@ -82,9 +96,9 @@ def _joint(parent: str, child: str, matrix: Floats) -> str:
 """
 
 
-def _mount_T_optical(params: UrdfParams) -> Floats | None:
+def _mount_T_optical(params: UrdfParams, mount: str, optical: str) -> Floats | None:
     if params.camera_urdf is not None:
-        return _chain(params.camera_urdf, params.mount, params.child)
+        return _chain(params.camera_urdf, mount, optical)
     return params.mount_T_optical.matrix if params.mount_T_optical else None
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from flangeye import Params
+from flangeye import Params, StageError
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.types import CalibratedPose, Floats
 
@@ -43,11 +43,31 @@ class FramesParams(NamedParams):
         "given. ROS drivers call the controller's own base by several names: for UR it is base, "
         "not base_link.",
     )  # fmt: skip
-    child: str = Field("camera", pattern=FRAME, description="The camera's own frame, z its view.")
+    child: str | None = Field(
+        None, pattern=FRAME, description="The camera's own frame, z its view; camera, or in a cell "
+        "the camera's name, if not given.",
+    )  # fmt: skip
 
     def carrier(self, pose: CalibratedPose) -> str:
         """Return the name of the frame that carries the camera."""
         return self.parent or pose.transform.parent
+
+    def carried(self, pose: CalibratedPose) -> str:
+        """Return the name of the camera's own frame."""
+        return self.child or pose.transform.child
+
+    def require_unnamed(self, pose: CalibratedPose) -> None:
+        """Refuse names of two frames for the many of a cell.
+
+        Raises:
+            StageError: Some are given.
+        """
+        given = self.model_fields_set - {"name"}
+        if pose.others and given:
+            raise StageError(
+                f"{' and '.join(sorted(given))}: of one camera, and the cell's frames have names "
+                "of their own; leave it out, or choose one with --camera"
+            )
 
 
 class LengthParams(NamedParams):

@@ -16,6 +16,7 @@ from flangeye.units import Length, param
 from flangeye_plugins.fit.planar import (
     PlanarPose,
     middles_beside_centres,
+    moved_by_camera,
     points_of,
     pose_from_points,
     poses_from_pixels,
@@ -278,4 +279,5 @@ def _feature(pose: PlanarPose, corners: Corners, image: Image, by_depth: bool) -
         pose.covariance,
         figures,
         np.hstack([corners.pixels, misses]),
+        np.zeros((6, 0)) if by_depth else moved_by_camera(corners, image, pose.matrix),
     )

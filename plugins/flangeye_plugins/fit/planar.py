@@ -124,6 +124,30 @@ def reprojection(corners: Corners, image: Image, pose: Floats) -> tuple[Floats, 
     return errors.ravel(), derivatives.reshape(-1, 6)
 
 
+def moved_by_camera(corners: Corners, image: Image, pose: Floats) -> Floats:
+    """Return (6, k) how a pose moves by one standard deviation of each of the camera's errors.
+
+    Corners stay where they were detected: what another camera does to their predictions, the pose
+    takes back by least squares. Of a camera that counts as known there are no errors, k = 0.
+
+    Args:
+        corners: In the image and on the target.
+        image: With the camera and its covariance.
+        pose: (4, 4) ``camera_T_target`` [m].
+    """
+    import cv2
+
+    turned, none = corners.points @ pose[:3, :3].T, np.zeros(3)
+    by_camera = np.asarray(
+        cv2.projectPoints(turned, none, pose[:3, 3], image.camera_matrix, image.distortion)[1]
+    )[:, 6 : 6 + len(image.camera_covariance)]
+    variances, axes = np.linalg.eigh(image.camera_covariance)
+    some = variances > 1e-12 * variances.max(initial=0.0)
+    errors = axes[:, some] * np.sqrt(variances[some])
+    jacobian = reprojection(corners, image, pose)[1]
+    return np.asarray(-np.linalg.lstsq(jacobian, by_camera @ errors, rcond=None)[0])
+
+
 def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius: float) -> Floats:
     """Return how far (N, 2) the middles of discs' images lie beside those of their centres [px].
 

@@ -21,6 +21,10 @@ FEWEST_POINTS = 50
 RINGS = 3
 """Rings about the line of sight in which, with the sectors, neighbouring points err together."""
 
+CURVED = 2.0
+"""By how much more than the distortion a free radius moves the centre along the view: a cap seen to
+60 degrees is half a radius deep, so what bends its edge against its middle counts twice."""
+
 LEAST_SCALE = 1e-6
 """Noise below which points are exact [m]."""
 
@@ -30,8 +34,9 @@ class SphereParams(Params):
 
     radius: Literal["known", "free"] = Field(
         "known",
-        description="Hold the radius at that of the recipe's sphere, or fit it. On a cap a free "
-        "radius costs the depth of the centre most of its accuracy.",
+        description="Hold the radius at that of the recipe's sphere, or fit it, as where the "
+        "diameter is unknown. On a cap a free radius costs the depth of the centre most of its "
+        "accuracy.",
     )
     max_incidence: Angle = param(
         "60 deg", gt=0, description="Points seen more obliquely than this are left out."
@@ -101,18 +106,21 @@ def fit_sphere(
     points = cloud.cloud.xyz.astype(np.float64)
     if len(points) < FEWEST_POINTS:
         return Rejected(f"{len(points)} points, at least {FEWEST_POINTS} are needed")
-    known = fit_cap(points, cloud.centre, sphere.radius, params.max_incidence, free=False)
-    free = fit_cap(known.points, known.centre, sphere.radius, params.max_incidence, free=True)
+    start = float(np.median(np.linalg.norm(points - cloud.centre, axis=1)))
+    size = start if sphere.size is None else sphere.size
+    known = fit_cap(points, cloud.centre, size, params.max_incidence, free=False)
+    free = fit_cap(known.points, known.centre, size, params.max_incidence, free=True)
+    held = params.radius == "known" and sphere.size is not None
     coverage = cap_coverage(known, params.max_incidence)
     problem = _why_not(free, coverage, sphere, params)
     if problem:
         return Rejected(problem)
-    chosen = known if params.radius == "known" else free
+    chosen = known if held else free
     return CircleFeature(
         centre=chosen.centre,
         normal=None,
         radii={"sphere": free.radius},
-        covariance=_covariance(chosen, params),
+        covariance=_covariance(chosen, held, params),
         normal_covariance=None,
         arc_coverage=coverage,
         centre_in_flange=np.array(sphere.centre_in_flange),
@@ -190,24 +198,26 @@ def _why_not(free: SphereFit, coverage: float, sphere: Sphere, params: SpherePar
             f"{coverage:.0%} of the cap seen within {np.degrees(params.max_incidence):g} deg, at "
             f"least {params.min_coverage:.0%} is needed"
         )
-    if abs(free.radius - sphere.radius) > params.radius_tolerance:
+    if sphere.size is not None and abs(free.radius - sphere.size) > params.radius_tolerance:
         return (
-            f"sphere radius {free.radius * 1e3:.2f} mm, expected {sphere.radius * 1e3:.2f} mm "
+            f"sphere radius {free.radius * 1e3:.2f} mm, expected {sphere.size * 1e3:.2f} mm "
             f"within {params.radius_tolerance * 1e3:g} mm"
         )
     return None
 
 
-def _covariance(fit: SphereFit, params: SphereParams) -> Floats:
-    """Return the (3, 3) covariance of the centre [m^2]."""
-    held = params.radius == "known"
+def _covariance(fit: SphereFit, held: bool, params: SphereParams) -> Floats:
+    """Return the (3, 3) covariance of the centre [m^2], its radius held or fitted."""
     jacobian = fit.jacobian[:, :3] if held else fit.jacobian
     cluster = _patch(fit, STRETCHES, np.sin(params.max_incidence))
     curvature = cauchy_curvature(fit.residuals, fit.scale)
     found = clustered_covariance(jacobian, fit.residuals, fit.weights, cluster, curvature)[:3, :3]
+    along = fit.centre / np.linalg.norm(fit.centre)
     if held:
         # What a larger sphere does: every residual smaller by the same amount.
         weighted = jacobian * curvature[:, None]
         moved = np.linalg.lstsq(weighted.T @ jacobian, weighted.sum(axis=0), rcond=None)[0]
         found = found + params.radius_error**2 * np.outer(moved, moved)
+    else:
+        found = found + (CURVED * params.scanner_error) ** 2 * np.outer(along, along)
     return np.asarray(found + params.scanner_error**2 * np.eye(3))

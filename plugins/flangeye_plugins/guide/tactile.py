@@ -22,6 +22,7 @@ from flangeye.plugin.stage import part
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.guide.pivoting import Hand, Pivoted, told_of, with_body
 from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams
@@ -57,6 +58,27 @@ def guide_tactile(
         StageError: The recipe has no such step, or the readings allow no calibration.
         NothingMoved: Motion was not asked for.
     """
+    return _guided(recipe, motion, ask, out, body=False)
+
+
+@part("guide.tool")
+def guide_tool(recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path) -> str:
+    """Calibrate the finger, then find where tip and torch are in the flange, and how well.
+
+    For that a person brings each to a mark, the tool in several attitudes.
+
+    Raises:
+        StageError: The recipe has no such step, the readings allow no calibration, or the poses
+            leave a place unknown.
+        NothingMoved: Motion was not asked for.
+    """
+    return _guided(recipe, motion, ask, out, body=True)
+
+
+def _guided(
+    recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path, body: bool
+) -> str:
+    """Go through the procedure and write the file; return what was found, for people."""
     params = _weld_params(recipe)
     finger: Finger = read_model(params.finger, Finger)
     driver: RobotDriver = recipe.context[RobotDriver]
@@ -78,17 +100,27 @@ def guide_tactile(
         rest = readings.take(AT_REST)
         ask(HOLD)
         held = list(readings.held())
-        name = robot.name
-    found = calibrate(rest, held, f"flangeye tactile calibrate, on {name}")
+        found = calibrate(rest, held, f"flangeye tactile calibrate, on {robot.name}")
+
+        def look() -> list[TagReading]:
+            # The person has moved the arm meanwhile: it is watched from where it stands now.
+            return Readings(Executor(robot, latest, model, limits), sensor, finger).take(EACH)
+
+        hand = Hand(robot, ask, look)
+        pivoted = Pivoted(hand.tip(finger, found), hand.torch()) if body else None
     measured = found.lateral is not None
     if not measured and finger.calibration is not None:
         known = finger.calibration
         found = found.model_copy(update={"lateral": known.lateral, "axial": known.axial})
     calibrated = finger.model_copy(update={"calibration": found})
+    if pivoted is not None:
+        calibrated = with_body(calibrated, pivoted)
     text = yaml.safe_dump(calibrated.model_dump(mode="json", exclude_none=True), sort_keys=False)
     write_whole(out, text)
     counts = f"{len(rest)} readings at rest, {len(held)} with the tip held"
-    return "\n".join([counts, *_told(found, measured), f"{out}: weld with it: finger: {out.name}"])
+    points = [] if pivoted is None else told_of(pivoted)
+    use = f"{out}: weld with it: finger: {out.name}"
+    return "\n".join([counts, *_told(found, measured), *points, use])
 
 
 def _told(found: Calibration, measured: bool) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import Field
 
+from flangeye.handeye.observability import in_base
 from flangeye.maths.geometry import hat, rigid, rotation_from_rpy
 from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between
 from flangeye.plugin.stage import Params, part
@@ -95,7 +96,7 @@ class Chooser:
         for index in np.argsort(self._expected_errors(candidates), kind="stable"):
             joints = self._site.joints(candidates[index])
             if joints is not None:
-                return PlannedPose(candidates[index], joints)
+                return PlannedPose(candidates[index], joints, self._why(candidates[index]))
         return None
 
     def _candidates(self, facing: Floats) -> Floats:
@@ -116,12 +117,32 @@ class Chooser:
 
     def _expected_errors(self, candidates: Floats) -> Floats:
         """Return the (M,) expected square error over the work after each candidate [m^2]."""
-        lost = self._site.lost()
-        counted = [pose for i, pose in enumerate(self._visited) if i not in lost]
-        known = np.diag(PRIOR**-2.0) + self._information(np.array(counted).reshape(-1, 4, 4)).sum(0)
-        covariance = np.linalg.inv(known + self._information(candidates))
+        covariance = np.linalg.inv(self._known() + self._information(candidates))
         moved = self._moved_by
         return np.asarray(np.einsum("pai,mij,paj->m", moved, covariance, moved))
+
+    def _known(self) -> Floats:
+        """Return the (6, 6) information of the poses that were visited and told something."""
+        lost = self._site.lost()
+        counted = [pose for i, pose in enumerate(self._visited) if i not in lost]
+        told = self._information(np.array(counted).reshape(-1, 4, 4)).sum(axis=0)
+        return np.asarray(np.diag(PRIOR**-2.0) + told)
+
+    def _why(self, pose: Floats) -> str:
+        """Say what a pose promises: how much less error, and what it tells most of."""
+        known, told = self._known(), self._information(pose[None])[0]
+        before, after = np.linalg.inv(known), np.linalg.inv(known + told)
+        weight = np.einsum("pai,paj->ij", self._moved_by, self._moved_by) / len(self._moved_by)
+        errors = [1e3 * np.sqrt(np.trace(weight @ of)) for of in (before, after)]
+        less = before - after
+        turn = np.trace(weight[:3, :3] @ less[:3, :3]) > np.trace(less[3:, 3:])
+        part, word = (less[:3, :3], "turn about") if turn else (less[3:, 3:], "shift along")
+        axis = np.linalg.eigh(part)[1][:, -1]
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        return (
+            f"expected error at the work {errors[0]:.2f} to {errors[1]:.2f} mm rms, mostly by the "
+            f"{word} base {in_base(axis, 2)}"
+        )
 
     def _information(self, poses: Floats) -> Floats:
         """Return the (M, 6, 6) Fisher information of poses (M, 4, 4), about the work's centre."""

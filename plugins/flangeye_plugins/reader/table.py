@@ -24,28 +24,23 @@ from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import recording_of, scans_in
-from flangeye.files.tables import Column, TextTable, number_of, read_text_table
+from flangeye.files.tables import Column, TextTable, number_of
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, turning
 from flangeye.types import FLANGE, FLANGE2, Floats
 from flangeye.units import param
+from flangeye_plugins.reader.columns import (
+    ColumnsParams,
+    Readings,
+    readings_of,
+    table_with_rows,
+    times_of,
+)
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
-from flangeye_plugins.reader.written import POINT, WrittenParams
+from flangeye_plugins.reader.written import POINT
 from flangeye_plugins.reader.yaml_poses import numbers, read_document, value_at
 
 DOCUMENTS = (".yaml", ".yml", ".json")
-PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-
-
-class ColumnsParams(WrittenParams):
-    """Which columns hold a pose, and how it is written."""
-
-    columns: tuple[Column, ...] = Field(
-        (), description="Names in the heading, or numbers from 1, in the order of the convention: "
-        "position first; all that nothing else takes if not given.",
-    )  # fmt: skip
-    time: Column | None = Field(None, description="Column of the time.")
-    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
 
 
 class OtherParams(ColumnsParams):
@@ -119,14 +114,6 @@ class Row(NamedTuple):
     numbers: Floats
 
 
-class Readings(NamedTuple):
-    """Poses or points of a table, None where cells are empty; their times [s], if given."""
-
-    file: Path
-    values: list[Floats | None]
-    times: Floats | None
-
-
 @part("reader.table")
 def table(path: Path, params: TableParams) -> Archive:
     """Read a table of poses in the stated convention, with scans beside it or the target in it."""
@@ -135,7 +122,7 @@ def table(path: Path, params: TableParams) -> Archive:
         raise NotThisLayout(f"{folder}: holds no {file.name}")
     if file.suffix in DOCUMENTS:
         return _of_rows(folder, file, _from_yaml(file), params)
-    text = _with_rows(file)
+    text = table_with_rows(file)
     if params.target is None:
         archive = _of_rows(folder, file, _from_text(text, params), params)
         return _with_times(archive, text, params)
@@ -156,13 +143,6 @@ def _of_rows(folder: Path, file: Path, rows: Sequence[Row], params: TableParams)
 def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
     pose = params.value(where, values)
     return pose if params.pose == "base_T_flange" else inverted(pose)
-
-
-def _with_rows(file: Path) -> TextTable:
-    text = read_text_table(file)
-    if not text.rows:
-        raise StageError(f"{file}: holds no poses")
-    return text
 
 
 def _from_text(text: TextTable, params: TableParams) -> list[Row]:
@@ -192,7 +172,7 @@ def _columns(text: TextTable, params: TableParams, scan: int | None) -> list[int
 
 def _with_times(archive: Archive, text: TextTable, params: TableParams) -> Archive:
     """Return the archive with its times, and the second arm of the same rows."""
-    times = _times(text, params)
+    times = times_of(text, params.time, params.time_unit)
     second = _second(archive.root, text, params)
     if second is not None and second.file != text.file:
         raise StageError(f"{second.file}: a second arm beside scans stands in the same table")
@@ -217,7 +197,7 @@ def _measured(folder: Path, text: TextTable, params: TableParams) -> Archive:
     target = _target(folder, text, params)
     second = _second(folder, text, params)
     files = list(dict.fromkeys([text.file, target.file, *([second.file] if second else [])]))
-    times = _times(text, params)
+    times = times_of(text, params.time, params.time_unit)
     if times is not None and target.times is not None and target.file != text.file:
         recordings, notes = _joined((times, poses), target, second, params)
     else:
@@ -297,7 +277,7 @@ def _poses(pose: Floats, second: Floats | None) -> dict[str, Floats]:
 def _target(folder: Path, text: TextTable, params: TableParams) -> Readings:
     given = params.target
     assert given is not None  # noqa: S101  for type checkers: there is one, or nobody asks
-    found = _readings(folder, text, given)
+    found = readings_of(_own(folder, text, given), given)
     if given.pose == "camera_T_target" or given.rotation == POINT:
         return found
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
@@ -306,47 +286,15 @@ def _target(folder: Path, text: TextTable, params: TableParams) -> Readings:
 def _second(folder: Path, text: TextTable, params: TableParams) -> Readings | None:
     if params.second is None:
         return None
-    found = _readings(folder, text, params.second)
+    found = readings_of(_own(folder, text, params.second), params.second)
     if params.second.pose == "base2_T_flange2":
         return found
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
 
 
-def _readings(folder: Path, text: TextTable, given: OtherParams) -> Readings:
-    """Return the values of one thing, from its own table or from the same."""
-    own = text if given.file is None else _with_rows(folder / given.file)
-    time = [] if given.time is None else [own.index(given.time)]
-    free = [i for i in range(len(own.rows[0][1])) if i not in time]
-    columns = [own.index(column) for column in given.columns] or free
-    values = [
-        None if all(_is_empty(cells, c) for c in columns) else _value(own, row, columns, given)
-        for row, (_, cells) in enumerate(own.rows)
-    ]
-    return Readings(own.file, values, _times(own, given))
-
-
-def _is_empty(cells: Sequence[str], column: int) -> bool:
-    return column >= len(cells) or cells[column].lower() in ("", "nan")
-
-
-def _value(own: TextTable, row: int, columns: Sequence[int], given: OtherParams) -> Floats:
-    one = replace(own, rows=(own.rows[row],))
-    return given.value(own.where(row), one.numbers(columns)[0])
-
-
-def _times(text: TextTable, given: ColumnsParams) -> Floats | None:
-    """Return the times [s]; they ascend.
-
-    Raises:
-        StageError: They do not.
-    """
-    if given.time is None:
-        return None
-    times = text.numbers([text.index(given.time)])[:, 0] * PER_SECOND[given.time_unit]
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if len(back):
-        raise StageError(f"{text.where(int(back[0]) + 1)}: its time is not after the row before it")
-    return np.asarray(times)
+def _own(folder: Path, text: TextTable, given: OtherParams) -> TextTable:
+    """Return the table that has something: its own, or the same."""
+    return text if given.file is None else table_with_rows(folder / given.file)
 
 
 # --- YAML, and the scans of rows

@@ -26,6 +26,12 @@ CANDIDATES = 6
 ROUNDS = 10
 """Times that a candidate is moved to fit the points near its surface."""
 
+UNKNOWN_SIZES = np.geomspace(75e-3, 8e-3, 14)
+"""Radii that are looked for where the size is unknown; each finds spheres up to 10 % off [m]."""
+
+SIZE_STEP = 0.1
+"""How far a sphere may be from such a radius, as a share of it."""
+
 SEEN_TO = np.sin(np.radians(60.0))
 """Share of the radius within which, across the view, a scanner sees a sphere well."""
 
@@ -50,17 +56,19 @@ class Candidate(NamedTuple):
     Attributes:
         centre: (3,) [m].
         seen: Share of the face it turns to the scanner that is there.
+        radius: [m].
     """
 
     centre: Floats
     seen: float
+    radius: float
 
 
 @stage("segment.sphere")
 def segment_sphere(
     capture: Capture, sphere: Sphere, params: SegmentSphereParams
 ) -> FlangeCloud | Rejected:
-    """Find a calibration sphere by its size, and cut it out.
+    """Find a calibration sphere, by its size where that is known, and cut it out.
 
     Every bit of surface proposes the point one radius behind it: on the sphere they all propose
     its centre (a Hough transform). The places with the most votes are compared with the sphere,
@@ -69,27 +77,35 @@ def segment_sphere(
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off.
     """
-    view = coarse_view(capture.cloud.xyz, 2 * sphere.radius / ACROSS)
-    if view is None:
-        return Rejected("no finite point")
-    check_scale(view.xyz, capture.id)
-    found = find_spheres(_between(view, params.near, params.far), sphere.radius, params.tolerance)
+    radii = UNKNOWN_SIZES if sphere.size is None else [sphere.size]
+    found: list[Candidate] = []
+    for radius in radii:
+        view = coarse_view(capture.cloud.xyz, 2 * radius / ACROSS)
+        if view is None:
+            return Rejected("no finite point")
+        check_scale(view.xyz, capture.id)
+        view = _between(view, params.near, params.far)
+        found += find_spheres(view, radius, params.tolerance, sized=sphere.size is not None)
+    found = _apart(sorted(found, key=lambda c: -c.seen))
     fitting = [candidate for candidate in found if candidate.seen >= params.min_coverage]
     if len(fitting) != 1:
         return Rejected(_why_not(found, fitting, sphere, params))
-    centre = fitting[0].centre
-    points = _shell(capture.cloud.xyz, centre, sphere.radius, params.margin)
+    centre, radius = fitting[0].centre, fitting[0].radius
+    points = _shell(capture.cloud.xyz, centre, radius, params.margin)
     towards = -centre / np.linalg.norm(centre)
     return FlangeCloud(PointCloud(capture.cloud.frame, points), centre, towards)
 
 
-def find_spheres(view: Grid, radius: float, tolerance: float) -> list[Candidate]:
+def find_spheres(
+    view: Grid, radius: float, tolerance: float, sized: bool = True
+) -> list[Candidate]:
     """Return places where a sphere of this radius may be, the best first, none overlapping.
 
     Args:
         view: The scene; missing points are NaN.
         radius: [m].
         tolerance: Largest distance of a point from the surface [m].
+        sized: Whether the radius is known; else it may be off by ``SIZE_STEP`` and is found.
     """
     points = view.xyz.reshape(-1, 3).astype(np.float64)
     votes = points - radius * surface_normals(view.xyz).reshape(-1, 3)
@@ -98,8 +114,8 @@ def find_spheres(view: Grid, radius: float, tolerance: float) -> list[Candidate]
         return []
     starts = most_voted(votes, CELL * radius, 2 * radius)
     points = points[np.isfinite(points[:, 2])]
-    found = [_settled(start, points, view.angle, radius, tolerance) for start in starts]
-    return _apart(sorted(found, key=lambda c: -c.seen), 2 * radius)
+    found = [_settled(start, points, view.angle, radius, tolerance, sized) for start in starts]
+    return _apart(sorted(found, key=lambda c: -c.seen))
 
 
 def surface_normals(xyz: Singles) -> Floats:
@@ -158,20 +174,29 @@ def _with_neighbours(keys: Indices, counts: Indices, shape: tuple[int, ...]) -> 
 
 
 def _settled(
-    start: Floats, points: Floats, angle: float, radius: float, tolerance: float
+    start: Floats, points: Floats, angle: float, radius: float, tolerance: float, sized: bool
 ) -> Candidate:
     """Move a candidate to where it fits the points near its surface, and say how many do."""
-    centre, near = start, points[np.linalg.norm(points - start, axis=1) < 1.5 * radius]
+    centre, size, near = (
+        start,
+        radius,
+        points[np.linalg.norm(points - start, axis=1) < 1.5 * radius],
+    )
     for gate in np.geomspace(max(0.3 * radius, tolerance), tolerance, ROUNDS):
         offsets = near - centre
         distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
-        on_surface = np.abs(distance - radius) < gate
+        on_surface = np.abs(distance - size) < gate
         if on_surface.sum() < 6:
-            return Candidate(start, 0.0)
+            return Candidate(start, 0.0, radius)
         outwards = offsets[on_surface] / distance[on_surface, None]
-        misfit = distance[on_surface] - radius
-        centre = centre + np.linalg.lstsq(outwards, misfit, rcond=None)[0]
-    return Candidate(centre, _share_seen(centre, near, angle, radius, tolerance))
+        misfit = distance[on_surface] - size
+        if not sized:
+            outwards = np.insert(outwards, 3, 1.0, axis=1)
+        step = np.linalg.lstsq(outwards, misfit, rcond=None)[0]
+        centre, size = centre + step[:3], size + step[3:].sum()
+        if abs(size / radius - 1) > 1.5 * SIZE_STEP:
+            return Candidate(start, 0.0, radius)
+    return Candidate(centre, _share_seen(centre, near, angle, size, tolerance), float(size))
 
 
 def _share_seen(
@@ -192,11 +217,12 @@ def _share_seen(
     return float(max(0.0, (for_it - against) / due))
 
 
-def _apart(candidates: list[Candidate], apart: float) -> list[Candidate]:
+def _apart(candidates: list[Candidate]) -> list[Candidate]:
+    """Return the candidates that overlap no better one; the best come first."""
     kept: list[Candidate] = []
-    for candidate in candidates:
-        if all(np.linalg.norm(candidate.centre - other.centre) > apart for other in kept):
-            kept.append(candidate)
+    for one in candidates:
+        if all(np.linalg.norm(one.centre - k.centre) > one.radius + k.radius for k in kept):
+            kept.append(one)
     return kept
 
 
@@ -209,7 +235,7 @@ def _between(view: Grid, near: float, far: float) -> Grid:
 def _why_not(
     found: list[Candidate], fitting: list[Candidate], sphere: Sphere, params: SegmentSphereParams
 ) -> str:
-    size = f"{2e3 * sphere.radius:g} mm across"
+    size = "of any size" if sphere.size is None else f"{2e3 * sphere.size:g} mm across"
     if fitting:
         places = " and ".join(
             "(" + ", ".join(f"{c * 1e3:.0f}" for c in candidate.centre) + ") mm"

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from flangeye import Params, stage
-from flangeye.handeye.cell import calibrate_cell
+from flangeye.handeye.cell import calibrate_cell, solve_so_far
+from flangeye.handeye.cell_plan import errors_at_work, is_foretold
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CELL
-from flangeye.types import HandEye, Observations
+from flangeye.types import HandEye, Journal, Observation, Observations, Progress
 from flangeye.units import Angle, Length, param
+
+CONFIRMED = 3
+"""Sightings in a row that were foretold, before an online run may stop."""
 
 
 class CellParams(Params):
@@ -19,10 +23,25 @@ class CellParams(Params):
     translation_limit: Length = param(
         "20 mm", gt=0, description="Refuse when a place has a larger standard deviation."
     )
+    required: Length | None = param(
+        None,
+        gt=0,
+        description="Stop acquiring once nothing that is to be found is off by more at its work, "
+        "with 95 % probability, and the last sightings lay where they were foretold; what joint "
+        "zeros may be off by is not counted, for no sighting lessens it. By default every sighting "
+        "is used.",
+    )
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Of a rotation [rad] and of a translation [m]."""
+        return self.rotation_limit, self.translation_limit
 
 
 @stage("solve.cell", serves=(CELL,))
-def solve_cell(observations: Observations, cell: Cell, params: CellParams) -> HandEye:
+def solve_cell(
+    observations: Observations, cell: Cell, params: CellParams, journal: Journal | None = None
+) -> HandEye:
     """Find every place that the recipe's cell leaves unknown, from all sightings at once.
 
     Takes whole poses, centres with normals, or centres alone, of any target by any camera, each
@@ -34,5 +53,34 @@ def solve_cell(observations: Observations, cell: Cell, params: CellParams) -> Ha
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    limits = params.rotation_limit, params.translation_limit
-    return calibrate_cell(list(observations), cell, limits, "solve.cell")
+    if params.required is None or observations.whole:
+        pulled = list(observations)
+    else:
+        pulled = _pull(observations, cell, params, params.required, journal)
+    return calibrate_cell(pulled, cell, params.limits, "solve.cell")
+
+
+def _pull(
+    observations: Observations,
+    cell: Cell,
+    params: CellParams,
+    required: float,
+    journal: Journal | None,
+) -> list[Observation]:
+    """Take sightings until nothing is off by more than ``required`` [m] at its work.
+
+    Each is first held against what those before it foretell: it verifies them at no cost.
+    """
+    pulled: list[Observation] = []
+    foretold, found = 0, None
+    for observation in observations:
+        if found is not None:
+            foretold = foretold + 1 if is_foretold(observation, found, cell) else 0
+        pulled.append(observation)
+        found = solve_so_far(pulled, cell, params.limits, found)
+        error = None if found is None else max(errors_at_work(found, cell, pulled).values())
+        if journal:
+            journal("progress", Progress(len(pulled), error, required))
+        if error is not None and error <= required and foretold >= CONFIRMED:
+            break
+    return pulled

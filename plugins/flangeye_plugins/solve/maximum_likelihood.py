@@ -7,6 +7,7 @@ from dataclasses import replace
 from flangeye import stage
 from flangeye.models.configuration import EVERY, Configuration
 from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
 from flangeye.types import HandEye, Observations
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
 
@@ -24,6 +25,7 @@ def solve_maximum_likelihood(
     params: MaximumLikelihoodParams,
     configuration: Configuration | None = None,
     robot: RobotModel | None = None,
+    scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Do what ``solve.robust`` does: the former name of it for whole configurations.
 
@@ -31,5 +33,5 @@ def solve_maximum_likelihood(
         StageError: As ``solve.robust``.
         CalibrationRefused: As ``solve.robust``.
     """
-    found = solve_poses(list(observations), params, robot, configuration, NAME)
+    found = solve_poses(list(observations), params, robot, configuration, NAME, scanner)
     return replace(found, notes=(*found.notes, RENAMED))

@@ -15,6 +15,7 @@ from flangeye.handeye.observability import ObservabilityLimits
 from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
 from flangeye.models.workspace import workspace_of
 from flangeye.types import (
     Box,
@@ -89,6 +90,12 @@ class RobustParams(Params):
         description="Estimate a smooth error of the arm over the workspace, if that helps on poses "
         "held out. The matrix stays the best for the arm as reported.",
     )
+    scanner_distortion: Literal["consider", "ignore"] = Field(
+        "consider",
+        description="Whether the scanner's smooth distortion is part of the model, as large as the "
+        "scanner's file has it (calibration_error): found as far as the poses show it, and in the "
+        "covariance.",
+    )
     translation_limit: Length = param(
         "20 mm", gt=0, description="A translation known less well is not observable."
     )
@@ -109,6 +116,11 @@ class RobustParams(Params):
         "but for one factor on all distances, as those of a single moving camera: then the arm's "
         "own motion tells it.",
     )
+    certify: bool = Field(
+        False,
+        description="Say whether the answer is globally optimal, of whole poses and two unknown "
+        "places: shown by a dual certificate, or not shown.",
+    )
     required: Length | None = param(
         None,
         gt=0,
@@ -127,13 +139,14 @@ class RobustParams(Params):
 
 
 @stage("solve.robust", serves=EVERY)
-def solve_robust(
+def solve_robust(  # noqa: PLR0913  what it asks the runner for
     observations: Observations,
     params: RobustParams,
     workspace: Box | None = None,
     robot: RobotModel | None = None,
     journal: Journal | None = None,
     configuration: Configuration | None = None,
+    scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Find the poses that agree, and whatever the configuration leaves unknown, most likely.
 
@@ -153,7 +166,7 @@ def solve_robust(
     """
 
     def solve(pulled: Sequence[Observation]) -> HandEye:
-        return solve_poses(pulled, params, robot, configuration)
+        return solve_poses(pulled, params, robot, configuration, scanner=scanner)
 
     if params.required is None:
         return solve(list(observations))
@@ -202,12 +215,13 @@ def solve_poses(
     robot: RobotModel | None = None,
     configuration: Configuration | None = None,
     method: str = "solve.robust",
+    scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Solve observations that are all there; see :func:`solve_robust`."""
     configuration = configuration or DEFAULT
     if configuration.is_default and all(isinstance(o.feature, CircleFeature) for o in pulled):
         check_poses(pulled)
-    return calibrate(Cell(pulled, configuration, robot), _options(params), method)
+    return calibrate(Cell(pulled, configuration, robot, scanner), _options(params), method)
 
 
 def _options(params: RobustParams) -> Options:
@@ -225,6 +239,8 @@ def _options(params: RobustParams) -> Options:
         joint_prior=params.joint_prior,
         joint_zeros=params.joint_zeros == "consider",
         smooth_error=params.smooth_error == "auto",
+        scanner_distortion=params.scanner_distortion == "consider",
         size_limit=params.size_limit,
         finds_size=params.target_size == "unknown",
+        certify=params.certify,
     )

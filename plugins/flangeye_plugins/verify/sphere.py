@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import Field
 
@@ -9,43 +11,90 @@ from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.types import Floats, HandEye, Verification
+from flangeye.types import Floats, HandEye, Journal, Verification
 from flangeye.units import Length, param
+
+
+class Bar(Params):
+    """Two balls at a known distance, as one scan shows them."""
+
+    first: tuple[Length, Length, Length] = Field(description="Centre of a ball, in the camera.")
+    second: tuple[Length, Length, Length] = Field(description="And of the other.")
+    length: Length = Field(gt=0, description="Distance of the centres, as it was calibrated.")
 
 
 class SphereParams(Params):
     """Parameters of ``verify.sphere``."""
 
+    bars: tuple[Bar, ...] = Field(
+        (),
+        description="Two balls at a known distance, at several places and in several directions: "
+        "then the scanner alone is checked, and the arm's poses are not looked at.",
+    )
     max_error: Length = param(
         "1 mm", gt=0, description="Largest error of a distance that passes, 95 % of the pairs."
     )
     shortest: Length = param(
         "50 mm", gt=0, description="Pairs nearer than this say nothing of scale."
     )
-    fewest: int = Field(10, ge=3, description="Pairs that are needed.")
+    fewest: int = Field(10, ge=3, description="Pairs of the arm's poses that are needed.")
 
 
 @stage("verify.sphere")
 def verify_sphere(
-    calibration: HandEye, params: SphereParams, robot: RobotModel | None = None
+    calibration: HandEye,
+    params: SphereParams,
+    robot: RobotModel | None = None,
+    journal: Journal | None = None,
 ) -> Verification:
-    """Compare distances between places of the target on the flange, seen and driven.
+    """Compare distances that the scanner saw with those that the arm drove, or that are known.
 
-    After the manner of the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13, with the arm in
-    place of a calibrated ball bar; it is not that test. The target is a ball on the flange
-    (``fit.sphere``), or the flange's own circle. Distances do not depend on the matrix: it can show
-    a scanner or an arm of the wrong scale and a scanner that is bent, and cannot show a wrong
-    matrix. Which of scanner and arm is wrong it cannot tell.
+    After the manner of the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13; it is not that
+    test. The target is a ball on the flange (``fit.sphere``), or the flange's own circle, with the
+    arm in place of a ball bar; or two balls at a known distance (``bars``). Distances do not depend
+    on the matrix: it can show a scanner or an arm of the wrong scale and a scanner that is bent,
+    and cannot show a wrong matrix. Which of scanner and arm is wrong only ``bars`` can tell.
 
     Figures [m]: ``pairs``, ``rms``, ``p95`` and ``max`` of the errors of distance, ``mean``, and
-    ``scale``: the seen distances over the driven ones, less one.
+    ``scale``: the seen distances over the others, less one. The errors over the distances are in
+    the log as ``comparison``.
+
+    Raises:
+        StageError: Too few pairs are far enough apart.
+    """
+    if params.bars:
+        measured, lengths = _of_bars(params.bars)
+    else:
+        measured, lengths = _of_poses(calibration, params, Arm(robot) if robot else None)
+    figures = _figures(measured - lengths, measured, lengths)
+    if journal:
+        points = 1e3 * np.column_stack([lengths, measured - lengths])
+        told = {"x": "distance [mm]", "y": "seen less true [mm]", "series": {"": points.tolist()}}
+        journal("comparison", told)
+    passed = figures["p95"] <= params.max_error
+    sign = "within" if passed else "above"
+    reason = (
+        f"95 % of {figures['pairs']:.0f} distances agree to {figures['p95'] * 1e3:.3f} mm, {sign} "
+        f"the limit of {params.max_error * 1e3:g} mm; scale {figures['scale'] * 1e6:+.0f} ppm"
+    )
+    return Verification(passed, reason, figures)
+
+
+def _of_bars(bars: Sequence[Bar]) -> tuple[Floats, Floats]:
+    """Return (N,) distances as seen, and as they are [m]."""
+    seen = np.array([bar.first for bar in bars]) - np.array([bar.second for bar in bars])
+    return np.linalg.norm(seen, axis=1), np.array([bar.length for bar in bars])
+
+
+def _of_poses(calibration: HandEye, params: SphereParams, arm: Arm | None) -> tuple[Floats, Floats]:
+    """Return (N,) distances of all pairs of poses as seen, and as driven [m].
 
     Raises:
         StageError: Too few pairs are far enough apart.
     """
     used = [pair for pair in calibration.pairs if pair.used]
     seen = np.array([pair.observation.feature.centre for pair in used]).reshape(-1, 3)
-    driven = _driven(calibration, Arm(robot) if robot else None)
+    driven = _driven(calibration, arm)
     first, second = np.triu_indices(len(used), 1)
     lengths = np.linalg.norm(driven[first] - driven[second], axis=1)
     apart = lengths >= params.shortest
@@ -54,16 +103,7 @@ def verify_sphere(
             f"verify.sphere: {int(apart.sum())} pairs of poses are {params.shortest * 1e3:g} mm or "
             f"more apart, {params.fewest} are needed: take poses that lie further apart"
         )
-    measured = np.linalg.norm(seen[first] - seen[second], axis=1)[apart]
-    lengths = lengths[apart]
-    figures = _figures(measured - lengths, measured, lengths)
-    passed = figures["p95"] <= params.max_error
-    sign = "within" if passed else "above"
-    reason = (
-        f"95 % of {figures['pairs']:.0f} distances agree to {figures['p95'] * 1e3:.3f} mm, {sign} "
-        f"the limit of {params.max_error * 1e3:g} mm; scale {figures['scale'] * 1e6:+.0f} ppm"
-    )
-    return Verification(passed, reason, figures)
+    return np.linalg.norm(seen[first] - seen[second], axis=1)[apart], lengths[apart]
 
 
 def _driven(calibration: HandEye, arm: Arm | None) -> Floats:

@@ -8,7 +8,7 @@ from pydantic import Field
 from flangeye import Params, stage
 from flangeye.maths.geometry import covariance_at, rigid, rotation_from_rpy
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.types import Floats, HandEye, Verification
+from flangeye.types import Floats, HandEye, Journal, Verification
 from flangeye.units import Angle, Length, param
 
 
@@ -40,7 +40,9 @@ class TouchParams(Params):
 
 
 @stage("verify.touch")
-def verify_touch(calibration: HandEye, params: TouchParams) -> Verification:
+def verify_touch(
+    calibration: HandEye, params: TouchParams, journal: Journal | None = None
+) -> Verification:
     """Compare where the matrix puts seen points with where a tip touched them.
 
     It can show that scanner, matrix, arm and tip agree at these places, which is what the work
@@ -49,7 +51,8 @@ def verify_touch(calibration: HandEye, params: TouchParams) -> Verification:
 
     Figures [m]: ``rms``, ``max``, ``x, y, z`` of the mean error in base (a tip that is wrong shows
     here too), and ``explained``: the share of points within what the covariance and the jogging
-    allow with 95 %.
+    allow with 95 %. Predicted less actual, along each axis at each point, is in the log as
+    ``comparison``.
     """
     estimate = calibration.base_T_camera
     predicted = estimate.transform.apply(np.array([t.seen for t in params.touches]))
@@ -66,8 +69,19 @@ def verify_touch(calibration: HandEye, params: TouchParams) -> Verification:
         "explained": float(np.mean(squares <= chi2_quantile(0.95, 3))),
     }
     per_point = {f"touch {i + 1}": float(length) for i, length in enumerate(lengths)}
+    if journal:
+        journal("comparison", _compared(errors))
     passed = figures["max"] <= params.max_error
     return Verification(passed, _told(figures, params.max_error, passed), figures, per_point)
+
+
+def _compared(errors: Floats) -> dict[str, object]:
+    """Return errors (N, 3) to be drawn: one that all points share is the matrix, or the tip."""
+    series = {
+        f"along {axis}": [[i + 1, 1e3 * float(x)] for i, x in enumerate(errors[:, column])]
+        for column, axis in enumerate("xyz")
+    }
+    return {"x": "point", "y": "predicted less actual [mm]", "series": series}
 
 
 def _touched(touch: Touch, tip: tuple[float, float, float]) -> Floats:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from flangeye.models.finger import Finger
+from flangeye.types import Floats
+from flangeye_plugins.weld.body import Body
+from flangeye_plugins.weld.joint import Joint, joint_of
 from flangeye_plugins.weld.settings import Following
 
 LIMIT = 4.0
@@ -20,7 +25,21 @@ UNCALIBRATED = (1000.0, 2000.0)
 CREEP = 0.02
 """Share of a displacement by which a finger creeps, one standard deviation."""
 
+STEEP = 0.35
+"""A tip that climbs rises along its wall, at least at this share of the planned slope."""
+
+NEARLY_UPRIGHT = math.radians(1.0)
+"""A wall that leans by less is as good as upright: nothing climbs it."""
+
 MINUTE = 60.0
+
+FLAT = math.radians(60.0)
+"""A wall that leans by more does not hold the tip when the tool is moved against it."""
+
+BALL_SIGMA = 0.02e-3
+"""Standard deviation of the radius of the tip's ball [m]."""
+
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -28,15 +47,18 @@ class Belief:
     """Tool, finger and joint as the files have them.
 
     Attributes:
-        distance: From the torch to the tip [m].
+        distance: From the torch to the tip, seen from above [m].
         lateral: Stiffness across the finger [N/m].
         axial: Stiffness along the finger [N/m].
-        half_angle: Half angle of the joint's walls [rad]; None where it is not known.
+        half_angle: Of the joint's walls from their bisector [rad]; None where it is not known.
         noise: Standard deviations of one measurement across and up [m].
         torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
         along_sigma: Standard deviation of the distance from the torch to the tip [m].
         tip_sigma: Standard deviation of the tip in the flange, along each axis [m].
         two_walls: Whether there is a wall on the other side too.
+        lean: Of the walls' bisector from the plane's normal, to the left [rad].
+        radius: Of the tip's ball [m].
+        level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.body`.
     """
 
     distance: float
@@ -48,37 +70,110 @@ class Belief:
     along_sigma: float = 0.3e-3
     tip_sigma: float = 0.1e-3
     two_walls: bool = True
+    lean: float = 0.0
+    radius: float = 1.5e-3
+    level_R_tool: tuple[tuple[float, ...], ...] = UPRIGHT
+
+    @property
+    def joint(self) -> Joint | None:
+        """The walls, where they are known."""
+        return None if self.half_angle is None else Joint(self.half_angle, self.lean)
+
+    @property
+    def beside(self) -> float:
+        """How far to the left of the seam the tip is when it touches both walls [m]."""
+        return 0.0 if self.joint is None else self.joint.seat(self.radius)[0]
+
+    def set_down(self, settings: Following) -> float:
+        """Return how far to the left of the plan the tip is set down [m].
+
+        Where one wall alone stands upright it comes down on the other side of the seam.
+        """
+        side = 1.0 if settings.side == "left" else -1.0
+        return 0.0 if self.two_walls else self.beside - side * settings.reach / 2.0
+
+    def pressing(self, settings: Following) -> Floats:
+        """Return the forces per deflection and preload (2, 2) [N/m].
+
+        Rows: towards the pressed wall, into the joint. The tip is free to slide along the seam.
+        """
+        side = 1.0 if settings.side == "left" else -1.0
+        axes = np.array(self.level_R_tool)
+        stiff = axes @ np.diag([self.lateral, self.lateral, self.axial]) @ axes.T
+        free = stiff[1:, 1:] - np.outer(stiff[1:, 0], stiff[0, 1:]) / stiff[0, 0]
+        facing = np.diag([side, -1.0])
+        return np.asarray(facing @ free @ facing)
+
+    def flat(self, side: float) -> float:
+        """Return how far a tip goes aside that climbs the wall on a side by one."""
+        if self.joint is None:
+            return 1.0
+        return math.tan(max(self.joint.left if side > 0 else self.joint.right, NEARLY_UPRIGHT))
 
     def seating(self, settings: Following) -> float | None:
         """Return by how much the preload outweighs the deflection on a wall; below 1 it climbs.
 
-        Axial stiffness times preload times cot(half angle), over lateral stiffness times
-        deflection; friction helps and is left out. None where the half angle is not known.
+        The force into the joint over the one that pushes up the pressed wall; upright that is
+        axial stiffness times preload times cot(half angle), over lateral stiffness times
+        deflection. Friction helps and is left out. None where the half angle is not known.
         """
-        if self.half_angle is None:
+        if self.joint is None:
             return None
-        holding = self.axial * settings.preload / math.tan(self.half_angle)
-        return holding / (self.lateral * settings.deflection)
+        aside, into = self.pressing(settings) @ [settings.deflection, settings.preload]
+        return float(into / max(aside * self._steepness(settings), 1e-9))
 
     def sliding(self, settings: Following) -> float:
         """Return the deflection that friction alone can give on a face [m]."""
-        return settings.friction * self.axial * settings.preload / self.lateral
+        forces = self.pressing(settings)
+        return float(settings.friction * forces[1, 1] * settings.preload / forces[0, 0])
+
+    def reaching(self, settings: Following) -> float:
+        """Return by how much the deflection outweighs the friction on a flat wall."""
+        aside, into = self.pressing(settings) @ [settings.deflection, settings.preload]
+        return float(aside / max(settings.friction * into, 1e-9))
+
+    def remedy(self, settings: Following, share: float) -> tuple[float, float]:
+        """Return a deflection, and instead of it a preload [m], that seat the tip by a share."""
+        forces, wall = self.pressing(settings), share * self._steepness(settings)
+        per_deflection = wall * forces[0, 0] - forces[1, 0]
+        per_preload = forces[1, 1] - wall * forces[0, 1]
+        ratio = float(per_deflection / per_preload)
+        return settings.preload / ratio, settings.deflection * ratio
 
     def fixed_variance(self, settings: Following) -> float:
         """Return the variance of the torch that nothing measured along the seam lessens [m^2]."""
         creep = CREEP * settings.deflection
         parts = (self.torch_sigma, settings.arm_sigma, settings.distortion, creep)
-        return sum(part**2 for part in parts)
+        return sum(part**2 for part in parts) + self._seat_variance(settings)
+
+    def _seat_variance(self, settings: Following) -> float:
+        """Return the variance of where the tip rests in a joint whose walls lean differently."""
+        if self.joint is None or not self.lean:
+            return 0.0
+        walls = settings.joint_sigma * self.joint.seat_slope(self.radius)
+        return float(2.0 * walls**2 + (BALL_SIGMA * self.beside / self.radius) ** 2)
+
+    def _steepness(self, settings: Following) -> float:
+        """Return the tangent of the pressed wall's angle from the plane's normal; 0 if unknown."""
+        lean = self.lean if settings.side == "left" else -self.lean
+        return 0.0 if self.half_angle is None else max(math.tan(self.half_angle + lean), 0.0)
 
 
-def belief_of(finger: Finger, half_angle: float | None, settings: Following) -> Belief:
-    """Return what a finger's file and the plan say."""
+def belief_of(finger: Finger, body: Body, half_angle: float | None, settings: Following) -> Belief:
+    """Return what a finger's file, the tool's stand and the plan say."""
     known = finger.calibration
     lateral, axial = UNCALIBRATED
     if known is not None and known.lateral is not None and known.axial is not None:
         lateral, axial = known.lateral, known.axial
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
+    radius = settings.tip_radius or finger.radius
+    side = 1.0 if settings.side == "left" else -1.0
+    joint = joint_of(settings.joint, half_angle, side, radius, settings.root_gap)
+    other = None if joint is None else joint.right if side > 0 else joint.left
     return Belief(
-        finger.torch, lateral, axial, half_angle, noise, finger.torch_sigma, finger.along_sigma,
-        finger.tip_sigma, settings.joint in ("groove", "butt"),
+        body.distance, lateral, axial, None if joint is None else joint.half_angle, noise,
+        finger.torch_sigma, finger.along_sigma, finger.tip_sigma,
+        bool(other is None or other < FLAT),
+        0.0 if joint is None else joint.lean, radius,
+        tuple(tuple(row) for row in body.level_R_tool.tolist()),
     )  # fmt: skip

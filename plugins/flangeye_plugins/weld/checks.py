@@ -11,10 +11,12 @@ from flangeye.models.finger import Finger
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import LIMIT, Belief
+from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.controller import Controller, SimulationOnly
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.weave import Weave
 
 LEAN = np.deg2rad(15.0)
 """The groove's opening may lean from the plane's normal by this much; the tool stays upright."""
@@ -25,6 +27,9 @@ SLOPE = np.deg2rad(10.0)
 CROOKED = np.deg2rad(60.0)
 """Largest angle between the tool and the seam at the torch: beyond, it would be pushed."""
 
+
+SWINGING = 0.8
+"""Share of the turn rate that a weave may use; the rest follows the seam."""
 
 SEATING = 1.4
 """The preload holds the tip in the groove by so much more than the deflection pushes it out."""
@@ -63,20 +68,24 @@ def check_controller(controller: Controller, driver: RobotDriver) -> None:
         )
 
 
+def check_tool(body: Body, belief: Belief, settings: Following) -> None:
+    """Refuse a tool that cannot hold its tip, know its torch, reach the seam or swing as asked.
+
+    Raises:
+        StageError: Which, and what would do.
+    """
+    check_belief(belief, settings)
+    check_body(body, belief, settings)
+    check_weave(body.distance, settings)
+
+
 def check_belief(belief: Belief, settings: Following) -> None:
     """Refuse a tip that would climb its wall, and a torch that is not known well enough.
 
     Raises:
         StageError: Which, and what would do.
     """
-    holding = belief.seating(settings)
-    if holding is not None and holding < SEATING:
-        raise StageError(
-            "weld.tactile: the tip would climb the wall: the preload holds it with "
-            f"{holding:.2f} times what the deflection pushes with, {SEATING} is asked for; lower "
-            f"'deflection' to {settings.deflection * holding / SEATING * 1e3:.2f} mm or raise "
-            f"'preload' to {settings.preload * SEATING / holding * 1e3:.1f} mm"
-        )
+    _check_seat(belief, settings)
     bound = LIMIT * float(np.sqrt(belief.fixed_variance(settings)))
     if bound > settings.max_error:
         raise StageError(
@@ -86,7 +95,66 @@ def check_belief(belief: Belief, settings: Following) -> None:
         )
 
 
-def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> None:
+def _check_seat(belief: Belief, settings: Following) -> None:
+    """Refuse a tip that would not lie where the joint's two walls meet."""
+    if settings.joint == "butt" and belief.joint is None:
+        raise StageError(
+            "weld.tactile: a butt joint with square edges is felt by a ball that rests on both: "
+            f"set 'root_gap', less than {2e3 * belief.radius:.3g} mm for a ball of radius "
+            f"{1e3 * belief.radius:.3g} mm, or take a larger tip; a prepared one is joint: groove"
+        )
+    holding = belief.seating(settings)
+    if holding is not None and holding < SEATING:
+        deflection, preload = belief.remedy(settings, SEATING)
+        raise StageError(
+            "weld.tactile: the tip would climb the wall: the preload holds it with "
+            f"{holding:.2f} times what the deflection pushes with, {SEATING} is asked for; lower "
+            f"'deflection' to {deflection * 1e3:.2f} mm or raise "
+            f"'preload' to {preload * 1e3:.1f} mm"
+        )
+    reaching = belief.reaching(settings)
+    if not belief.two_walls and reaching < SEATING:
+        raise StageError(
+            "weld.tactile: friction may hold the tip off the wall: the deflection pushes with "
+            f"{reaching:.2f} times what the plate holds it with, {SEATING} is asked for; raise "
+            "'deflection', lower 'preload', or lean the tool less ('work_angle')"
+        )
+
+
+def check_body(body: Body, belief: Belief, settings: Following) -> None:
+    """Refuse a tool that leans so that its torch is far above the seam, or below it.
+
+    Raises:
+        StageError: How far, and what would do.
+    """
+    above = float(body.torch[2]) + (belief.joint.seat(belief.radius)[1] if belief.joint else 0.0)
+    if abs(above) > settings.torch_height:
+        raise StageError(
+            f"weld.tactile: as the tool leans its torch is {above * 1e3:+.1f} mm above the seam, "
+            f"allowed are {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', set "
+            "torch_up in the finger's file to where the torch's end is, or raise 'torch_height'"
+        )
+
+
+def check_weave(distance: float, settings: Following) -> None:
+    """Refuse a weave for which the tool would have to turn faster than it may.
+
+    Raises:
+        StageError: How fast, and what would do.
+    """
+    weave = Weave(settings.weave_width, settings.weave_frequency)
+    asked, allowed = weave.fastest / distance, SWINGING * settings.turn_rate
+    if asked > allowed:
+        raise StageError(
+            f"weld.tactile: a weave of {weave.width * 1e3:.3g} mm at "
+            f"{weave.frequency:.3g} Hz turns the tool at {np.degrees(asked):.0f} deg/s, "
+            f"{SWINGING:.0%} of turn_rate are {np.degrees(allowed):.0f} deg/s; lower "
+            f"'weave_frequency' to {weave.frequency * allowed / asked:.2f}, or raise "
+            "'turn_rate'"
+        )
+
+
+def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> None:
     """Refuse a seam that this tool cannot follow.
 
     Raises:
@@ -110,10 +178,10 @@ def check_seam(seam: Seam, plan: Path, finger: Finger, settings: Following) -> N
             f"(allowed {np.degrees(SLOPE):.0f}), its opening turns by {np.degrees(lean):.0f} deg "
             f"(allowed {np.degrees(LEAN):.0f}); the tool is not tilted on the way"
         )
-    crooked = float(np.abs(tool_angles(plan, finger.torch)).max())
+    crooked = float(np.abs(tool_angles(plan, distance)).max())
     if crooked > CROOKED:
         raise StageError(
-            f"weld.tactile: the seam is too curved for a torch {finger.torch * 1e3:.0f} mm behind "
+            f"weld.tactile: the seam is too curved for a torch {distance * 1e3:.0f} mm behind "
             f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
             f"{np.degrees(CROOKED):.0f}"
         )

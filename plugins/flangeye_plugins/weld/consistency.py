@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 
 from flangeye.types import Floats
+from flangeye_plugins.weld.belief import STEEP
 
 NEWEST = 5
 """Samples that are judged together: never one alone."""
@@ -20,11 +22,11 @@ ASIDE = 0.35e-3
 LIFTED = 3e-3
 """A tip that is lifted by this is not in the groove any more; a tack weld lifts it less [m]."""
 
-STEEP = 0.35
-"""A tip that climbs rises along its wall, at least at this share of the planned slope."""
+PLANNED = (0.02, 0.01)
+"""A plan is wrong by these slopes, aside and up; what leaves it faster may be a tip that climbs."""
 
-SURE = 5.0
-"""Standard deviations of what is judged."""
+LIKELY, SURE = 2.0, 5.0
+"""Standard deviations of what is judged, to reckon with it and to stop for it."""
 
 
 class Seating:
@@ -32,16 +34,28 @@ class Seating:
 
     A seated tip may wander aside with the seam, or be lifted by a tack weld; both at once, towards
     the wall that it presses, is climbing.
+
+    Attributes:
+        doubt: How far aside the tip may have climbed, too little to be sure of it [m].
     """
 
-    def __init__(self, side: float, half_angle: float | None) -> None:
-        self._side = side
-        self._steep = STEEP / np.tan(np.pi / 4 if half_angle is None else half_angle)
+    def __init__(self, side: float, flat: float) -> None:
+        """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
+        self._side, self.doubt = side, 0.0
+        self._flat = flat
         self._samples: deque[tuple[float, float, float]] = deque()
+        self._newest: deque[tuple[float, float, float]] = deque(maxlen=NEWEST)
+        self._seated: deque[tuple[float, float, float]] = deque()
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
+        self.doubt = 0.0
         self._samples.clear()
+        self._newest.clear()
+
+    def seated(self, s: float, offset: float, height: float) -> None:
+        """Take a sample of a tip that is known to be seated; see :meth:`judge`."""
+        self._seated.append((s, offset, height))
 
     def judge(self, s: float, offset: float, height: float) -> str | None:
         """Take a sample; return what is wrong.
@@ -51,17 +65,21 @@ class Seating:
             offset: Distance of the tip to the left of the plan [m].
             height: Above the plan's [m].
         """
+        self._newest.append((s, offset, height))
         self._samples.append((s, offset, height))
         while s - self._samples[0][0] > BEFORE[1]:
             self._samples.popleft()
-        samples = np.array(self._samples)
-        before = samples[samples[:, 0] < s - BEFORE[0]]
+        newest, before = np.array(self._newest), self._before(self._samples, s)
+        self._seated.append((s, offset, height))
+        known = self._before(self._seated, s)
+        if len(known) >= 2 * NEWEST:
+            self._doubt_newest(*_newest_from(known, newest, PLANNED))
         if len(before) < 2 * NEWEST:
             return None
-        aside, lifted = _newest_from(before, samples[-NEWEST:])
+        aside, lifted = _newest_from(before, newest)
         if lifted[0] > LIFTED + SURE * lifted[1]:
             return f"the tip is lifted out of the groove by {lifted[0] * 1e3:.1f} mm"
-        climbed = max(self._steep * abs(aside[0]), SURE * lifted[1])
+        climbed = max(STEEP * abs(aside[0]) / self._flat, SURE * lifted[1])
         if self._side * aside[0] > ASIDE + SURE * aside[1] and lifted[0] > climbed:
             return (
                 f"the tip climbs the wall: {abs(aside[0]) * 1e3:.1f} mm aside, "
@@ -69,13 +87,36 @@ class Seating:
             )
         return None
 
+    def _before(self, samples: Iterable[tuple[float, float, float]], s: float) -> Floats:
+        """Return the samples (K, 3) that lie behind the tip."""
+        near = [sample for sample in samples if BEFORE[0] < s - sample[0] < BEFORE[1]]
+        return np.array(near).reshape(-1, 3)
 
-def _newest_from(before: Floats, newest: Floats) -> tuple[tuple[float, float], ...]:
-    """Return how far aside and up the newest are from a line, each with its sigma [m]."""
+    def _doubt_newest(self, aside: tuple[float, float], lifted: tuple[float, float]) -> None:
+        """Note how far the tip may have climbed; later ones are held against an unlifted tip."""
+        towards, up = self._side * aside[0], lifted[0]
+        likely = towards > LIKELY * aside[1] and up > LIKELY * lifted[1]
+        self.doubt = min(towards, up * self._flat / STEEP) if likely else 0.0
+        if up > SURE * lifted[1]:  # lower ones would bend the line by their noise alone
+            s, offset, height = self._seated[-1]
+            self._seated[-1] = s, offset - self._side * self.doubt, height - up
+
+
+def _newest_from(
+    before: Floats, newest: Floats, steepest: tuple[float, float] = (np.inf, np.inf)
+) -> tuple[tuple[float, float], ...]:
+    """Return how far aside and up the newest are from a line, each with its sigma [m].
+
+    Args:
+        before: (K, 3) rows of arc length, offset and height that the line goes through [m].
+        newest: (M, 3) the same.
+        steepest: Largest slopes of the line against the plan, aside and up.
+    """
     middle = before.mean(axis=0)
     from_middle = before - middle
     along = from_middle[:, 0]
     slopes = along @ from_middle[:, 1:] / max(float(along @ along), 1e-18)
+    slopes = np.clip(slopes, -np.array(steepest), steepest)
     left = from_middle[:, 1:] - along[:, None] * slopes
     newest_from = newest.mean(axis=0) - middle
     off = newest_from[1:] - newest_from[0] * slopes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Literal
 
 State = Literal["seeking", "held", "lost"]
@@ -62,3 +63,50 @@ class Contact:
             weight = 1.0 - math.exp(-(time - self._time) / SMOOTHING)
             self.deflection += weight * (deflection - self.deflection)
         self._time = time
+
+
+LEANING = 0.1e-3
+"""A tip that is let go of and is displaced by more is held by a wall [m]."""
+
+NEWEST = 5
+"""Measurements that are judged together: never one alone."""
+
+SURE = 4.0
+"""Standard deviations of their mean by which it has to exceed a threshold."""
+
+
+class Release:
+    """Whether the tip is still between the walls while it is let go of.
+
+    Where the robot is, and what was felt before, say by how much it should be deflected. When it is
+    not, its wall is gone; when it is deflected to the other side, the other wall holds it, whatever
+    was expected.
+
+    Attributes:
+        loose: Whether what the tip does says nothing of the seam.
+        other: Whether the other wall holds it.
+    """
+
+    def __init__(self, two_walls: bool) -> None:
+        self.loose = self.other = False
+        self._two_walls = two_walls
+        self._newest: deque[tuple[float, float]] = deque(maxlen=NEWEST)
+
+    def judge(self, deflection: float, expected: float, sigma: float) -> None:
+        """Take a measurement and what was expected of it, towards the pressed wall [m].
+
+        Args:
+            deflection: As measured.
+            expected: If the seam is where it was felt to lead.
+            sigma: Standard deviation of one measurement.
+        """
+        self._newest.append((deflection, expected))
+        if len(self._newest) < NEWEST:
+            return
+        deflection, expected = (sum(column) / NEWEST for column in zip(*self._newest, strict=True))
+        least = LEANING + SURE * sigma / math.sqrt(NEWEST)
+        self.other = self._two_walls and deflection < -least
+        if self.other:
+            self.loose = False
+        elif expected > least and deflection < LOST * expected:
+            self.loose = True

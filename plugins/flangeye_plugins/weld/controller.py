@@ -9,7 +9,10 @@ import numpy as np
 
 from flangeye_plugins.weld.motion import Command, ToolPose, Touch
 
-Phase = Literal["seeking", "probing", "following", "bridging", "ending", "done", "stopped"]
+Phase = Literal[
+    "seeking", "probing", "following", "bridging", "ending", "returning", "passing", "done",
+    "stopped",
+]  # fmt: skip
 
 STILL = Command(np.zeros(3), 0.0)
 

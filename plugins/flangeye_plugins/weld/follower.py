@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
 from flangeye_plugins.weld.consistency import Seating
-from flangeye_plugins.weld.contact import LOST, Contact
+from flangeye_plugins.weld.contact import Contact, Release
 from flangeye_plugins.weld.controller import STILL, Phase
 from flangeye_plugins.weld.motion import Command, Felt, ToolPose, Touch, Track, turned
 from flangeye_plugins.weld.path import Path
@@ -21,6 +21,7 @@ from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.search import Search
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
+from flangeye_plugins.weld.weave import Sway, Weave
 
 BELIEF = 0.3
 """A sample is believed when contact has not been doubted for so long after it [s]."""
@@ -36,9 +37,6 @@ STEADY = 0.03e-3
 
 PLAYED = 1.0
 """Share of the finger's play and hysteresis that stays uncertain, one standard deviation."""
-
-LEANING = 0.1e-3
-"""A tip that must be deflected by more, and is not, has lost its wall at the seam's end [m]."""
 
 FIRM = 0.7
 """Share of the wanted deflection below which the tip slows down."""
@@ -67,7 +65,7 @@ class Kept:
     """What a stopped weld leaves to who goes on with it.
 
     Attributes:
-        samples: (K, 4) what was felt; see :meth:`RefinedPath.samples`.
+        samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
         torch: Arc length of the torch's progress [m].
     """
 
@@ -91,6 +89,7 @@ class Follower:
         sigma: Standard deviation of the torch's place across the seam [m].
         bound: What the torch's distance from the seam does not exceed [m].
         band: The same for 95 % of the seam [m].
+        aim: How far to the left of the seam the torch is to be [m].
         lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
     """
 
@@ -115,8 +114,9 @@ class Follower:
         self.phase: Phase = "seeking" if touch else "following"
         self.reason = ""
         self.tip, self.torch = settings.inset, settings.inset - belief.distance
+        self._coming = self.torch
         self.wanted = 0.0
-        self.refined = RefinedPath(plan, belief.distance + settings.ending)
+        self.refined = RefinedPath(plan, belief.distance + settings.ending, settings.wander)
         self._before = before
         if before is not None:
             self.refined.recall(before.samples)
@@ -127,20 +127,24 @@ class Follower:
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
         self._belief, self.learned = belief, Learned()
         self.sigma = self.bound = self.band = 0.0
+        self.aim = self._offset = settings.offset_across
+        self._weave = Weave(settings.weave_width, settings.weave_frequency)
+        self._swings: float | None = None
         self.lit: float | None = None
         self.side = 1.0 if settings.side == "left" else -1.0
         self._track = Track()
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
-        self._loose, self._latency = False, 0.0
+        self._release, self._latency = Release(belief.two_walls), 0.0
         self._place = plan.at(self.tip)
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
-        self._seating = Seating(self.side, belief.half_angle)
+        self._seating = Seating(self.side, belief.flat(self.side))
+        self._level = np.array(belief.level_R_tool)
         self._response = Response()
         self._elapsed = self._began = 0.0
-        self._newest: tuple[ToolPose, Touch] | None = None
+        self._swept: list[tuple[ToolPose, Touch]] = []
 
     def kept(self) -> Kept | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
@@ -154,26 +158,42 @@ class Follower:
         self._track.add(pose)
         for touch in touches:
             if self._touching and touch.time > self._seen:
-                self._feel(touch)
+                self._feel(Touch(touch.time, self._level @ touch.displacement))
         coming = self._response.ahead(pose)
         self._judge(coming)
         waiting = self.phase == "seeking" and self._search.resting
         if self.phase in ("done", "stopped") or self._felt is None or waiting:
             return STILL
-        command = self._probe(pose) if self.phase == "probing" else self._lead(coming)
+        command = self._probe(pose) if self.phase == "probing" else self._lead(pose, coming)
         self._response.told(pose.time, command)
         return command
 
-    def _lead(self, pose: ToolPose) -> Command:
-        """Return the command that leads the tip along the seam and the torch behind it."""
+    def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:
+        """Return the command that leads the tip along the seam and the torch behind it.
+
+        Args:
+            pose: Where the tool is.
+            coming: Where it will be when it has done all it was told.
+        """
         self._ramp(self._elapsed)
-        self._progress(pose)
-        point, normal = self.refined.frame(self.torch)
-        velocity = self._velocity(pose, self._pace(pose, normal))
-        error = float((self._torch_position(pose) - point) @ normal)
-        self._estimate(error, float(pose.direction @ normal), pose.angle)
-        turn = self._steering.turn(velocity[:2], pose.direction, normal, error)
+        self._progress(pose, coming)
+        point, normal = self.refined.frame(self._coming)
+        velocity = self._velocity(coming, self._pace(coming, normal))
+        sway = self._swayed(coming.time)
+        there = float((self._torch_position(coming) - point) @ normal)
+        error = there - self._offset - sway.aside
+        self._estimate(pose)
+        turn = self._steering.turn(velocity[:2], coming.direction, normal, error, sway.rate)
         return Command(velocity, turn if velocity[:2].any() else 0.0)
+
+    def _swayed(self, now: float) -> Sway:
+        """Return the swing to command, for the arm to be on it; note where it is to be now."""
+        dead, lag = self._response.dead_time, self._response.lag
+        if self._swings is None and self._coming >= max(self._settings.offset_along, 0.0):
+            self._swings = now + dead
+        elapsed = -1.0 if self._swings is None else now - self._swings
+        self.aim = self._offset + self._weave.at(elapsed).aside
+        return self._weave.at(elapsed + dead).led(lag)
 
     def _probe(self, pose: ToolPose) -> Command:
         """Return the next piece of the sweep."""
@@ -181,19 +201,20 @@ class Follower:
         self._probing.note(pose.time, speed, self._lateral(pose))
         return Command(np.array([*(speed * self._place.normal), 0.0]), 0.0)
 
-    def _estimate(self, error: float, slant: float, angle: float) -> None:
-        """Estimate how far the torch may be from the seam, and stop where that is too far.
-
-        Args:
-            error: Error of the torch from the refined path [m].
-            slant: Sine of the angle between the tool and the path.
-            angle: Of the tool [rad].
-        """
+    def _estimate(self, pose: ToolPose) -> None:
+        """Estimate how far the torch may be from the seam now, and stop where that is too far."""
         if not self._touching:
             return
-        self.sigma = float(np.sqrt(self._variance(slant, angle)))
-        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
-        if self.phase == "seeking" or not 0.0 <= self.torch <= self._plan.length:
+        point, normal = self.refined.frame(self.torch)
+        error = abs(float((self._torch_position(pose) - point) @ normal) - self.aim)
+        error += self.refined.doubt(self.torch)
+        self.sigma = math.sqrt(self._variance(float(pose.direction @ normal), pose.angle))
+        self.band, self.bound = error + BAND * self.sigma, error + LIMIT * self.sigma
+        welds_from = max(self._settings.offset_along, 0.0)
+        if (
+            self.phase in ("seeking", "probing")
+            or not welds_from <= self.torch <= self._plan.length
+        ):
             return
         if self.bound <= self._settings.max_error:
             self.lit = self.torch if self.lit is None else self.lit
@@ -203,7 +224,12 @@ class Follower:
             self._stop("the torch was not on the seam again where it had stopped; raise 'overlap'")
 
     def _variance(self, slant: float, angle: float) -> float:
-        """Return the variance of the torch's place across the seam [m^2]."""
+        """Return the variance of the torch's place across the seam [m^2].
+
+        Args:
+            slant: Sine of the angle between the tool and the path.
+            angle: Of the tool [rad].
+        """
         settings, learned = self._settings, self.learned
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
@@ -215,7 +241,8 @@ class Follower:
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
         turned_by = 2.0 * math.sin((angle - self.refined.angle(self.torch, angle)) / 2.0)
         tip = (self._belief.tip_sigma * turned_by) ** 2
-        return fixed + gain**2 + play + waves + tip + self.refined.variance(self.torch)
+        felt = self.refined.variance(self.torch) + self._weave.variance
+        return fixed + gain**2 + play + waves + tip + felt
 
     # --- what the finger says -------------------------------------------------------------------
 
@@ -238,7 +265,7 @@ class Follower:
             moved = turned(touch.displacement - self._search.rest, pose.angle)
             along = float(moved[:2] @ self._place.tangent)
             self._probing.feel(touch.time, -self.side * deflection, felt.height, along)
-            self._newest = pose, touch
+            self._swept.append((pose, touch))
         else:
             self._believe(touch.time, s, felt, deflection, pose.angle)
 
@@ -247,15 +274,26 @@ class Follower:
         tip = pose.position + turned(self._corrected(touch.displacement), pose.angle)
         s = self._plan.foot(tip[:2], self.tip)
         place = self._plan.at(s)
-        felt = Felt(float((tip[:2] - place.point) @ place.normal), float(tip[2]) - place.height)
+        beside = float((tip[:2] - place.point) @ place.normal) - self._belief.beside
+        felt = Felt(beside, float(tip[2]) - place.height)
         return s, felt, self.side * float((pose.position - tip)[:2] @ place.normal)
 
     def _corrected(self, displacement: Floats) -> Floats:
         """Return a displacement (3,) without what the finger's rest, gain and play add to it."""
         moved = displacement - self._search.rest
-        play = np.array([0.0, self.side * self.learned.width, 0.0])
-        gain = np.array([1.0 + self.learned.gain, 1.0 + self.learned.gain, 1.0])
+        play = np.array([0.0, self.side * self.learned.width * self._pressing(), 0.0])
+        across = 1.0 + self.learned.gain
+        # The sweep measures the gain across. That upwards is its like; where it is not, the
+        # preload errs towards pressing harder, which holds the tip in its groove.
+        gain = np.array([across, across, max(across, 1.0)])
         return np.asarray((moved - play) / gain)
+
+    def _pressing(self) -> float:
+        """Return on which side of its play the finger is: 1 pressed, -1 let go of, and between."""
+        width = abs(self.learned.width)
+        if self.phase != "ending" or not width:
+            return 1.0
+        return 1.0 - min((self._settings.deflection - self.wanted) / width, 2.0)
 
     def _smoothed(self, felt: Felt) -> Felt:
         """Return a mean over as many measurements as their scatter asks for."""
@@ -269,25 +307,28 @@ class Follower:
         )
 
     def _believe(self, time: float, s: float, felt: Felt, deflection: float, angle: float) -> None:
-        """Keep what the tip felt, unless contact is doubtful.
+        """Keep what the tip felt, unless contact is doubtful."""
+        if not self._tells(s, felt, deflection):
+            return
+        if self.phase == "following" and self.contact.doubted(deflection, self.wanted):
+            return
+        settled = time - self.contact.since > BELIEF
+        if settled and s < self._plan.length - self._settings.ending / 2:
+            self._felt = self._smoothed(felt)
+            self._compare(s, felt.offset)
+            self._watch(s, felt)
+            self.refined.add(time, s, felt.offset, angle, self._seating.doubt)
+        self.refined.confirm(time - BELIEF)
 
-        A finger with play is not believed while it is let go of: the tag is then on the other side.
-        """
+    def _tells(self, s: float, felt: Felt, deflection: float) -> bool:
+        """Return whether a wall holds the tip, so that it tells where the seam is."""
         if self.phase == "ending":
             self._notice_loss(s, felt, deflection)
-            if self._loose:
-                return
-        released = self.phase == "ending" and abs(self.learned.width) <= STEADY
-        if released or (self.phase == "following" and self.contact.state == "held"):
-            if self.phase == "following" and self.contact.doubted(deflection, self.wanted):
-                return
-            settled = time - self.contact.since > BELIEF
-            if settled and s < self._plan.length - self._settings.ending / 2:
-                self._felt = self._smoothed(felt)
-                self._compare(s, felt.offset)
-                self.refined.add(time, s, felt.offset, angle)
-                self._watch(s, felt)
-            self.refined.confirm(time - BELIEF)
+            return not self._release.loose
+        if self.phase == "bridging":  # the wall is gone, or turned away; there is another one
+            self._release.judge(deflection, 0.0, self.refined.noise)
+            return self._release.other and deflection < 0.0
+        return self.phase == "following" and self.contact.state == "held"
 
     def _compare(self, s: float, offset: float) -> None:
         """Stop where the seam is not where it was felt before the weld was stopped."""
@@ -311,15 +352,12 @@ class Follower:
             self._stop(wrong)
 
     def _notice_loss(self, s: float, felt: Felt, deflection: float) -> None:
-        """Notice that the wall is gone while the tip is let go of: it then goes with the robot.
-
-        What it should be deflected by follows from where the robot is and what was felt before.
-        """
+        """Notice that the wall is gone while the tip is let go of: it then goes with the robot."""
         if self.refined.empty:
             return
         expected = deflection + self.side * (felt.offset - self.refined.offset(s))
-        if expected > LEANING and deflection < LOST * expected:
-            self._loose = True
+        self._release.judge(deflection, expected, self.refined.noise)
+        if self._release.loose:
             self.refined.forget_pending()
 
     # --- what follows from it -------------------------------------------------------------------
@@ -367,13 +405,14 @@ class Follower:
         self._response.dead_time, self._response.lag = found.dead_time, found.lag
         self.refined.noise = max(found.noise, float(self._search.sigma[1]))
         self._began = self._time or 0.0
-        if self._newest is not None:
-            _, self._felt, self.wanted = self._located(*self._newest)
-            self.contact.hold(self._seen, self.wanted)
+        for pose, touch in self._swept:
+            s, self._felt, self.wanted = self._located(pose, touch)
+            self._seating.seated(s, self._felt.offset, self._felt.height)
+        self.contact.hold(self._seen, self.wanted)
         self._enter("following")
 
     def _enter(self, phase: Phase) -> None:
-        self._loose = phase == "ending" and self.phase == "bridging"
+        self._release.loose = phase == "ending" and self.phase == "bridging"
         self.phase = phase
 
     def _refuse(self, pose: ToolPose, settings: Following) -> None:
@@ -415,11 +454,12 @@ class Follower:
         step = rate * elapsed
         self.wanted += _within(target - self.wanted, step)
 
-    def _progress(self, pose: ToolPose) -> None:
-        reach = self._settings.speed * 0.1
-        self.tip = self._plan.advance(pose.position[:2], self.tip, reach)
+    def _progress(self, pose: ToolPose, coming: ToolPose) -> None:
+        advance, reach = self._plan.advance, self._settings.speed * 0.1
+        self.tip = advance(coming.position[:2], self.tip, reach)
         self._place = self._plan.at(self.tip)
-        self.torch = self._plan.advance(self._torch_position(pose), self.torch, reach)
+        self._coming = advance(self._torch_position(coming), self._coming, reach)
+        self.torch = advance(self._torch_position(pose), self.torch, reach)
 
     def _torch_position(self, pose: ToolPose) -> Floats:
         """Return P_t (2,), equation (12)."""
@@ -481,9 +521,9 @@ class Follower:
         return _within(self.refined.slope(self.tip), 1.0)
 
     def _lateral(self, pose: ToolPose) -> float:
-        """Return how far the end point is to the left of the plan [m]."""
+        """Return how far the end point is to the left of where a seated tip is planned [m]."""
         place = self._place
-        return float((pose.position[:2] - place.point) @ place.normal)
+        return float((pose.position[:2] - place.point) @ place.normal) - self._belief.beside
 
     def _seam_at_tip(self) -> Felt:
         """Return the seam at the tip: as felt, or as predicted while nothing is felt."""

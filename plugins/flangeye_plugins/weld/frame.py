@@ -7,6 +7,7 @@ import numpy as np
 from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Finger
 from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.weld.body import Body, body_from
 from flangeye_plugins.weld.motion import Command, ToolPose
 
 UPRIGHT_GAIN = 1.0
@@ -44,17 +45,21 @@ class WorkPlane:
 class Tool:
     """Translates between the flange in the base and the tool in the plane."""
 
-    def __init__(self, finger: Finger, plane: WorkPlane) -> None:
+    def __init__(self, finger: Finger, plane: WorkPlane, body: Body | None = None) -> None:
+        """Take a tool that stands upright, or as its ``body`` does."""
+        body = body or body_from(finger.torch_from_tip, 0.0, 0.0)
         self._plane = plane.base_T_plane
         self._tip = np.array(finger.tip)
         self._flange_R_tool = finger.flange_R_tool
+        self._flange_R_level = finger.flange_R_tool @ body.level_R_tool.T
+        self._torch = self._tip + self._flange_R_level @ body.torch
         self._angle: float | None = None
 
     def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
         """Return the tool in the plane; its angle goes on where the last one left off."""
         plane = self._plane
         tip = plane.rotation.T @ (base_T_flange.apply(self._tip) - plane.translation)
-        ahead = plane.rotation.T @ base_T_flange.rotation @ self._flange_R_tool[:, 0]
+        ahead = plane.rotation.T @ base_T_flange.rotation @ self._flange_R_level[:, 0]
         angle = float(np.arctan2(ahead[1], ahead[0]))
         if self._angle is not None:
             angle += 2 * np.pi * round((self._angle - angle) / (2 * np.pi))
@@ -66,36 +71,35 @@ class Tool:
         """(3,) the plane's normal, out of the work, in base."""
         return self._plane.rotation[:, 2]
 
-    def lowest(self, base_T_flange: Floats, torch: float) -> float:
+    def lowest(self, base_T_flange: Floats) -> float:
         """Return how high the lower one of tip and torch is above the plane [m].
 
         Args:
             base_T_flange: (4, 4) pose of the flange.
-            torch: From the torch to the tip [m].
         """
-        in_flange = np.stack([self._tip, self._tip - torch * self._flange_R_tool[:, 0]])
+        in_flange = np.stack([self._tip, self._torch])
         in_base = in_flange @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]
         return float(((in_base - self._plane.translation) @ self.normal).min())
 
     def tilt(self, base_T_flange: Transform) -> float:
-        """Return the angle between the tool's z and the plane's [rad]."""
-        up = base_T_flange.rotation @ self._flange_R_tool[:, 2]
+        """Return the angle between the tool's level z and the plane's [rad]."""
+        up = base_T_flange.rotation @ self._flange_R_level[:, 2]
         return float(np.arccos(np.clip(up @ self._plane.rotation[:, 2], -1.0, 1.0)))
 
     def twist(self, command: Command, base_T_flange: Transform) -> Floats:
         """Return the flange's twist (6,), along the base's axes, that carries out a command."""
         normal = self._plane.rotation[:, 2]
-        up = base_T_flange.rotation @ self._flange_R_tool[:, 2]
+        up = base_T_flange.rotation @ self._flange_R_level[:, 2]
         angular = command.turn * normal + UPRIGHT_GAIN * _cross(up, normal)
         lever = -base_T_flange.rotation @ self._tip
         linear = self._plane.rotation @ command.velocity + _cross(angular, lever)
         return np.concatenate([linear, angular])
 
     def base_T_flange(self, position: Floats, angle: float) -> Transform:
-        """Return where the flange is with the tip at (3,) in the plane, and the tool upright."""
+        """Return where the flange is with the tip at (3,) in the plane, the tool as it stands."""
         c, s = np.cos(angle), np.sin(angle)
-        plane_R_tool = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        rotation = self._plane.rotation @ plane_R_tool @ self._flange_R_tool.T
+        plane_R_level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rotation = self._plane.rotation @ plane_R_level @ self._flange_R_level.T
         tip = self._plane.apply(position)
         return Transform(BASE, FLANGE, rigid(rotation, tip - rotation @ self._tip))
 

@@ -20,6 +20,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.follower import Follower, Kept
 from flangeye_plugins.weld.motion import ToolPose, Touch
+from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 
@@ -36,7 +37,15 @@ def controller_of(
     """Return the controller of the mode that was asked for."""
     if mode == "as_printed":
         return AsPrinted(plan, belief.distance, settings)
-    return Follower(plan, belief, settings, mode == "tactile", kept)
+    root = Follower(plan, belief, settings, mode == "tactile", kept)
+    return Passes(root, plan, belief, settings) if settings.passes and mode == "tactile" else root
+
+
+def follower_of(controller: Controller) -> Follower | None:
+    """Return what follows the seam by touch; of several passes the root's."""
+    if isinstance(controller, Passes):
+        return controller.root
+    return controller if isinstance(controller, Follower) else None
 
 
 def controller_from(start: Mapping[str, Any]) -> Controller:
@@ -67,11 +76,12 @@ def kept_of(log: FilePath, points: Floats) -> Kept | None:
             again = _Again(controller_from(note.value))
         elif again is not None:
             again.take(note)
-    if again is None or not isinstance(again.controller, Follower):
+    root = None if again is None else follower_of(again.controller)
+    if root is None:
         raise StageError(f"{log}: holds no weld by touch to go on with")
-    if again.controller.phase == "done":
+    if root.phase == "done":
         raise StageError(f"{log}: this weld came to its end; there is nothing to go on with")
-    return again.controller.kept()
+    return root.kept()
 
 
 class _Again:

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.belief import STEEP, Belief
 from flangeye_plugins.weld.response import identify
 from flangeye_plugins.weld.settings import Following
 
-MARGIN = 1.1
+MARGIN = 1.25
 """The sweep presses harder than the weld by this, so that the tip is known to stay seated."""
 
 ENDS = 0.75
@@ -40,6 +40,9 @@ REVERSALS = (0.02e-3, 0.1e-3, 0.2e-3, 0.4e-3, 1e-3)
 
 CLIMBED = 0.05e-3
 """A seated tip rises by less when it is pressed [m]."""
+
+UNSEEN = 0.1e-3
+"""A tip that goes along with the sweep by no more is in the stated bound [m]."""
 
 UNEXPLAINED = 0.04e-3
 """A finger whose displacement the sweep leaves unexplained by more is not understood [m]."""
@@ -68,7 +71,7 @@ class Learned:
         stamp: Timestamps are late by this [s].
         dead_time: Dead time of the arm [s].
         lag: Lag of the arm [s].
-        unexplained: rms that the model leaves [m].
+        unexplained: rms that the model leaves beyond the noise [m].
         askew: Tangent of the angle at which the walls stand to the plan.
         noise: Standard deviation of one measurement across [m].
     """
@@ -99,6 +102,7 @@ class Probing:
         self._turns = [reach, back, ENDS * settings.deflection]
         self._two_walls = belief.two_walls
         self._side, self._wanted, self._noise = side, settings.deflection, belief.noise
+        self._deflection, self._flat = settings.deflection, belief.flat(side)
         self.over, self._time = False, 0.0
         self._cycles: list[tuple[float, float, float]] = []
         self._felt: list[tuple[float, float, float, float]] = []
@@ -131,10 +135,11 @@ class Probing:
         found = self._fit(felt, cycles)
         if abs(found.gain) > LARGEST_GAIN:
             return f"the finger's gain is off by {found.gain:.0%}; calibrate it again"
-        if found.unexplained > UNEXPLAINED + CURVED * abs(found.askew) + found.noise:
+        left = math.hypot(found.unexplained, found.noise)
+        if left > UNEXPLAINED + CURVED * abs(found.askew) + found.noise:
             return (
                 "the finger's displacement is not understood: "
-                f"{found.unexplained * 1e3:.2f} mm are left unexplained by gain, play and delay"
+                f"{left * 1e3:.2f} mm are left unexplained by gain, play and delay"
             )
         if abs(found.width) > LARGEST_PLAY:
             return (
@@ -166,13 +171,13 @@ class Probing:
             stamp=float(stamps[best]),
             dead_time=dead,
             lag=lag,
-            unexplained=float(rms[best]),
+            unexplained=math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)),
             askew=askew,
             noise=noise,
         )
 
     def _climb(self, felt: Floats, cycles: Floats, found: Learned) -> str | None:
-        """Say that the tip rises where it is pressed hard."""
+        """Say that the tip rises where it is pressed hard, or that it may."""
         at = np.interp(felt[:, 0] - found.stamp, cycles[:, 0], cycles[:, 2])
         from_wall = self._side * at
         middle = from_wall.min() if not self._two_walls else (at.max() + at.min()) / 2 * self._side
@@ -183,12 +188,19 @@ class Probing:
         rise = float(hard.mean() - soft.mean())
         scatter = max(_scatter(felt[:, 2]), self._noise[1])
         sigma = scatter * float(np.sqrt(1 / len(hard) + 1 / len(soft)))
-        if rise < CLIMBED + 3 * sigma:
-            return None
-        return (
-            f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
-            "'deflection' or raise 'preload'"
-        )
+        if rise > CLIMBED + 3 * sigma:
+            return (
+                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
+                "'deflection' or raise 'preload'"
+            )
+        # A tip that climbs goes along with the arm, and so looks like a finger that shows less.
+        aside = -found.gain * MARGIN * self._deflection
+        if aside > UNSEEN and rise + 2 * sigma > STEEP * aside / self._flat:
+            return (
+                f"the finger shows {-found.gain:.0%} less than its file says, or the tip climbs "
+                "the wall, and it is too noisy to tell; calibrate it again, or raise 'preload'"
+            )
+        return None
 
 
 def _scatter(values: Floats) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -43,6 +44,7 @@ class Task:
         tool: Translates between flange and plane.
         plan: The seam.
         params: Speeds and clearances.
+        aside: How far to the left of the plan the tip is set down [m].
     """
 
     model: RobotModel
@@ -51,6 +53,7 @@ class Task:
     tool: Tool
     plan: Path
     params: WeldTactileParams
+    aside: float = 0.0
 
 
 class Station(NamedTuple):
@@ -124,9 +127,7 @@ class SeamReach:
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         task = self._task
         allowed = float(task.plan.points[:, 2].max()) + 0.9 * task.params.clearance
-        lowest = min(
-            task.tool.lowest(matrix, task.finger.torch) for matrix in self._arm.flange(postures)
-        )
+        lowest = min(task.tool.lowest(matrix) for matrix in self._arm.flange(postures))
         if lowest >= allowed:
             return None
         return Barred(
@@ -202,6 +203,10 @@ def flange_speed(finger: Finger, settings: Following) -> float:
     """Return the largest speed of the flange along a seam [m/s]."""
     lever = float(np.hypot(*finger.tip[:2]))
     going = np.linalg.norm([settings.speed, settings.lateral_speed, settings.lateral_speed])
+    if settings.passes:
+        swing = max(math.pi * one.weave_frequency * one.weave_width for one in settings.passes)
+        back = np.sqrt(2.0) * settings.return_speed
+        going = max(going, back, np.hypot(settings.speed, swing))
     return float(going) + settings.turn_rate * lever
 
 
@@ -212,7 +217,8 @@ def _stations(task: Task) -> list[Station]:
     """
     plan, params, tool = task.plan, task.params, task.tool
     start = plan.at(params.inset)
-    above = np.array([*start.point, start.height + params.clearance])
+    aside = start.point + task.aside * start.normal
+    above = np.array([*aside, start.height + params.clearance])
     count = 1 + int(np.ceil(abs(params.start_angle) / (JUMP / 2)))
     angles = _angle(start) + np.linspace(params.start_angle, 0.0, count)
     poses = [tool.base_T_flange(above + [0.0, 0.0, HIGHER], float(angles[0]))]

@@ -1,10 +1,12 @@
 """The seam as the tip felt it: the paper's refined path, kept as an offset from the plan.
 
 The plan is wrong mostly as a whole, shifted and turned, so the offset changes slowly even where
-the seam curves. Where nothing was felt (before the start, in a gap, beyond the end) the plan,
-shifted and turned onto what was felt nearby, stands in. What that leaves is a smooth field: a
-Gaussian process, whose amplitude is that of what is left and whose correlation length is the one
-that predicts each bin best from its neighbours (leave-one-out; Rasmussen and Williams 2006, 5.12).
+the seam curves. What that leaves is a smooth field: a Gaussian process of two parts. One is what a
+plan's shape is off by in any case (``wander``, over :data:`SLOW`); the other has the amplitude of
+what is left, and the correlation length of the greatest restricted likelihood. Where nothing was
+felt (before the start, in a gap, beyond the end) the shifted and turned plan and the field's
+continuation stand in. Both are found together, by generalised least squares: bins that are off
+alike are not taken for independent witnesses (Rasmussen and Williams 2006, 2.7).
 """
 
 from __future__ import annotations
@@ -25,17 +27,17 @@ BIN = 0.5e-3
 SLOPE = 1.5e-3
 """Half the length over which the path's direction is taken [m]."""
 
-REACH = 8e-3
-"""How far along the seam what is left of the fit has a say [m]."""
+BESIDE = 16
+"""Filled bins to either side that have a say in what is left of the fit: across a gap too."""
 
-LENGTHS = (1.5e-3, 3e-3, 6e-3)
-"""Correlation lengths among which the field's stiffness is chosen [m]."""
+LENGTHS = (1.5e-3, 3e-3, 6e-3, 12e-3, 24e-3)
+"""Correlation lengths among which the field's is chosen [m]."""
 
-BEYOND = 15e-3
-"""So far from what was felt the plan's shape is trusted half as well [m]."""
+SLOW = 30e-3
+"""Correlation length of what a plan's shape is off by in any case [m]."""
 
 CHOOSING = 12
-"""New bins after which the stiffness is chosen again."""
+"""New bins after which motion and field are found again."""
 
 FEW = 48
 """While fewer bins are filled, each new one counts as many."""
@@ -43,18 +45,23 @@ FEW = 48
 ZONE = 8
 """Bins for which the plan is shifted and turned alike."""
 
+DOUBTED = 4e-3
+"""So far along the seam a doubt reaches: it comes a few measurements late [m]."""
+
 SMALLEST = 0.02e-3
 """A field's amplitude is not believed to be less [m]."""
 
-WINDOW = 60e-3
-"""How far along the seam samples have a say in how the plan is shifted and turned [m]."""
+SCANTY = 10
+"""With so many bins the standard deviation is taken for twice of what they say."""
+
+SAYING, THINNED = 120, 60
+"""Filled bins to either side that have a say in how the plan is moved; so many are looked at."""
 
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
 
-SAMPLE_SIGMA = 0.05e-3
-"""Standard deviation of a bin about a plan that is only shifted and turned [m]."""
-
+SAMPLE_SIGMA = 0.01e-3
+"""Standard deviation of one sample, until it is known [m]."""
 
 SPAN = 4
 """Bins to both sides of a place at which its fit is tabulated: the direction is taken there."""
@@ -66,14 +73,34 @@ class _Fit(NamedTuple):
     Attributes:
         offsets: (2 SPAN + 1,) of the seam from the plan at the bins around it [m].
         variance: Of the one in the middle [m^2].
-        amplitude: Variance of the field [m^2].
+        waviness: Variance of what the plan's motion leaves around [m^2].
         angle: Of the tool when the nearest bin was felt [rad].
     """
 
     offsets: list[float]
     variance: float
-    amplitude: float
+    waviness: float
     angle: float
+
+
+class _Field(NamedTuple):
+    """What the plan's motion leaves, as a Gaussian process.
+
+    Attributes:
+        variance: Of the part that was felt [m^2].
+        length: Its correlation length [m].
+        wander: Variance of what a plan's shape is off by in any case [m^2].
+    """
+
+    variance: float
+    length: float
+    wander: float
+
+    def covariance(self, here: Floats, there: Floats) -> Floats:
+        """Return the covariances (N, M) between two rows of places [m^2]."""
+        squared = (here[:, None] - there) ** 2
+        felt = self.variance * np.exp(squared * (-0.5 / self.length**2))
+        return np.asarray(felt + self.wander * np.exp(squared * (-0.5 / SLOW**2)))
 
 
 class _Motion(NamedTuple):
@@ -83,15 +110,15 @@ class _Motion(NamedTuple):
         about: (2,) the middle of what was felt [m].
         shift: (3,) along x and y [m], and turn about the middle [rad].
         covariance: (3, 3) of it.
-        amplitude: Variance of what it leaves [m^2].
-        used: The filled bins.
+        field: What it leaves.
+        excess: By so much the variance of what was felt exceeds what the field expects, at least 1.
     """
 
     about: Floats
     shift: Floats
     covariance: Floats
-    amplitude: float
-    used: NDArray[np.intp]
+    field: _Field
+    excess: float
 
 
 class RefinedPath:
@@ -101,43 +128,49 @@ class RefinedPath:
         noise: Standard deviation of one sample [m].
     """
 
-    def __init__(self, plan: Path, margin: float) -> None:
-        """Start empty, with room for ``margin`` [m] beyond both ends of the plan."""
-        self._plan = plan
+    def __init__(self, plan: Path, margin: float, wander: float = 0.3e-3) -> None:
+        """Start empty.
+
+        Args:
+            plan: The planned seam.
+            margin: Room beyond both ends of the plan [m].
+            wander: Standard deviation of the seam about the plan's shape [m].
+        """
+        self._plan, self._wander = plan, wander**2
         self._start = -margin - SPAN * BIN
         count = int((plan.length - 2 * self._start) / BIN) + 2
         self._sum, self._count, self._angle = np.zeros(count), np.zeros(count), np.zeros(count)
-        self._along = np.zeros(count)
+        self._along, self._doubt = np.zeros(count), np.zeros(count)
         self._middles: Floats = self._start + (np.arange(count, dtype=np.float64) + 0.5) * BIN
         points, tangents = plan.evaluate(self._middles)
         self._points, self._normals = points[:, :2], _left(tangents)
         self._fits: dict[int, _Fit | None] = {}
         self._motions: dict[int, _Motion | None] = {}
-        self.noise = SAMPLE_SIGMA / 5
-        self._length, self._new = LENGTHS[1], 0
-        self._pending: deque[tuple[float, float, float, float]] = deque()
+        self.noise, self._new = SAMPLE_SIGMA, 0
+        self._pending: deque[tuple[float, float, float, float, float]] = deque()
 
     @property
     def empty(self) -> bool:
         """Whether nothing has been confirmed yet."""
         return not self._count.any()
 
-    def add(self, time: float, s: float, offset: float, angle: float) -> None:
+    def add(self, time: float, s: float, offset: float, angle: float, doubt: float = 0.0) -> None:
         """Note that the tip was ``offset`` to the left of the plan at ``s``; not yet believed.
 
-        The tool then stood at ``angle`` [rad].
+        The tool then stood at ``angle`` [rad]; the tip may be off the seam by ``doubt`` [m].
         """
-        self._pending.append((time, s, offset, angle))
+        self._pending.append((time, s, offset, angle, doubt))
 
     def confirm(self, until: float) -> None:
         """Believe what was felt up to the time ``until`` [s]."""
         while self._pending and self._pending[0][0] <= until:
-            _, s, offset, angle = self._pending.popleft()
+            _, s, offset, angle, doubt = self._pending.popleft()
             index = int((s - self._start) / BIN)
             if 0 <= index < len(self._count):
                 self._sum[index] += offset
                 self._along[index] += s
                 self._angle[index] = angle
+                self._doubt[index] = max(self._doubt[index], doubt)
                 self._new += not self._count[index]
                 self._count[index] += 1
                 self._forget_fits(index)
@@ -148,8 +181,7 @@ class RefinedPath:
             self._new = 0
             self._fits.clear()
             self._motions.clear()
-            self._choose_length(index)
-        near = round(REACH / BIN) + SPAN
+        near = BESIDE + SPAN
         for other in [i for i in self._fits if abs(i - index) <= near]:
             del self._fits[other]
 
@@ -158,17 +190,17 @@ class RefinedPath:
         self._pending.clear()
 
     def samples(self) -> Floats:
-        """Return what is believed: rows (K, 4) of arc length, offset, tool's angle and count."""
+        """Return what is believed: rows (K, 5) of arc length, offset, angle, count and doubt."""
         filled = np.flatnonzero(self._count)
         count = self._count[filled]
         means = (self._along[filled] / count, self._sum[filled] / count)
-        return np.column_stack([*means, self._angle[filled], count])
+        return np.column_stack([*means, self._angle[filled], count, self._doubt[filled]])
 
     def recall(self, samples: Floats) -> None:
-        """Believe samples (K, 4) of an earlier weld of this plan; see :meth:`samples`."""
-        for s, offset, angle, count in samples.tolist():
+        """Believe samples (K, 5) of an earlier weld of this plan; see :meth:`samples`."""
+        for s, offset, angle, count, doubt in samples.tolist():
             for _ in range(int(count)):
-                self.add(-math.inf, s, offset, angle)
+                self.add(-math.inf, s, offset, angle, doubt)
         self.confirm(0.0)
 
     def offset(self, s: float) -> float:
@@ -186,9 +218,14 @@ class RefinedPath:
         return float(PRIOR[0] ** 2) if fit is None else fit.variance
 
     def waviness(self, s: float) -> float:
-        """Return the variance of the field that the plan's motion leaves around a place [m^2]."""
+        """Return the variance of what the plan's motion leaves around a place [m^2]."""
         fit = self._fit(s)
-        return 0.0 if fit is None else fit.amplitude
+        return 0.0 if fit is None else fit.waviness
+
+    def doubt(self, s: float) -> float:
+        """Return how far off the seam the tip may have been around a place [m]."""
+        index, near = self._index(s), round(DOUBTED / BIN)
+        return float(self._doubt[max(index - near, 0) : index + near + 1].max())
 
     def angle(self, s: float, otherwise: float) -> float:
         """Return the tool's angle when the seam was felt at ``s``, or nearest to it [rad]."""
@@ -239,23 +276,19 @@ class RefinedPath:
         if motion is None:
             return None
         near, rows, residual = self._residual(motion, index)
-        felt = self._along[near] / self._count[near]
-        precision = _precision(felt, motion.amplitude, self._noise(near), self._length)
+        felt, field = self._along[near] / self._count[near], motion.field
+        among = field.covariance(felt, felt) + np.diag(self._noise(near))
         table = np.arange(index - SPAN, index + SPAN + 1)
         there = self._rows(motion, table)
-        kernel = _kernel(self._middles[table], felt, motion.amplitude, self._length)
-        weights = kernel @ precision
+        kernel = field.covariance(self._middles[table], felt)
+        weights = kernel @ np.linalg.inv(among)
         offsets = there @ motion.shift + weights @ residual
         free = there[SPAN] - weights[SPAN] @ rows
-        field = max(motion.amplitude - float(weights[SPAN] @ kernel[SPAN]), 0.0)
-        filled = near if len(near) else motion.used
-        nearest = int(filled[np.abs(filled - index).argmin()])
-        away = abs(nearest - index) * BIN
-        # Beyond what was felt the plan's shape is trusted less the farther, and the less the worse
-        # it has fitted so far: an error of its curvature grows with the square of the distance.
-        beyond = (1.0 + (away / BEYOND) ** 2) ** 2 if away > REACH / 2 else 1.0
-        variance = field * beyond + float(free @ motion.covariance @ free)
-        return _Fit(offsets.tolist(), variance, motion.amplitude, float(self._angle[nearest]))
+        held = float(weights[SPAN] @ kernel[SPAN])
+        left = motion.excess * max(field.variance + field.wander - held, 0.0)
+        variance = left + float(free @ motion.covariance @ free)
+        nearest = int(near[np.abs(near - index).argmin()])
+        return _Fit(offsets.tolist(), variance, field.variance, float(self._angle[nearest]))
 
     def _motion(self, index: int) -> _Motion | None:
         """Return how the plan is moved in the zone of a bin; the same for all its bins."""
@@ -266,21 +299,25 @@ class RefinedPath:
         return self._motions[zone]
 
     def _moved(self, s: float) -> _Motion | None:
-        used = self._near(s)
+        used = self._nearest(self._index(s), SAYING)
         if not len(used):
             return None
-        felt = self._sum[used] / self._count[used]
-        about = self._points[used].mean(axis=0)
-        rows = _rigid_rows(self._points[used] - about, self._normals[used])
-        shift, covariance = _solve(rows, felt)
-        amplitude = max(float(np.mean((felt - rows @ shift) ** 2)), SMALLEST**2)
-        return _Motion(about, shift, covariance, amplitude, used)
+        some = used[:: -(-len(used) // THINNED)]
+        count, about = self._count[some], self._points[some].mean(axis=0)
+        rows = _rigid_rows(self._points[some] - about, self._normals[some])
+        along, felt = self._along[some] / count, self._sum[some] / count
+        waviness = max(_unexplained(rows, felt), SMALLEST**2)
+        fields = [_Field(waviness, length, self._wander) for length in LENGTHS]
+        found = [_explained(field, along, rows, felt, self._noise(some)) for field in fields]
+        best = int(np.argmax([likelihood for *_, likelihood in found]))
+        shift, covariance, excess, _ = found[best]
+        # What was felt at few places only may be off by more than it seems there.
+        few = (1.0 + SCANTY / len(used)) ** 2
+        return _Motion(about, shift, few * covariance, fields[best], few * excess)
 
     def _residual(self, motion: _Motion, index: int) -> tuple[NDArray[np.intp], Floats, Floats]:
-        """Return the filled bins near one, their rows, and what the motion leaves there."""
-        reach = round(REACH / BIN)
-        low = max(index - reach, 0)
-        near = low + np.flatnonzero(self._count[low : index + reach + 1])
+        """Return the filled bins nearest to one, their rows, and what the motion leaves there."""
+        near = self._nearest(index, BESIDE)
         rows = self._rows(motion, near)
         return near, rows, self._sum[near] / self._count[near] - rows @ motion.shift
 
@@ -290,27 +327,13 @@ class RefinedPath:
     def _noise(self, used: NDArray[np.intp]) -> Floats:
         return np.asarray(self.noise**2 / np.minimum(self._count[used], 4.0))
 
-    def _choose_length(self, index: int) -> None:
-        """Choose the field's stiffness by what was felt around a bin."""
-        motion = self._motion(index)
-        if motion is None:
-            return
-        near, _, residual = self._residual(motion, index)
-        felt = self._along[near] / self._count[near]
-        noise = self._noise(near)
-        self._length = _best_length(felt, residual, motion.amplitude, noise)
-
-    def _near(self, s: float) -> NDArray[np.intp]:
-        """Return the filled bins that have a say at ``s``."""
+    def _nearest(self, index: int, count: int) -> NDArray[np.intp]:
+        """Return the filled bins nearest to one, ``count`` to either side; more where one ends."""
         # A piece of the seam, not all of it: a long seam costs a cycle no more than a short one.
-        low = max(int((s - WINDOW - self._start) / BIN), 0)
-        high = int((s + WINDOW - self._start) / BIN) + 1
-        near = low + np.flatnonzero(self._count[low:high])
-        if len(near):
-            return np.asarray(near)
-        filled = np.flatnonzero(self._count)  # far from all that was felt, which is rare
-        distance = np.abs(self._middles[filled] - s)
-        return np.asarray(filled[distance <= distance.min(initial=np.inf) + WINDOW / 2])
+        filled = np.flatnonzero(self._count)
+        low = int(np.searchsorted(filled, index)) - count
+        low = max(min(low, len(filled) - 2 * count), 0)
+        return np.asarray(filled[low : low + 2 * count])
 
 
 def _left(tangents: Floats) -> Floats:
@@ -323,33 +346,29 @@ def _rigid_rows(levers: Floats, normals: Floats) -> Floats:
     return np.column_stack([normals, turned])
 
 
-def _solve(rows: Floats, felt: Floats) -> tuple[Floats, Floats]:
-    """Return the shift and turn (3,) that explain the offsets, the smallest where free.
+def _unexplained(rows: Floats, felt: Floats) -> float:
+    """Return the variance that no motion of the plan explains [m^2]."""
+    return float(np.var(felt - rows @ np.linalg.lstsq(rows, felt, rcond=None)[0]))
 
-    With their covariance (3, 3), from what is left.
+
+def _explained(
+    field: _Field, along: Floats, rows: Floats, felt: Floats, noise: Floats
+) -> tuple[Floats, Floats, float, float]:
+    """Return the motion (3,) that explains offsets (K,) best, if a field leaves the rest.
+
+    With its covariance (3, 3), by how much the rest is larger than the field expects, and the
+    logarithm of the restricted likelihood (Rasmussen and Williams 2006, 2.45), the field's scale
+    left free.
     """
-    gram = rows.T @ rows + np.diag((SAMPLE_SIGMA / PRIOR) ** 2)
+    nugget = noise + 1e-6 * field.variance
+    root = np.linalg.cholesky(field.covariance(along, along) + np.diag(nugget))
+    white = np.linalg.solve(root, np.column_stack([rows, felt]))
+    white_rows, white_felt = white[:, :3], white[:, 3]
+    gram = white_rows.T @ white_rows + np.diag(PRIOR**-2)
     inverse = np.linalg.inv(gram)
-    motion = inverse @ (rows.T @ felt)
-    left = max(float(np.mean((felt - rows @ motion) ** 2)), (1.5 * SMALLEST) ** 2)
-    return np.asarray(motion), np.asarray(left * inverse)
-
-
-def _precision(middles: Floats, amplitude: float, noise: Floats, length: float) -> Floats:
-    covariance = _kernel(middles, middles, amplitude, length)
-    return np.asarray(np.linalg.inv(covariance + np.diag(noise)))
-
-
-def _kernel(here: Floats, there: Floats, amplitude: float, length: float) -> Floats:
-    """Return the field's covariances (N, M) between two rows of places."""
-    return amplitude * np.exp(-0.5 * ((here[:, None] - there) / length) ** 2)
-
-
-def _best_length(middles: Floats, residual: Floats, amplitude: float, noise: Floats) -> float:
-    """Return the correlation length that predicts each bin best from the others."""
-
-    def missed(length: float) -> float:
-        precision = _precision(middles, amplitude, noise, length)
-        return float(np.mean((precision @ residual / np.diag(precision)) ** 2))
-
-    return min(LENGTHS, key=missed) if len(middles) > 3 else LENGTHS[1]
+    shift = inverse @ (white_rows.T @ white_felt)
+    freedom = max(len(felt) - 3, 1)
+    scale = max(float(np.sum((white_felt - white_rows @ shift) ** 2)) / freedom, 1e-9)
+    volume = 2.0 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(gram)[1])
+    excess = max(scale, 1.0)
+    return shift, excess * inverse, excess, -0.5 * (freedom * math.log(scale) + volume)

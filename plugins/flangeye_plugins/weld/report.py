@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.models.finger import Finger
 from flangeye.types import Floats, Seam, WeldReport
+from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.controller import Controller
-from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.going_on import follower_of
 from flangeye_plugins.weld.motion import turned
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.weld_log import WeldLog, columns
@@ -24,7 +24,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     seam: Seam,
     plane: WorkPlane,
     plan: Path,
-    finger: Finger,
+    body: Body,
     controller: Controller,
     weld_log: WeldLog,
     reason: str,
@@ -36,8 +36,8 @@ def report_of(  # noqa: PLR0913  all that a weld had
     kept = kept[kept >= 0]
     cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
-    ahead = np.stack([np.cos(cycle["angle"]), np.sin(cycle["angle"]), 0 * cycle["angle"]], axis=1)
-    tip, deflection = _felt(weld_log, plan, kept)
+    tip, deflection = _felt(weld_log, plan, body, kept)
+    torch = robot + np.array([turned(body.torch, angle) for angle in cycle["angle"]]).reshape(-1, 3)
     to_base = plane.base_T_plane.apply
     velocity = cycle["velocity"].reshape(-1, 3)
     return WeldReport(
@@ -49,7 +49,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
         opening=plane.base_T_plane.rotation[:, 2],
         time=cycle["time"] - cycle["time"][0] if len(kept) else np.zeros(0),
         tip=to_base(tip),
-        torch=to_base(robot - finger.torch * ahead),
+        torch=to_base(torch),
         robot=to_base(robot),
         deflection=controller.side * deflection,
         wanted=np.array(every["wanted"])[kept],
@@ -73,20 +73,23 @@ def _at(times: Floats, known: Floats, points: Floats) -> Floats:
 
 def learned_figures(controller: Controller) -> Mapping[str, float]:
     """Return what the sweep at the start found."""
-    if not isinstance(controller, Follower):
+    root = follower_of(controller)
+    if root is None:
         return {}
-    found = controller.learned
+    found = root.learned
     return {
         "finger_gain_error": found.gain,
         "finger_play": 2.0 * abs(found.width),
         "timestamps_late": found.stamp,
         "arm_dead_time": found.dead_time,
         "arm_lag": found.lag,
-        "lit_from": -1.0 if controller.lit is None else controller.lit,
+        "lit_from": -1.0 if root.lit is None else root.lit,
     }
 
 
-def _felt(weld_log: WeldLog, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _felt(
+    weld_log: WeldLog, plan: Path, body: Body, kept: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
     """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).
 
     Each image meets the pose of its own time; until the next one the tip stays there.
@@ -100,7 +103,8 @@ def _felt(weld_log: WeldLog, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats
     times = np.array([feeling.time_ns for feeling in felt]) * 1e-9
     then = np.stack([np.interp(times, every["time"], axis) for axis in robot.T], axis=1)
     angle = np.interp(times, every["time"], every["angle"])
-    moved = np.array([turned(f.displacement, a) for f, a in zip(felt, angle, strict=True)])
+    level = np.array([feeling.displacement for feeling in felt]) @ body.level_R_tool.T
+    moved = np.array([turned(d, a) for d, a in zip(level, angle, strict=True)])
     _, tangents = plan.evaluate(np.interp(times, every["time"], every["tip"]))
     across = tangents[:, 1] * moved[:, 0] - tangents[:, 0] * moved[:, 1]
     newest = np.maximum(used - 1, 0)
@@ -110,11 +114,12 @@ def _felt(weld_log: WeldLog, plan: Path, kept: NDArray[np.intp]) -> tuple[Floats
 
 def _refined(controller: Controller, plan: Path) -> Floats:
     """Return the seam as it was felt, (M, 3) in the plane."""
-    if not isinstance(controller, Follower) or controller.refined.empty:
+    root = follower_of(controller)
+    if root is None or root.refined.empty:
         return np.zeros((0, 3))
     s = np.arange(0.0, plan.length, 1e-3)
     points, tangents = plan.evaluate(s)
-    offsets = np.array([controller.refined.offset(x) for x in s.tolist()])
+    offsets = np.array([root.refined.offset(x) for x in s.tolist()])
     points[:, :2] += offsets[:, None] * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     return points
 

@@ -50,14 +50,19 @@ class Search:
     """
 
     def __init__(self, settings: Following, belief: Belief) -> None:
-        """Sweep ``reach`` to the left of the plan, then as far to the right."""
+        """Sweep ``reach`` to the left of the plan, then as far to the right.
+
+        Where one wall alone holds the tip, that one is looked for.
+        """
         self.resting, self.bent = True, False
         self.down = self.found = self.seated = self.over = False
         self.rest = np.zeros(3)
         self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
         self._settings = settings
         self._wall = max(STEEPER * belief.sliding(settings), settings.probe / 2)
-        self._turns = [settings.reach, -settings.reach]
+        toward = 1.0 if settings.side == "left" else -1.0
+        both = [settings.reach, -settings.reach]
+        self._turns = both if belief.two_walls else [toward * settings.reach]
         self._free: list[Floats] = []
         self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
 

@@ -11,8 +11,22 @@ from flangeye.files.paths import RecipePath
 from flangeye.models.finger import FingerPath
 from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
+from flangeye_plugins.weld.joint import JointKind
 
 Mode = Literal["tactile", "as_printed", "vision"]
+
+
+class PassParams(Params):
+    """A pass after the root's, along the path that this has found; nothing is touched."""
+
+    across: Length = param("0 mm", ge=-0.03, le=0.03, description="To the left of the seam.")
+    up: Length = param(
+        "3 mm", gt=0, le=0.05, description="Higher than the root pass, the finger too; it must "
+        "clear what was welded.",
+    )  # fmt: skip
+    along: Length = param("0 mm", ge=0, description="It begins so far after the seam does.")
+    weave_width: Length = param("0 mm", ge=0, le=0.03, description="As of the weld itself.")
+    weave_frequency: float = Field(1.0, gt=0, le=10)
 
 
 class Following(Params):
@@ -91,9 +105,54 @@ class Following(Params):
     probing: bool = Field(
         True, description="Sweep the seated tip at the start: finger, clock and arm are measured."
     )
-    joint: Literal["groove", "butt", "fillet", "lap", "corner"] = Field(
-        "groove", description="A groove or butt joint has two walls that hold the tip."
+    joint: JointKind = Field(
+        "groove",
+        description="groove, butt and corner hold the tip between two walls; in a fillet or lap "
+        "joint it lies on a flat plate against a wall on its side. Where the plan knows a "
+        "half_angle both walls lean by it from the opening.",
     )
+    root_gap: Length = param(
+        "0 mm", ge=0, description="Between the plates of a butt joint with square edges: the tip "
+        "rests on these.",
+    )  # fmt: skip
+    joint_sigma: Angle = param(
+        "1 deg", ge=0, description="Standard deviation of the walls' angles."
+    )
+    tip_radius: Length | None = param(
+        None, gt=0, description="Radius of the tip's ball, where it is not the one of the finger's "
+        "file.",
+    )  # fmt: skip
+    work_angle: Angle = param(
+        "0 deg", ge=-np.pi / 3, le=np.pi / 3,
+        description="The tool's upper end leans away from the pressed wall by this.",
+    )  # fmt: skip
+    travel_angle: Angle = param(
+        "0 deg", ge=-np.pi / 6, le=np.pi / 6,
+        description="The tool's upper end leans forwards along the seam by this.",
+    )  # fmt: skip
+    offset_across: Length = param(
+        "0 mm", ge=-0.02, le=0.02,
+        description="How far to the left of the seam the torch is led.",
+    )  # fmt: skip
+    offset_along: Length = param(
+        "0 mm", description="How far after the planned start the torch begins to weld."
+    )
+    weave_width: Length = param(
+        "0 mm", ge=0, le=0.03,
+        description="The torch swings across the seam by this from side to side, the tool turning "
+        "about its tip.",
+    )  # fmt: skip
+    weave_frequency: float = Field(1.0, gt=0, le=10, description="How often it does in a second.")
+    passes: tuple[PassParams, ...] = Field(
+        (), max_length=20, description="Passes after the root's, in their order."
+    )
+    return_speed: Speed = param(
+        "20 mm/s", gt=0, le=0.1, description="Speed of the tool between two passes."
+    )
+    torch_height: Length = param(
+        "8 mm", gt=0,
+        description="The torch's end may be higher or lower than the seam by at most this.",
+    )  # fmt: skip
     blind: Duration = param(
         "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
     )
@@ -116,6 +175,11 @@ class WeldTactileParams(Following):
     log_images: bool = Field(
         True, description="Log what was read of every image, 17 kB each; replaying needs it."
     )
+    leg: int | None = Field(
+        None, ge=1,
+        description="Of a plan with sharp corners, which leg between them this step welds; at a "
+        "corner the torch stops.",
+    )  # fmt: skip
     clearance: Length = param(
         "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
     )

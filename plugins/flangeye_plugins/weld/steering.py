@@ -32,7 +32,9 @@ class Steering:
     share: float = 0.7
     usual: float = 0.8
 
-    def turn(self, velocity: Floats, tool: Floats, normal: Floats, error: float) -> float:
+    def turn(
+        self, velocity: Floats, tool: Floats, normal: Floats, error: float, sway: float = 0.0
+    ) -> float:
         """Return the angular velocity [rad/s], never beyond :attr:`rate`.
 
         Args:
@@ -40,6 +42,7 @@ class Steering:
             tool: (2,) unit vector from the torch to the tip, t_d.
             normal: (2,) unit normal of the refined path at the torch, n_t.
             error: How far the torch is off the refined path, along ``normal`` [m].
+            sway: How fast it is to leave that path to the left all the same [m/s].
         """
         cosine, sine = _cos_sin(tool, normal)
         most = self.share * float(np.hypot(*velocity))
@@ -48,7 +51,8 @@ class Steering:
         # Near n_d perpendicular to n_t equation (16) divides by zero and below it the torch would
         # be pushed, not pulled: there the tool is turned into the path's direction instead.
         aligning = -float(np.copysign(self.rate, sine))
-        solved = (float(velocity @ normal) + back) / (self.distance * cosine) if trusted else 0.0
+        asked = float(velocity @ normal) + back - sway
+        solved = asked / (self.distance * cosine) if trusted else 0.0
         wanted = trusted * solved + (1.0 - trusted) * aligning
         return float(min(max(wanted, -self.rate), self.rate))
 

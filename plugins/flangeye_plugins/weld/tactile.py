@@ -19,7 +19,9 @@ from flangeye.types import Floats, Journal, Seam, Seed, VerifiedHandEye, WeldRep
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
+from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Cell, follow
 from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import (
@@ -60,22 +62,24 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         RunStopped: The operator stopped the arm.
     """
     finger: Finger = read_model(params.finger, Finger)
+    seam = leg_of(seam, params)
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
     points = plane.points(seam.points_in_base)
     plan = Path(points)
-    tool = Tool(finger, plane)
+    body = body_of(finger, params)
+    tool = Tool(finger, plane, body)
     reader = Reader(finger)
     allowed = limits_of(limits, model)
     checks.check_finger(finger, params)
-    checks.check_seam(seam, plan, finger, params)
+    checks.check_seam(seam, plan, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else kept_of(params.resume, points)
     if kept is not None:
-        params = set_back(params, plan, finger.torch, kept)
-    passage = SeamReach(Task(model, allowed, finger, tool, plan, params))
+        params = set_back(params, plan, body.distance, kept)
+    belief = belief_of(finger, body, seam.half_angle, params)
+    checks.check_tool(body, belief, params)
+    passage = SeamReach(Task(model, allowed, finger, tool, plan, params, belief.set_down(params)))
     simulated = driver.simulated
-    belief = belief_of(finger, seam.half_angle, params)
-    checks.check_belief(belief, params)
     controller = controller_of(plan, belief, params, params.mode, kept)
     checks.check_controller(controller, driver)
     if not (motion.allowed or simulated):
@@ -91,10 +95,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         drive = Executor(robot, latest, model, allowed, keyboard)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
         approach(cell, passage, weld_log, params.mode)
-        longest = 60.0 + 3.0 * (plan.length + finger.torch) / params.speed
+        passes = 1 + 2 * len(params.passes)  # there and back
+        longest = 60.0 + 3.0 * passes * (plan.length + body.distance) / params.speed
         reason = follow(cell, controller, weld_log, longest)
         truth = sensor.true_torch() if isinstance(sensor, KnowsTorch) else None
-    return report_of(seam, plane, plan, finger, controller, weld_log, reason, truth)
+    return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
 
 
 def _eyes(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:

@@ -274,7 +274,7 @@ def loopback(
         ),
         (
             ["ur5e", "--joints", "0 x deg"],
-            "error: --joints '0 x deg': 'x deg' is not a angle: write a number and a unit "
+            "error: --joints '0 x deg': 'x deg' is not an angle: write a number and a unit "
             "(deg, rad, mrad, for example '17 deg')\n",
         ),
         (

@@ -143,15 +143,28 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
     assert not [name for name in modules if name.startswith("flangeye_emulators")]
 
 
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(4042, id="bowed plan, tip let go of on the other wall"),
+        pytest.param(100031, id="tip stays up on its wall after a tack weld"),
+        pytest.param(100076, id="hardly felt before the wall ends, plan bowed by 4 mm"),
+        pytest.param(300162, id="wall at 64 deg, heights too noisy to see the tip climb it"),
+        pytest.param(100178, id="waves at speed: the torch is not yet where it was sent"),
+    ],
+)
+def test_what_once_was_a_silent_failure_is_in_its_stated_bound(seed: int) -> None:
+    assert judged(seed).outside <= 1.0
+
+
 def test_worlds_are_drawn_again_as_they_were() -> None:
     assert drawn(3) == drawn(3) != drawn(4)
 
 
 @pytest.mark.slow
-def test_no_weld_is_reported_done_beyond_its_bound() -> None:
+def test_no_torch_is_beyond_its_stated_bound_whether_done_or_stopped() -> None:
     verdicts = [judged(seed) for seed in range(2000, 2040)]
-    done = [v for v in verdicts if v.done]
-    assert len(done) >= 6
-    assert not [v for v in done if v.silent]
-    assert np.mean([v.inside for v in done]) >= 0.93
+    assert len([v for v in verdicts if v.done]) >= 6
+    assert not [v.seed for v in verdicts if v.silent]
+    assert np.mean([v.inside for v in verdicts if v.welded]) >= 0.93
     assert f"{len(verdicts)} worlds" in summary(verdicts)[0]

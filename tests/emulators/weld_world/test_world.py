@@ -25,6 +25,7 @@ from flangeye_plugins.weld.motion import Command, ToolPose
 from flangeye_plugins.weld.path import Path
 
 LINE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+TORCH = np.array([-40e-3, 0.0, 0.0])
 RNG = np.random.default_rng
 
 
@@ -65,12 +66,14 @@ def test_the_arm_is_not_where_it_says() -> None:
 
 def test_the_tool_is_where_the_world_has_it() -> None:
     tool = TrueTool(
-        params(ToolTruth, tip=["1 mm", "0 mm", "2 mm"], torch=["0 mm", "0.5 mm"]), 40e-3
+        params(ToolTruth, tip=["1 mm", "0 mm", "2 mm"], torch=["0 mm", "0.5 mm"]), TORCH
     )
-    np.testing.assert_allclose(tool.rest(pose(angle=np.pi / 2)), [0, 1e-3, 2e-3], atol=1e-12)
-    np.testing.assert_allclose(tool.torch(pose()), [-40e-3, 0.5e-3, 2e-3], atol=1e-12)
-    turned = TrueTool(params(ToolTruth, yaw="1 deg"), 40e-3)
-    assert turned.torch(pose())[1] == pytest.approx(-40e-3 * np.sin(np.pi / 180))
+    np.testing.assert_allclose(
+        tool.rest(pose(angle=np.pi / 2), np.eye(3)), [0, 1e-3, 2e-3], atol=1e-12
+    )
+    np.testing.assert_allclose(tool.torch(pose(), np.eye(3)), [-40e-3, 0.5e-3, 2e-3], atol=1e-12)
+    turned = TrueTool(params(ToolTruth, yaw="1 deg"), TORCH)
+    assert turned.torch(pose(), np.eye(3))[1] == pytest.approx(-40e-3 * np.sin(np.pi / 180))
 
 
 def test_the_finger_shows_less_and_later_than_it_feels() -> None:

@@ -5,8 +5,12 @@ import pytest
 
 from flangeye.models.loading import load_model
 from flangeye_emulators.world.cell import Cell
-from flangeye_emulators.world.raycast import Scene, pixels_of
+from flangeye_emulators.world.raycast import Pixels, Scene, _rays, pixels_of
 from tests.emulators.world.bench import SCANNER, facing, flange, flange_scene, plate, zoomed
+
+
+def axes_of(pixels: Pixels) -> list[np.ndarray]:
+    return list(np.moveaxis(pixels.directions, -1, 0))
 
 
 def test_pixels_fill_the_field_of_view() -> None:
@@ -24,26 +28,36 @@ def test_resolution_scales_the_image_and_keeps_the_field() -> None:
     assert pixels.size == pytest.approx(4 * pixels_of(SCANNER).size, rel=1e-6)
 
 
+@pytest.mark.parametrize("size", [(400, 300), (399, 301)])
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
-def test_looking_at_every_second_pixel_finds_what_every_pixel_sees(tilt: float) -> None:
-    pixels = pixels_of(zoomed())
+def test_looking_at_every_second_pixel_finds_what_every_pixel_sees(
+    tilt: float, size: tuple[int, int]
+) -> None:
+    pixels = pixels_of(zoomed(SCANNER, *size))
     scene = flange_scene(facing(tilt))
-    quick, full = scene.look(pixels), scene._cast(pixels.directions)
+    quick, full = scene.look(pixels), scene._cast(_rays(np.zeros(3), *axes_of(pixels)))
     assert (quick.body == full.body).mean() > 0.9999
     same = quick.body == full.body
     assert np.abs(quick.depth - full.depth)[same].max() < 2e-6
-    turned = np.abs((quick.normals * full.normals).sum(axis=-1))[same]
-    assert turned.min() > 0.999
+    towards = np.stack([quick.facing(axis) for axis in np.eye(3)])
+    assert np.abs((towards * full.normals).sum(axis=0))[same].min() > 0.999
+    slant = (np.stack(axes_of(pixels)) * towards).sum(axis=0)
+    assert np.abs(quick.slant - slant).max() < 1e-6
 
 
 def test_shadows_at_every_second_pixel_are_those_at_every_pixel() -> None:
     pixels = pixels_of(zoomed())
     scene = flange_scene(facing(0.3))
     light = np.array([0.35, 0.0, 0.07])
-    beams = pixels.directions * scene.look(pixels).depth[..., None] - light.astype(np.float32)
-    differs = scene.hidden(light, beams) != scene._blocked(light, beams)
-    assert 0 < scene.hidden(light, beams).mean() < 1
-    assert differs.mean() < 1e-3
+    depth = scene.look(pixels).depth
+    points = pixels.directions * depth[..., None]
+    hidden = scene.hidden(light, pixels, depth, np.ones(depth.shape, bool))
+    assert 0 < hidden.mean() < 1
+    exactly = scene._blocked(_rays(light, *np.moveaxis(points - light, -1, 0)))
+    assert (hidden != exactly).mean() < 1e-3
+    part = np.zeros(depth.shape, bool)
+    part[101:220, 33:280] = True
+    np.testing.assert_array_equal(scene.hidden(light, pixels, depth, part)[part], hidden[part])
 
 
 def test_a_gap_shows_nothing() -> None:

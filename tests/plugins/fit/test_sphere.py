@@ -19,7 +19,7 @@ from flangeye.types import (
 from flangeye.units import SI
 from flangeye_plugins.fit.sphere import SphereParams, fit_sphere, sphere_jacobian
 
-SPHERE = Sphere(radius=0.01905, centre_in_flange=(0.0, 0.01, 0.06))
+SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.01, 0.06))
 CENTRE = np.array([0.05, -0.03, 0.65])
 
 

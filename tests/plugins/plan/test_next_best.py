@@ -1,5 +1,7 @@
 """The next best pose: it tells most, and needs fewer poses than a grid."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,10 @@ from flangeye.motion.planning import Site, angle_between
 from flangeye_plugins.plan.next_best import NextBestParams, next_best
 from tools.study_next_best import compare
 
+SAID = (
+    r"expected error at the work ([\d.]+) to ([\d.]+) mm rms, mostly by the (?:turn about|"
+    r"shift along) base \(.*\)"
+)
 CENTRE, EYE = np.array([0.6, 0.0, 0.3]), np.array([0.6, 0.0, 1.0])
 
 
@@ -67,3 +73,22 @@ def test_it_needs_at_most_sixty_percent_of_the_grids_poses(seed: int) -> None:
     wanted, found = compare(seed)
     assert found is not None
     assert found.poses <= 0.6 * wanted.poses
+
+
+def test_a_pose_says_what_it_promises_and_what_it_tells_most_of() -> None:
+    plan = next_best(site(), np.random.default_rng(0), NextBestParams(count=6, candidates=50))
+    said = [re.fullmatch(SAID, pose.why) for pose in plan.poses]
+    before, after = (np.array([float(s[i]) for s in said if s]) for i in (1, 2))
+    assert len(before) == 6
+    assert (after < before).all()
+    np.testing.assert_allclose(before[1:], after[:-1])  # nothing was lost between
+
+
+def test_a_pose_that_was_lost_is_not_counted_in_what_the_next_promises() -> None:
+    lost: set[int] = set()
+    plan = next_best(site(lost=lambda: lost), np.random.default_rng(0), NextBestParams(count=3))
+    found = []
+    for index, pose in enumerate(plan.poses):
+        found.append(re.fullmatch(SAID, pose.why))
+        lost.add(index)
+    assert len({s[1] for s in found if s}) == 1  # it knows as little as before

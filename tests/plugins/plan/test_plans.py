@@ -94,7 +94,7 @@ def test_an_arm_reaches_what_is_planned_for_it(robot: str) -> None:
     site = Site(np.array([0.6, -0.0125, 0.3]), base_T_camera[:3, 3], reach.facing, reach.joints)
     plan = grid(site, rng(3), params=GridParams(counts=(2, 2, 2)))
     assert len(plan.poses) >= 6
-    for pose, joints in plan.poses:
+    for pose, joints, _ in plan.poses:
         assert reach.arm.flange(joints) == pytest.approx(pose, abs=1e-8)
         assert ((joints >= reach.arm.lower) & (joints <= reach.arm.upper)).all()
         assert reach.in_view(pose)

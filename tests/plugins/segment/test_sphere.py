@@ -21,7 +21,7 @@ from flangeye_plugins.segment.sphere import (
     surface_normals,
 )
 
-SPHERE = Sphere(radius=0.01905, centre_in_flange=(0.0, 0.0, 0.06))
+SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.06))
 
 
 def acquire(resolution=0.25, sphere=SPHERE, **changes):
@@ -74,6 +74,23 @@ def test_its_fit_is_good_to_a_tenth_of_a_millimetre() -> None:
         assert np.linalg.norm(circle.centre - centre) < 0.3e-3
 
 
+def test_without_its_size_it_is_found_too_and_measured() -> None:
+    unknown = Sphere(size=None, centre_in_flange=SPHERE.centre_in_flange)
+    for capture, centre in scanned()[:2]:
+        found = segment(capture, unknown)
+        assert isinstance(found, FlangeCloud), found.reason
+        circle = fit_sphere(found, unknown, SphereParams())
+        assert circle.radii["sphere"] == pytest.approx(SPHERE.radius, abs=0.15e-3)
+        off = circle.centre - centre
+        assert off @ np.linalg.solve(circle.covariance, off) < 11.3  # 99 %
+
+
+def test_a_wall_has_no_sphere_of_any_size() -> None:
+    found = segment(of(wall()), Sphere(size=None, centre_in_flange=(0, 0, 0.06)))
+    assert isinstance(found, Rejected)
+    assert found.reason.startswith("no sphere of any size: of the best candidate's face ")
+
+
 def test_a_cloud_without_order_gives_the_same_sphere() -> None:
     capture, _ = scanned()[0]
     loose = segment(of(capture.cloud.points()))
@@ -90,9 +107,7 @@ def test_a_cell_without_one_has_none() -> None:
 
 def test_a_sphere_of_another_size_is_not_taken() -> None:
     capture, _ = scanned()[0]
-    assert isinstance(
-        segment(capture, Sphere(radius=0.03, centre_in_flange=(0, 0, 0.06))), Rejected
-    )
+    assert isinstance(segment(capture, Sphere(size=0.03, centre_in_flange=(0, 0, 0.06))), Rejected)
 
 
 def test_two_of_them_are_told_apart_by_nobody() -> None:

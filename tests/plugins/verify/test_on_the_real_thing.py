@@ -106,6 +106,36 @@ def test_sphere_finds_a_scale_and_cannot_see_the_matrix() -> None:
     assert stretched.figures["scale"] == pytest.approx(0.01, rel=1e-6)
 
 
+def test_two_balls_at_a_known_distance_show_the_scanners_scale_alone() -> None:
+    rng, noise = np.random.default_rng(2), 0.02e-3
+    bars, scale = [], 1.0004
+    for _ in range(20):
+        first = rng.uniform(-0.2, 0.2, 3) + [0, 0, 0.8]
+        way = rng.normal(size=3)
+        second = first + 0.2 * way / np.linalg.norm(way)
+        seen = [_m(scale * ball + rng.normal(0, noise, 3)) for ball in (first, second)]
+        bars.append({"first": seen[0], "second": seen[1], "length": "200 mm"})
+    drawn: dict[str, Any] = {}
+    # The arm is of another scale, which must not matter.
+    found = verify_sphere(
+        calibration(scale=1.05), SphereParams(bars=bars), journal=drawn.__setitem__
+    )
+    assert found.passed and found.figures["pairs"] == 20
+    assert found.figures["scale"] == pytest.approx(
+        scale - 1, abs=3 * noise * 2**0.5 / 0.2 / 20**0.5
+    )
+    assert drawn["comparison"]["series"][""][0][0] == pytest.approx(200.0)
+
+
+def test_touch_draws_what_was_predicted_less_what_was_touched() -> None:
+    drawn: dict[str, Any] = {}
+    verify_touch(calibration(shift=(2e-3, 0, 0)), touches(3), journal=drawn.__setitem__)
+    series = drawn["comparison"]["series"]
+    assert [x for x, _ in series["along x"]] == [1, 2, 3]
+    assert [y for _, y in series["along x"]] == pytest.approx([2.0] * 3, abs=1e-5)
+    assert [y for _, y in series["along z"]] == pytest.approx([0.0] * 3, abs=1e-5)
+
+
 def test_what_cannot_be_checked_is_one_line() -> None:
     with pytest.raises(StageError, match="1 verification views, two are needed"):
         verify_stitch(calibration(), views(1), StitchParams())

@@ -13,7 +13,8 @@ from flangeye.models.model import read_model
 from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Contact as Tip3D
 from flangeye_emulators.weld_world.groove import Groove, Section, Tip
-from flangeye_plugins.weld.contact import DWELL, LOST, REGAINED, SMOOTHING, Contact
+from flangeye_plugins.weld.consistency import Seating
+from flangeye_plugins.weld.contact import DWELL, LOST, REGAINED, SMOOTHING, Contact, Release
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Command, ToolPose, Track, turned
 from flangeye_plugins.weld.path import Path
@@ -122,7 +123,7 @@ def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one() -> None:
     for s in np.arange(0.0, 4.0, 4e-4):
         refined.add(0.0, float(s), 1e-3, 0.0)
     refined.confirm(1.0)
-    assert len(refined._near(0.01)) <= len(refined._near(2.0)) <= 2 * 60e-3 / 0.5e-3 + 2
+    assert len(refined._nearest(20, 120)) == len(refined._nearest(4000, 120)) == 240
     assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
     assert refined.offset(4.5) == pytest.approx(1e-3, abs=1e-5)  # half a metre beyond
 
@@ -290,3 +291,72 @@ def test_where_the_field_is_held_by_samples_an_error_of_the_plan_s_motion_does_n
     assert np.sqrt(refined.variance(0.04)) < 0.03e-3
     assert np.sqrt(refined.variance(0.1)) > 0.5e-3  # where nothing was felt the waves go on unseen
     assert refined.angle(0.04, 0.0) == 0.2
+
+
+@pytest.mark.parametrize("bow", [-3e-3, 3e-3])
+def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) -> None:
+    """A bow that shift and turn nearly explain leads the plan elsewhere beyond its last sample."""
+    plan = Path(curved(0.1))
+    rng = np.random.default_rng(0)
+    refined = RefinedPath(plan, 0.05)
+    refined.noise = 30e-6
+
+    def bowed(s):
+        return bow * np.sin(np.pi * s / plan.length)
+
+    for s in np.arange(5e-3, plan.length - 10e-3, 2e-4):
+        refined.add(0.0, s, bowed(s) + refined.noise * rng.standard_normal(), 0.0)
+    refined.confirm(1.0)
+    for s in np.arange(plan.length - 10e-3, plan.length, 1e-3):
+        off = abs(refined.offset(s) - bowed(s))
+        assert off < 4 * np.sqrt(refined.variance(s)) < 4e-3
+
+
+def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
+    few, many = RefinedPath(Path(straight()), 0.05), RefinedPath(Path(straight()), 0.05)
+    for refined, end in ((few, 1e-3), (many, 40e-3)):
+        for s in np.arange(0.0, end, 2e-4):
+            refined.add(0.0, s, 1e-3, 0.0)
+        refined.confirm(1.0)
+    assert few.variance(11e-3) > 20 * many.variance(50e-3)
+
+
+# --- whether the tip is where the seam is ---------------------------------------------------------
+
+
+def released(deflections, expected, two_walls=True, sigma=10e-6):
+    release = Release(two_walls)
+    for deflection, wanted in zip(deflections, expected, strict=True):
+        release.judge(deflection, wanted, sigma)
+    return release.loose
+
+
+def test_a_tip_that_is_let_go_of_and_should_still_be_pressed_has_lost_its_wall() -> None:
+    assert released([0.0] * 5, [0.5e-3] * 5)
+    assert not released([0.0] * 4, [0.5e-3] * 4)  # never on fewer
+    assert not released([0.0] * 5, [0.05e-3] * 5)
+    assert not released([0.3e-3] * 5, [0.5e-3] * 5)
+    assert not released([0.0] * 5, [0.2e-3] * 5, sigma=0.2e-3)  # a finger too noisy to say so
+
+
+def test_the_other_wall_tells_where_the_seam_is_though_the_wall_seemed_lost() -> None:
+    pressed_back = [0.0] * 5 + [-0.5e-3] * 5
+    assert not released(pressed_back, [0.5e-3] * 10)
+    assert released(pressed_back, [0.5e-3] * 10, two_walls=False)
+
+
+def climbing(aside, lifted):
+    """Judge a straight seam, then a tip aside and lifted [m]; return the largest doubt."""
+    seating, rng, doubt = Seating(1.0, 1.0), np.random.default_rng(0), 0.0
+    for i in range(200):
+        there = i >= 120
+        noise = 10e-6 * rng.standard_normal(2)
+        assert seating.judge(i * 2e-4, there * aside + noise[0], there * lifted + noise[1]) is None
+        doubt = max(doubt, seating.doubt if i > 130 else 0.0)
+    return doubt
+
+
+def test_a_tip_that_may_have_climbed_a_little_is_doubted_by_so_much() -> None:
+    assert climbing(0.3e-3, 0.3e-3) == pytest.approx(0.3e-3, abs=0.05e-3)
+    assert climbing(0.0, 1.5e-3) < 0.05e-3  # a tack weld
+    assert climbing(0.3e-3, 0.0) < 0.05e-3  # the seam turns aside

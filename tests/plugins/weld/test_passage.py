@@ -45,7 +45,7 @@ def test_every_chain_of_postures_is_one_smooth_way(name: str, angle: str) -> Non
         assert np.abs(np.diff(chain, axis=0)).max() <= JUMP
         assert (chain >= task.limits.lower + ROOM).all()
         assert (chain <= task.limits.upper - ROOM).all()
-        heights = [task.tool.lowest(pose, FINGER.torch) for pose in arm.flange(chain)]
+        heights = [task.tool.lowest(pose) for pose in arm.flange(chain)]
         assert heights[0] == pytest.approx(task.params.clearance + 0.05, abs=2e-3)
         assert min(heights) == pytest.approx(0.0, abs=1e-3)  # on the seam itself
     # The last posture has the tip beyond the seam's end, where the torch comes to it.

@@ -30,6 +30,7 @@ class View:
         fitted: Those that became an observation.
         arm: Where the arm was last: position [m], and when [s].
         progress: What the solver last knew of its error.
+        next: Where the arm goes, and why there: the capture's id, and what it promises.
         events: The latest lines for people.
         newest_ns: When the last message was logged.
         ended: Whether the run came to its end.
@@ -41,6 +42,7 @@ class View:
     fitted: int = 0
     arm: tuple[list[float], str] | None = None
     progress: dict[str, Any] | None = None
+    next: tuple[str, str] | None = None
     events: list[str] = field(default_factory=list)
     newest_ns: int = 0
     ended: bool = False
@@ -76,7 +78,7 @@ class View:
         elif topic.startswith("/step/"):
             self._step(topic.removeprefix("/step/"), schema, content)
         elif topic.startswith("/note/"):
-            self._note(schema, content["value"])
+            self._note(topic.rpartition("/")[2], schema, content["value"])
 
     def _step(self, step: str, schema: str, content: dict[str, Any]) -> None:
         if content["capture"] is None:
@@ -86,8 +88,10 @@ class View:
             self.fitted += 1
             self._say(f"fitted {content['capture']}")
 
-    def _note(self, schema: str, value: dict[str, Any]) -> None:
-        if schema == "flangeye.RobotState":
+    def _note(self, name: str, schema: str, value: dict[str, Any]) -> None:
+        if name == "next":
+            self.next = value["id"], value["why"]
+        elif schema == "flangeye.RobotState":
             self._place(value["base_T_flange"], value["mode"])
         elif schema == "flangeye.Progress":
             self.progress = value
@@ -117,6 +121,7 @@ class View:
             ("captures", f"{self.captures}{of}, {self.fitted} fitted"),
             ("arm", self._arm()),
             ("error so far", self._error()),
+            *([("next pose", ": ".join(filter(None, self.next)))] if self.next else []),
         ]
 
     def _arm(self) -> str:

@@ -223,7 +223,10 @@ def _averaged(
     """Return the variances [m^2] at ``point`` from the scans and the arm, and the arm's own."""
     turn = np.array(estimate.matrix)[:3, :3]
     own = turn @ np.array([o.covariance for o in used]) @ turn.T
-    places = np.array([o.tcp_in_base for o in used], dtype=float)
+    seen = np.array([o.centre_in_camera for o in used], dtype=float)
+    places = seen @ turn.T + np.array(estimate.matrix)[:3, 3]
+    if used[0].tcp_in_base is not None:  # in a cell no single arm tells
+        places = np.array([o.tcp_in_base for o in used], dtype=float)
     residuals = np.array([o.residual_in_base for o in used], dtype=float)
     noise = excess_variance(residuals, own)
     weights = np.linalg.inv(own + max(noise, 1e-14) * np.eye(3))

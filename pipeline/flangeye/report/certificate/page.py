@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +21,31 @@ from flangeye.report.certificate.budget import Conditions, budget_of, shares_of,
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
+from flangeye.result import result_of_camera
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
-def write_certificate(run: Path, path: Path | None, conditions: Conditions) -> Path:
+def write_certificate(
+    run: Path, path: Path | None, conditions: Conditions, camera: str | None = None
+) -> Path:
     """Write the certificate of a run and return its path.
 
     Args:
         run: The run's folder or its ``run.mcap``.
         path: The file; by default ``certificate.html`` beside the log.
         conditions: What the person says of the place.
+        camera: Of a cell, the camera that is certified.
 
     Raises:
-        StageError: There is no log, no calibration in it, or the file cannot be written.
+        StageError: There is no log, no calibration in it, it is of a cell and no camera was
+            chosen, or the file cannot be written.
     """
     log = run / "run.mcap" if run.is_dir() else run
-    page = render(facts_of(read_run(log)), conditions)
-    path = path or log.parent / "certificate.html"
+    facts = facts_of(read_run(log))
+    facts = replace(facts, result=result_of_camera(facts.result, camera))
+    page = render(facts, conditions)
+    path = path or log.parent / f"certificate{f'-{camera}' if camera else ''}.html"
     write_whole(path, page)
     return path
 
@@ -106,10 +114,16 @@ def _objects(header: dict[str, Any], scanner: ScannerModel | None) -> list[tuple
         "Robot": str(robot.get("model", "")),
         "Scanner": f"{scanner.maker} {scanner.model}" if scanner else "",
         "Target": str(feature.get("standard") or feature.get("sphere") or "the robot's flange"),
-        "Configuration": str((header.get("configuration") or {}).get("name", "eye-on-base")),
+        "Configuration": _configured(header),
         "Serial": str(_serial(header.get("scanner") or {})),
     }
     return [(name, value) for name, value in rows.items() if value]
+
+
+def _configured(header: dict[str, Any]) -> str:
+    if "cell" in header:
+        return "a cell of several cameras, arms or targets, all calibrated at once"
+    return str((header.get("configuration") or {}).get("name", "eye-on-base"))
 
 
 def _serial(section: dict[str, Any]) -> str:

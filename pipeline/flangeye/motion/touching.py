@@ -1,0 +1,117 @@
+"""A tip on points that the scanner saw: the arm goes near, slowly; a person jogs the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.devices import RobotDriver
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rigid
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.motion.arm import watched
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.reading import read_state
+from flangeye.motion.route import Barred, Route, Router
+from flangeye.types import Floats
+
+ABOVE = 0.05
+"""The tip goes to this distance before a point first, then on along the tool [m]."""
+SHORT = 0.005
+"""It stops this far before the point [m]: a wrong matrix must not drive it into the work."""
+SLOW = 0.02
+"""Largest speed of the flange [m/s]."""
+SLOW_JOINT = 0.2
+"""Largest speed of a joint [rad/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """A point that was touched.
+
+    Attributes:
+        predicted: (3,) where the calibration has it, in ``base`` [m].
+        actual: (3,) where the tip was, by the arm [m].
+        base_T_flange: (4, 4) the arm's pose then.
+    """
+
+    predicted: Floats
+    actual: Floats
+    base_T_flange: Floats
+
+    @property
+    def error(self) -> Floats:
+        """(3,) predicted less actual [m]."""
+        return np.asarray(self.predicted - self.actual)
+
+
+@dataclass(frozen=True, eq=False)
+class Toucher:
+    """An arm with a tip.
+
+    Attributes:
+        driver: Opens the arm.
+        model: Its model.
+        limits: What it must keep to; it keeps to :data:`SLOW` besides.
+        tip: (3,) in the flange [m].
+        ask: Shows a person a sentence and returns when it is done.
+    """
+
+    driver: RobotDriver
+    model: RobotModel
+    limits: MotionLimits
+    tip: Floats
+    ask: Callable[[str], None]
+
+    def touch(self, points: Floats, move: bool) -> Iterator[Touched]:
+        """Yield what was touched at each point (N, 3) in ``base``.
+
+        With ``move`` the arm goes to :data:`SHORT` before each, in the orientation that it has.
+        It is let go of before the person is asked to jog, and is only read afterwards.
+
+        Raises:
+            StageError: There is no way to a point; says what bars it.
+            DeviceError: The arm cannot be read or moved.
+        """
+        for number, point in enumerate(points, 1):
+            if move:
+                self._approach(number, point)
+            self.ask(f"point {number}: jog the tip onto it, slowly")
+            flange = read_state(self.driver)[1].base_T_flange.matrix
+            yield Touched(point, flange[:3, :3] @ self.tip + flange[:3, 3], flange)
+
+    def _approach(self, number: int, point: Floats) -> None:
+        """Drive to before a point, by a way that was checked as a whole."""
+        state = read_state(self.driver)[1]
+        ways = self._ways(number, point, state.base_T_flange.rotation, state.joints)
+        self.ask(f"point {number}: the arm will go to {SHORT * 1e3:g} mm before it; keep clear")
+        with watched(self.driver, self.model, self._slowly()) as arm:
+            for way in ways:
+                arm.go(way)
+                arm.wait()
+
+    def _ways(self, number: int, point: Floats, turn: Floats, joints: Floats) -> list[Route]:
+        arm, router = Arm(self.model), Router(self.model, self._slowly(), joints)
+        along = turn @ (self.tip / np.linalg.norm(self.tip))
+        ways = []
+        for before in (ABOVE, SHORT):
+            pose = rigid(turn, point - before * along - turn @ self.tip)
+            found = arm.inverse_near(pose, joints[None])
+            way = router.route(joints, found[0]) if len(found) else Barred("out of the arm's reach")
+            if isinstance(way, Barred):
+                raise StageError(
+                    f"touch: no way to {before * 1e3:g} mm before point {number}: {way.reason}; "
+                    "jog the arm nearer, turn the tool, or go without --move"
+                )
+            joints = found[0]
+            ways.append(way)
+        return ways
+
+    def _slowly(self) -> MotionLimits:
+        limits = self.limits
+        return replace(
+            limits, speed=min(limits.speed, SLOW), joint_speed=min(limits.joint_speed, SLOW_JOINT)
+        )

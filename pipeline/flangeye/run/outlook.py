@@ -1,0 +1,107 @@
+"""What the poses so far are worth: while a run goes, after it was killed, or when it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flangeye import types as t
+from flangeye.errors import FlangeyeError
+from flangeye.log.read import RunLog
+from flangeye.maths.statistics import corners_of, largest_error_quantile
+from flangeye.models.coverage import Coverage, coverage_of
+from flangeye.models.workspace import work_of, workspace_of
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.run.runner import Runner
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What a calibration of the poses so far would be.
+
+    Attributes:
+        residuals: By pose, of those that the solver used [m].
+        set_aside: Why the solver did not use a pose, by pose.
+        error: No point of the work is off by more, with 95 % probability [m]; None where unknown.
+        missing: What the solver lacks, in its own words: the motion that is missing; else empty.
+        coverage: What of the work the poses have been in, where it is known.
+    """
+
+    residuals: dict[str, float] = field(default_factory=dict)
+    set_aside: dict[str, str] = field(default_factory=dict)
+    error: float | None = None
+    missing: str = ""
+    coverage: Coverage | None = None
+
+    def lines(self) -> list[str]:
+        """Return it for people, a line each."""
+        poses = [f"{pose}  {size * 1e3:.3f} mm" for pose, size in self.residuals.items()]
+        poses += [f"{pose}  set aside: {why}" for pose, why in self.set_aside.items()]
+        worth = "error to expect: not known yet"
+        if self.error is not None:
+            worth = f"error to expect: 95 % below {self.error * 1e3:.3f} mm anywhere at the work"
+        covered = [f"covered: {self.coverage}"] if self.coverage else []
+        missing = [f"missing: {self.missing}"] if self.missing else []
+        return [*poses, worth, *covered, *missing, *(f"better: {x}" for x in self.better)]
+
+    @property
+    def better(self) -> list[str]:
+        """Which motions would make it better."""
+        return self.coverage.lacking() if self.coverage else []
+
+
+def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
+    """Return the outlook of a log by its own recipe; the run may be going on, killed or done."""
+    text = log.text("recipe.resolved.yaml") or log.text("recipe.yaml") or ""
+    recipe = parse_recipe(text, log.path.name, registry)
+    return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
+
+
+def outlook(
+    recipe: Recipe, registry: Registry, seen: Sequence[t.Observation], source: t.Source
+) -> Outlook:
+    """Return what the recipe's solve step makes of what was seen so far.
+
+    Args:
+        recipe: The run's recipe.
+        registry: The registry it was checked with.
+        seen: What was fitted so far.
+        source: Where it comes from.
+    """
+    # The truth of a simulation is no business of the solver's.
+    runner = Runner(_of_all(recipe), registry, t.ArchivePath())
+    try:
+        found = runner.solve(seen, replace(source, truth=None))
+    except FlangeyeError as error:
+        return Outlook(missing=str(error), coverage=_coverage(recipe, seen, source))
+    used = {p.observation.id: float(np.linalg.norm(p.residual)) for p in found.pairs if p.used}
+    aside = {p.observation.id: p.reason or "not used" for p in found.pairs if not p.used}
+    return Outlook(used, aside, _error(found, recipe, source), "", _coverage(recipe, seen, source))
+
+
+def _of_all(recipe: Recipe) -> Recipe:
+    """Return the recipe with a solver that does not stop before the last pose."""
+    steps = [
+        replace(step, params=step.params.model_copy(update={"required": None}))
+        if step.stage.kind == "solve" and getattr(step.params, "required", None) and step.params
+        else step
+        for step in recipe.steps
+    ]
+    return replace(recipe, steps=tuple(steps))
+
+
+def _error(found: t.HandEye, recipe: Recipe, source: t.Source) -> float:
+    camera = found.camera
+    box = work_of(found, source, recipe.context.get(t.Box))
+    corners = camera.about[None] if box is None else corners_of(box.centre, box.size)
+    return largest_error_quantile(camera.covariance, camera.about, corners)
+
+
+def _coverage(recipe: Recipe, seen: Sequence[t.Observation], source: t.Source) -> Coverage | None:
+    seen = [o for o in seen if t.FLANGE in o.poses]
+    pairs = [t.Pair(o, np.zeros(3)) for o in seen]
+    box = workspace_of(source, recipe.context.get(t.Box), pairs)
+    return coverage_of(box, [o.base_T_flange.matrix for o in seen]) if box and seen else None

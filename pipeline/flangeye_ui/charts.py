@@ -1,0 +1,94 @@
+"""Charts of a run: residuals by pose, what of the work was covered, where the flange has been."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from typing import Any
+
+import numpy as np
+
+from flangeye.models.coverage import ENOUGH, Coverage
+from flangeye.run.outlook import Outlook
+
+USED, ASIDE, FAINT = "#1a7f45", "#c02626", "#8a93a3"
+LAYERS = ("low", "middle", "high")
+
+
+def residual_chart(found: Outlook | None) -> dict[str, Any]:
+    """Return a bar for the residual of each pose; those set aside are named at their place."""
+    sizes = dict(found.residuals) if found else {}
+    aside = list(found.set_aside) if found else []
+    names = sorted([*sizes, *aside])
+    bars = [round(1e3 * sizes[n], 4) if n in sizes else None for n in names]
+    crosses = [[n, 0] for n in aside]
+    return {
+        "animation": False,
+        "grid": {"left": 45, "right": 10, "top": 25, "bottom": 25},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "category", "data": names, "axisLabel": {"color": FAINT}},
+        "yAxis": {
+            "type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
+            "axisLabel": {"color": FAINT}, "splitLine": {"lineStyle": {"opacity": 0.3}},
+        },
+        "series": [
+            {"type": "bar", "name": "residual, mm", "data": bars, "color": USED},
+            {
+                "type": "scatter", "name": "set aside", "data": crosses, "color": ASIDE,
+                "symbol": "diamond", "symbolSize": 12,
+            },
+        ],
+    }  # fmt: skip
+
+
+def place_chart(places: Mapping[str, list[float]], aside: Set[str]) -> dict[str, Any]:
+    """Return the flange's places from above: used ones green, those set aside red."""
+    axis = {"type": "value", "scale": True, "axisLabel": {"color": FAINT}}
+    axis["splitLine"] = {"lineStyle": {"opacity": 0.3}}
+    series = []
+    for name, colour, wanted in (("used", USED, False), ("set aside", ASIDE, True)):
+        at = [[1e3 * p[0], 1e3 * p[1]] for k, p in places.items() if (k in aside) is wanted]
+        series.append({"type": "scatter", "name": name, "data": at, "color": colour})
+    grid = {"left": 50, "right": 10, "top": 10, "bottom": 30}
+    return {"xAxis": axis, "yAxis": axis, "grid": grid, "series": series, "animation": False}
+
+
+def coverage_drawing(found: Coverage) -> str:
+    """Return an SVG: the cells of the work, layer by layer from above, and the turns."""
+    layers = "".join(_layer(found, i) for i in range(len(LAYERS)))
+    turns = "".join(_turn(found, i) for i in range(3))
+    return (
+        f'<svg viewBox="0 0 360 118" width="100%" role="img" fill="currentColor" font-size="9" '
+        f'style="max-width:30rem"><title>{found}</title>{layers}{turns}</svg>'
+    )
+
+
+def _layer(found: Coverage, z: int) -> str:
+    """Return the cells of one height, base x to the right and y up."""
+    cells, left = [], 4 + 82 * z
+    for (x, y), count in np.ndenumerate(found.places[:, :, z]):
+        at = f'x="{left + 24 * x}" y="{50 - 24 * y + 2}" width="22" height="22" rx="3"'
+        cells.append(
+            f'<rect {at} fill="{USED}" fill-opacity="{min(0.25 + 0.2 * count, 1.0):.2f}"/>'
+            f'<text x="{left + 24 * x + 11}" y="{50 - 24 * y + 16}" text-anchor="middle">{count}'
+            "</text>"
+            if count
+            else f'<rect {at} fill="none" stroke="{FAINT}" stroke-dasharray="2 2"/>'
+        )
+    label = f'<text x="{left + 35}" y="90" text-anchor="middle">{LAYERS[z]}</text>'
+    return "".join(cells) + label
+
+
+def _turn(found: Coverage, axis: int) -> str:
+    """Return a bar to either side for the turns about one axis; 30 deg is its whole length."""
+    y, middle = 10 + 26 * axis, 305
+    parts = [f'<text x="{middle - 52}" y="{y + 4}">{"xyz"[axis]}</text>']
+    for sign, size in zip((-1, 1), found.turns[axis], strict=True):
+        length = min(float(np.degrees(size)), 30.0) * 40 / 30
+        colour = USED if size >= ENOUGH else ASIDE
+        x = middle - length if sign < 0 else middle
+        parts.append(
+            f'<rect x="{x:.1f}" y="{y - 5}" width="{length:.1f}" height="10" fill="{colour}"/>'
+        )
+    parts.append(f'<line x1="{middle}" x2="{middle}" y1="{y - 8}" y2="{y + 8}" stroke="{FAINT}"/>')
+    label = f'<text x="{middle}" y="90" text-anchor="middle">turned about, ±30°</text>'
+    return "".join(parts) + (label if axis == 2 else "")

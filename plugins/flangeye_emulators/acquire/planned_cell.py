@@ -1,0 +1,340 @@
+"""What simulated sessions of cells have in common: parameters, moments, and who sees whom."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.errors import StageError
+from flangeye.handeye.cell import solve_so_far
+from flangeye.handeye.cell_plan import foreseen, foreseen_poses, most_telling
+from flangeye.handeye.graph import LIMITS, Solved
+from flangeye.maths.frame_graph import Frame, chain, composed
+from flangeye.maths.geometry import invert
+from flangeye.models.cell import Axis, Cell
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import Params
+from flangeye.types import Feature, Floats, Observation, Poses, Source, Transform, Truth
+from flangeye.units import Angle, Length, param
+from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, PlaceParams, noise_free
+from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
+from flangeye_emulators.world.session import DRAWS, View, disturbed
+
+UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
+"""Joints of an arm of which nothing is said."""
+GRID = (-1.0, 0.0, 1.0)
+"""Values of each joint on a grid, in shares of the spread."""
+CANDIDATES = 100
+"""Moments that are compared for each camera and target."""
+FEWEST = 3
+"""Sightings that each camera and each target takes part in, at least."""
+
+
+class CellSessionParams(Params):
+    """What simulated sessions of cells have in common."""
+
+    sightings: int = Field(60, ge=3, description="How many, dealt evenly to who sees whom.")
+    places: dict[str, PlaceParams] = Field(
+        default_factory=dict,
+        description="Where everything that the cell leaves unknown truly is, by frame; the base of "
+        "an arm called two is two_base.",
+    )
+    home: dict[str, tuple[Angle, ...]] = Field(
+        default_factory=dict,
+        description="Joints of an arm at the middle of its poses, by its name.",
+    )
+    plan: Literal["random", "grid", "next_best"] = Field(
+        "random",
+        description="Which moments are taken: drawn at random, or a grid of joints, in turn for "
+        "each camera and target; or always the camera, the target and the joints that promise to "
+        "tell most of the whole cell, by what was seen so far.",
+    )
+    spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
+    facing: Angle = param(
+        "50 deg", gt=0, description="Largest angle between a target's z and the view."
+    )
+    robot_rotation: Angle = param("0.01 deg", ge=0, description="Noise of a reported pose.")
+    robot_position: Length = param("0.05 mm", ge=0, description="And of its place.")
+    arm: ArmErrors = Field(
+        default_factory=ArmErrors,
+        description="How far the arms are from what their controllers say; by default by the "
+        "noise of the pose alone.",
+    )
+
+
+Sight = tuple[int, str, str]
+"""A moment, a camera, a target."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedCell:
+    """A session that was planned.
+
+    Attributes:
+        moments: What may be seen.
+        dealt: What is, unless it is chosen as it goes.
+        source: Where it comes from, with the truth.
+        view: What the cameras see.
+        chooses: Whether each sighting is chosen by what was seen so far.
+    """
+
+    moments: Moments
+    dealt: Sequence[Sight]
+    source: Source
+    view: View
+    chooses: bool
+
+    def sights(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sight]:
+        """Yield what is seen, as it is asked for.
+
+        Args:
+            seen: Gives what came of the sightings so far.
+        """
+        yield from Chooser(self).sights(seen) if self.chooses else self.dealt
+
+
+class Chooser:
+    """Chooses the sighting that promises to tell most, by what was seen so far.
+
+    Until that tells where everything is, sightings are those a person would show: each pair in
+    turn. A choice at which the camera does not see the target after all gives nothing, and counts.
+    """
+
+    def __init__(self, planned: PlannedCell) -> None:
+        """Start before the first sighting."""
+        self._planned, self._left = planned, list(planned.dealt)
+        self._rng = np.random.default_rng(len(planned.dealt))
+        self._taken: set[int] = set()
+        self._found: Solved | None = None
+
+    def sights(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sight]:
+        """Yield what is seen, as many at most as were to be dealt."""
+        moments, cell = self._planned.moments, self._planned.moments.cell
+        for _ in self._planned.dealt:
+            before = seen()
+            self._found = solve_so_far(before, cell, LIMITS, self._found)
+            chosen = self._choose(before) or self._left.pop(0)
+            self._taken.add(chosen[0])
+            if self._planned.view.sees(moments.pose(*chosen)[None])[0]:
+                yield chosen
+
+    def _choose(self, seen: Sequence[Observation]) -> Sight | None:
+        if self._found is None:
+            return None
+        cell = self._planned.moments.cell
+        foreseen = [o for pair in self._pairs(seen) for o in self._in_view(*pair, self._found)]
+        if not foreseen:
+            return None
+        best = foreseen[most_telling(foreseen, self._found, cell, seen)]
+        return int(best.id), best.camera, best.target
+
+    def _pairs(self, seen: Sequence[Observation]) -> list[tuple[tuple[str, str], Feature]]:
+        """Return who may see whom, and what such a sighting measures."""
+        of = {(o.camera, o.target): o.feature for o in seen}
+        return [(pair, feature) for pair, feature in of.items()]
+
+    def _in_view(self, ends: tuple[str, str], like: Feature, found: Solved) -> list[Observation]:
+        """Return moments drawn, at which a camera sees a target by what is known so far."""
+        moments = self._planned.moments
+        drawn = self._rng.choice(DRAWS, CANDIDATES, replace=False)
+        free = [int(i) for i in drawn if int(i) not in self._taken]
+        reported = [moments.poses(i) for i in free]
+        foretold = foreseen(reported, ends, found, moments.cell, like)
+        poses = foreseen_poses(reported, ends, found, moments.cell)
+        visible = np.flatnonzero(self._planned.view.sees(poses))
+        return [replace(foretold[k], id=str(free[k])) for k in visible]
+
+
+def plan_cell(
+    cell: Cell, seed: int, params: CellSessionParams, view: View, rng: np.random.Generator
+) -> PlannedCell:
+    """Draw where everything that moves is, and deal the moments to who sees whom.
+
+    Raises:
+        StageError: The place of an unknown is not given, or a camera or target takes part in too
+            few sightings.
+    """
+    _require_places(cell, params)
+    moments = _draw(cell, params, rng)
+    chosen = _deal(cell, moments, params.sightings, view)
+    sights, unseen = chosen[: params.sightings], chosen[params.sightings :]
+    truth = Truth(*_true(cell, params), unseen=tuple(moments.exact(*each) for each in unseen))
+    source = replace(_source(cell, seed, params), truth=truth)
+    return PlannedCell(moments, sights, source, view, params.plan == "next_best")
+
+
+def _require_places(cell: Cell, params: CellSessionParams) -> None:
+    missing = [name for name in cell.unknown_frames if name not in params.places]
+    if missing:
+        raise StageError(
+            f"a simulated cell: places says where everything unknown truly is, and lacks "
+            f"{', '.join(missing)}: write places: {{{missing[0]}: {{position: [1 m, 0 m, 0 m]}}}}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What the controllers report at N moments, and where things are.
+
+    Attributes:
+        cell: What stands on what.
+        reported: (N, 4, 4) by what moves.
+        actual: All frames with their true places.
+        angles: (N, n) by arm, as they are [rad].
+    """
+
+    cell: Cell
+    reported: Mapping[str, Floats]
+    actual: Mapping[str, Frame]
+    angles: Mapping[str, Floats]
+
+    def seen(self, camera: str, target: str) -> Floats:
+        """Return (N, 4, 4) camera_T_target."""
+        return np.asarray(invert(_each(self.actual, camera)) @ _each(self.actual, target))
+
+    def place(self, i: int, name: str) -> Floats:
+        """Return (4, 4) of a frame in the root, at one moment."""
+        frames = {
+            each: replace(frame, place=frame.place[i])
+            if frame.place is not None and frame.place.ndim == 3
+            else frame
+            for each, frame in self.actual.items()
+        }
+        return composed(frames, name)
+
+    def pose(self, i: int, camera: str, target: str) -> Floats:
+        """Return (4, 4) camera_T_target at one moment."""
+        return np.asarray(invert(self.place(i, camera)) @ self.place(i, target))
+
+    def poses(self, i: int) -> Poses:
+        """Return what the controllers report at one moment."""
+        return {
+            name: Transform(f"{name}_base", name, places[i])
+            for name, places in self.reported.items()
+        }
+
+    def exact(self, i: int, camera: str, target: str) -> Observation:
+        """Return what a camera without noise sees."""
+        return replace(
+            noise_free(self.pose(i, camera, target), i, self.poses(i), None),
+            id=name_of((i, camera, target)),
+            camera=camera,
+            target=target,
+        )
+
+
+def name_of(sight: Sight) -> str:
+    """Return what a sighting is called."""
+    i, camera, target = sight
+    return f"{i:04d}-{camera}-{target}"
+
+
+def _each(frames: Mapping[str, Frame], name: str) -> Floats:
+    return np.broadcast_to(composed(frames, name), (DRAWS, 4, 4))
+
+
+def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Moments:
+    """Draw where everything that moves is reported to be, and where it then is."""
+    drawn = {name: _moved(name, mover, params, rng) for name, mover in cell.movers.items()}
+    reported = {name: places for name, (places, *_) in drawn.items()}
+    angles = {name: joints for name, (*_, joints) in drawn.items() if joints is not None}
+    noise = params.robot_rotation, params.robot_position
+    actual = {name: disturbed(places, noise, rng) for name, (_, places, _) in drawn.items()}
+    still = {name: place.matrix for name, place in params.places.items()}
+    frames = {
+        name: replace(frame, place=(still | actual).get(name, frame.place))
+        for name, frame in cell.frames.items()
+    }
+    return Moments(cell, reported, frames, angles)
+
+
+def _moved(
+    name: str, mover: RobotModel | Axis, params: CellSessionParams, rng: np.random.Generator
+) -> tuple[Floats, Floats, Floats | None]:
+    """Return (N, 4, 4) places of what moves: as reported, and as they are; an arm's true angles."""
+    if isinstance(mover, Axis):
+        low, high = mover.travel
+        shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
+        places = np.array([mover.place(low + x * (high - low)) for x in shares])
+        return places, places, None
+    home = np.array(params.home.get(name, UPRIGHT))
+    joints = home + params.spread * _changes(params.plan, len(home), rng)
+    arm = ImperfectArm(mover, 0.0 if params.arm.is_default else 1.0, rng.spawn(1)[0], params.arm)
+    angles = arm.angles(joints)
+    return arm.reported(joints), arm.flange(angles), angles
+
+
+def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
+    """Return (N, n) changes of joints, from -1 to 1: drawn, or on a grid in an order that is.
+
+    Those to choose from are of both: what tells most is often at the edge.
+    """
+    anywhere = rng.uniform(-1, 1, (DRAWS, joints))
+    if plan == "random":
+        return anywhere
+    grid = np.stack(np.meshgrid(*[GRID] * joints, indexing="ij"), axis=-1).reshape(-1, joints)
+    order = [rng.permutation(len(grid)) for _ in range(-(-DRAWS // len(grid)))]
+    regular = np.asarray(grid[np.concatenate(order)[:DRAWS]])
+    either = rng.random((DRAWS, 1)) < 0.5
+    return regular if plan == "grid" else np.where(either, regular, anywhere)
+
+
+def _deal(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sight]:
+    """Choose who sees whom at which moment: each pair in turn, as long as it sees anything."""
+    pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
+    free = {p: list(np.flatnonzero(view.sees(moments.seen(*p)))) for p in pairs if _apart(cell, p)}
+    taken: set[int] = set()
+    chosen: list[Sight] = []
+    while len(chosen) < sightings + UNSEEN and any(free.values()):
+        for (camera, target), left in free.items():
+            i = next((i for i in left if i not in taken), None)
+            left[:] = [] if i is None else left[left.index(i) + 1 :]
+            if i is not None:
+                taken.add(int(i))
+                chosen.append((int(i), camera, target))
+    _require_seen(cell, chosen, sightings)
+    return chosen
+
+
+def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
+    """Return whether anything moves the two against each other."""
+    first, second = ({*chain(cell.frames, end)} & {*cell.movers} for end in pair)
+    return first != second
+
+
+def _require_seen(cell: Cell, chosen: list[Sight], wanted: int) -> None:
+    count = Counter(end for _, camera, target in chosen for end in (camera, target))
+    for end in (*cell.cameras, *cell.targets):
+        if count[end] < FEWEST:
+            what = "sees" if end in cell.cameras else "is seen in"
+            raise StageError(
+                f"a simulated cell: '{end}' {what} {count[end]} of {DRAWS} moments drawn; "
+                "move it or the arms' home, or make spread larger"
+            )
+    if len(chosen) < wanted:
+        raise StageError(
+            f"a simulated cell: {len(chosen)} of {DRAWS} moments drawn give a sighting, and "
+            f"{wanted} are needed; make spread smaller, or move cameras and targets"
+        )
+
+
+def _true(cell: Cell, params: CellSessionParams) -> tuple[Transform, tuple[Transform, ...]]:
+    camera, *others = (
+        Transform.named(cell.name_of(name), params.places[name].matrix)
+        for name in cell.unknown_frames
+    )
+    return camera, tuple(others)
+
+
+def _source(cell: Cell, seed: int, params: CellSessionParams) -> Source:
+    made_of = [cell.describe(), params.model_dump(mode="json")]
+    text = json.dumps([VERSION, seed, made_of], sort_keys=True)
+    note = f"simulated: a cell, {params.sightings} sightings"
+    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,))

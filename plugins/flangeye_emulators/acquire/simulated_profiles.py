@@ -1,0 +1,141 @@
+"""``acquire.simulated_profiles``: a line scanner in the hand passes a sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flangeye.models.configuration import Configuration
+from flangeye.models.robots import RobotModel
+from flangeye.models.targets import Sphere
+from flangeye.plugin.stage import stage
+from flangeye.types import CAMERA, Capture, Captures, Floats, PointCloud, Seed
+from flangeye.units import Angle, Length, param
+from flangeye_emulators.acquire.planned_session import (
+    VERSION,
+    PlaceParams,
+    SessionParams,
+    plan_session,
+    source_of,
+)
+from flangeye_emulators.world.session import View, seen_from
+
+IN_THE_HAND = {"position": ("60 mm", "0 mm", "40 mm"), "rpy": ("0 deg", "0 deg", "90 deg")}
+DRAWS = 60_000
+"""Joint vectors tried: a laser passes a small sphere at few of them."""
+
+PASSES = (0.5, 0.95)
+"""How far beside the sphere's centre the laser passes, in radii."""
+
+
+class ProfilesParams(SessionParams):
+    """Parameters of ``acquire.simulated_profiles``."""
+
+    distance: Length = param("240 mm", gt=0, description="Scanner to sphere at the first pose.")
+    camera: PlaceParams | None = Field(
+        default_factory=lambda: PlaceParams.model_validate(IN_THE_HAND),
+        description="The scanner's true place on what carries it.",
+    )
+    near: Length = param("190 mm", gt=0, description="Nearest that the scanner sees.")
+    far: Length = param("290 mm", gt=0, description="Farthest that the scanner sees.")
+    fan: Angle = param("28 deg", gt=0, description="Full angle of the laser's fan.")
+    points: int = Field(1280, ge=50, description="Points of a profile.")
+    receiver: Length = param(
+        "-90 mm",
+        description="Where the receiver is beside the laser's plane, along y; from there the "
+        "sphere hides what is behind it.",
+    )
+    noise: Length = param("0.03 mm", ge=0, description="Of a point, along its ray.")
+    table: Length = param("40 mm", gt=0, description="How far under the sphere the table is.")
+
+
+@dataclass(frozen=True)
+class ProfileView(View):
+    """What a line scanner can see of a sphere: one that its laser passes beside the centre."""
+
+    radius: float = 0.0
+
+    def first(self) -> Floats:
+        """Return (4, 4) camera_T_target at the first pose: the laser passes 0.7 radii beside."""
+        pose = super().first()
+        pose[1, 3] = 0.7 * self.radius
+        return pose
+
+    def sees(self, poses: Floats) -> NDArray[np.bool_]:
+        """Return in which of (N, 4, 4) camera_T_target the laser cuts a circle well."""
+        x, y, z = poses[:, :3, 3].T
+        across = np.abs(x) + self.radius < np.tan(self.field[0] / 2) * z
+        beside = (y > PASSES[0] * self.radius) & (y < PASSES[1] * self.radius)
+        return np.asarray(across & beside & (z > self.near + self.radius) & (z < self.far))
+
+
+@stage("acquire.simulated_profiles")
+def acquire_simulated_profiles(
+    robot: RobotModel,
+    configuration: Configuration,
+    sphere: Sphere,
+    seed: Seed,
+    params: ProfilesParams,
+) -> Captures:
+    """Take profiles of a sphere by a line scanner, the centre always on the +y side of its plane.
+
+    Raises:
+        StageError: The laser cuts the sphere at too few poses.
+    """
+    rng = np.random.default_rng([VERSION, seed])
+    seen = params.distance, params.near, params.far, (params.fan, 0.0), params.facing
+    view = ProfileView(*seen, DRAWS, sphere.radius)
+    session = plan_session(robot, None, configuration, (params, view), rng)
+    up = session.actual.camera[:, :3, :3] @ session.places.x[:3, :3]
+
+    def captures() -> Iterator[Capture]:
+        for i, target in enumerate(seen_from(session.actual, session.places)):
+            table = up[i].T @ np.array([0.0, 0.0, 1.0])
+            xyz = profile_of(target[:3, 3], sphere.radius, table, params, rng)
+            poses, joints = session.poses(i)
+            yield Capture(f"{i:04d}", PointCloud(CAMERA, xyz), poses, joints)
+
+    return Captures(captures(), source_of(session, robot, seed, params), params.poses)
+
+
+def profile_of(
+    centre: Floats, radius: float, up: Floats, params: ProfilesParams, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Return the (N, 3) points of a profile of a sphere over a table, y = 0 [m].
+
+    Args:
+        centre: (3,) of the sphere, in ``camera`` [m].
+        radius: [m].
+        up: (3,) normal of the table, in ``camera``.
+        params: The scanner.
+        rng: Draws its noise.
+    """
+    x = np.linspace(-1, 1, params.points) * np.tan(params.fan / 2)
+    rays = np.stack([x, np.zeros_like(x), np.ones_like(x)], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table = ((centre - params.table * up) @ up) / (rays @ up)
+    depth = np.fmin(_sphere_depth(rays, centre, radius), np.where(table > 0, table, np.nan))
+    points = rays * depth[:, None]
+    eye = np.array([0.0, params.receiver, 0.0])
+    seen = (depth > params.near) & (depth < params.far) & ~_hidden(points, eye, centre, radius)
+    noisy = points + rays * (params.noise * rng.standard_normal(len(x)))[:, None]
+    return noisy[seen].astype(np.float32)
+
+
+def _sphere_depth(rays: Floats, centre: Floats, radius: float) -> Floats:
+    """Return where (N, 3) rays from the origin meet a sphere first; NaN where they do not."""
+    a, b = (rays**2).sum(axis=1), rays @ centre
+    inside = b**2 - a * (centre @ centre - radius**2)
+    return np.asarray((b - np.sqrt(np.where(inside > 0, inside, np.nan))) / a)
+
+
+def _hidden(points: Floats, eye: Floats, centre: Floats, radius: float) -> NDArray[np.bool_]:
+    """Return which points (N, 3) the sphere hides from ``eye``, its own far side too."""
+    rays = points - eye
+    with np.errstate(invalid="ignore"):
+        first = _sphere_depth(rays, centre - eye, radius)
+        return np.asarray(first < 1 - 1e-6)

@@ -1,0 +1,102 @@
+"""Recordings of a cell, held against what the recipe says stands in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flangeye import StageError
+from flangeye.files.recording import MAX_REACH, MIN_CAPTURES, MIN_SPREAD, Recording
+from flangeye.models.cell import Axis, Cell
+from flangeye.types import Floats, Poses, Transform
+
+
+def cell_poses(recording: Recording, cell: Cell) -> Poses:
+    """Return where a recording has everything that moves in the cell."""
+    return {
+        name: Transform(f"{name}_base", name, _place(recording, name, cell))
+        for name in cell.movers
+        if name in recording.poses or name in recording.axes
+    }
+
+
+def _place(recording: Recording, name: str, cell: Cell) -> Floats:
+    mover = cell.movers[name]
+    if isinstance(mover, Axis) and name in recording.axes:
+        return mover.place(recording.axes[name])
+    return recording.poses[name]
+
+
+def check_cell(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
+    """Refuse recordings that are not of this cell, or that nothing can be found from.
+
+    Raises:
+        StageError: A camera, a target or something that moves is unknown or lacks its recordings,
+            an arm is out of any arm's reach, or nothing moves.
+    """
+    _require_known(root, "camera", (r.seen_by for r in recordings), cell.cameras)
+    _require_known(root, "target", (r.saw for r in recordings), cell.targets)
+    moved = {name for r in recordings for name in (*r.poses, *r.axes)}
+    _require_known(root, "arm, rail or positioner", moved, tuple(cell.movers))
+    _require_all(root, recordings, cell)
+    _require_kinds(root, recordings, cell)
+    if len(recordings) < MIN_CAPTURES:
+        raise StageError(
+            f"{root}: {len(recordings)} sightings; at least {MIN_CAPTURES} of each camera are "
+            "needed, at different poses"
+        )
+    _require_motion(root, recordings)
+
+
+def _require_known(root: Path, what: str, given: Iterable[str], known: tuple[str, ...]) -> None:
+    for name in dict.fromkeys(given):
+        if name not in known:
+            raise StageError(
+                f"{root}: has recordings of '{name}', which is no {what} of the recipe's cell; it "
+                f"has {', '.join(known) or 'none'}"
+            )
+
+
+def _require_all(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
+    seen = {end for r in recordings for end in (r.seen_by, r.saw)}
+    for end in (*cell.cameras, *cell.targets):
+        if end not in seen:
+            what = "sees nothing" if end in cell.cameras else "is seen by no camera"
+            raise StageError(
+                f"{root}: '{end}' {what}; add its table to the reader, or leave it out of the cell"
+            )
+    for name in cell.movers:
+        if any(name not in r.poses and name not in r.axes for r in recordings):
+            raise StageError(
+                f"{root}: has no poses of '{name}', which moves in this cell; add its table to the "
+                "reader"
+            )
+
+
+def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
+    for recording in recordings:
+        for name in recording.axes:
+            if not isinstance(cell.movers[name], Axis):
+                raise StageError(
+                    f"{root}: '{name}' is an arm, and has one value a pose; give its poses in the "
+                    "reader's arms"
+                )
+        for name, pose in recording.poses.items():
+            distance = float(np.linalg.norm(pose[:3, 3]))
+            if distance > MAX_REACH:
+                raise StageError(
+                    f"{root}: pose '{recording.id}' has '{name}' {distance:.4g} m from its base, "
+                    "beyond any arm; are the positions in millimetres?"
+                )
+
+
+def _require_motion(root: Path, recordings: Sequence[Recording]) -> None:
+    first = recordings[0]
+    for recording in recordings:
+        if any(abs(x - first.axes[name]) > MIN_SPREAD for name, x in recording.axes.items()):
+            return
+        if any(np.abs(p - first.poses[n]).max() > MIN_SPREAD for n, p in recording.poses.items()):
+            return
+    raise StageError(f"{root}: nothing moves in all {len(recordings)} sightings; move the arms")

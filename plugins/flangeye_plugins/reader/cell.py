@@ -1,0 +1,350 @@
+"""Tables of a cell: one of each arm, rail or positioner, and one of what each camera saw.
+
+They are joined by the number of the pose, by time, or, where tables have neither, row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flangeye import Params, StageError, part
+from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.tables import Column, TextTable
+from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.streams import (
+    STILL_ANGLE,
+    STILL_DISTANCE,
+    interpolated,
+    mean_pose,
+    turning,
+)
+from flangeye.types import Floats
+from flangeye.units import param
+from flangeye_plugins.reader.columns import (
+    ColumnsParams,
+    readings_of,
+    table_with_rows,
+    times_of,
+)
+from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
+from flangeye_plugins.reader.written import POINT
+
+PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
+NUMBER = "Column of the pose's number, or name, by which tables are joined."
+
+
+class OwnTableParams(ColumnsParams):
+    """A table of its own."""
+
+    file: str = Field(description="The table's name, beside the others.")
+    number: Column | None = Field(None, description=NUMBER)
+
+    @model_validator(mode="after")
+    def _joined_one_way(self) -> OwnTableParams:
+        if self.number is not None and self.time is not None:
+            raise ValueError("give number or time, whichever the tables are joined by")
+        return self
+
+
+class ArmTableParams(OwnTableParams):
+    """Where an arm's controller had its flange."""
+
+    pose: Literal["base_T_flange", "flange_T_base"] = Field(
+        "base_T_flange", description="Whose pose it is: the flange's in the arm's base, or inverse."
+    )
+
+
+class AxisTableParams(Params):
+    """Where a rail's or a positioner's controller had it."""
+
+    file: str = Field(description="The table's name, beside the others.")
+    column: Column = Field(description="Column of the value.")
+    unit: Literal["m", "mm", "rad", "deg"] = Field(description="Its unit.")
+    number: Column | None = Field(None, description=NUMBER)
+    time: Column | None = Field(None, description="Column of the time.")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+
+
+class SightingsParams(OwnTableParams):
+    """One target as one camera saw it; empty cells where it did not."""
+
+    camera: str = Field(description="The camera's name in the recipe's cell.")
+    target: str = Field(description="The target's name there.")
+    pose: Literal["camera_T_target", "target_T_camera"] = Field(
+        "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
+    )
+
+    @classmethod
+    def more(cls) -> tuple[str, ...]:
+        """A point has no rotation."""
+        return (POINT,)
+
+
+class ScansParams(Params):
+    """The scans that one camera took of one target."""
+
+    camera: str = Field(description="The camera's name in the recipe's cell.")
+    target: str = Field(description="The target's name there.")
+    file: str = Field(description="The table that names them, beside the others.")
+    scan: Column = Field("scan", description="Column of the scans' files, beside the table.")
+    number: Column | None = Field(None, description=NUMBER)
+
+
+class CellParams(Params):
+    """Which tables there are, each in a stated convention."""
+
+    arms: dict[str, ArmTableParams] = Field(
+        default_factory=dict, description="Of each arm, by its name in the recipe's cell."
+    )
+    axes: dict[str, AxisTableParams] = Field(
+        default_factory=dict, description="Of each rail and positioner."
+    )
+    sightings: tuple[SightingsParams, ...] = Field(
+        (), description="Poses or points that cameras measured."
+    )
+    scans: tuple[ScansParams, ...] = Field((), description="Scans that cameras took.")
+    join: PairingParams = param(
+        PairingParams(), description="How they are joined where they have times."
+    )
+
+    @model_validator(mode="after")
+    def _says_what_was_seen(self) -> CellParams:
+        if not (self.sightings or self.scans):
+            raise ValueError("give sightings or scans: a table of what each camera saw")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """What a controller recorded.
+
+    Attributes:
+        name: Of what moves.
+        file: The table.
+        values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
+        keys: Of each row: the pose's number, its place in the table; None where it has a time.
+        times: (N,) [s], or None.
+    """
+
+    name: str
+    file: Path
+    values: Floats
+    keys: dict[str, int] | None
+    times: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a camera recorded of a target: (4, 4), (3,) or a scan, None where it did not see it."""
+
+    given: SightingsParams | ScansParams
+    text: TextTable
+    values: Sequence[Floats | Path | None]
+    keys: dict[str, int] | None
+    times: Floats | None
+
+
+@part("reader.cell")
+def cell(path: Path, params: CellParams) -> Archive:
+    """Read the tables of a cell: of what each controller reported, and of what each camera saw."""
+    files = {given.file for given in params.sightings} | {given.file for given in params.scans}
+    if not any((path / file).is_file() for file in files):
+        raise NotThisLayout(f"{path}: holds no {' or '.join(sorted(files))}")
+    moved = [*_arms(path, params), *_axes(path, params)]
+    seen = [*_sightings(path, params), *_scans(path, params)]
+    recordings, notes = [], []
+    for sightings in seen:
+        _require_one_join(sightings, moved)
+        found, told = _joined(sightings, moved, params.join)
+        recordings += found
+        notes += told
+    read = list(dict.fromkeys([each.file for each in moved] + [each.text.file for each in seen]))
+    layout = f"tables of a cell, {', '.join(table.name for table in read)}"
+    return Archive(layout, path, recordings, read, None, notes)
+
+
+# --- reading
+
+
+def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
+    for name, given in params.arms.items():
+        text = table_with_rows(folder / given.file)
+        found = readings_of(text, given, _taken(given))
+        for row, value in enumerate(found.values):
+            if value is None:
+                raise StageError(f"{text.where(row)}: has no pose of '{name}'")
+        poses = np.array(found.values)
+        poses = poses if given.pose == "base_T_flange" else inverted(poses)
+        yield Moved(name, text.file, poses, _keys(text, given.number, found.times), found.times)
+
+
+def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
+    for name, given in params.axes.items():
+        text = table_with_rows(folder / given.file)
+        values = text.numbers([text.index(given.column)])[:, 0] * PER_UNIT[given.unit]
+        times = times_of(text, given.time, given.time_unit)
+        yield Moved(name, text.file, values, _keys(text, given.number, times), times)
+
+
+def _sightings(folder: Path, params: CellParams) -> Iterator[Seen]:
+    for given in params.sightings:
+        text = table_with_rows(folder / given.file)
+        found = readings_of(text, given, _taken(given))
+        values = found.values
+        if given.pose == "target_T_camera" and given.rotation != POINT:
+            values = [None if value is None else inverted(value) for value in values]
+        yield Seen(given, text, values, _keys(text, given.number, found.times), found.times)
+
+
+def _scans(folder: Path, params: CellParams) -> Iterator[Seen]:
+    for given in params.scans:
+        text = table_with_rows(folder / given.file)
+        names = text.texts(text.index(given.scan))
+        for row, name in enumerate(names):
+            if name and not (folder / name).is_file():
+                raise StageError(f"{text.where(row)}: its scan '{name}' does not exist")
+        scans = [folder / name if name else None for name in names]
+        yield Seen(given, text, scans, _keys(text, given.number, None), None)
+
+
+def _taken(given: OwnTableParams) -> list[Column]:
+    return [] if given.number is None else [given.number]
+
+
+def _keys(text: TextTable, number: Column | None, times: Floats | None) -> dict[str, int] | None:
+    """Return where the row of each number is, or of each row where there are no numbers.
+
+    Raises:
+        StageError: A number is given twice.
+    """
+    if times is not None:
+        return None
+    if number is None:
+        return {str(row): row for row in range(len(text.rows))}
+    keys: dict[str, int] = {}
+    for row, key in enumerate(text.texts(text.index(number))):
+        if key in keys:
+            raise StageError(f"{text.where(row)}: pose {key} is there twice")
+        keys[key] = row
+    return keys
+
+
+# --- joining
+
+
+def _require_one_join(seen: Seen, moved: Sequence[Moved]) -> None:
+    for each in moved:
+        if (each.times is None) != (seen.times is None):
+            files = (seen.text.file, each.file)
+            timed, other = files if each.times is None else files[::-1]
+            raise StageError(
+                f"{timed}: has times, and {other.name} has none; join all tables by time, or all "
+                "by number"
+            )
+
+
+def _joined(
+    seen: Seen, moved: Sequence[Moved], params: PairingParams
+) -> tuple[list[Recording], list[str]]:
+    if seen.times is not None:
+        return _by_time(seen, moved, params)
+    return list(_by_number(seen, moved)), []
+
+
+def _by_number(seen: Seen, moved: Sequence[Moved]) -> Iterator[Recording]:
+    for key, row in (seen.keys or {}).items():
+        for each in moved:
+            if key not in (each.keys or {}):
+                raise StageError(
+                    f"{seen.text.where(row)}: pose {key} is not in {each.file.name}; every pose "
+                    f"needs its row of '{each.name}'"
+                )
+        at = {each.name: each.values[(each.keys or {})[key]] for each in moved}
+        yield _recording(seen, key, seen.values[row], at)
+
+
+def _by_time(
+    seen: Seen, moved: Sequence[Moved], params: PairingParams
+) -> tuple[list[Recording], list[str]]:
+    """Pair with the first arm's standstills; the others must stand still as well."""
+    first = next((each for each in moved if each.values.ndim == 3), None)
+    if first is None or first.times is None:
+        raise StageError(f"{seen.text.file}: joining by time needs the table of an arm")
+    kept = [i for i, value in enumerate(seen.values) if value is not None]
+    events, values = np.asarray(seen.times)[kept], [seen.values[i] for i in kept]
+    arm = first.times, first.values
+    try:
+        pairs, notes = pair(arm, events, _signals(arm, events, values), params)
+    except StageError as error:
+        raise StageError(f"{seen.text.file}: {error}") from None
+    still = [p for p in pairs if all(_stands(each, p, events) for each in moved)]
+    if len(still) < len(pairs):
+        notes.append(f"left out {len(pairs) - len(still)} poses, at which something else moved")
+    found = [
+        _recording(
+            seen, f"{i:04}", _mean([values[k] for k in p.events]),
+            {each.name: p.pose if each is first else _at(each, p.time) for each in moved}, p.time,
+        )
+        for i, p in enumerate(still)
+    ]  # fmt: skip
+    return found, [f"{seen.text.file.name}: {note}" for note in notes]
+
+
+Signal = tuple[Floats, Floats]
+
+
+def _signals(arm: Signal, events: Floats, values: Sequence[Floats | Path | None]) -> (
+    tuple[Signal, Signal] | None
+):  # fmt: skip
+    whole = [v for v in values if isinstance(v, np.ndarray) and v.shape == (4, 4)]
+    if len(whole) < max(2, len(values)):
+        return None
+    return turning(*arm), turning(events, np.array(whole))
+
+
+def _at(each: Moved, time: float) -> Floats:
+    times = np.asarray(each.times)
+    if each.values.ndim == 1:
+        return np.asarray(np.interp(time, times, each.values))
+    return np.asarray(interpolated(times, each.values, np.array([time]))[0])
+
+
+def _stands(each: Moved, found: Pair, events: Floats) -> bool:
+    """Whether something stands still while the measurements of one standstill are taken."""
+    half = np.ptp(events[list(found.events)]) / 2
+    before, after = (_at(each, found.time + side) for side in (-half, half))
+    if each.values.ndim == 1:
+        return bool(abs(after - before) < STILL_DISTANCE)
+    turned = np.arccos(np.clip((np.trace(before[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
+    moved = np.linalg.norm(after[:3, 3] - before[:3, 3])
+    return bool(moved < STILL_DISTANCE and turned < STILL_ANGLE)
+
+
+def _mean(values: Sequence[Floats | Path | None]) -> Floats:
+    seen = np.array(values)
+    return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
+
+
+def _recording(
+    seen: Seen, key: str, value: Floats | Path | None, at: Mapping[str, Floats], time: float = 0.0
+) -> Recording:
+    given = seen.given
+    found = Recording(
+        f"{key}-{given.camera}-{given.target}",
+        {name: pose for name, pose in at.items() if pose.ndim == 2},
+        time_ns=round(time * 1e9),
+        axes={name: float(x) for name, x in at.items() if x.ndim == 0},
+        seen_by=given.camera,
+        saw=given.target,
+    )
+    if value is None or isinstance(value, Path):
+        return replace(found, cloud=value)
+    if value.shape == (3,):
+        return replace(found, centre_in_camera=value)
+    return replace(found, camera_T_target=value)

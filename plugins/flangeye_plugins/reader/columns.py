@@ -1,0 +1,95 @@
+"""Columns of a text table: which of them hold a pose, a point or a time, and how it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import StageError
+from flangeye.files.tables import Column, TextTable, read_text_table
+from flangeye.types import Floats
+from flangeye_plugins.reader.written import WrittenParams
+
+PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+class ColumnsParams(WrittenParams):
+    """Which columns hold a pose, and how it is written."""
+
+    columns: tuple[Column, ...] = Field(
+        (), description="Names in the heading, or numbers from 1, in the order of the convention: "
+        "position first; all that nothing else takes if not given.",
+    )  # fmt: skip
+    time: Column | None = Field(None, description="Column of the time.")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+
+
+class Readings(NamedTuple):
+    """Poses or points of a table, None where cells are empty; their times [s], if given."""
+
+    file: Path
+    values: list[Floats | None]
+    times: Floats | None
+
+
+def table_with_rows(file: Path) -> TextTable:
+    """Return a table that holds something.
+
+    Raises:
+        StageError: It cannot be read, or holds no rows.
+    """
+    text = read_text_table(file)
+    if not text.rows:
+        raise StageError(f"{file}: holds no poses")
+    return text
+
+
+def readings_of(own: TextTable, given: ColumnsParams, taken: Sequence[Column] = ()) -> Readings:
+    """Return the values of one thing in a table.
+
+    Args:
+        own: The table.
+        given: Its columns, all but those ``taken`` and that of the time where none are named.
+        taken: Columns that hold something else.
+
+    Raises:
+        StageError: A cell is no number, or the times do not ascend.
+    """
+    other = [own.index(column) for column in (given.time, *taken) if column is not None]
+    width = max(len(cells) for _, cells in own.rows)  # empty last cells are not counted
+    free = [i for i in range(width) if i not in other]
+    columns = [own.index(column) for column in given.columns] or free
+    values = [
+        None if all(_is_empty(cells, c) for c in columns) else _value(own, row, columns, given)
+        for row, (_, cells) in enumerate(own.rows)
+    ]
+    return Readings(own.file, values, times_of(own, given.time, given.time_unit))
+
+
+def _is_empty(cells: Sequence[str], column: int) -> bool:
+    return column >= len(cells) or cells[column].lower() in ("", "nan")
+
+
+def _value(own: TextTable, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:
+    one = replace(own, rows=(own.rows[row],))
+    return given.value(own.where(row), one.numbers(columns)[0])
+
+
+def times_of(text: TextTable, column: Column | None, unit: str) -> Floats | None:
+    """Return the times of a column [s], None without one; they ascend.
+
+    Raises:
+        StageError: They do not.
+    """
+    if column is None:
+        return None
+    times = text.numbers([text.index(column)])[:, 0] * PER_SECOND[unit]
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        raise StageError(f"{text.where(int(back[0]) + 1)}: its time is not after the row before it")
+    return np.asarray(times)

@@ -1,0 +1,117 @@
+"""Sharp corners of a plan: each leg between them is a weld of its own.
+
+At a corner the torch stops: the weld of one leg ends, the tool is lifted, turned, and set down for
+the next. The finger goes ahead of the torch, straight beyond the end of its leg, and the torch
+comes from behind the start of the next: for both there is room only where the upright plate of a
+fillet or lap joint ends at the corner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.types import Floats, Seam
+from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.settings import WeldTactileParams
+
+SHARP = np.radians(35.0)
+"""A plan that turns by more within twice :data:`CHORD` has a corner."""
+
+CHORD = 5e-3
+"""Length of the chords to both sides of a corner [m]."""
+
+
+class Corner(NamedTuple):
+    """A corner of a polyline.
+
+    Attributes:
+        point: Its number.
+        along: Arc length there [m].
+        turn: To the left [rad].
+    """
+
+    point: int
+    along: float
+    turn: float
+
+
+def corners_of(points: Floats) -> list[Corner]:
+    """Return the corners of a polyline (N, 3) in the plane of the work, in their order."""
+    planar = points[:, :2]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(planar, axis=0), axis=1))])
+    turns = np.array([_turn(planar, along, s) for s in along])
+    found: list[Corner] = []
+    for index in np.flatnonzero(np.abs(turns) > SHARP).tolist():
+        corner = Corner(index, float(along[index]), float(turns[index]))
+        if found and corner.along - found[-1].along < 2 * CHORD:
+            found[-1] = max(found[-1], corner, key=lambda each: abs(each.turn))
+        else:
+            found.append(corner)
+    return found
+
+
+def _turn(planar: Floats, along: Floats, s: float) -> float:
+    """Return by how much a polyline turns to the left at an arc length; nothing at its ends."""
+    if not CHORD <= s <= along[-1] - CHORD:
+        return 0.0
+    before, here, after = (
+        np.array([np.interp(s + d, along, axis) for axis in planar.T]) for d in (-CHORD, 0.0, CHORD)
+    )
+    (ax, ay), (bx, by) = here - before, after - here
+    return float(np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
+
+
+def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
+    """Return the leg of a plan that is to be welded: all of it where it has no corner.
+
+    Raises:
+        StageError: It has corners and no leg is chosen, or the other way round, or the tool has no
+            room beyond one of the leg's ends.
+    """
+    plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
+    corners = corners_of(plane.points(seam.points_in_base))
+    if params.leg is None:
+        if corners:
+            raise StageError(
+                f"weld.tactile: the seam has sharp corners ({_listed(corners)}), at which the "
+                f"torch has to stop: write a step weld.tactile for each leg, leg: 1 to "
+                f"{len(corners) + 1}"
+            )
+        return seam
+    if params.leg > len(corners) + 1:
+        raise StageError(
+            f"weld.tactile: leg {params.leg} of a seam with {len(corners) + 1}; its sharp corners: "
+            f"{_listed(corners) or 'none'}"
+        )
+    ends = corners[max(params.leg - 2, 0) : params.leg]
+    for corner in ends:
+        _require_room(corner, seam, params)
+    bounds = [0, *(corner.point for corner in corners), len(seam.points_in_base) - 1]
+    kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
+    return replace(
+        seam,
+        points_in_base=seam.points_in_base[kept],
+        openings_in_base=seam.openings_in_base[kept],
+        covariance=seam.covariance[kept],
+    )
+
+
+def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None:
+    side = 1.0 if params.side == "left" else -1.0
+    one_wall = params.joint in ("fillet", "lap") and seam.half_angle is None
+    if not (one_wall and side * corner.turn > 0.0):
+        raise StageError(
+            f"weld.tactile: at the corner {_listed([corner])} the finger ahead of the torch would "
+            "run into a wall: room is only round the outside of the upright plate of a fillet or "
+            "lap joint; press that plate ('side'), or end the plan before the corner"
+        )
+
+
+def _listed(corners: list[Corner]) -> str:
+    return ", ".join(
+        f"{np.degrees(each.turn):+.0f} deg at {each.along * 1e3:.0f} mm" for each in corners
+    )

@@ -1,0 +1,232 @@
+"""Passes after the root's: the torch goes along the refined path again, aside of it and higher.
+
+The root pass is found by touch. After it nothing is touched: the tool stands along the path, its
+tip above what was welded, and the torch is steered by
+
+    V_t = v t + k (q - P_t),    V_r = V_t + L w n_d,    w = v curvature + k (heading - angle)
+
+with q the refined path, moved by the pass's offsets; the second is equation (A) of the README.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
+from flangeye_plugins.weld.controller import STILL, Phase
+from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.motion import Command, ToolPose, Touch
+from flangeye_plugins.weld.path import Path, Place
+from flangeye_plugins.weld.response import Response
+from flangeye_plugins.weld.settings import Following, PassParams
+from flangeye_plugins.weld.weave import Sway, Weave
+
+STEP = 0.5e-3
+"""Spacing of the path that the later passes follow [m]."""
+
+GAIN = 2.0
+"""How fast a pass takes back an error of place or heading [1/s]."""
+
+OVER = 15e-3
+"""Between two passes the tool is lifted by this [m]."""
+
+THERE = 0.1e-3
+"""A place is reached when the tool is as near to it [m]."""
+
+TURNED = math.radians(0.2)
+"""And turned to it as well [rad]."""
+
+
+class Traced:
+    """What the root pass leaves: where the seam is, how well known, and how high the tool was."""
+
+    def __init__(self, root: Follower, plan: Path) -> None:
+        self._root, self._plan = root, plan
+        self._rows: list[tuple[float, float, float]] = []
+
+    def note(self, height: float) -> None:
+        """Remember a cycle of the root pass, in which the end point was so high [m]."""
+        root = self._root
+        if not self._rows or root.torch > self._rows[-1][0]:
+            self._rows.append((root.torch, height, root.sigma))
+
+    def path(self, chosen: PassParams) -> Path:
+        """Return the torch's path of a pass; its height is that of the tool's end point."""
+        s = np.arange(max(chosen.along, 0.0), self._plan.length + STEP / 2, STEP)
+        frames = [self._root.refined.frame(x) for x in s.tolist()]
+        planar = np.array([point + chosen.across * normal for point, normal in frames])
+        torch, height, _ = np.array(self._rows).T
+        return Path(np.column_stack([planar, np.interp(s, torch, height) + chosen.up]))
+
+    def sigma(self, s: float) -> float:
+        """Return the standard deviation of the seam at an arc length of the root pass [m]."""
+        torch, _, sigma = np.array(self._rows).T
+        return float(np.interp(s, torch, sigma))
+
+
+class Passes:
+    """The root pass by touch, then the others along what it has found.
+
+    Attributes:
+        root: The root pass.
+        number: Which pass it is, the root's is 0.
+        aim: How far to the left of the seam the torch is to be [m].
+    """
+
+    def __init__(self, root: Follower, plan: Path, belief: Belief, settings: Following) -> None:
+        """Follow the root first, then ``settings.passes``."""
+        self.root, self.number = root, 0
+        self.mode, self.side = root.mode, root.side
+        self._belief, self._settings = belief, settings
+        self._traced = Traced(root, plan)
+        self._response = Response()
+        self._path = plan
+        self._began: float | None = None
+        self._over = 0.0
+        self._take_over()
+
+    def _take_over(self) -> None:
+        root = self.root
+        self.phase: Phase = root.phase
+        self.reason, self.tip, self.torch, self.wanted = (
+            root.reason, root.tip, root.torch, root.wanted
+        )  # fmt: skip
+        self.sigma, self.bound, self.band, self.aim = root.sigma, root.bound, root.band, root.aim
+
+    @property
+    def lit(self) -> float | None:
+        """Where the torch first was within ``max_error`` in the root pass, by arc length [m]."""
+        return self.root.lit
+
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        if not self.number:
+            return self._root_step(pose, touches)
+        coming = self._response.ahead(pose)
+        command = self._return(coming) if self.phase == "returning" else self._weld(coming)
+        self._response.told(pose.time, command)
+        return command
+
+    def _root_step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        command = self.root.step(pose, touches)
+        self._traced.note(float(pose.position[2]))
+        self._take_over()
+        if self.phase == "done":
+            learned = self.root.learned
+            self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
+            self._next_pass(pose)
+        return command
+
+    @property
+    def _pass(self) -> PassParams:
+        return self._settings.passes[self.number - 1]
+
+    def _next_pass(self, pose: ToolPose) -> None:
+        """Go back for the next pass; after the last one it is done."""
+        if self.number == len(self._settings.passes):
+            self.phase = "done"
+            return
+        self.number += 1
+        self._path, self._began = self._traced.path(self._pass), None
+        self._weave = Weave(self._pass.weave_width, self._pass.weave_frequency)
+        self._over = float(max(pose.position[2], self._path.points[:, 2].max())) + OVER
+        self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
+        self.wanted = self.sigma = self.bound = self.band = 0.0
+        self.aim = self._pass.across
+
+    # --- back to the start, above the work -------------------------------------------------------
+
+    def _return(self, pose: ToolPose) -> Command:
+        """Up, across to the start, down."""
+        start = self._path.at(0.0)
+        aside = self._tool_at(start)[:2] - pose.position[:2]
+        turn = _nearest(_heading(start) - pose.angle)
+        there = float(np.hypot(*aside)) < THERE and abs(turn) < TURNED
+        goal = start.height if there else self._over
+        up = goal - float(pose.position[2])
+        if there and abs(up) < THERE:
+            self.phase = "passing"
+            return self._weld(pose)
+        away = 0.0 if up > OVER / 3 else 1.0  # lifted first
+        speed = self._settings.return_speed
+        return Command(
+            np.array([*(away * _towards(aside, speed)), _within(GAIN * up, speed)]),
+            away * _within(GAIN * turn, self._settings.turn_rate),
+        )
+
+    def _tool_at(self, place: Place) -> Floats:
+        """Return where the end point is (3,) with the torch at a place, the tool along the path."""
+        return np.array([*(place.point + self._belief.distance * place.tangent), place.height])
+
+    # --- along the refined path ------------------------------------------------------------------
+
+    def _weld(self, pose: ToolPose) -> Command:
+        """Lead the torch along the pass's path."""
+        settings, distance = self._settings, self._belief.distance
+        ahead = np.array([math.cos(pose.angle), math.sin(pose.angle)])
+        torch = pose.position[:2] - distance * ahead
+        self.torch = self._path.advance(torch, self.torch, settings.speed * 0.1)
+        self.tip = self.torch + self._pass.along + distance
+        if self.torch >= self._path.length:
+            self._next_pass(pose)
+            return STILL
+        self._began = pose.time if self._began is None else self._began
+        sway = self._swayed(pose.time)
+        place = self._path.at(self.torch)
+        error = float((torch - place.point) @ place.normal) - sway.aside
+        self._estimate(error)
+        across = sway.rate - GAIN * error
+        torch_speed = settings.speed * place.tangent + across * place.normal
+        turning = GAIN * _nearest(_heading(place) - pose.angle) + settings.speed * self._bend()
+        turn = _within(turning, settings.turn_rate)
+        planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])
+        up = settings.height_gain * (place.height - float(pose.position[2]))
+        up += settings.speed * self._path.climb(self.torch)
+        return Command(np.array([*planar, up]), turn)
+
+    def _swayed(self, now: float) -> Sway:
+        dead, elapsed = self._response.dead_time, now - (self._began or now)
+        self.aim = self._pass.across + self._weave.at(elapsed - dead).aside
+        return self._weave.at(elapsed).led(self._response.lag)
+
+    def _bend(self) -> float:
+        """Return the path's curvature at the torch [1/m], to the left positive."""
+        before, after = self._path.at(self.torch - STEP), self._path.at(self.torch + STEP)
+        return _nearest(_heading(after) - _heading(before)) / (2 * STEP)
+
+    def _estimate(self, error: float) -> None:
+        """State how far the torch may be from where it is to be, and stop where that is too far."""
+        settings = self._settings
+        again = settings.arm_sigma**2 + settings.distortion**2 + self._weave.variance
+        seam = self._traced.sigma(self.torch + self._pass.along)
+        self.sigma = math.sqrt(seam**2 + again)
+        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
+        if self.bound > settings.max_error:
+            self.phase = "stopped"
+            self.reason = (
+                f"in pass {self.number + 1} the torch is known to {self.bound * 1e3:.2f} mm only, "
+                f"max_error is {settings.max_error * 1e3:.3g} mm"
+            )
+
+
+def _heading(place: Place) -> float:
+    return math.atan2(float(place.tangent[1]), float(place.tangent[0]))
+
+
+def _nearest(angle: float) -> float:
+    """Return an angle within half a turn."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _towards(way: Floats, speed: float) -> Floats:
+    """Return the velocity (2,) towards a place: slower near to it."""
+    far = float(np.hypot(*way))
+    return way * (min(GAIN * far, speed) / max(far, 1e-9))
+
+
+def _within(value: float, most: float) -> float:
+    return min(max(value, -most), most)

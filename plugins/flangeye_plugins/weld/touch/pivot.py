@@ -1,0 +1,113 @@
+"""Where a point of the tool is in the flange, from poses in which it was at one place. Arrays only.
+
+With the point ``p`` in the flange and the mark ``q`` in base, every pose gives ``R p + t = q``; the
+differences to their mean are free of ``q``: ``(R_i - mean R) p = mean t - t_i``. A point along an
+axis about which alone the tool was turned stays unknown, and is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.types import Floats
+
+FEWEST = 5
+"""Poses of a pivot."""
+
+TILTED = np.radians(12.0)
+"""So far the tool must have been turned, as a root of the mean of squares, about two axes."""
+
+PLACED = 0.05e-3
+"""Standard deviation with which a person and an arm bring a point to its mark, at the least [m]."""
+
+SLIPPED = 1.0e-3
+"""A pose that is off by more was not at the mark [m]."""
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """A point of the tool.
+
+    Attributes:
+        point: (3,) in the flange [m].
+        covariance: (3, 3) of it [m^2].
+        mark: (3,) where it was, in base [m].
+        rms: What the poses leave unexplained, along an axis [m].
+    """
+
+    point: Floats
+    covariance: Floats
+    mark: Floats
+    rms: float
+
+
+def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None = None) -> Pivot:
+    """Return the point that was at one place in all poses (least squares), with its covariance.
+
+    Args:
+        what: Its name, for people.
+        poses: (4, 4) of the flange in base.
+        displaced: (3,) for each pose: how far the point was from its rest then, in the flange's
+            axes [m]; nothing for a rigid one.
+
+    Raises:
+        StageError: Too few poses, a motion that is missing, or a point that did not stay.
+    """
+    if len(poses) < FEWEST:
+        raise StageError(f"pivot of the {what}: {len(poses)} poses, at least {FEWEST} are needed")
+    given = np.array(poses)
+    rotations, places = given[:, :3, :3], given[:, :3, 3]
+    if displaced is not None:
+        places = places + np.einsum("kij,kj->ki", rotations, np.array(displaced))
+    rows = rotations - rotations.mean(axis=0)
+    _require_turned(what, rows)
+    information = np.einsum("kji,kjl->il", rows, rows)
+    inverse = np.linalg.inv(information)
+    moved = places.mean(axis=0) - places
+    point = inverse @ np.einsum("kji,kj->i", rows, moved)
+    left = moved - rows @ point
+    _require_stayed(what, left)
+    free = 3 * len(poses) - 6
+    rms = float(np.sqrt(np.sum(left**2) / free))
+    covariance = max(rms, PLACED) ** 2 * inverse
+    mark = rotations.mean(axis=0) @ point + places.mean(axis=0)
+    return Pivot(point, covariance, mark, rms)
+
+
+def _require_turned(what: str, rows: Floats) -> None:
+    """Refuse poses that leave a direction of the point unknown; say which motion is missing."""
+    # Turned about v by a, the columns across v move by about a, and the one along v does not.
+    information = np.einsum("kji,kjl->il", rows, rows) / len(rows)
+    values, vectors = np.linalg.eigh(information)
+    turned = np.sqrt(np.maximum(values, 0.0))
+    if turned[0] >= TILTED:
+        return
+    axis = AXES[int(np.abs(vectors[:, 0]).argmax())]
+    across = " and ".join(each for each in AXES if each != axis)
+    if turned[-1] < TILTED:
+        raise StageError(
+            f"pivot of the {what}: the tool was hardly turned; tilt it about the flange's x and y, "
+            f"each to both sides, by {np.degrees(TILTED) * 1.5:.0f} deg or more"
+        )
+    raise StageError(
+        f"pivot of the {what}: turned by {np.degrees(turned[0]):.1f} deg about what lies across "
+        f"the flange's {axis}, so where the point is along {axis} stays unknown; tilt it about "
+        f"{across}, each to both sides, by {np.degrees(TILTED) * 1.5:.0f} deg or more"
+    )
+
+
+def _require_stayed(what: str, left: Floats) -> None:
+    off = np.linalg.norm(left, axis=1)
+    worst = int(off.argmax())
+    if off[worst] > SLIPPED:
+        raise StageError(
+            f"pivot of the {what}: in pose {worst + 1} it was {off[worst] * 1e3:.2f} mm away "
+            f"from where it was in the others, allowed are {SLIPPED * 1e3:.3g} mm; did it leave "
+            "its mark?"
+        )

@@ -1,0 +1,109 @@
+"""A cell's transforms in other programs' words: all of them, or those of one camera."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from flangeye import StageError
+from flangeye.files.bundled import bundled
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+from flangeye.report.certificate import Conditions, budget_of, write_certificate
+from flangeye.report.certificate.budget import shares_of
+from flangeye.result import result_of_camera
+from flangeye.run.folder import RunFolder
+from flangeye.run.session import Start, record_run
+
+TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The folder of a run with two scanners, and its result."""
+    path = tmp_path_factory.mktemp("cell") / "run"
+    registry = load_registry()
+    recipe = load_recipe(TWO, registry, ["steps.0.sightings=16"])
+    folder = RunFolder.create("run", path)
+    result = record_run(recipe, registry, folder, Start(), report=False)
+    assert result.status == "verified"
+    return path, result
+
+
+def export(run: Path, *words: str) -> Any:
+    return subprocess.run(
+        [sys.executable, "-m", "flangeye.cli", "export", str(run), *words],
+        capture_output=True, text=True,
+    )  # fmt: skip
+
+
+def test_a_urdf_has_a_joint_for_every_transform(run: Any) -> None:
+    path, result = run
+    told = export(path, "--to", "urdf", "--out", "-")
+    assert told.returncode == 0
+    joints = ElementTree.fromstring(told.stdout).findall("joint")
+    found = {f"{j.find('parent').get('link')}_T_{j.find('child').get('link')}": j for j in joints}
+    assert set(found) == set(result.transforms) == {"base_T_left", "base_T_right", "arm_T_marker"}
+    for name, joint in found.items():
+        place = [float(x) for x in joint.find("origin").get("xyz").split()]
+        assert np.allclose(place, np.array(result.transforms[name].matrix)[:3, 3], atol=1e-8)
+
+
+def test_one_camera_is_chosen_where_a_format_carries_one(run: Any) -> None:
+    path, result = run
+    told = export(path, "--to", "matrix")
+    assert told.returncode == 2
+    assert told.stderr == (
+        "error: export.matrix: carries one transform, and the cell has 3: add --camera left or "
+        "--camera right\n"
+    )
+    for camera in ("left", "right"):
+        assert export(path, "--to", "matrix", "--camera", camera).returncode == 0
+        wanted = np.array(result.transforms[f"base_T_{camera}"].matrix)
+        assert np.allclose(np.loadtxt(path / "exports" / f"{camera}.txt"), wanted, atol=1e-8)
+    launched = export(path, "--to", "ros2_launch", "--camera", "right", "--out", "-").stdout
+    assert '"--frame-id", "base"' in launched
+    assert '"--child-frame-id", "right"' in launched
+    assert "left" not in launched
+
+
+def test_a_certificate_is_of_one_camera(run: Any) -> None:
+    path, result = run
+    with pytest.raises(StageError) as error:
+        write_certificate(path, None, Conditions())
+    assert str(error.value) == (
+        "the run is of a cell, and a certificate is of one camera: add --camera left or "
+        "--camera right"
+    )
+    for camera in ("left", "right"):
+        page = write_certificate(path, None, Conditions(), camera)
+        assert page.name == f"certificate-{camera}.html"
+        assert f"base_T_{camera}" in page.read_text()
+        of_camera = result_of_camera(result, camera)
+        assert [*of_camera.transforms] == [f"base_T_{camera}"]
+        assert len(of_camera.observations) == 8
+        shares = sum(share.standard**2 for share in shares_of(of_camera))
+        assert shares == pytest.approx(float(np.sum(budget_of(of_camera).standard ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ["--to", "ur", "--camera", "lefft"],
+            "error: --camera lefft: no such camera was found; the run has left, right\n",
+        ),
+        (
+            ["--to", "ros2_command", "--set", "child=eye"],
+            "error: child: of one camera, and the cell's frames have names of their own; leave it "
+            "out, or choose one with --camera\n",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(run: Any, words: list[str], told: str) -> None:
+    refused = export(run[0], *words)
+    assert (refused.returncode, refused.stderr) == (2, told)

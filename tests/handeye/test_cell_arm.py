@@ -1,0 +1,44 @@
+"""A cell's covariance holds for arms whose joints are not where their controllers say."""
+
+from typing import Any
+
+import numpy as np
+
+from flangeye.files.bundled import bundled
+from flangeye.handeye.cell import calibrate_cell, solve_cell
+from flangeye.handeye.graph import LIMITS
+from flangeye.maths.geometry import rotation_log
+from flangeye.models.cell import Cell
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+from flangeye.run.runner import Runner
+from flangeye.types import ArchivePath
+
+REGISTRY = load_registry()
+TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
+SEEDS = 5
+
+
+def squares(seed: int) -> Any:
+    """Return of both cameras how far off they are, in units of what is stated: with zeros, without."""
+    recipe = load_recipe(TWO, REGISTRY, [f"seed={seed}", "steps.0.arm={zeros: 0.2 mrad}"])
+    seen = Runner(recipe, REGISTRY, ArchivePath(None)).take(None)
+    cell, places = recipe.context[Cell], recipe.steps[0].params.places
+    bare = solve_cell(seen, cell, LIMITS)
+    told = calibrate_cell(seen, cell, LIMITS, "solve.cell").transforms
+    for camera in ("left", "right"):
+        found, true = bare.places[camera], places[camera].matrix
+        about = told[f"base_T_{camera}"].about
+        turn = rotation_log(found[:3, :3] @ true[:3, :3].T)
+        off = np.concatenate([turn, found[:3, 3] - true[:3, 3]])
+        moved = np.concatenate([turn, off[3:] + np.cross(turn, about - found[:3, 3])])
+        covariances = told[f"base_T_{camera}"].covariance, bare.covariances[camera]
+        yield [e @ np.linalg.solve(c, e) for e, c in zip((moved, off), covariances, strict=True)]
+
+
+def test_what_joint_zeros_may_be_off_by_is_in_the_covariance() -> None:
+    """UR5s with zeros as large as their file says; a sound covariance has a mean square of six."""
+    considered, bare = np.array([s for seed in range(SEEDS) for s in squares(seed)]).T
+    assert bare.mean() > 12
+    assert 3 < considered.mean() < 10
+    assert (considered < 12.6).mean() >= 0.8  # the 95 % region

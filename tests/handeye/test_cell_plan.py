@@ -1,0 +1,77 @@
+"""The next sighting of a cell is the one that shrinks the whole graph's uncertainty most."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.files.bundled import bundled
+from flangeye.handeye.cell import solve_cell
+from flangeye.handeye.cell_plan import errors_at_work, foreseen, is_foretold, most_telling
+from flangeye.handeye.graph import LIMITS
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.models.cell import Cell
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+from flangeye.run.folder import RunFolder
+from flangeye.run.runner import Runner
+from flangeye.run.session import Start, record_run
+from flangeye.types import ArchivePath, Transform
+
+REGISTRY = load_registry()
+TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
+
+
+def recipe(*overrides: str) -> Any:
+    return load_recipe(TWO, REGISTRY, overrides)
+
+
+@pytest.fixture(scope="module")
+def session() -> Any:
+    """The cell, eight sightings by the left scanner and six by the right, and many more."""
+    checked = recipe("steps.0.sightings=80")
+    seen = Runner(checked, REGISTRY, ArchivePath(None)).take(None)
+    left, right = ([o for o in seen if o.camera == name] for name in ("left", "right"))
+    return checked.context[Cell], [*left[:20], *right[:6]], [*left[20:], *right[6:]]
+
+
+def test_the_choice_is_the_one_after_which_least_is_left_unknown(session: Any) -> None:
+    """Against what solving again with each candidate states; the scanner that saw less is first."""
+    cell, seen, candidates = session
+    found = solve_cell(seen, cell, LIMITS)
+
+    def left(candidate: Any) -> float:
+        errors = errors_at_work(
+            solve_cell([*seen, candidate], cell, LIMITS, found.places), cell, seen
+        )
+        return sum(e**2 for e in errors.values())
+
+    some = candidates[::5]
+    expected = [foreseen([o.poses], (o.camera, o.target), found, cell, o.feature)[0] for o in some]
+    chosen = most_telling(expected, found, cell, seen)
+    assert some[chosen].camera == "right"
+    states = np.array([left(o) for o in some])
+    assert states[chosen] <= np.quantile(states, 0.25)
+
+
+def test_a_sighting_that_is_wrong_is_not_foretold(session: Any) -> None:
+    cell, seen, candidates = session
+    found = solve_cell(seen, cell, LIMITS)
+    assert np.mean([is_foretold(o, found, cell) for o in candidates]) > 0.95
+    (o, *_) = candidates
+    pose = o.feature.camera_T_target
+    off = rigid(rotation_exp([0.02, 0, 0]), [0.01, 0, 0]) @ pose.matrix
+    moved = replace(o.feature, camera_T_target=Transform(pose.parent, pose.child, off))
+    assert not is_foretold(replace(o, feature=moved), found, cell)
+
+
+def test_a_run_ends_when_enough_was_seen(tmp_path: Any) -> None:
+    """What is stated then is what was required; a plain run takes every sighting."""
+    checked = recipe("steps.0.plan=next_best", "steps.0.sightings=40", "steps.1.required=0.35 mm")
+    folder = RunFolder.create("run", tmp_path / "run")
+    result = record_run(checked, REGISTRY, folder, Start(), report=False)
+    assert result.status == "verified"
+    assert 6 < len(result.observations) < 40
+    assert result.truth.rms_over_workspace < 0.35e-3
+    assert {o.camera for o in result.observations} == {"left", "right"}

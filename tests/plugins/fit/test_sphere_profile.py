@@ -1,0 +1,126 @@
+"""fit.sphere_profile: the circle in which a laser's plane cuts a sphere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flangeye.models.targets import Sphere
+from flangeye.types import (
+    CAMERA,
+    Capture,
+    CircleFeature,
+    Floats,
+    PointCloud,
+    Rejected,
+    Transform,
+    by_frame,
+)
+from flangeye.units import SI
+from flangeye_emulators.acquire.simulated_profiles import ProfilesParams, profile_of
+from flangeye_plugins.fit.sphere_profile import SphereProfileParams, fit_sphere_profile
+
+SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.0))
+CENTRE = np.array([0.012, 0.7 * 0.01905, 0.25])
+UP = np.array([0.0, 0.1, -0.995])
+
+
+def profile(centre: Floats = CENTRE, seed: int = 0, **changes: Any) -> Floats:
+    """Return what a line scanner sees of a sphere over a table."""
+    params = ProfilesParams(**changes)
+    found = profile_of(centre, SPHERE.radius, UP, params, np.random.default_rng(seed))
+    return found.astype(np.float64)
+
+
+def fit(xyz: Floats, sphere: Sphere = SPHERE, **changes: Any) -> CircleFeature | Rejected:
+    pose = by_frame(Transform("base", "flange", np.eye(4)))
+    capture = Capture("a", PointCloud(CAMERA, np.asarray(xyz, dtype=np.float32)), pose)
+    return fit_sphere_profile(capture, sphere, SphereProfileParams(**{"side": "+y", **changes}), 0)
+
+
+def found(xyz: Floats, **changes: Any) -> CircleFeature:
+    feature = fit(xyz, **changes)
+    assert isinstance(feature, CircleFeature), feature.reason
+    return feature
+
+
+def test_an_exact_profile_gives_the_exact_centre() -> None:
+    feature = found(profile(noise=SI(0)))
+    assert feature.centre == pytest.approx(CENTRE, abs=2e-7)  # single precision
+    assert feature.normal is None
+    assert feature.radii["profile"] == pytest.approx(SPHERE.radius * np.sqrt(1 - 0.49), abs=2e-7)
+
+
+def test_the_other_side_is_the_mirror_image() -> None:
+    feature = found(profile(noise=SI(0)), side="-y")
+    assert feature.centre == pytest.approx(CENTRE * [1, -1, 1], abs=2e-7)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32), st.floats(-0.02, 0.02), st.floats(0.5, 0.9), st.floats(0.22, 0.27))
+def test_wherever_it_passes_the_centre_is_found(
+    seed: int, x: float, beside: float, z: float
+) -> None:
+    centre = np.array([x, beside * SPHERE.radius, z])
+    off = found(profile(centre, seed)).centre - centre
+    assert np.linalg.norm(off) < 0.15e-3
+
+
+@pytest.mark.parametrize("beside", [0.5, 0.8])
+def test_the_covariance_is_that_of_the_errors(beside: float) -> None:
+    centre = np.array([0.0, beside * SPHERE.radius, 0.25])
+    exact = {"scanner_error": SI(0), "radius_error": SI(0)}
+    fits = [found(profile(centre, seed), **exact) for seed in range(100)]
+    errors = np.array([f.centre - centre for f in fits])
+    stated = np.mean([f.covariance for f in fits], axis=0)
+    assert errors.std(axis=0) == pytest.approx(np.sqrt(np.diag(stated)), rel=0.35)
+
+
+def test_a_profile_near_the_middle_is_worth_little_across() -> None:
+    near, far = (
+        found(profile(np.array([0.0, b * SPHERE.radius, 0.25])), scanner_error=SI(0))
+        for b in (0.45, 0.9)
+    )
+    assert near.covariance[1, 1] > 3 * far.covariance[1, 1]
+
+
+@pytest.mark.parametrize(
+    ("xyz", "reason"),
+    [
+        (np.zeros((0, 3)), "0 points, at least 20 are needed"),
+        (
+            np.random.default_rng(0).uniform(0.2, 0.3, (100, 3)),
+            "no profile: points lie up to 298 mm off the plane y = 0; ",
+        ),
+        (
+            np.stack([np.linspace(-0.05, 0.05, 500), np.zeros(500), np.full(500, 0.25)], axis=1),
+            "no circle that a sphere 38.1 mm across leaves in the laser's plane, its middle away "
+            "from the scanner",
+        ),
+        (
+            profile(np.array([0.0, 0.32 * SPHERE.radius, 0.25])),
+            "the laser passes 0.32 radii beside the sphere's centre, 0.4 to 0.97 are asked for "
+            "(offset); move the scanner across its line",
+        ),
+    ],
+)
+def test_what_is_no_good_profile_is_set_aside(xyz: Floats, reason: str) -> None:
+    feature = fit(xyz)
+    assert isinstance(feature, Rejected)
+    assert feature.reason.startswith(reason)
+
+
+def test_a_hidden_half_is_set_aside() -> None:
+    xyz = profile()
+    right = fit(xyz[(xyz[:, 0] > CENTRE[0]) & (xyz[:, 0] < CENTRE[0] + 0.005)])
+    assert isinstance(right, Rejected)
+    assert right.reason.endswith("of the circle is seen, at least 15% is needed (min_coverage)")
+
+
+def test_the_sphere_hides_what_is_behind_it_from_the_receiver() -> None:
+    beside = np.array([0.0, -0.8 * SPHERE.radius, 0.25])  # between receiver and laser
+    assert len(profile(beside)) < len(profile(-beside * [1, 1, -1]))

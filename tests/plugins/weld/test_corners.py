@@ -1,0 +1,114 @@
+"""Plans with sharp corners: found, refused where the tool has no room, welded leg by leg."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from flangeye.errors import StageError
+from flangeye.types import Seam
+from flangeye_plugins.weld.corners import corners_of, leg_of
+from flangeye_plugins.weld.settings import WeldTactileParams
+from tests.plugins.weld import cell
+
+Points = NDArray[np.float64]
+
+
+def polyline(*turns: float, leg: float = 0.06) -> Points:
+    """Legs of equal length, turning to the left by so much [deg] between them."""
+    headings = np.radians(np.cumsum([0.0, *turns]))
+    steps = leg * np.stack([np.cos(headings), np.sin(headings), 0 * headings], axis=1)
+    return np.concatenate([[[0.0, 0, 0]], np.cumsum(steps, axis=0)])
+
+
+def dense(points: Points) -> Points:
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    ticks = np.unique(np.concatenate([np.arange(0.0, along[-1], 1.7e-3), along]))
+    return np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
+
+
+def seam_of(points: Points) -> Seam:
+    n = len(points)
+    return Seam(points, np.tile([0.0, 0, 1.0], (n, 1)), np.tile(np.eye(3) * 1e-8, (n, 1, 1)))
+
+
+def told(**given):
+    return WeldTactileParams.model_construct(**{"side": "left", "joint": "lap", **given})
+
+
+@pytest.mark.parametrize("turns", [(90.0,), (60.0, -60.0), (120.0, -120.0, 120.0), (-45.0,)])
+@pytest.mark.parametrize("sampled", [polyline, lambda *t: dense(polyline(*t))])
+def test_corners_are_found_where_they_are(turns, sampled) -> None:
+    found = corners_of(sampled(*turns))
+    np.testing.assert_allclose([np.degrees(each.turn) for each in found], turns, atol=1e-6)
+    np.testing.assert_allclose(
+        [each.along for each in found], 0.06 * np.arange(1, len(turns) + 1), atol=1e-9
+    )
+
+
+def test_a_curve_has_no_corner() -> None:
+    angle = np.linspace(0.0, np.pi, 200)
+    curve = 0.02 * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1)
+    assert corners_of(curve) == []
+
+
+def test_a_leg_is_what_lies_between_its_corners() -> None:
+    points = dense(polyline(90.0, 60.0))
+    legs = [leg_of(seam_of(points), told(leg=k)).points_in_base for k in (1, 2, 3)]
+    for leg, corner in zip(legs, polyline(90.0, 60.0), strict=False):
+        np.testing.assert_allclose(leg[0], corner, atol=1e-12)
+        assert np.linalg.norm(leg[-1] - leg[0]) == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(
+    ("turns", "given", "message"),
+    [
+        ((90.0,), {}, r"sharp corners \(\+90 deg at 60 mm\).*leg: 1 to 2"),
+        ((120.0, -120.0), {}, r"\+120 deg at 60 mm, -120 deg at 120 mm.*leg: 1 to 3"),
+        ((90.0,), {"leg": 3}, r"leg 3 of a seam with 2; its sharp corners: \+90 deg"),
+        ((), {"leg": 2}, "leg 2 of a seam with 1; its sharp corners: none"),
+        ((-90.0,), {"leg": 1}, r"at the corner -90 deg at 60 mm the finger .* run into a wall"),
+        ((90.0,), {"leg": 2, "joint": "groove"}, "run into a wall: room is only round the outside"),
+        ((60.0, -60.0), {"leg": 2}, "at the corner -60 deg at 120 mm the finger"),
+    ],
+)
+def test_what_has_no_room_or_is_not_chosen_is_refused(turns, given, message: str) -> None:
+    with pytest.raises(StageError, match=message):
+        leg_of(seam_of(polyline(*turns)), told(**{"leg": None, **given}))
+
+
+BENT = [[-40.0, -15.0, 14.0], [20.0, -15.0, 14.0], [20.0, 40.0, 14.0]]
+"""An L round the corner of a plate that lies to its left [mm]."""
+
+
+@pytest.fixture
+def bent(tmp_path: Path) -> Path:
+    cad = Path("data/workpieces/v-straight.stl").absolute()
+    (tmp_path / "bent.stl").write_bytes(cad.read_bytes())
+    seam = {"name": "groove", "points": BENT, "opening": [0, 0, 1]}
+    file = {"title": "L", "cad": "bent.stl", "unit": "mm", "seams": [seam], "source": "test"}
+    (tmp_path / "bent.yaml").write_text(yaml.safe_dump(file))
+    return tmp_path / "bent.yaml"
+
+
+@pytest.mark.parametrize("leg", [1, 2])
+def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: Path, leg: int) -> None:
+    line = np.array(BENT) * 1e-3 @ cell.HERE[:3, :3].T + cell.HERE[:3, 3]
+    off = np.array([1e-3, -0.7e-3, 0.0])
+    seam = seam_of(line + off)
+    section = {"left": "0 deg", "right": "90 deg", "depth": "5 mm"}
+    report, _ = cell.run(seam, bent, sensor={"section": section, "leg": leg}, joint="lap", leg=leg)
+    assert report.completed, report.reason
+    start, end = line[leg - 1], line[leg]
+    along = (end - start) / np.linalg.norm(end - start)
+    torch = report.true_torch - start
+    s, across = torch @ along, torch @ np.cross([0.0, 0, 1], along)
+    lit = report.figures["lit_from"]
+    beside = (s > max(lit, 0.0)) & (s < np.linalg.norm(end - start))
+    assert s[beside].min() < 0.012  # the first leg's weld begins, and the second's, at its start
+    # Along the seam nothing is felt: where a leg ends is as the plan has it.
+    planned = (seam.points_in_base[leg] - start) @ along
+    assert s[beside].max() == pytest.approx(min(planned, np.linalg.norm(end - start)), abs=0.3e-3)
+    assert np.sqrt(np.mean(across[beside] ** 2)) < 0.1e-3

@@ -1,0 +1,163 @@
+"""Where the tip rests in a joint, what holds it there, and how a leaning tool stands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rotation_from_rpy
+from flangeye.models.finger import Finger
+from flangeye_emulators.weld_world.bench import FINGER, try_condition
+from flangeye_emulators.weld_world.conditions import CONDITIONS
+from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
+from flangeye_plugins.weld.belief import belief_of
+from flangeye_plugins.weld.body import body_from, body_of, leaning
+from flangeye_plugins.weld.checks import check_belief, check_body
+from flangeye_plugins.weld.joint import Joint, edges_half_angle, joint_of
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld import cell
+
+SHORT = 0.07
+RADIUS = 1.5e-3
+LINE = Path(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
+
+
+def following(**given):
+    return Following.model_validate(given)
+
+
+def believed(**given):
+    settings = following(**given)
+    finger = Finger.model_validate(FINGER)
+    return belief_of(finger, body_of(finger, settings), None, settings), settings
+
+
+@pytest.mark.parametrize("half_angle", [30.0, 45.0, 60.0])
+@pytest.mark.parametrize("lean", [-45.0, 0.0, 20.0])
+def test_a_seated_ball_is_one_radius_away_from_both_walls(half_angle: float, lean: float) -> None:
+    joint = Joint(*np.radians([half_angle, lean]))
+    across, up = joint.seat(RADIUS)
+    left = -np.cos(joint.left) * across + np.sin(joint.left) * up
+    right = np.cos(joint.right) * across + np.sin(joint.right) * up
+    np.testing.assert_allclose([left, right], RADIUS)
+
+
+def test_the_seat_moves_with_a_wall_as_its_slope_says() -> None:
+    fillet = joint_of("fillet", None, 1.0, RADIUS, 0.0)
+    assert fillet is not None
+    np.testing.assert_allclose([fillet.left, fillet.right], [0.0, np.pi / 2], atol=1e-12)
+    wider = Joint(fillet.half_angle + 5e-4, fillet.lean + 5e-4)  # the left wall by 1 mrad
+    moved = wider.seat(RADIUS)[0] - fillet.seat(RADIUS)[0]
+    assert abs(moved) == pytest.approx(1e-3 * fillet.seat_slope(RADIUS), rel=0.01)
+
+
+def test_the_plan_knows_better_than_the_kind_of_joint() -> None:
+    assert joint_of("fillet", 0.7, 1.0, RADIUS, 0.0) == Joint(0.7)
+    assert joint_of("groove", None, 1.0, RADIUS, 0.0) is None
+    assert edges_half_angle(np.sqrt(2) * RADIUS, RADIUS) == pytest.approx(np.pi / 4)
+
+
+def test_a_leaning_tool_still_heads_from_its_torch_to_its_tip() -> None:
+    body = body_from(np.array([-0.04, 0.003, -0.01]), 0.5, 0.2)
+    assert body.torch[1] == pytest.approx(0.0, abs=1e-15)
+    assert np.linalg.norm(body.torch) == pytest.approx(np.linalg.norm([0.04, 0.003, 0.01]))
+    np.testing.assert_allclose(leaning(0.5, 0.0)[:, 2], [0, -np.sin(0.5), np.cos(0.5)])
+    np.testing.assert_allclose(leaning(0.0, 0.2)[:, 2], [np.sin(0.2), 0, np.cos(0.2)])
+
+
+def test_springs_balance_on_the_wall_of_a_leaning_finger() -> None:
+    """Against the least energy, sought on a grid of places along the wall."""
+    contact = Contact(Groove(LINE, Section(np.pi / 4, 0.02, -np.pi / 4)), Tip(friction=0.0))
+    axes = leaning(0.4, 0.0)
+    stiff = axes @ np.diag([1000.0, 1000.0, 2000.0]) @ axes.T
+    rest = np.array([0.05, 0.0, 0.5e-3])
+    contact.settle(np.array([0.05, -5e-3, 1e-3]), 0.0, axes)
+    rest[1] = -4e-3  # away from the upright wall: the ball lies on the plate
+    found = contact.settle(rest, 0.0, axes)
+    places = np.linspace(-6e-3, -RADIUS, 20001)
+    off = np.stack([0 * places, places - rest[1], np.full(len(places), RADIUS - rest[2])])
+    least = places[np.einsum("ik,ij,jk->k", off, stiff, off).argmin()]
+    np.testing.assert_allclose(found[1:], [least, RADIUS], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "T-fillet, upright tool",
+        "T-fillet, pressed on the right, upright tool",
+        "T-fillet, tool leans 40 deg away, 10 deg forwards",
+        "T-fillet, plates at 91 deg, tool leans 1 deg more than set",
+        "lap joint, plate of 5 mm, upright tool",
+        "lap joint, plate of 5 mm, tool leans 20 deg away",
+        "butt joint, square edges, root gap 2.2 mm",
+        "corner joint, open, tool leans 10 deg forwards",
+        "torch led 1 mm to the left",
+    ],
+)
+def test_the_torch_is_on_the_seam_of_every_joint(name: str) -> None:
+    found = try_condition(CONDITIONS[name], 0, SHORT, 16e-3)
+    assert found.done, found.controller.reason
+    assert np.sqrt(np.mean(found.errors**2)) < 0.1e-3
+    assert (found.errors <= found.column("bound")[found.beside]).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"joint": "butt"}, "rests on both: set 'root_gap', less than 3 mm for a ball of radius"),
+        ({"joint": "butt", "root_gap": "1 mm"}, "lower 'deflection' to 0.76 mm or raise"),
+        ({"joint": "fillet", "friction": 0.6}, "friction may hold the tip off the wall: .* 1.11"),
+    ],
+)
+def test_a_joint_that_would_not_hold_the_tip_is_refused(given, message: str) -> None:
+    with pytest.raises(StageError, match=message):
+        check_belief(*believed(**given))
+
+
+def test_a_remedy_is_one_where_the_tool_leans_too() -> None:
+    given = {"joint": "corner", "work_angle": "20 deg", "deflection": "3 mm"}
+    belief, settings = believed(**given)
+    deflection, preload = belief.remedy(settings, 1.4)
+    for better in ({"deflection": f"{deflection} m"}, {"preload": f"{preload} m"}):
+        again, told = believed(**{**given, **better})
+        assert again.seating(told) == pytest.approx(1.4)
+
+
+def test_a_torch_lifted_off_the_seam_by_a_leaning_tool_is_refused() -> None:
+    belief, settings = believed(travel_angle="20 deg")
+    body = body_of(Finger.model_validate(FINGER), settings)
+    with pytest.raises(StageError, match="torch is .13.7 mm above the seam.*torch_up"):
+        check_body(body, belief, settings)
+
+
+def test_a_leaning_tool_on_an_arm_and_a_fillet_on_an_inclined_plate() -> None:
+    """The simulated finger knows the joint; the weld is told its kind alone."""
+    turned = rotation_from_rpy(*np.radians([12.0, -8.0, 20.0])) @ cell.HERE[:3, :3].T
+    flat = cell.planned("v-straight", (1e-3, 2e-3, 0.0), 0.01, end=0.06)
+    seam = replace(
+        flat, points_in_base=_about(flat.points_in_base, turned),
+        openings_in_base=flat.openings_in_base @ turned.T,
+    )  # fmt: skip
+    report, _ = cell.run(
+        seam, joint="fillet", work_angle="25 deg", preload="1.2 mm",
+        sensor={
+            "section": {"left": "0 deg", "right": "90 deg", "depth": "20 mm"},
+            "rpy": ["12 deg", "-8 deg", "20 deg"],
+        },
+    )  # fmt: skip
+    assert report.completed, report.reason
+    line = _about(cell.true_line("v-straight", 0.06), turned)
+    along = line[-1] - line[0]
+    along /= np.linalg.norm(along)
+    across = np.cross(turned @ cell.HERE[:3, 2], along)
+    torch = report.true_torch - line[0]
+    beside = (torch @ along > 0.01) & (torch @ along < 0.055)
+    assert beside.sum() > 50
+    assert np.sqrt(np.mean((torch @ across)[beside] ** 2)) < 0.1e-3
+
+
+def _about(points, rotation):
+    """Points (N, 3) turned about where the workpiece lies."""
+    return (points - cell.HERE[:3, 3]) @ rotation.T + cell.HERE[:3, 3]

@@ -1,0 +1,138 @@
+"""Where tip and torch are: pivots with known truth, what is refused, and the guided procedure."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flangeye.devices import MotionAllowed, RobotDriver
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import find_recipe, load_recipe
+from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_plugins.guide.pivoting import ATTITUDES, Pivoted, with_body
+from flangeye_plugins.guide.tactile import guide_tool
+from flangeye_plugins.weld.belief import belief_of
+from flangeye_plugins.weld.body import body_of
+from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.touch.pivot import Pivot, pivot
+from tests.plugins.weld.cell import HOME, MODEL
+from tests.plugins.weld.test_guide import HELD, WELD
+
+CONE = np.radians(
+    [[0, 0, 0], [20, 0, 0], [-20, 0, 0], [0, 20, 0], [0, -20, 0], [0, 20, 40], [20, 0, -40]]
+)
+"""Turns of the flange about its own axes, for each of the attitudes."""
+
+TIP, TORCH = np.array([1.5e-3, -0.8e-3, 181e-3]), np.array([-38e-3, 1.2e-3, 184e-3])
+
+
+def poses_about(
+    point: NDArray[np.float64], mark: NDArray[np.float64], noise: float = 0.0, seed: int = 0
+) -> list[NDArray[np.float64]]:
+    rng = np.random.default_rng(seed)
+    upright = rotation_exp([np.pi, 0.0, 0.0])
+    turns = [upright @ rotation_exp(turn) for turn in CONE]
+    return [rigid(r, mark - r @ point + noise * rng.standard_normal(3)) for r in turns]
+
+
+def test_the_point_is_found_with_its_covariance() -> None:
+    mark = np.array([0.6, 0.1, 0.2])
+    exact = pivot("tip", poses_about(TIP, mark))
+    np.testing.assert_allclose(exact.point, TIP, atol=1e-12)
+    np.testing.assert_allclose(exact.mark, mark, atol=1e-12)
+    squared = []
+    for seed in range(200):
+        found = pivot("tip", poses_about(TIP, mark, 0.1e-3, seed))
+        off = found.point - TIP
+        squared.append(off @ np.linalg.inv(found.covariance) @ off / 3)
+    assert np.median(squared) == pytest.approx(0.8, abs=0.15)  # chi2 of 3, over 3
+
+
+@pytest.mark.parametrize(
+    ("turns", "message"),
+    [
+        (CONE[:4], "4 poses, at least 5 are needed"),
+        (CONE * [0.1, 0.1, 0.1], "the tool was hardly turned; tilt it about the flange's x and y"),
+        (CONE * [0, 0, 1] + np.outer(np.linspace(-0.7, 0.7, 7), [0, 0, 1]),
+         "where the point is along z stays unknown; tilt it about x and y"),
+        (CONE * [1, 0, 0], "where the point is along x stays unknown; tilt it about y and z"),
+    ],
+)  # fmt: skip
+def test_a_motion_that_is_missing_is_named(turns: NDArray[np.float64], message: str) -> None:
+    upright = rotation_exp([np.pi, 0.0, 0.0])
+    turned = [upright @ rotation_exp(turn) for turn in turns]
+    with pytest.raises(StageError, match=f"pivot of the torch: .*{message}"):
+        pivot("torch", [rigid(r, -r @ TORCH) for r in turned])
+
+
+def test_a_point_that_left_its_mark_is_named() -> None:
+    poses = poses_about(TORCH, np.zeros(3))
+    poses[3][:3, 3] += [3e-3, 0.0, 0.0]
+    with pytest.raises(StageError, match=r"in pose 4 it was 2\.\d+ mm away"):
+        pivot("torch", poses)
+
+
+def test_the_covariance_goes_into_the_welds_bound() -> None:
+    finger = read_model(Path("data/fingers/srm.yaml").absolute(), Finger)
+    tip = Pivot(TIP, np.diag([0.1e-3, 0.2e-3, 0.3e-3]) ** 2, np.zeros(3), 0.0)
+    torch = Pivot(TORCH, np.diag([0.2e-3, 0.1e-3, 0.3e-3]) ** 2, np.zeros(3), 0.0)
+    found = with_body(finger, Pivoted(tip, torch))
+    settings = Following()
+    body = body_of(found, settings)
+    np.testing.assert_allclose(
+        found.tip + found.flange_R_tool @ body.level_R_tool.T @ body.torch, TORCH, atol=1e-12
+    )
+    belief = belief_of(found, body, None, settings)
+    assert belief.tip_sigma == pytest.approx(0.3e-3)
+    assert belief.torch_sigma == pytest.approx(np.hypot(0.2e-3, 0.1e-3), rel=0.02)
+    assert belief.fixed_variance(settings) > belief.torch_sigma**2
+
+
+class Person(SimulatedRobot):
+    """An arm, and who brings its true tip and torch to the mark when asked to."""
+
+    def __init__(self) -> None:
+        super().__init__(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+        self.home = self.arm.stance.base_T_tcp.copy()
+        self.mark = self.home[:3, :3] @ TIP + self.home[:3, 3]
+        self.count = 0
+
+    def asked(self, text: str) -> None:
+        if not text.startswith("Bring"):
+            return
+        turn = CONE[self.count % len(ATTITUDES)]
+        self.count += 1
+        point = TIP if "the tip" in text else TORCH
+        rotation = self.home[:3, :3] @ rotation_exp(turn)
+        pressed = np.array([0.0, 0.0, -0.3e-3]) if "the tip" in text else np.zeros(3)
+        target = rigid(rotation, self.mark + pressed - rotation @ point)
+        ways = Arm(MODEL).inverse(target)
+        here = self.arm.stance.joints
+        near = ways + 2 * np.pi * np.round((here - ways) / (2 * np.pi))
+        self.move_joints(near[np.abs(near - here).max(axis=1).argmin()], 1.0, 5.0)
+        while self.state().mode == "moving" or self.cycles % 50:
+            self.wait_cycle()
+
+
+def test_the_guided_procedure_finds_tip_and_torch(tmp_path: Path) -> None:
+    """The finger's file has the tip at (0, 0, 180) mm and the torch 40 mm behind it."""
+    wrong = [HELD, "steps.7.sensor.simulated_finger.world={tool: {tip: [1.5 mm, 0.8 mm, -1 mm]}}"]
+    recipe = load_recipe(find_recipe(WELD), load_registry(), wrong)
+    person = Person()
+    recipe.context[RobotDriver] = RobotDriver("robot.simulated", lambda: person, simulated=True)
+    out = tmp_path / "finger.yaml"
+    told = guide_tool.function(recipe, MotionAllowed(False), person.asked, out)
+    assert person.count == 2 * len(ATTITUDES)
+    found = read_model(out, Finger)
+    np.testing.assert_allclose(found.tip, TIP, atol=0.05e-3)
+    torch = np.array(found.tip) + found.flange_R_tool @ found.torch_from_tip
+    np.testing.assert_allclose(torch, TORCH, atol=0.05e-3)
+    assert found.calibration is not None
+    assert "\ntip        at (1.5" in told
+    assert 0.03e-3 < found.tip_sigma < 0.3e-3

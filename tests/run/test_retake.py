@@ -1,0 +1,80 @@
+"""Captures that are taken again, or left out: by command, on what a log holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flangeye import stage
+from flangeye.log.read import read_run
+from flangeye.plugin.registry import Registry
+from flangeye.types import Captures, Resumed, Seed
+from tests import toy
+from tests.cli.conftest import flangeye  # noqa: F401  a fixture
+
+Call = Callable[..., Any]
+
+
+@stage("acquire.toy_again")
+def acquire_again(
+    seed: Seed, params: toy.AcquireParams, resumed: Resumed | None = None
+) -> Captures:
+    """Make those of the toy's captures that an earlier run did not."""
+    every = toy.acquire.function(seed, params)
+    done = resumed.done if resumed else frozenset()
+    return Captures((c for c in every if c.id not in done), every.source, every.total)
+
+
+@pytest.fixture
+def done(flangeye: Call, toy_registry: Registry, toy_recipe: Path) -> Call:  # noqa: F811
+    """Return the command line, after a run of six captures into ``done``."""
+    toy_registry.stages["acquire.toy_again"] = acquire_again
+    toy_recipe.write_text(toy_recipe.read_text().replace("acquire.toy:", "acquire.toy_again:"))
+    assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
+    return flangeye
+
+
+def test_a_capture_is_taken_again_and_the_rest_is_kept(done: Call) -> None:
+    toy.acquired.clear()
+    code, _, err = done("run", "--resume", "done", "--retake", "003", "--out", "again")
+    assert code == 0, err
+    log = read_run(Path("again"))
+    assert list(log.poses) == ["003", "000", "001", "002", "004", "005"]
+    assert log.observations()[0].id == "003"
+    assert log.complete
+
+
+def test_a_capture_is_left_out_and_named_so(done: Call) -> None:
+    words = ("--from", "done/run.mcap", "--at", "solve.toy", "--leave-out", "003", "--out", "less")
+    code, _, err = done("run", "toy.yaml", *words)
+    assert code == 0, err
+    found = read_run(Path("less")).result
+    assert found is not None
+    aside = {o["id"]: o["reason"] for o in found["observations"] if not o["used"]}
+    assert aside == {"003": "acquire: left out by --leave-out"}
+    assert sum(o["used"] for o in found["observations"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("toy.yaml", "--retake", "003"),
+         "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP"),
+        (("toy.yaml", "--leave-out", "003"),
+         "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP"),
+        (("--resume", "done"),
+         "done/run.mcap: this run came to its end; there is nothing to go on with "
+         "(--retake ID takes a capture again)"),
+        (("--resume", "done", "--retake", "9"),
+         "--retake 9: done/run.mcap has no such capture; it has 000, 001, 002, 003, 004, 005"),
+        (("toy.yaml", "--from", "done/run.mcap", "--at", "solve.toy", "--leave-out", "x"),
+         "--leave-out x: done/run.mcap has no such capture; it has 000, 001, 002, 003, 004, 005"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_taken_again_is_one_line(
+    done: Call, words: tuple[str, ...], line: str
+) -> None:
+    assert done("run", *words)[::2] == (2, f"error: {line}\n")
