@@ -29,6 +29,14 @@ settings.load_profile("same")
 # A suite in the background of a script ignores Ctrl-C, and so would every process it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let what waits for a browser run with the real clients: after the others, one at a time."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.realtime)
+
+
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 
 
