@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from flangeye.errors import CalibrationRefused
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.models.configuration import Configuration
 from flangeye.models.corners import Corners
@@ -101,22 +103,46 @@ def test_without_it_the_region_is_far_too_small() -> None:
     assert np.median(stated) > 30
 
 
-def test_a_focal_length_known_badly_is_corrected_by_the_arms_motion() -> None:
-    share, rng = 0.03, np.random.default_rng(0)
+def longer_focal(share: float, known: bool, seed: int = 0) -> list[Observation]:
+    """Return what is seen by a camera whose focal length is said to be longer than it is.
+
+    Args:
+        share: By how much.
+        known: Whether it is said to be known as it is, or to be that uncertain.
+        seed: Of the session.
+    """
+    rng = np.random.default_rng(seed)
     both = share * 1400 * np.array([1.0, 1, 0, 0, 0, 0, 0, 0])
     wrong = MATRIX * [[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]]
     image = Image(np.zeros((2, 2), np.uint8), wrong, LENS, np.outer(both, both))
-    seen = [(Corners(pixels, POINTS), pose) for pose, pixels in views(rng)]
-    known, told = (
-        [observation(str(i), *each, image, shares, rng) for i, each in enumerate(seen)]
-        for shares in (False, True)
-    )
+    return [
+        observation(str(i), Corners(pixels, POINTS), pose, image, not known, rng)
+        for i, (pose, pixels) in enumerate(views(rng))
+    ]
+
+
+def test_a_focal_length_known_badly_is_corrected_by_the_arms_motion() -> None:
     off, found = (
-        np.linalg.norm(solved(each, 0.1).camera.transform.translation - X[:3, 3])
-        for each in (known, told)
+        np.linalg.norm(
+            solved(longer_focal(0.03, known), 0.1).camera.transform.translation - X[:3, 3]
+        )
+        for known in (True, False)
     )
     assert off > 10e-3
     assert found < 2e-3
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_a_focal_length_that_is_said_to_be_known_and_is_not_is_refused(share: float) -> None:
+    with pytest.raises(CalibrationRefused, match="the camera's focal length is 0.9") as refused:
+        solved(longer_focal(share, known=True))
+    told, _, sigma = str(refused.value).split("length is ")[1].split()[:3]
+    assert abs(float(told) - 1 / (1 + share)) < 5 * float(sigma) < 0.01
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_focal_length_that_is_right_is_not_refused(seed: int) -> None:
+    assert distance(solved(longer_focal(0.0, known=True, seed=seed), 1e-4)) < 30
 
 
 def test_what_the_camera_does_to_a_pose_is_what_another_camera_gives() -> None:

@@ -37,7 +37,7 @@ from flangeye.handeye.observability import (
     require_turns,
     unobservable,
 )
-from flangeye.handeye.target_size import longer_distances, require_size, told_size
+from flangeye.handeye.target_size import longer_distances, require_size, told_factor
 from flangeye.handeye.wander import with_wander
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
@@ -200,7 +200,8 @@ def _with_size(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]
     """Return the cell as it is with the target's size found, and what is then agreed on."""
     size = 1.0
     for _ in range(SIZES):
-        told = told_size(model.problem, model.found)
+        longer = longer_distances(model.problem.measurements)
+        told = told_factor(model.problem, model.found, longer)
         if not 0.1 < 1 + told.share < 10 or told.sigma > LOOSEST_SIZE:
             raise CalibrationRefused(
                 f"the target's size is told to {told.sigma:.1%} only: move the arm further between "

@@ -1,93 +1,109 @@
-"""Whether a marker is as large as the recipe says: its distances are measured by its size alone.
+"""Whether a marker is as large as the recipe says, and the focal length as long as the camera says.
 
-The arm's own motion is in metres, so one factor on all the camera's distances shows. Arrays only.
+A marker's distances are measured by its size, and those along the camera's axis by the focal length
+as well. The arm's own motion is in metres, so one factor on either shows. Arrays only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.likelihood import Problem, Solution, weigh, with_noise
 from flangeye.handeye.measurements import Measurements
+from flangeye.handeye.nuisance import nuisance_of
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats
 
 CERTAIN = 1 - 1e-6
-"""Probability with which a size that is named is not noise's doing."""
+"""Probability with which a factor that is named is not noise's doing."""
 
 
 def require_size(problem: Problem, found: Solution, limit: float) -> None:
     """Refuse poses of a target whose distances fit far better when all are longer or shorter.
 
+    All distances, as those of a target of another size are; or those along the camera's axis alone,
+    as a wrong focal length makes them. The one is named that is the surer.
+
     Args:
         problem: What was given.
         found: Its fit, whose inliers count.
-        limit: Share by which the size may be off and nobody needs to know.
+        limit: Share by which either may be off and nobody needs to know.
 
     Raises:
-        CalibrationRefused: Says how large the target is.
+        CalibrationRefused: Says how large the target, or how long the focal length is.
     """
     if not problem.measurements.are_poses:
         return
-    told = told_size(problem, found)
-    if abs(told.share) > limit and told.is_certain:
+    longer = longer_distances(problem.measurements)
+    size, focal = (told_factor(problem, found, moves) for moves in (longer, deeper(longer)))
+    told, is_size = (size, True) if size.score >= focal.score else (focal, False)
+    if abs(told.share) <= limit or not told.is_certain:
+        return
+    factor = f"{1 + told.share:.4f} +- {told.sigma:.4f} times as"
+    if is_size:
         raise CalibrationRefused(
-            f"by the arm's own motion the target is {1 + told.share:.4f} +- {told.sigma:.4f} times "
-            "as large as was said where it was fitted: measure the print; or the camera's focal "
-            "length is off by as much (size_limit allows more, target_size: unknown finds it)"
+            f"by the arm's own motion the target is {factor} large as was said where it was "
+            "fitted: measure the print; or the camera's focal length is off by as much "
+            "(size_limit allows more, target_size: unknown finds it)"
         )
+    raise CalibrationRefused(
+        f"by the arm's own motion the camera's focal length is {factor} long as was said, for "
+        "distances along its axis are off and those across it are not: calibrate the camera "
+        "(acquire.images does from its views of a board; size_limit allows more)"
+    )
 
 
 @dataclass(frozen=True)
-class ToldSize:
-    """What the arm's motion tells of the target's size.
+class ToldFactor:
+    """What the arm's motion tells of a factor on the camera's distances.
 
     Attributes:
-        share: By which it is larger than was said.
+        share: By which it is larger than one.
         sigma: Standard deviation of it.
         freedom: Of the noise that comes from.
     """
 
     share: float
     sigma: float
-    freedom: int
+    freedom: float
+
+    @property
+    def score(self) -> float:
+        """How sure it is that the factor is not one: squared, in standard deviations."""
+        return (self.share / self.sigma) ** 2
 
     @property
     def is_certain(self) -> bool:
-        """Whether another size than was said is not noise's doing."""
-        return (self.share / self.sigma) ** 2 > f_quantile(CERTAIN, 1, self.freedom)
+        """Whether another factor than one is not noise's doing."""
+        return self.score > f_quantile(CERTAIN, 1, self.freedom)
 
 
-def told_size(problem: Problem, found: Solution) -> ToldSize:
-    """Return the size that poses of a target tell: one step of Gauss-Newton, with all else unknown.
+def told_factor(problem: Problem, found: Solution, moves: Floats) -> ToldFactor:
+    """Return the factor that poses of a target tell, with all else unknown, the noise as well.
+
+    The noise of a fit without the factor would take what the factor does for noise, and where only
+    depth is wrong it would hide in the noise of depths.
 
     Args:
         problem: What was given: whole poses.
         found: Its fit, whose inliers count.
+        moves: (N, 6, 1) by which a larger factor moves what is predicted.
     """
-    kept = found.inliers
-    jacobian = found.linear.jacobian[kept] @ found.basis
-    longer = longer_distances(problem.measurements.where(kept))
-    rows = np.concatenate([jacobian, longer], axis=2)
-    weights, residuals = found.weights[kept], found.linear.residuals[kept]
-    information = np.einsum("nai,nab,nbj->ij", rows, weights, rows, optimize=True)
-    slope = np.einsum("nai,nab,nb->i", rows, weights, residuals, optimize=True)
-    root = np.sqrt(np.diag(information))
-    inverse = np.linalg.pinv(information / np.outer(root, root), rcond=1e-12, hermitian=True)
-    step = -inverse @ (slope / root) / root
-    variance = float(inverse[-1, -1] / root[-1] ** 2)
-    # The noise was taken from residuals in which a wrong size counts as noise: what is left of
-    # the distances without it is the measure.
-    after = (residuals + rows @ step)[:, 3:]
-    left = float(np.einsum("na,nab,nb->", after, weights[:, 3:, 3:], after))
-    freedom = max(after.size - rows.shape[2] // 2, 1)
-    told = (weights @ (residuals + rows @ step)[..., None])[..., 0]
-    scores = np.einsum("nai,na->ni", rows, told) @ (inverse[-1] / root / root[-1])
-    sigma = float(np.sqrt(variance * left / freedom * correlation(scores)))
-    return ToldSize(-float(step[-1]), sigma, freedom)
+    still = np.zeros_like(moves)
+    nuisance = nuisance_of(still, still, np.inf, seen=moves)
+    if len(problem.nuisance):
+        nuisance = problem.nuisance.and_also(nuisance)
+    free = replace(problem, nuisance=nuisance, in_depth=not problem.stated)
+    at = replace(found.at, nuisance=np.append(found.at.nuisance, 0.0))
+    fit = with_noise(free, weigh(free, at, found.noise, found.inliers.astype(float)))
+    row, linear = fit.covariance[-1], fit.linear.where(fit.inliers)
+    told = (fit.weights[fit.inliers] @ linear.residuals[..., None])[..., 0]
+    scores = np.einsum("nai,na->ni", linear.jacobian, told) @ row
+    sigma = float(np.sqrt(row[-1] * correlation(scores)))
+    return ToldFactor(float(fit.at.nuisance[-1]), sigma, fit.freedom)
 
 
 def longer_distances(measurements: Measurements) -> Floats:
@@ -95,6 +111,11 @@ def longer_distances(measurements: Measurements) -> Floats:
     longer = np.zeros((len(measurements), 6, 1))
     longer[:, 3:, 0] = -measurements.centres
     return longer
+
+
+def deeper(longer: Floats) -> Floats:
+    """Return the (N, 6, 1) part of longer distances that a longer focal length makes."""
+    return np.asarray(longer * np.array([0.0, 0, 0, 0, 0, 1])[:, None])
 
 
 def correlation(scores: Floats) -> float:
