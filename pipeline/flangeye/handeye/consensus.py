@@ -118,7 +118,8 @@ def _start(
     x = rigid(rotation, mean_b - rotation @ mean_c)
     at = Unknowns(x, np.eye(4), problem.loop.place, np.zeros(2))
     pose = sigma**2 if problem.pose_noise is None else problem.pose_noise
-    return weigh(problem, at, Noise(pose, tilt), inliers.astype(float))
+    noise = Noise(0.0, 0.0) if problem.stated else Noise(pose, tilt)
+    return weigh(problem, at, noise, inliers.astype(float))
 
 
 def _without_bad_normals(problem: Problem, found: Solution) -> tuple[Problem, Solution, int]:
