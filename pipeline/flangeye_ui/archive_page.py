@@ -20,7 +20,7 @@ from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.run_page import FLANGE, SCAN
-from flangeye_ui.scene import draw_cloud
+from flangeye_ui.scene import draw_cloud, new_scene
 
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
@@ -161,7 +161,7 @@ class Scrubber:
         )
         self._slider.props('aria-label="Capture" label')
         self._told = ui.label().props('role="status"')
-        self._scene = ui.scene(width=600, height=360, background_color="#eef1f5").classes("w-full")
+        self._scene = new_scene(600, 360)
         ui.timer(0.05, lambda: self._open(runs[0]), once=True)
 
     async def _open(self, run: str) -> None:

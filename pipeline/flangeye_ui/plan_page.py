@@ -18,7 +18,7 @@ from flangeye.recipe.load import Recipe
 from flangeye.types import Floats
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
-from flangeye_ui.scene import draw_arm, draw_box, draw_frustum
+from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
 
 ROW = re.compile(r"^(\d{4})\s+(\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(\d+) deg\s+(.*)$")
 TIMES = re.compile(r"^(\d+) stops, (\d+) s under way", re.MULTILINE)
@@ -69,9 +69,7 @@ class Planner:
         self._project, self._recipe = project, recipe
         with ui.row().classes("w-full gap-4"):
             with ui.column().classes("col-12 col-md-7"):
-                self._scene = ui.scene(width=640, height=460, background_color="#eef1f5").classes(
-                    "w-full"
-                )
+                self._scene = new_scene(640, 460)
                 self._draw()
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()

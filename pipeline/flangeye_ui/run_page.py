@@ -14,7 +14,7 @@ from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
 from flangeye_ui.layout import command_line, confirmed, mistake, page
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
-from flangeye_ui.scene import draw_cloud, outline_of
+from flangeye_ui.scene import draw_cloud, new_scene, outline_of
 
 EVERY = 0.25
 """Between two looks at the run [s]."""
@@ -71,8 +71,8 @@ class Panel:
         ui.keyboard(on_key=self._key)
 
     def _pictures(self) -> None:
-        self._scene = ui.scene(width=600, height=330, fps=5, background_color="#eef1f5")
-        self._scene.classes("w-full").move_camera(0.0, -0.15, 0.25, 0, 0, 0.8, 0, -1, 0)
+        self._scene = new_scene(600, 330, fps=5)
+        self._scene.move_camera(0.0, -0.15, 0.25, 0, 0, 0.8, 0, -1, 0)
         ui.label("Residual of each pose so far").classes("text-caption")
         self._bars = ui.echart(residual_chart(None)).classes("w-full h-40")
         ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")

@@ -19,6 +19,16 @@ BALLS = 5
 ROUND = 90
 """Points that a circle is drawn with."""
 
+DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
+"""At night what is light is dark and colours keep their hue: a scene has one background only."""
+
+
+def new_scene(width: int, height: int, fps: int = 20) -> ui.scene:
+    """Return an empty scene as wide as its column, which follows the page into the dark."""
+    ui.add_css(DARK)
+    scene = ui.scene(width=width, height=height, fps=fps, background_color="#eef1f5")
+    return scene.classes("w-full scene")
+
 
 def draw_arm(scene: ui.scene, robot: RobotModel, joints: Floats) -> None:
     """Draw the arm's capsules; where the model has none, its links as lines."""

@@ -290,6 +290,8 @@ def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, name
         shot(page, f"narrow_dark_{name.lower()}")
     assert page.evaluate("document.body.classList.contains('body--dark')")
+    filtered = "getComputedStyle(document.querySelector('.scene canvas')).filter"
+    assert "invert" in page.evaluate(filtered)
     reached = set()
     for _ in range(12):
         page.keyboard.press("Tab")
