@@ -3,8 +3,10 @@
 import os
 import signal
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pluggy
 import pytest
@@ -100,3 +102,31 @@ def replaced(stage, function):
         yield
     finally:
         object.__setattr__(stage, "function", plain)
+
+
+@pytest.fixture(scope="session")
+def store_server() -> Iterator[str]:
+    """A server that speaks as S3 does, on loopback; its URL."""
+    moto_server = pytest.importorskip("moto.server")
+    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(store_server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The client of an empty bucket s3://cell; processes that are started reach it too."""
+    s3fs = pytest.importorskip("s3fs")
+    for name, value in {
+        "AWS_ENDPOINT_URL": store_server, "AWS_ACCESS_KEY_ID": "nobody",
+        "AWS_SECRET_ACCESS_KEY": "nothing", "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    store = s3fs.S3FileSystem()
+    store.mkdir("cell")
+    yield store
+    store.rm("cell", recursive=True)
+    s3fs.S3FileSystem.clear_instance_cache()

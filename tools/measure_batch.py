@@ -4,8 +4,9 @@ Overhead: the wall time of a batch on one running worker, less the time its sess
 session; and what command and worker use of the processor, less what the same sessions use in a
 loop: on a machine that does other things besides, only this means something. The start of the
 cluster, and of the plugins in its first session, are told apart.
-Speed: the same batch on two workers. Memory: of the command and of its largest worker, early and
-late in MANY sessions that do next to nothing (0 leaves this out). Each line comes when it is known.
+Speed: the same batch on two workers. Many: MANY sessions that do nothing but have rows, what each
+costs, and the memory of client and scheduler early and at most. 0 leaves either out. Each line
+comes when it is known.
 """
 
 import os
@@ -13,21 +14,25 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import psutil
 
-ROOT = Path(__file__).parents[2]
-SITE = Path(__file__).parent / "site"
+ROOT = Path(__file__).parents[1]
+SITE = ROOT / "tests" / "batch" / "site"
 for folder in (str(ROOT), str(SITE)):
     if folder not in sys.path:
         sys.path.insert(0, folder)
+os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(SITE)])  # of the workers
 
 from rich.console import Console  # noqa: E402
 
-from flangeye.batch import Request, run_batch  # noqa: E402
+from flangeye.batch import Request, cluster, command, run_batch, work  # noqa: E402
 from flangeye.batch.cluster import local_client  # noqa: E402
+from flangeye.batch.outcome import SessionOutcome  # noqa: E402
 from flangeye.plugin.registry import load_registry  # noqa: E402
 from flangeye.recipe.load import load_recipe  # noqa: E402
 from flangeye.run.folder import RunFolder  # noqa: E402
@@ -42,6 +47,9 @@ steps:
   - solve.work: {wait: WAIT ms}
   - verify.toy: {max_rms: 2 mm}
 """
+OUTCOME = SessionOutcome(
+    "verified", None, 75, 76, 1e-4, 9e-5, 2e-4, 1.2e-4, 2.1e-4, 1e-4, 5e-5, 1e-3, 41.7
+)
 WORK = 300
 """What each session waits [ms]: long enough for two workers to be worth their start."""
 
@@ -57,17 +65,18 @@ class Bench:
     def __init__(self, folder):
         self.folder, self.registry = folder, load_registry()
 
-    def batch(self, name, sessions, address, wait=WORK):
+    def batch(self, name, sessions, client, wait=WORK):
         """Run a batch; return its seconds on the wall and those of its sessions, added up."""
         recipe = self.folder / f"toy-{wait}.yaml"
         recipe.write_text(RECIPE.replace("WAIT", str(wait)))
         out = self.folder / name
-        request = Request(str(recipe), repeat=sessions, scheduler=address, out=out, report=False)
+        request = Request(str(recipe), repeat=sessions, out=str(out), report=False)
         begun = time.perf_counter()
-        done = run_batch(request, self.registry, Console(stderr=True, quiet=True))
+        with patch.object(command, "_client", lambda *_: nullcontext(client)):
+            done = run_batch(request, self.registry, Console(stderr=True, quiet=True))
         wall = time.perf_counter() - begun
-        assert done.accepted and len(done.outcomes) == sessions
-        return wall, sum(outcome.seconds for outcome in done.outcomes.values())
+        assert done.accepted and done.tally.total == sessions
+        return wall, done.tally.seconds
 
     def loop(self, sessions):
         """Run sessions one after the other, as ``flangeye run`` does each."""
@@ -80,19 +89,18 @@ class Bench:
 
     @contextmanager
     def workers(self, count):
-        """Start workers, and run a session on each; yield their scheduler's address."""
+        """Start workers, and run a session on each; yield their client."""
         begun = time.perf_counter()
         with local_client(count) as client:
-            address = client.scheduler.address
             started = time.perf_counter() - begun
-            wall, _ = self.batch(f"first-{count}-{time.monotonic_ns()}", 2 * count, address, 0)
+            wall, _ = self.batch(f"first-{count}-{time.monotonic_ns()}", 2 * count, client, 0)
             say(f"start of {count} worker(s): {started:.1f} s; first sessions, which load the "
                 f"plugins: {wall:.1f} s")  # fmt: skip
-            yield address
+            yield client
 
 
 class Memory(threading.Thread):
-    """Samples the resident memory [MB] of this process and of the largest below it."""
+    """Samples the resident memory [MB] of this process, which is client and scheduler."""
 
     def __init__(self):
         super().__init__(daemon=True)
@@ -101,14 +109,15 @@ class Memory(threading.Thread):
 
     def run(self):
         own = psutil.Process(os.getpid())
-        while not self.stop.wait(0.5):
-            below = []
-            for child in own.children(recursive=True):
-                try:
-                    below.append(child.memory_info().rss)
-                except psutil.NoSuchProcess:
-                    continue
-            self.samples.append((own.memory_info().rss / 1e6, max(below, default=0) / 1e6))
+        while not self.stop.wait(0.2):
+            self.samples.append(own.memory_info().rss / 1e6)
+
+
+def empty_chunk(job, chunk):
+    """Stand in for a worker's chunk: sessions that do nothing, whose rows are written."""
+    begun = time.perf_counter()
+    told = work.write_rows(job, chunk, [OUTCOME] * len(chunk.sessions))
+    return replace(told, seconds=time.perf_counter() - begun)
 
 
 def used():
@@ -124,41 +133,50 @@ def measure_overhead(bench, sessions):
     bench.loop(sessions)
     alone, each = used() - before, 1e3 / sessions
     say(f"{sessions} sessions in a loop: {each * alone:.1f} ms of the processor each")
-    with bench.workers(1) as address:
+    with bench.workers(1) as client:
         before = used()
-        bench.batch("quick", sessions, address, wait=0)
+        bench.batch("quick", sessions, client, wait=0)
         beyond = used() - before - alone
-        one, worked = bench.batch("one", sessions, address)
+        one, worked = bench.batch("one", sessions, client)
     say(f"{sessions} sessions, 1 worker: {one:.2f} s, of which the sessions took {worked:.2f} s")
     say(f"  overhead a session: {each * (one - worked):.1f} ms on the wall, "
         f"{each * beyond:.1f} ms of the processor beyond the loop")  # fmt: skip
-    with bench.workers(2) as address:
-        two, _ = bench.batch("two", sessions, address)
-        again, _ = bench.batch("two", sessions, address)
+    with bench.workers(2) as client:
+        two, _ = bench.batch("two", sessions, client)
+        again, _ = bench.batch("two", sessions, client)
     say(f"{sessions} sessions, 2 workers: {two:.2f} s, {one / two:.2f} times as fast as one")
     say(f"started again, all finished: {again:.2f} s")
 
 
-def measure_memory(bench, sessions):
-    """Say the memory early and late in a batch of quick sessions."""
+def measure_many(bench, sessions):
+    """Say what sessions that do nothing cost, and the memory of client and scheduler over them."""
     memory = Memory()
-    with bench.workers(2) as address:
+    with bench.workers(1) as client, patch.object(cluster, "run_chunk", empty_chunk):
+        bench.batch("few", 200, client, wait=0)
         memory.start()
-        wall, _ = bench.batch("many", sessions, address, wait=0)
+        cpu, before = time.process_time(), used()
+        wall, _ = bench.batch("many", sessions, client, wait=0)
         memory.stop.set()
-    early, late = memory.samples[len(memory.samples) // 4], memory.samples[-2]
-    say(f"{sessions} quick sessions: {wall:.1f} s; memory of the command {early[0]:.0f} -> "
-        f"{late[0]:.0f} MB, of the largest worker {early[1]:.0f} -> {late[1]:.0f} MB")  # fmt: skip
+        own, both = time.process_time() - cpu, used() - before
+        early, late = memory.samples[len(memory.samples) // 10], max(memory.samples)
+        say(f"{sessions} sessions that do nothing: {1e3 * wall / sessions:.2f} ms each on the wall; "
+            f"of the processor {1e3 * own / sessions:.2f} ms for client and scheduler, "
+            f"{1e3 * (both - own) / sessions:.2f} ms for the worker")  # fmt: skip
+        say(f"  memory of client and scheduler {early:.0f} -> {late:.0f} MB")
+        cpu = time.process_time()
+        bench.batch("many", sessions, client, wait=0)
+        say(f"  started again, all finished: {time.process_time() - cpu:.1f} s of the processor")
 
 
 def main():
     """Print the figures."""
-    sessions, many = (int(v) for v in (sys.argv[1:] + ["60", "500"][len(sys.argv) - 1 :]))
+    sessions, many = (int(v) for v in (sys.argv[1:] + ["60", "10000"][len(sys.argv) - 1 :]))
     with tempfile.TemporaryDirectory() as name:
         bench = Bench(Path(name))
-        measure_overhead(bench, sessions)
+        if sessions:
+            measure_overhead(bench, sessions)
         if many:
-            measure_memory(bench, many)
+            measure_many(bench, many)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from __future__ import annotations
 import heapq
 import sys
 import time
+from collections import Counter
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +23,7 @@ from unittest.mock import patch
 import numpy as np
 
 from flangeye.batch import cluster
-from flangeye.batch.outcome import SessionOutcome
+from flangeye.batch.work import ChunkTold
 
 MEASURED = 2000
 """Sessions that do nothing, to measure the scheduler by."""
@@ -171,19 +172,19 @@ class Cluster:
         self._ask(now, core)
 
 
-def do_nothing(job: Any, session: Any) -> SessionOutcome:
-    """Stand in for a session's work."""
-    return SessionOutcome("verified", None, 50, 50)
+def do_nothing(job: Any, chunk: Any) -> ChunkTold:
+    """Stand in for the work of a chunk: one session, as long as a chunk is to be."""
+    return ChunkTold(Counter({"verified": 1}), [], cluster.CHUNK_SECONDS)
 
 
 def scheduling_seconds() -> float:
     """Return what client and scheduler, both in this process, spend on a session [s]."""
-    sessions: Any = [SimpleNamespace(id=str(k)) for k in range(MEASURED)]
-    with patch.object(cluster, "run_session", do_nothing), cluster.local_client(1) as client:
+    sessions: Any = list(enumerate(SimpleNamespace(id=str(k)) for k in range(MEASURED)))
+    with patch.object(cluster, "run_chunk", do_nothing), cluster.local_client(1) as client:
         job: Any = None
-        list(cluster.run_all(client, job, sessions[:100]))
+        list(cluster.run_all(client, job, sessions[:100], 100))
         start = time.process_time()
-        list(cluster.run_all(client, job, sessions))
+        list(cluster.run_all(client, job, sessions, MEASURED))
         return (time.process_time() - start) / MEASURED
 
 

@@ -17,10 +17,11 @@ from typing import Any
 import pytest
 
 from flangeye.batch import cluster
+from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.plan import plan
 from flangeye.batch.request import BatchError, Request
-from flangeye.batch.software import software_of
-from flangeye.batch.work import STARTS, WORKER_DIED, Job
+from flangeye.batch.software import Software, software_of
+from flangeye.batch.work import READY, STARTS, WORKER_DIED, Job
 
 SLURM = Path(cluster.__file__).with_name("slurm_cluster.py")
 PATIENCE = 120
@@ -28,7 +29,7 @@ PATIENCE = 120
 
 
 def rows(folder):
-    with (folder / "sessions.csv").open(newline="") as file:
+    with Path(folder, "sessions.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -46,12 +47,12 @@ def test_every_end_is_a_row_and_costs_only_itself(
     assert rows(done.out)[0]["reason"] == WORKER_DIED
     assert not done.accepted
     assert f"crashed {rows(done.out)[0]['session']}: {WORKER_DIED}\n" in said
-    assert done.out == Path("batches") / "toy"
-    assert not (done.out / STARTS).exists()
+    assert done.out == "batches/toy"
+    assert not Path(done.out, STARTS).exists()
 
     more = {"overrides": ("steps.3.once=once",), "workers": 1}
     again, _ = batch(grid=("steps.3.what=work,refuse,fail",), **more)
-    assert (again.known, len(again.outcomes)) == (2, 3)
+    assert (again.known, again.tally.total) == (2, 3)
     third, _ = batch(grid=("steps.3.what=work,refuse",), **more)
     assert (third.known, len(rows(third.out))) == (2, 2)
 
@@ -222,6 +223,13 @@ def test_the_slurm_script_and_a_batch_on_it(
     assert re.search(r"dask_worker tcp://\S+ .*--nthreads 1 .*--nworkers 2 ", job)
 
 
+def a_job(folder: Path, software: Software) -> Job:
+    """Return the job of a batch that may begin."""
+    job = Job(str(folder / "out"), False, software, columns_of({}))
+    job.place.write(READY, b"")
+    return job
+
+
 def test_two_workers_are_at_work_nearly_all_the_time(
     recipe: Path, registry: Any, tmp_path: Path
 ) -> None:
@@ -229,15 +237,17 @@ def test_two_workers_are_at_work_nearly_all_the_time(
     software = software_of(registry)
     wanted = Request(str(recipe), repeat=26, overrides=("steps.3.wait=100 ms",))
     sessions = plan(wanted, registry, software)
-    job = Job(tmp_path / "out", report=False, software=software)
-    (job.out / STARTS).mkdir(parents=True)
+    job = a_job(tmp_path, software)
+    todo = list(enumerate(sessions))
     with cluster.local_client(2) as client:
-        assert len(list(cluster.run_all(client, job, sessions[:2]))) == 2  # imports everything
+        assert len(list(cluster.run_all(client, job, todo[:2], 2))) == 2  # imports everything
         begun = time.perf_counter()
-        outcomes = [outcome for _, outcome in cluster.run_all(client, job, sessions[2:])]
+        told = list(cluster.run_all(client, job, todo[2:], 24))
         took = time.perf_counter() - begun
-    assert {outcome.status for outcome in outcomes} == {"verified"}
-    worked = sum(outcome.seconds for outcome in outcomes)
+    assert {status for each in told for status in each.counts} == {"verified"}
+    rows = list(Dataset(job.place, job.columns).rows(Ledger(sessions)))
+    worked = sum(row["seconds"] for row in rows[2:])
+    assert len(rows) == 26
     assert worked / took > 1.8
     assert (2 * took - worked) / 24 < 0.03
 
@@ -248,16 +258,17 @@ def test_500_sessions_keep_memory_flat(recipe: Path, registry: Any, tmp_path: Pa
 
     software = software_of(registry)
     sessions = plan(Request(str(recipe), repeat=500), registry, software)
-    job = Job(tmp_path / "out", report=False, software=software)
-    (job.out / STARTS).mkdir(parents=True)
+    job = a_job(tmp_path, software)
 
     def resident():
         return psutil.Process().memory_info().rss
 
     with cluster.local_client(1) as client:
-        memory = []
-        for i, _ in enumerate(cluster.run_all(client, job, sessions)):
-            if i in (100, 499):
+        memory: list[tuple[int, int]] = []
+        done = 0
+        for told in cluster.run_all(client, job, enumerate(sessions), len(sessions)):
+            done += told.counts.total()
+            if (not memory and done > 100) or done == len(sessions):
                 (worker,) = client.run(resident).values()
                 memory.append((resident(), worker))
     for early, late in zip(*memory, strict=True):

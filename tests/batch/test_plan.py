@@ -25,7 +25,7 @@ SOFTWARE = Software("1", ("toy 1.0",))
 @pytest.fixture
 def sessions(recipe: Path, registry: Any) -> Callable[..., Any]:
     def call(name=recipe, software=SOFTWARE, **wanted):
-        return plan(Request(str(name), **wanted), registry, software)
+        return list(plan(Request(str(name), **wanted), registry, software))
 
     return call
 
@@ -37,12 +37,12 @@ def test_grid_times_seeds(sessions: Callable[..., Any]) -> None:
         for inlier in ("0.2 mm", "0.3 mm") for count in "567" for seed in (3, 4)
     ]  # fmt: skip
     assert len({s.id for s in found}) == 12
-    assert found[0].overrides == ("steps.2.inlier=0.2 mm", "steps.0.count=5", "seed=3")
+    assert found[0].overrides == ("steps.2.inlier=0.2 mm", "steps.0.count=5")
 
 
 def test_a_grid_compares_solvers() -> None:
     request = Request("ur5_phoxi-m_sample", grid=("steps.3=solve.svd,solve.robust",))
-    found = plan(request, load_registry(), SOFTWARE)
+    found = list(plan(request, load_registry(), SOFTWARE))
     assert [s.varied for s in found] == [{"steps.3": "solve.svd"}, {"steps.3": "solve.robust"}]
     assert len({s.key for s in found}) == 2
 
@@ -227,3 +227,13 @@ def test_workers_must_have_the_same_software(registry: Any) -> None:
     ):
         with pytest.raises(StageError, match=told):
             check_software(other, here, "host")
+
+
+def test_sessions_are_counted_without_being_made_and_made_again_alike(
+    recipe: Path, registry: Any
+) -> None:
+    made = plan(Request(str(recipe), grid=("steps.0.count=5,6",), repeat=3), registry, SOFTWARE)
+    assert len(made) == 6 and list(made) == list(made)
+    assert made.values() == {"steps.0.count": ["5", "6"]}
+    assert all(session.id.endswith(f"_{session.key[:16]}") for session in made)
+    assert {session.number for session in made} == {session.key[:16] for session in made}

@@ -12,23 +12,54 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from flangeye.batch.command import _tell
+from flangeye.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
 from flangeye.batch.figures import drawings_of
 from flangeye.batch.outcome import SessionOutcome
-from flangeye.batch.page import render, write_page
+from flangeye.batch.page import render as rendered
+from flangeye.batch.page import write_page
 from flangeye.batch.plan import BatchSession
-from flangeye.batch.tables import table_of, write_tables
+from flangeye.batch.software import Software
+from flangeye.batch.tally import Tally
+from flangeye.batch.work import Job
+from flangeye.files.place import place_at
 
 EVIL = "<script>alert(1)</script>"
 
 
 def session(i, archive=None, **varied):
-    return BatchSession(f"toy_{i:012d}", str(i), Path("/r/toy.yaml"), archive, (), varied, i)
+    return BatchSession(f"toy_{i:016d}", str(i), Path("/r/toy.yaml"), archive, (), varied, i)
 
 
 def outcome(rms=3e-4, **more):
-    report = more.pop("report", "toy_000000000000/report.html")
+    report = more.pop("report", "toy_0000000000000000/report.html")
     return SessionOutcome("verified", None, 5, 6, rms, rms, 2 * rms, rms, 2 * rms, seconds=1.5,
                    report=report, **more)  # fmt: skip
+
+
+def columns(entries: Any) -> dict[str, Kind]:
+    paths = entries[0][0].varied
+    return columns_of({path: [session.varied[path] for session, _ in entries] for path in paths})
+
+
+def tally_of(entries: Any) -> Tally:
+    """Return the tally of sessions, as it is gathered in blocks of five hundred."""
+    kinds = columns(entries)
+    tally = Tally(kinds, tuple(entries[0][0].varied), len(entries))
+    rows = [row_of(session, outcome, kinds) for session, outcome in entries]
+    for first in range(0, len(rows), 500):
+        schema = pa.schema(list(kinds.items()))
+        tally.add(pa.Table.from_pylist(rows[first : first + 500], schema))
+    return tally
+
+
+def render(entries: Any) -> str:
+    return rendered(tally_of(entries))
+
+
+def drawings(entries: Any) -> Any:
+    tally = tally_of(entries)
+    return drawings_of(tally.sample, tally.varied)
 
 
 @pytest.fixture
@@ -42,7 +73,14 @@ def entries() -> Any:
 
 
 def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
-    write_tables(table_of(entries), tmp_path)
+    kinds = columns(entries)
+    job = Job(str(tmp_path), False, Software("1", ()), kinds)
+    dataset = Dataset(job.place, kinds)
+    for number, (session, outcome) in reversed(list(enumerate(entries))):
+        dataset.write_part(0, str(number), [row_of(session, outcome, kinds)])
+    tally = Tally(kinds, tuple(entries[0][0].varied), 3)
+    _tell(job, dataset, Ledger([session for session, _ in entries]), tally)
+    assert [path.name for path in (tmp_path / "sessions.parquet").iterdir()] == ["000000.parquet"]
     with (tmp_path / "sessions.csv").open(newline="") as file:
         read = list(csv.DictReader(file))
     table = pq.read_table(tmp_path / "sessions.parquet")
@@ -60,7 +98,7 @@ def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
 
 
 def test_columns(entries: Any) -> None:
-    assert table_of(entries).columns == (
+    assert tuple(columns(entries)) == (
         "session", "recipe", "archive", "steps.0.noise", "steps.0.count", "seed", "status",
         "reason", "used", "captures", "holdout_rms_m", "holdout_median_m", "holdout_p95_m",
         "predicted_rms_m", "predicted_p95_m", "true_rms_m", "true_centre_m", "true_rotation_rad",
@@ -69,9 +107,9 @@ def test_columns(entries: Any) -> None:
 
 
 def test_quantities_stand_on_an_axis_by_their_number(entries: Any) -> None:
-    drawings = dict(drawings_of(table_of(entries)))
-    assert set(drawings) == {"Held-out error, rms", "Predicted error, 95 %", "Time"}
-    figure = drawings["Held-out error, rms"]
+    drawn = dict(drawings(entries))
+    assert set(drawn) == {"Held-out error, rms", "Predicted error, 95 %", "Time"}
+    figure = drawn["Held-out error, rms"]
     assert figure["layout"]["xaxis"]["title"]["text"] == "step 0.noise [mm]"
     dots = [dict(zip(t["x"], t["y"], strict=True)) for t in figure["data"]]
     assert dots == [{0.1: pytest.approx(0.1)}, {0.2: pytest.approx(0.2)}]
@@ -85,17 +123,17 @@ def test_names_stand_side_by_side_and_medians_join_repetitions() -> None:
         (session(i, **{"steps.3.cost": cost}), outcome(rms * 1e-3))
         for i, (cost, rms) in enumerate([("a", 1), ("a", 2), ("a", 4), ("b", 3), ("b", 5)])
     ]
-    figure = dict(drawings_of(table_of(entries)))["Held-out error, rms"]
+    figure = dict(drawings(entries))["Held-out error, rms"]
     assert figure["layout"]["xaxis"]["type"] == "category"
     *_, medians = figure["data"]
     assert (medians["x"], medians["y"]) == (["a", "b"], [2.0, 4.0])
 
 
 def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries: Any) -> None:
-    page = render(table_of(entries))
+    page = render(entries)
     assert EVIL not in page
     assert "bad, &lt;script&gt;alert(1)&lt;/script&gt;" in page
-    assert '<a href="toy_000000000000/report.html">' in page
+    assert '<a href="toy_0000000000000000/report.html">' in page
     own = re.sub(r"<script>.*?</script>", "", page, flags=re.S)
     assert not re.search(r"(src|href)=\"(?!toy_)", own)
     assert "default-src 'none'" in page
@@ -103,15 +141,15 @@ def test_the_page_escapes_what_it_is_given_and_asks_for_nothing(entries: Any) ->
 
 def test_archives_are_told_apart_by_what_differs() -> None:
     paths = ["/data/a/poses", "/data/b/poses", f"/data/{EVIL}"]
-    page = render(table_of([(session(i, path), outcome()) for i, path in enumerate(paths)]))
+    page = render([(session(i, path), outcome()) for i, path in enumerate(paths)])
     assert '<td class="">a/poses</td>' in page
     assert EVIL not in page
 
 
 def test_variants_are_summed_up_when_repeated(entries: Any) -> None:
-    page = render(table_of(entries))
+    page = render(entries)
     assert '<h2 id="variants">' in page
-    assert '<h2 id="variants">' not in render(table_of(entries[:2]))
+    assert '<h2 id="variants">' not in render(entries[:2])
     row = re.search(r"<tr><td>0.2 mm</td><td>6</td>(.*?)</tr>", page, re.S).group(1)
     assert re.findall(r">([^<>]*)</td>", row) == ["2", "1", "1", "0.200", "0.400", ""]
 
@@ -119,15 +157,15 @@ def test_variants_are_summed_up_when_repeated(entries: Any) -> None:
 def test_a_page_of_very_many_sessions_shows_the_worst() -> None:
     many = [(session(i), replace(outcome(), holdout_rms_m=1e-6 * i)) for i in range(1200)]
     many[5] = (session(5), SessionOutcome("crashed", "no"))
-    page = render(table_of(many))
+    page = render(many)
     assert "1000 of 1200: those without a calibration" in page
-    assert "toy_000000000005" in page and "toy_000000001199" in page
-    assert "toy_000000000006<" not in page and len(page) < 6e6
+    assert "toy_0000000000000005" in page and "toy_0000000000001199" in page
+    assert "toy_0000000000000006<" not in page and len(page) < 6e6
 
 
 def test_nothing_accepted_still_makes_a_page() -> None:
     entries = [(session(0), SessionOutcome("crashed", "no"))]
-    page = render(table_of(entries))
+    page = render(entries)
     assert "1 sessions" not in page
     assert "1 session of toy" in page
 
@@ -137,7 +175,7 @@ def test_the_table_sorts_in_a_browser(entries: Any, tmp_path: Path) -> None:
     if chromium is None:
         pytest.skip("no chromium on this machine: apt-get install chromium")
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    write_page(table_of(entries), tmp_path / "summary.html")
+    write_page(tally_of(entries), place_at(str(tmp_path)))
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--host-resolver-rules=MAP * ~NOTFOUND"]
     problems: list[str] = []
     requested: list[str] = []
@@ -161,4 +199,4 @@ def test_the_table_sorts_in_a_browser(entries: Any, tmp_path: Path) -> None:
 
 
 def test_figures_are_plain_json(entries: Any) -> None:
-    json.dumps([figure for _, figure in drawings_of(table_of(entries))], allow_nan=False)
+    json.dumps([figure for _, figure in drawings(entries)], allow_nan=False)

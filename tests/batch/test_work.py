@@ -3,16 +3,29 @@
 import json
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flangeye.batch.dataset import columns_of
 from flangeye.batch.outcome import MARKER, SessionOutcome, finished_outcome
 from flangeye.batch.plan import plan
 from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
-from flangeye.batch.work import STARTS, WORKER_DIED, Job, _registry, run_session
+from flangeye.batch.work import (
+    READY,
+    STARTS,
+    WORKER_DIED,
+    Chunk,
+    Job,
+    Recipes,
+    _registry,
+    run_chunk,
+    run_session,
+)
+from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
 
 
@@ -26,12 +39,16 @@ class Worker:
         self, report: bool = False, name: Path | None = None, **wanted: Any
     ) -> SessionOutcome:
         software = software_of(self.registry)
-        self.job = Job(self.out, report, software)
-        (self.out / STARTS).mkdir(parents=True, exist_ok=True)
+        self.job = Job(str(self.out), report, software, columns_of({}))
+        self.job.place.write(READY, b"")
         request = Request(str(name or self.recipe), **wanted)
         (self.session,) = plan(request, self.registry, software)
         self.folder = self.out / self.session.id
-        return run_session(self.job, self.session)
+        return self.again()
+
+    def again(self) -> SessionOutcome:
+        """Run the same session as another chunk would."""
+        return run_session(self.job, self.session, Recipes(self.job))
 
 
 @pytest.fixture
@@ -60,7 +77,7 @@ def test_a_session_leaves_what_run_leaves(work: Any) -> None:
     ]  # fmt: skip
     result = json.loads((work.folder / "result.json").read_text())
     assert result["holdout"]["rms"] == outcome.holdout_rms_m
-    assert list((work.job.out / STARTS).iterdir()) == []
+    assert [path.name for path in (work.out / STARTS).iterdir()] == ["ready"]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +94,7 @@ def test_what_goes_wrong_is_the_outcome(work: Worker, what: str, status: str, re
     outcome = work(overrides=(f"steps.3.what={what}",))
     assert (outcome.status, outcome.reason) == (status, reason)
     assert (work.folder / MARKER).exists() == (status == "refused")
-    assert list((work.job.out / STARTS).iterdir()) == []
+    assert [path.name for path in (work.out / STARTS).iterdir()] == ["ready"]
 
 
 def test_no_archive(work: Worker, archive_recipe: Path, archives: Any) -> None:
@@ -123,16 +140,17 @@ def test_an_unfinished_session_is_run_again(work: Worker) -> None:
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"key": "other"}', "\x00", '{"key": null}'])
 def test_a_marker_that_is_not_ours_counts_for_nothing(work: Worker, text: str) -> None:
     work()
-    assert finished_outcome(work.folder, work.session.key, report=False)
+    given = (work.job.place, work.session.id, work.session.key, False)
+    assert finished_outcome(*given)
     (work.folder / MARKER).write_text(text)
-    assert finished_outcome(work.folder, work.session.key, report=False) is None
+    assert finished_outcome(*given) is None
 
 
 def test_a_session_that_killed_its_worker_twice_is_not_started_again(work: Worker) -> None:
     work()
     (work.folder / MARKER).unlink()
-    (work.job.out / STARTS / work.session.id).write_bytes(b"..")
-    outcome = run_session(work.job, work.session)
+    (work.out / STARTS / work.session.id).write_bytes(b"..")
+    outcome = work.again()
     assert (outcome.status, outcome.reason) == ("crashed", WORKER_DIED)
     assert WORKER_DIED == (
         "its worker died 2 times while it ran: killed, out of memory, or a crash in native code"
@@ -143,7 +161,7 @@ def test_a_recipe_that_changed_meanwhile(work: Worker, recipe: Path) -> None:
     work()
     (work.folder / MARKER).unlink()
     recipe.write_text(recipe.read_text().replace("2 mm", "3 mm"))
-    outcome = run_session(work.job, work.session)
+    outcome = work.again()
     assert outcome == SessionOutcome(
         "failed",
         f"{recipe}: has changed since the batch was started; start it again",
@@ -153,8 +171,8 @@ def test_a_recipe_that_changed_meanwhile(work: Worker, recipe: Path) -> None:
 
 def test_a_worker_without_the_shared_folder(work: Worker) -> None:
     work()
-    elsewhere = Job(work.job.out / "elsewhere", report=False, software=work.job.software)
-    outcome = run_session(elsewhere, work.session)
+    elsewhere = replace(work.job, out=str(work.out / "elsewhere"))
+    outcome = run_session(elsewhere, work.session, Recipes(elsewhere))
     assert outcome.status == "failed" and outcome.reason
     assert "elsewhere: not there on worker " in outcome.reason
     assert outcome.reason.endswith("must be on a file system that all workers share")
@@ -164,5 +182,25 @@ def test_a_folder_that_cannot_be_written(work: Worker) -> None:
     work()
     (work.folder / MARKER).unlink()
     (work.folder / MARKER).with_suffix(".json.part").mkdir()
-    outcome = run_session(work.job, work.session)
+    outcome = work.again()
     assert outcome.status == "verified"  # what lay in the way was of an earlier start
+
+
+def test_a_chunk_writes_its_rows(work: Worker) -> None:
+    import pyarrow.parquet as pq
+
+    outcome = work()
+    told = run_chunk(work.job, Chunk(7, [work.session]))
+    assert told.counts == {"verified": 1} and told.bad == [] and told.seconds > 0
+    (part,) = (work.out / "sessions.parquet").iterdir()
+    assert part.name == f"000007-{work.job.start}-{work.session.number}.parquet"
+    (row,) = pq.read_table(part).to_pylist()
+    assert row["session"] == work.session.id
+    assert row["holdout_rms_m"] == outcome.holdout_rms_m
+
+
+def test_rows_that_cannot_be_written_are_no_outcome(work: Worker) -> None:
+    work()
+    (work.out / "sessions.parquet").write_text("in the way")
+    with pytest.raises(StageError, match=r"sessions.parquet/.*: cannot be written: "):
+        run_chunk(work.job, Chunk(0, [work.session]))

@@ -3,7 +3,6 @@
 from typing import Any
 
 from tests.cli.conftest import flangeye  # noqa: F401  a fixture
-from tests.files.test_elsewhere import bucket, server  # noqa: F401  fixtures
 from tests.run.test_retake import Call, done  # noqa: F401  a fixture
 
 

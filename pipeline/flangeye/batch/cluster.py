@@ -7,17 +7,22 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
-from itertools import islice
+from itertools import groupby, islice
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from flangeye.batch.dataset import BLOCK
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession
 from flangeye.batch.request import BatchError, Tls
-from flangeye.batch.work import WORKER_DIED, Job, run_session
+from flangeye.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
+from flangeye.errors import FlangeyeError
 from flangeye.files.children import keep_current_folder_out
 
 if TYPE_CHECKING:
@@ -26,8 +31,17 @@ if TYPE_CHECKING:
 CONNECT_SECONDS = 5.0
 """How long to wait for a scheduler that was given by address."""
 
-WINDOW = 1000
-"""Sessions that the scheduler knows of at most, or four for each worker if that is more."""
+AHEAD = 3
+"""Chunks that the scheduler is to know of for each worker."""
+
+WINDOW = 256
+"""Sessions that a scheduler elsewhere is to know of at least: its workers may only be starting."""
+
+CHUNK_SECONDS, MOST = 5.0, 500
+"""How long a worker is to be busy with a chunk [s], and how many sessions it has at most."""
+
+WORKERS_SECONDS = 5.0
+"""How long a count of the workers is believed [s]."""
 
 SINGLE_THREADED = {
     name: 1
@@ -172,46 +186,116 @@ def worker_count(client: Client) -> int:
     return len(client.scheduler_info(n_workers=-1)["workers"])
 
 
+class Pace:
+    """How much to have submitted, and how long each chunk is to be.
+
+    Some seconds of work, so that nothing counts beside it; less towards the end, so that all
+    workers come to it together.
+    """
+
+    def __init__(self, client: Client, sessions: int) -> None:
+        self._client, self._left = client, sessions
+        self._ended, self._seconds = 0, 0.0
+        self._workers, self._asked = 0, -np.inf
+
+    def workers(self) -> int:
+        """Return how many workers there are, or were some seconds ago; at least one."""
+        if time.monotonic() > self._asked + WORKERS_SECONDS:
+            self._workers, self._asked = worker_count(self._client), time.monotonic()
+        return max(1, self._workers)
+
+    def size(self) -> int:
+        """Return how many sessions the next chunk is to have."""
+        if not self._ended:
+            return 1
+        mean = max(self._seconds / self._ended, 1e-6)
+        wanted = min(CHUNK_SECONDS / mean, self._left / (2 * self.workers()), MOST)
+        return max(1, int(wanted))
+
+    def asks(self, waiting: Collection[Chunk]) -> bool:
+        """Return whether the scheduler is to know of more than these."""
+        if len(waiting) < AHEAD * self.workers():
+            return True
+        elsewhere = self._client.cluster is None
+        return elsewhere and sum(len(chunk.sessions) for chunk in waiting) < WINDOW
+
+    def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
+        """Yield chunks, as long as is right when each is asked for."""
+        for block, members in groupby(sessions, key=lambda each: each[0] // BLOCK):
+            while some := [session for _, session in islice(members, self.size())]:
+                self._left -= len(some)
+                yield Chunk(block, some)
+
+    def ended(self, told: ChunkTold) -> None:
+        """Take note of what a chunk took."""
+        self._ended += told.counts.total()
+        self._seconds += told.seconds
+
+
 def run_all(
-    client: Client, job: Job, sessions: Sequence[BatchSession]
-) -> Iterator[tuple[BatchSession, SessionOutcome]]:
-    """Yield each session with its outcome as it ends.
+    client: Client, job: Job, sessions: Iterable[tuple[int, BatchSession]], count: int
+) -> Iterator[ChunkTold]:
+    """Yield what became of each chunk as it ends.
 
     They are submitted as others end: what client and scheduler hold does not grow with their
     number.
+
+    Args:
+        client: Of the scheduler.
+        job: What all have in common.
+        sessions: Where each stands among all that are asked for, and what it is.
+        count: How many they are.
+
+    Raises:
+        StageError: Rows cannot be written.
     """
     from distributed import as_completed
 
-    waiting: dict[str, BatchSession] = {}
-    rest = iter(sessions)
-    half = max(WINDOW // 2, 2 * worker_count(client))
+    pace = Pace(client, count)
+    again: list[Chunk] = []
+    chunks = pace.cut(sessions)
+    waiting: dict[str, Chunk] = {}
+    done = as_completed()
 
-    def submit(count: int) -> list[Future]:
-        some = list(islice(rest, count))
-        futures = client.map(run_session, [job] * len(some), some, pure=False)
-        waiting.update(zip((future.key for future in futures), some, strict=True))
-        return list(futures)
+    def submit() -> None:
+        while pace.asks(waiting.values()):
+            chunk = again.pop() if again else next(chunks, None)
+            if chunk is None:
+                return
+            future = client.submit(run_chunk, job, chunk, pure=False)
+            waiting[future.key] = chunk
+            done.add(future)
 
-    done = as_completed(submit(2 * half))
+    submit()
     for future in done:
-        session = waiting.pop(future.key)
-        if len(waiting) <= half:
-            done.update(submit(half))
-        yield session, _outcome(future)
-        future.release()  # so that each is forgotten, with its outcome, once it was told
+        chunk = waiting.pop(future.key)
+        told = _outcome(future, job, chunk)
+        if told is None:  # each for itself, to find the one that it was
+            again += [Chunk(chunk.block, [session]) for session in chunk.sessions]
+        else:
+            pace.ended(told)
+            yield told
+        if not future.cancelled():
+            submit()
+        future.release()  # so that each is forgotten once it was told
 
 
-def _outcome(future: Future) -> SessionOutcome:
-    """Return what the worker gave, or why it could give nothing."""
+def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkTold | None:
+    """Return what the worker gave, or why it could give nothing; None for one of several."""
     if future.cancelled():
-        return SessionOutcome("crashed", "the connection to the scheduler was lost before it ended")
-    try:
-        outcome: SessionOutcome = future.result()
-    except Exception as error:  # of dask: the worker's own are in the outcome
-        if type(error).__name__ == "KilledWorker":
-            return SessionOutcome("crashed", WORKER_DIED)
-        return SessionOutcome("crashed", _told(error))
-    return outcome
+        reason = "the connection to the scheduler was lost before it ended"
+    else:
+        try:
+            told: ChunkTold = future.result()
+            return told
+        except FlangeyeError:
+            raise
+        except Exception as error:  # of dask: the worker's own are in the outcome
+            reason = WORKER_DIED if type(error).__name__ == "KilledWorker" else _told(error)
+            if len(chunk.sessions) > 1:
+                return None
+    crashed = SessionOutcome("crashed", reason)
+    return write_rows(job, chunk, [crashed] * len(chunk.sessions))
 
 
 def _told(error: BaseException) -> str:

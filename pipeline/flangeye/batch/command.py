@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
+import csv
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,20 +18,44 @@ from flangeye.batch.cluster import (
     run_all,
     worker_count,
 )
-from flangeye.batch.outcome import Batch, SessionOutcome, finished_outcome
+from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.page import write_page
-from flangeye.batch.plan import BatchSession, plan
+from flangeye.batch.plan import BatchSession, Plan, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
 from flangeye.batch.software import Software, software_of
-from flangeye.batch.tables import table_of, write_tables
-from flangeye.batch.work import STARTS, Job
+from flangeye.batch.tally import Tally
+from flangeye.batch.work import READY, STARTS, Job
+from flangeye.errors import FlangeyeError
+from flangeye.files.elsewhere import is_url
 
 if TYPE_CHECKING:
     from distributed import Client
     from rich.console import Console
 
     from flangeye.plugin.registry import Registry
+
+CSV = "sessions.csv"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a batch came to.
+
+    Attributes:
+        out: Its folder, path or URL.
+        tally: Aggregates of all sessions.
+        known: How many of them had finished at an earlier start.
+    """
+
+    out: str
+    tally: Tally
+    known: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every session gave a calibration."""
+        return self.tally.accepted
 
 
 def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
@@ -46,38 +73,48 @@ def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     """
     check_installed()
     software = software_of(registry)
-    return run_sessions(request, plan(request, registry, software), software, console)
+    sessions = plan(request, registry, software)
+    out = (request.out or str(Path("batches") / sessions.recipe.stem)).rstrip("/")
+    return run_sessions(request, out, sessions, sessions.values(), software, console)
 
 
 def run_sessions(
-    request: Request, sessions: list[BatchSession], software: Software, console: Console
+    request: Request,
+    out: str,
+    sessions: Plan | Sequence[BatchSession],
+    varied: Mapping[str, Sequence[str]],
+    software: Software,
+    console: Console,
 ) -> Batch:
-    """Do as :func:`run_batch` with sessions that are planned, of whatever recipes."""
-    job = Job(_out(request, sessions).absolute(), request.report, software)
-    batch = Batch(_out(request, sessions), _finished_earlier(job, sessions), 0)
-    batch.known = len(batch.outcomes)
-    todo = [session for session in sessions if session.id not in batch.outcomes]
-    if todo:
-        with _client(request, len(todo)) as client:
-            _prepare(batch.out)
+    """Do as :func:`run_batch` with sessions that are planned, of whatever recipes.
+
+    Args:
+        request: How to run them.
+        out: The batch's folder, path or URL.
+        sessions: Gone through up to three times, and not held.
+        varied: Path in the recipe -> all its values, for what differs between them.
+        software: What they were planned with.
+        console: Where progress is shown.
+    """
+    columns = columns_of(varied)
+    at = out if is_url(out) else str(Path(out).absolute())
+    job = Job(at, request.report, software, columns)
+    dataset, ledger = Dataset(job.place, columns), Ledger(sessions)
+    missing = ~dataset.finished(ledger, request.report)
+    known = len(missing) - int(missing.sum())
+    tally = Tally(columns, tuple(varied), len(missing))
+    if missing.any():
+        todo = compress(enumerate(sessions), missing)
+        with _client(request, int(missing.sum())) as client:
+            _prepare(job, out)
             try:
-                _run(client, job, todo, batch, console)
+                _run(client, job, todo, int(missing.sum()), console)
             finally:
-                shutil.rmtree(job.out / STARTS, ignore_errors=True)
-                _tell(sessions, batch)
+                job.place.remove(STARTS)
+                _tell(job, dataset, ledger, tally)
     else:
-        _tell(sessions, batch)
-    return batch
-
-
-def _out(request: Request, sessions: list[BatchSession]) -> Path:
-    """Return the folder; it has no time in its name, so that a second start finds it."""
-    return request.out or Path("batches") / sessions[0].recipe.stem
-
-
-def _finished_earlier(job: Job, sessions: list[BatchSession]) -> dict[str, SessionOutcome]:
-    found = {s.id: finished_outcome(job.out / s.id, s.key, job.report) for s in sessions}
-    return {session: outcome for session, outcome in found.items() if outcome}
+        _tell(job, dataset, ledger, tally)
+    return Batch(out, tally, known)
 
 
 def _client(request: Request, todo: int) -> AbstractContextManager[Client]:
@@ -90,30 +127,36 @@ def _client(request: Request, todo: int) -> AbstractContextManager[Client]:
     return remote_client(request.scheduler, request.tls)
 
 
-def _prepare(out: Path) -> None:
+def _prepare(job: Job, out: str) -> None:
     """Make the folder; starts that an earlier batch counted are forgotten."""
+    job.place.remove(STARTS)
     try:
-        shutil.rmtree(out / STARTS, ignore_errors=True)
-        (out / STARTS).mkdir(parents=True)
-    except OSError as error:
-        raise BatchError(f"{out}: cannot be made: {error.strerror or error}") from None
+        job.place.write(READY, b"")
+    except FlangeyeError as error:
+        reason = str(error).rpartition(": ")[2]
+        raise BatchError(
+            str(error) if is_url(out) else f"{out}: cannot be made: {reason}"
+        ) from None
 
 
-def _run(
-    client: Client, job: Job, todo: list[BatchSession], batch: Batch, console: Console
-) -> None:
-    with BatchProgress(console, len(todo)) as progress:
+def _run(client: Client, job: Job, todo: Iterable[tuple[int, BatchSession]], count: int,
+         console: Console) -> None:  # fmt: skip
+    with BatchProgress(console, count) as progress:
         if not worker_count(client):
             progress.note("note: the scheduler has no workers yet; sessions wait for them")
-        for session, outcome in run_all(client, job, todo):
-            batch.outcomes[session.id] = outcome
-            progress.finished(session, outcome)
+        for told in run_all(client, job, todo, count):
+            progress.ended(told)
 
 
-def _tell(sessions: list[BatchSession], batch: Batch) -> None:
-    """Write the tables and the page."""
-    table = table_of([(s, batch.outcomes[s.id]) for s in sessions if s.id in batch.outcomes])
-    if not table.rows:
-        return
-    write_tables(table, batch.out)
-    write_page(table, batch.out / "summary.html")
+def _tell(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
+    """Write ``sessions.csv`` and the page, from the rows that are there."""
+    with job.place.draft(CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(tally.columns)
+        for table in dataset.blocks(ledger):
+            tally.add(table)
+            writer.writerows(zip(*(table[n].to_pylist() for n in tally.columns), strict=True))
+    if tally.total:
+        write_page(tally, job.place)
+    else:
+        job.place.remove(CSV)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from flangeye.batch.tables import Row, Table
+from flangeye.batch.dataset import Row
 
 Drawing = dict[str, Any]
 
@@ -51,19 +51,24 @@ FIGURES = (
 )
 
 
-def drawings_of(table: Table) -> list[tuple[str, Drawing]]:
-    """Return (title, plot) for every figure that some session has."""
-    x, colour = _axes(table)
+def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, Drawing]]:
+    """Return (title, plot) for every figure that some session has.
+
+    Args:
+        rows: Of the sessions to draw.
+        varied: Columns that the grid sets.
+    """
+    x, colour = _axes(rows, varied)
     return [
-        (figure.title, _drawing(rows, figure, x, colour))
+        (figure.title, _drawing(with_it, figure, x, colour))
         for figure in FIGURES
-        if (rows := [row for row in table.rows if row[figure.column] is not None])
+        if (with_it := [row for row in rows if row[figure.column] is not None])
     ]
 
 
-def _axes(table: Table) -> tuple[str, str | None]:
+def _axes(rows: Sequence[Row], varied: Sequence[str]) -> tuple[str, str | None]:
     """Return the columns that say where a session stands and, if there is a second, its colour."""
-    distinct = {name: len({row[name] for row in table.rows}) for name in (*table.varied, "archive")}
+    distinct = {name: len({row[name] for row in rows}) for name in (*varied, "archive")}
     varying = sorted((n for n in distinct if distinct[n] > 1), key=lambda n: -distinct[n])
     if not varying:
         return "seed", None

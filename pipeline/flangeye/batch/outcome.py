@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Literal
 
+from flangeye.files.place import Place
 from flangeye.result import Result
 
 Status = Literal["verified", "unverified", "refused", "failed", "crashed"]
@@ -56,26 +56,6 @@ class SessionOutcome:
     report: str | None = None
 
 
-@dataclass
-class Batch:
-    """What a batch came to.
-
-    Attributes:
-        out: Its folder.
-        outcomes: Session id -> what became of it.
-        known: How many of them had finished at an earlier start.
-    """
-
-    out: Path
-    outcomes: dict[str, SessionOutcome]
-    known: int
-
-    @property
-    def accepted(self) -> bool:
-        """Whether every session gave a calibration."""
-        return all(outcome.status in ACCEPTED for outcome in self.outcomes.values())
-
-
 def outcome_of(result: Result) -> SessionOutcome:
     """Return the headline figures of a result."""
     holdout, workspace, truth = result.holdout, result.workspace, result.truth
@@ -95,25 +75,29 @@ def outcome_of(result: Result) -> SessionOutcome:
     )
 
 
-def mark_finished(folder: Path, key: str, outcome: SessionOutcome) -> None:
-    """Leave the outcome in a session's folder, whole or not at all."""
-    draft = folder / f"{MARKER}.part"
-    draft.write_text(json.dumps({"key": key, **asdict(outcome)}, indent=2) + "\n", encoding="utf-8")
-    draft.replace(folder / MARKER)
+def mark_finished(place: Place, folder: str, key: str, outcome: SessionOutcome) -> None:
+    """Leave the outcome in a session's folder, whole or not at all.
+
+    Raises:
+        StageError: It cannot be written.
+    """
+    text = json.dumps({"key": key, **asdict(outcome)}, indent=2) + "\n"
+    place.write(f"{folder}/{MARKER}", text.encode())
 
 
-def finished_outcome(folder: Path, key: str, report: bool) -> SessionOutcome | None:
+def finished_outcome(place: Place, folder: str, key: str, report: bool) -> SessionOutcome | None:
     """Return what :func:`mark_finished` left; None when the session has to run.
 
     Args:
-        folder: The session's folder.
+        place: The batch's folder.
+        folder: The session's in it.
         key: The session's key; anything else there is of another session.
         report: Whether a report is wanted.
     """
     try:
-        data = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        data = json.loads(place.read(f"{folder}/{MARKER}") or b"")
         if data.pop("key") != key or (report and not data["report"]):
             return None
         return SessionOutcome(**data)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None  # not there, or not ours

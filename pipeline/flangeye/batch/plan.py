@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
 from flangeye import types as t
@@ -23,11 +23,11 @@ class BatchSession:
     """One run of the batch.
 
     Attributes:
-        id: Name of its folder: readable, and unique by ``key``.
+        id: Name of its folder: readable, and unique by ``number``.
         key: Hash of everything that decides its result.
         recipe: Absolute path.
         archive: Absolute path or URL, if any.
-        overrides: All of them, those of the grid and the seed included.
+        overrides: All of them, those of the grid included, the seed aside if it is counted up.
         varied: Path in the recipe -> value as written, for what differs between sessions.
         seed: The recipe's, or the repetition's.
     """
@@ -40,9 +40,66 @@ class BatchSession:
     varied: Mapping[str, str]
     seed: int
 
+    @property
+    def number(self) -> str:
+        """Sixteen hexadecimal digits that tell it from all others."""
+        return self.id[-16:]
 
-def plan(request: Request, registry: Registry, software: Software) -> list[BatchSession]:
-    """Return the sessions of a batch, each with its recipe checked.
+
+@dataclass(frozen=True)
+class Variant:
+    """What sessions that differ in seed and archive alone have in common.
+
+    Attributes:
+        overrides: All of them.
+        varied: Path in the recipe -> value as written, for what differs between variants.
+        common: Hash of all that decides their results.
+        seeds: Of its sessions.
+    """
+
+    overrides: tuple[str, ...]
+    varied: Mapping[str, str]
+    common: str
+    seeds: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The sessions of a batch; each is made when it is come to, so none of them are held.
+
+    Attributes:
+        recipe: Absolute path.
+        variants: Checked.
+        archives: Absolute paths or URLs; one None for recipes that take none.
+    """
+
+    recipe: Path
+    variants: Sequence[Variant]
+    archives: Sequence[str | None]
+    _prints: Fingerprints = field(default_factory=Fingerprints)
+
+    def __len__(self) -> int:
+        return len(self.archives) * sum(len(variant.seeds) for variant in self.variants)
+
+    def __iter__(self) -> Iterator[BatchSession]:
+        names = [_session_name(self.recipe.stem, archive) for archive in self.archives]
+        for variant in self.variants:
+            for seed in variant.seeds:
+                for archive, name in zip(self.archives, names, strict=True):
+                    key = session_key(variant.common, seed, archive, self._prints)
+                    yield BatchSession(
+                        f"{name}_{key[:16]}", key, self.recipe, archive, variant.overrides,
+                        variant.varied, seed,
+                    )  # fmt: skip
+
+    def values(self) -> dict[str, list[str]]:
+        """Return path in the recipe -> all its values, for what differs between sessions."""
+        paths = self.variants[0].varied
+        return {path: list({v.varied[path]: None for v in self.variants}) for path in paths}
+
+
+def plan(request: Request, registry: Registry, software: Software) -> Plan:
+    """Return the sessions of a batch, with the recipe of each checked.
 
     Raises:
         RecipeError: The recipe, an override or a value of the grid is wrong.
@@ -52,35 +109,26 @@ def plan(request: Request, registry: Registry, software: Software) -> list[Batch
     base = load_recipe(path, registry, request.overrides)
     archives = _archives(base, request.archives)
     prints = Fingerprints()
-    sessions: list[BatchSession] = []
-    known, common = base, common_key(base, software, prints)
-    for varied, recipe, seed in _recipes(request, base, path, registry):
+    found = []
+    for varied, recipe, seeds in _recipes(request, base, path, registry):
         overrides = (*request.overrides, *_written(varied))
         shown = {k: v for k, v in varied.items() if k != SEED}
-        if recipe is not known:
-            known, common = recipe, common_key(recipe, software, prints)
-        for archive in archives:
-            key = session_key(common, seed, archive, prints)
-            name = _session_id(recipe.name, archive, key)
-            sessions.append(BatchSession(name, key, path, archive, overrides, shown, seed))
-    _check_distinct(sessions)
-    return sessions
+        found.append(Variant(overrides, shown, common_key(recipe, software, prints), seeds))
+    made = Plan(path, found, archives, prints)
+    _check_distinct(made)
+    return made
 
 
 def _recipes(
     request: Request, base: Recipe, path: Path, registry: Registry
-) -> Iterator[tuple[dict[str, str], Recipe, int]]:
-    """Yield every variant with its recipe and seed.
-
-    Seeds that are counted up share one recipe: a hundred thousand would take minutes to read.
-    """
-    counted = request.repeat is not None
-    recipe, read = base, dict[str, str]()
-    for varied in variants(request, base.header.seed):
-        rest = {k: v for k, v in varied.items() if not (counted and k == SEED)}
-        if rest != read:
-            recipe, read = _variant(path, registry, (*request.overrides, *_written(rest))), rest
-        yield varied, recipe, int(varied[SEED]) if counted else recipe.header.seed
+) -> Iterator[tuple[dict[str, str], Recipe, Sequence[int]]]:
+    """Yield every variant with its recipe and seeds, which share one recipe."""
+    first = base.header.seed
+    counted = None if request.repeat is None else range(first, first + request.repeat)
+    for varied in variants(request):
+        written = (*request.overrides, *_written(varied))
+        recipe = _variant(path, registry, written) if varied else base
+        yield varied, recipe, counted or [recipe.header.seed]
 
 
 def _written(varied: Mapping[str, str]) -> list[str]:
@@ -102,20 +150,28 @@ def _variant(path: Path, registry: Registry, overrides: Sequence[str]) -> Recipe
         raise RecipeError(str(error).replace("--set ", "--set-grid ")) from None
 
 
-def _session_id(recipe: str, archive: str | None, key: str) -> str:
+def _session_name(recipe: str, archive: str | None) -> str:
     name = f"{recipe}_{PurePath(archive).name}" if archive else recipe
-    return f"{re.sub(r'[^A-Za-z0-9._=-]+', '-', name)[:80].lstrip('.-')}_{key[:12]}"
+    return re.sub(r"[^A-Za-z0-9._=-]+", "-", name)[:80].lstrip(".-")
 
 
-def _check_distinct(sessions: Sequence[BatchSession]) -> None:
-    seen: dict[str, BatchSession] = {}
-    for session in sessions:
-        other = seen.setdefault(session.key, session)
-        if other is not session:
-            raise BatchError(
-                f"the same session is asked for twice: {_told(other)} and {_told(session)}"
-            )
+def _check_distinct(made: Plan) -> None:
+    """Refuse equal sessions: those of an archive that is given twice, or of equal variants."""
+    seen: dict[tuple[str, int], Variant] = {}
+    for variant in made.variants:
+        other = seen.setdefault((variant.common, variant.seeds[0]), variant)
+        if other is not variant:
+            _refuse(made, (other, made.archives[0]), (variant, made.archives[0]))
+    known: set[str | None] = set()
+    for archive in made.archives:
+        if archive in known:
+            _refuse(made, *[(made.variants[0], archive)] * 2)
+        known.add(archive)
 
 
-def _told(session: BatchSession) -> str:
-    return " ".join([str(session.archive or session.recipe.name), *_written(session.varied)])
+def _refuse(made: Plan, *same: tuple[Variant, str | None]) -> None:
+    told = (
+        " ".join([archive or made.recipe.name, *_written(variant.varied)])
+        for variant, archive in same
+    )
+    raise BatchError(f"the same session is asked for twice: {' and '.join(told)}")

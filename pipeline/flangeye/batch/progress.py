@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
-from statistics import median
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from flangeye.batch.outcome import ACCEPTED, STATUSES, Batch, SessionOutcome
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.batch.outcome import STATUSES, SessionOutcome, Status
 from flangeye.files.printable import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flangeye.batch.plan import BatchSession
+    from flangeye.batch.command import Batch
+    from flangeye.batch.work import ChunkTold
 
 
 TOLD_AT_MOST = 10
@@ -34,7 +37,8 @@ class BatchProgress:
         )
 
         self._console = console
-        self._counts: Counter[str] = Counter()
+        self._counts: Counter[Status] = Counter()
+        self._told = 0
         self._progress = Progress(
             BarColumn(),
             MofNCompleteColumn(),
@@ -57,45 +61,45 @@ class BatchProgress:
         """Say a line above the bar."""
         self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
-    def finished(self, session: BatchSession, outcome: SessionOutcome) -> None:
-        """Count a session, and say what was wrong with it."""
-        self._counts[outcome.status] += 1
-        if outcome.status not in ACCEPTED:
+    def ended(self, told: ChunkTold) -> None:
+        """Count the sessions of a chunk, and say what was wrong with some."""
+        self._counts.update(told.counts)
+        for session, outcome in told.bad:
             self._tell(session, outcome)
-        self._progress.update(self._task, advance=1, description=count_text(self._counts))
+        done = told.counts.total()
+        self._progress.update(self._task, advance=done, description=count_text(self._counts))
 
-    def _tell(self, session: BatchSession, outcome: SessionOutcome) -> None:
-        told = self._counts.total() - sum(self._counts[status] for status in ACCEPTED)
-        if told <= TOLD_AT_MOST:
-            self.note(f"{outcome.status} {session.id}: {outcome.reason}")
-        elif told == TOLD_AT_MOST + 1:
+    def _tell(self, session: str, outcome: SessionOutcome) -> None:
+        self._told += 1
+        if self._told <= TOLD_AT_MOST:
+            self.note(f"{outcome.status} {session}: {outcome.reason}")
+        elif self._told == TOLD_AT_MOST + 1:
             self.note("further ones will be in sessions.csv")
 
 
-def count_text(counts: Counter[str]) -> str:
+def count_text(counts: Mapping[Status, int]) -> str:
     """Return ``3 verified, 1 failed``."""
-    return ", ".join(f"{counts[status]} {status}" for status in STATUSES if counts[status])
+    return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts.get(s))
 
 
 def summary_text(batch: Batch) -> str:
     """Return the lines at the end of a batch."""
-    outcomes = list(batch.outcomes.values())
+    tally = batch.tally
     earlier = f" ({batch.known} of them finished earlier)" if batch.known else ""
-    counts = count_text(Counter(outcome.status for outcome in outcomes))
-    accepted = [outcome for outcome in outcomes if outcome.status in ACCEPTED]
+    figures = tally.figures()
+    sessions = f"{tally.total} session{'s' if tally.total != 1 else ''}"
     lines = [
-        f"{len(outcomes)} session{'s' if len(outcomes) != 1 else ''}: {counts}{earlier}",
-        *_spread("held-out error", [o.holdout_rms_m for o in accepted]),
-        *_spread("true error", [o.true_rms_m for o in accepted]),
+        f"{sessions}: {count_text(tally.counts)}{earlier}",
+        *_spread("held-out error", figures["holdout_rms_m"]),
+        *_spread("true error", figures["true_rms_m"]),
         "",
         f"{batch.out}/: summary.html  sessions.csv  sessions.parquet",
     ]
     return "\n".join(lines)
 
 
-def _spread(name: str, figures: Iterable[float | None]) -> list[str]:
-    metres = [figure for figure in figures if figure is not None]
-    if not metres:
+def _spread(name: str, metres: NDArray[np.float64]) -> list[str]:
+    if not len(metres):
         return []
-    mm = [f"{value * 1e3:.3f}" for value in (median(metres), min(metres), max(metres))]
+    mm = [f"{value * 1e3:.3f}" for value in (np.median(metres), metres.min(), metres.max())]
     return [f"  {name:18} {mm[0]} mm rms in the median session, {mm[1]} to {mm[2]} mm in all"]

@@ -43,7 +43,7 @@ class Request:
         workers: Worker processes on this machine; None for one per core.
         scheduler: Address of a running dask scheduler, instead of workers here.
         tls: What proves to that scheduler who we are, and to us that it is the one.
-        out: Folder of the batch; None for ``batches/<recipe>``.
+        out: Folder of the batch, by path or URL; None for ``batches/<recipe>``.
         report: Make each session's ``report.html``.
     """
 
@@ -56,5 +56,5 @@ class Request:
     workers: int | None = None
     scheduler: str | None = None
     tls: Tls | None = None
-    out: Path | None = None
+    out: str | None = None
     report: bool = True

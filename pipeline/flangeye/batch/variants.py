@@ -1,4 +1,4 @@
-"""Every combination of the grid's values and the seeds."""
+"""Every combination of the grid's values."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from flangeye.batch.request import SEED, BatchError, Request
 _OPENING, _CLOSING = "[{", "]}"
 
 
-def variants(request: Request, first_seed: int) -> Iterator[dict[str, str]]:
-    """Yield every combination: path in the recipe -> value as written.
+def variants(request: Request) -> Iterator[dict[str, str]]:
+    """Yield every combination of the grid: path in the recipe -> value as written.
 
     Args:
         request: What was asked for.
-        first_seed: The recipe's seed, which ``repeat`` counts up from.
 
     Raises:
         BatchError: The grid or the repetition is not well written.
     """
     axes = _grid(request.grid)
     if request.repeat is not None:
-        axes |= _seeds(request, first_seed, taken=SEED in axes)
+        _check_repetition(request, taken=SEED in axes)
     for values in itertools.product(*axes.values()):
         yield dict(zip(axes, values, strict=True))
 
@@ -60,7 +59,7 @@ def _axis(text: str) -> tuple[str, list[str]]:
     return path, split
 
 
-def _seeds(request: Request, first: int, taken: bool) -> dict[str, list[str]]:
+def _check_repetition(request: Request, taken: bool) -> None:
     if request.vary != SEED:
         raise BatchError(
             f"--vary {request.vary}: only the seed can be repeated with; for other values write "
@@ -68,4 +67,3 @@ def _seeds(request: Request, first: int, taken: bool) -> dict[str, list[str]]:
         )
     if taken:
         raise BatchError("--repeat counts the seed up, and --set-grid sets it; use one of them")
-    return {SEED: [str(seed) for seed in range(first, first + (request.repeat or 0))]}

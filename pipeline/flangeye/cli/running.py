@@ -256,8 +256,8 @@ def batch(  # noqa: PLR0913  one argument an option
         Path | None, typer.Option(help="Its key (PEM): who has it may use the workers.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for everything; default batches/<recipe>."),
+        str | None,
+        typer.Option(metavar="PATH|URL", help="Folder for everything; default batches/<recipe>."),
     ] = None,
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Make each session's report.html.")

@@ -66,8 +66,8 @@ def results_at(place: str | None) -> Iterator[Path | None]:
     if place is None or not is_url(place):
         yield None if place is None else Path(place)
         return
-    system, root = _system(place)
-    with _reaching(place):
+    system, root = system_of(place)
+    with reaching(place):
         if system.exists(root) and system.find(root):
             raise StageError(f"{place}: already holds files; name a new or empty folder")
     with TemporaryDirectory(prefix="flangeye-") as folder:
@@ -80,7 +80,7 @@ def results_at(place: str | None) -> Iterator[Path | None]:
             raise
         finally:
             if local.is_dir():
-                with _reaching(place):
+                with reaching(place):
                     system.put(f"{local}/", f"{root.rstrip('/')}/", recursive=True)
             del _STANDING_IN[local]
 
@@ -135,13 +135,13 @@ class _StandIn:
 
     def __init__(self, url: str, root: Path) -> None:
         self.url, self._root = url, root
-        self._system, self._there = _system(url)
+        self._system, self._there = system_of(url)
         self.later: dict[Path, Mapping[str, Any]] = {}
         self._names: dict[Path, str] = {}
 
     def listed(self) -> dict[str, Mapping[str, Any]]:
         """Return name below the URL -> what the store says of the file; "" if it is one itself."""
-        with _reaching(self.url):
+        with reaching(self.url):
             found = self._system.find(self._there, detail=True)
         if not found:
             raise StageError(f"{self.url}: holds nothing")
@@ -161,7 +161,7 @@ class _StandIn:
 
     def fetch(self, path: Path) -> None:
         """Bring a file here."""
-        with _reaching(told(str(path))):
+        with reaching(told(str(path))):
             self._system.get_file(self._names[path], str(path))
 
     def _name_of(self, path: str) -> str:
@@ -185,8 +185,12 @@ def _state(about: Mapping[str, Any]) -> str:
     return hashlib.sha256(f"{about.get('size')} {known}".encode()).hexdigest()
 
 
-def _system(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL and the path in it."""
+def system_of(url: str) -> tuple[Any, str]:
+    """Return the file system of a URL and the path in it.
+
+    Raises:
+        StageError: The URL is of another kind, or what opens it is not installed.
+    """
     for each in url.split("::"):
         protocol = each.partition("://")[0]
         if "://" in each and protocol not in PROTOCOLS:
@@ -196,7 +200,7 @@ def _system(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        with _reaching(url):
+        with reaching(url):
             # What it listed before may have changed since: it is asked again.
             fresh = {"skip_instance_cache": True} if url.startswith("zip:") else {}
             system, path = fsspec.url_to_fs(url, **fresh)
@@ -210,8 +214,12 @@ def _system(url: str) -> tuple[Any, str]:
 
 
 @contextmanager
-def _reaching(url: str) -> Iterator[None]:
-    """Say in one line what went wrong with a store."""
+def reaching(url: str) -> Iterator[None]:
+    """Say in one line what went wrong with a store.
+
+    Raises:
+        StageError: Something did.
+    """
     try:
         yield
     except (FlangeyeError, ImportError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from flangeye import types as t
 from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
 from flangeye.files.regular import read_text
@@ -54,6 +55,11 @@ class Recipe:
     @cached_property
     def _resolved(self) -> str:
         return yaml.safe_dump(self.data(), sort_keys=False, allow_unicode=True, width=100)
+
+    def with_seed(self, seed: int) -> Recipe:
+        """Return the recipe with another seed, as if it had been written so."""
+        header = self.header.model_copy(update={"seed": seed})
+        return replace(self, header=header, context={**self.context, t.Seed: seed})
 
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from flangeye.batch.command import run_sessions
+from flangeye.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession, plan
 from flangeye.batch.regress.manifest import Expected, Manifest
@@ -17,6 +18,7 @@ from flangeye.batch.request import Request
 from flangeye.batch.software import software_of
 from flangeye.doctor import examine, open_session
 from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.files.place import place_at
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,7 +67,7 @@ def compare(
     there = {file: m for file, m in manifests.items() if _recording(file, m).exists()}
     sessions = {file: _session(file, m, registry) for file, m in there.items()}
     outcomes = _run(
-        list(sessions.values()), Request("", workers=workers, out=out), registry, console
+        list(sessions.values()), Request("", workers=workers, out=str(out)), registry, console
     )
     return [
         _compared(
@@ -102,7 +104,11 @@ def _run(
     if not sessions:
         return {}
     once = list({session.id: session for session in sessions}.values())
-    return run_sessions(request, once, software_of(registry), console).outcomes
+    out = str(request.out)
+    run_sessions(request, out, once, {}, software_of(registry), console)
+    rows = Dataset(place_at(out), columns_of({})).rows(Ledger(once))
+    fields = SessionOutcome.__dataclass_fields__
+    return {row["session"]: SessionOutcome(**{name: row[name] for name in fields}) for row in rows}
 
 
 def _compared(
