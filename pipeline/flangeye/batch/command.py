@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +23,7 @@ from flangeye.batch.plan import BatchSession, Plan, plan
 from flangeye.batch.progress import BatchProgress
 from flangeye.batch.request import BatchError, Request
 from flangeye.batch.software import Software, software_of
-from flangeye.batch.tally import Tally
+from flangeye.batch.tally import Batch, Tally
 from flangeye.batch.work import READY, STARTS, Job
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_url
@@ -36,26 +35,6 @@ if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
 
 CSV = "sessions.csv"
-
-
-@dataclass(frozen=True)
-class Batch:
-    """What a batch came to.
-
-    Attributes:
-        out: Its folder, path or URL.
-        tally: Aggregates of all sessions.
-        known: How many of them had finished at an earlier start.
-    """
-
-    out: str
-    tally: Tally
-    known: int
-
-    @property
-    def accepted(self) -> bool:
-        """Whether every session gave a calibration."""
-        return self.tally.accepted
 
 
 def run_batch(request: Request, registry: Registry, console: Console) -> Batch:

@@ -15,7 +15,7 @@ from flangeye.files.printable import printable
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flangeye.batch.command import Batch
+    from flangeye.batch.tally import Batch
     from flangeye.batch.work import ChunkTold
 
 

@@ -161,6 +161,26 @@ class Tally:
         self._worst = worst
 
 
+@dataclass(frozen=True)
+class Batch:
+    """What a batch came to.
+
+    Attributes:
+        out: Its folder, path or URL.
+        tally: Aggregates of all sessions.
+        known: How many of them had finished at an earlier start.
+    """
+
+    out: str
+    tally: Tally
+    known: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every session gave a calibration."""
+        return self.tally.accepted
+
+
 def _counts(statuses: NDArray[np.int8]) -> dict[Status, int]:
     numbers = np.bincount(statuses, minlength=len(STATUSES)).tolist()
     return dict(zip(STATUSES, numbers, strict=True))
