@@ -19,6 +19,7 @@ STAGES = {
 }
 
 PARTS = {
+    "controller.as_printed": "flangeye_paper.as_printed:controller_as_printed",
     "error.oracle_as_in_paper": "flangeye_paper.oracle:error_oracle",
     "error.icp_as_in_paper": "flangeye_paper.icp_as_in_paper:error_icp_as_in_paper",
 }

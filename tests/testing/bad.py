@@ -26,6 +26,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.motion.planning import Plan, Site
+from flangeye.motion.seam_following import Command, Controller, FollowingTask
 from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
@@ -363,6 +364,24 @@ def sensor(**methods):
         return made()
 
     return sensor_bad
+
+
+def controller(**methods):
+    made = type("Bad", (Lead,), methods)
+
+    @part("controller.bad")
+    def controller_bad(task: FollowingTask) -> Controller:
+        """Lead badly."""
+        return made()
+
+    return controller_bad
+
+
+class Lead:
+    phase = "following"
+
+    def step(self, pose, touches):
+        return Command(np.zeros(3), 0.0)
 
 
 def sleepy(self):

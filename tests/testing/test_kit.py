@@ -12,6 +12,7 @@ from flangeye import StageError
 from flangeye import types as t
 from flangeye.devices import Scan, SensorFrame
 from flangeye.files.recording import Recording
+from flangeye.motion.seam_following import Command
 from flangeye.testing import KITS
 from flangeye.types import CAMERA, FLANGE, PointCloud
 from flangeye_emulators.robot.simulated import SimulatedRobot
@@ -632,6 +633,34 @@ CASES = [
             frame=lambda self: SensorFrame(t.Image(np.zeros((8, 8), np.uint8), np.eye(3)), 1)
         ),
         "not in this image's pixels",
+        {},
+    ),
+    (
+        "controller",
+        "test_it_commands_the_same_twice",
+        bad.controller(step=lambda self, *_: Command(np.zeros(3), 0.1 * random())),
+        "two runs with equal input differ",
+        {},
+    ),
+    (
+        "controller",
+        "test_its_commands_are_finite_and_turn_no_faster_than_allowed",
+        bad.controller(phase="thinking"),
+        "phase 'thinking' is none of seeking",
+        {},
+    ),
+    (
+        "controller",
+        "test_its_commands_are_finite_and_turn_no_faster_than_allowed",
+        bad.controller(step=lambda self, *_: Command(np.full(3, np.nan), 0.0)),
+        "three finite velocities and a turn are expected",
+        {},
+    ),
+    (
+        "controller",
+        "test_its_commands_are_finite_and_turn_no_faster_than_allowed",
+        bad.controller(step=lambda self, *_: Command(np.zeros(3), 1.0)),
+        "commanded a turn of 1 rad/s",
         {},
     ),
     (

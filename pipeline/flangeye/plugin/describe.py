@@ -76,7 +76,7 @@ def _before_args(documentation: str) -> str:
 def _kind(params: type[BaseModel], name: str, field: FieldInfo) -> str:
     for note in field.metadata:
         if isinstance(note, Choose):
-            return f"a {note.kind}"
+            return " | ".join([*note.words, f"a {note.kind}"])
     described: dict[str, Any] = params.model_json_schema()["properties"][name]
     alternatives = described.get("anyOf", [described])
     return " or ".join(_of_schema(a) for a in alternatives if a.get("type") != "null")

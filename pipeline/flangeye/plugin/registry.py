@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pluggy
@@ -223,6 +224,22 @@ class Registry:
             self._own(owner, offered.name)
             self.renamed.update(dict.fromkeys(offered.formerly, offered.name))
             (self.stages if isinstance(offered, Stage) else self.parts)[offered.name] = offered
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """The context in which parameters are validated: the parts on offer, and paths' folder."""
+
+    registry: Registry
+    folder: Path = Path()
+
+    def part(self, name: str) -> Part:
+        """Return the part ``name``; raises as :meth:`Registry.part` does."""
+        return self.registry.part(name)
+
+    def siblings(self, part: Part) -> Siblings:
+        """Return the other parts of a part's kind."""
+        return self.registry.siblings(part)
 
 
 def load_registry() -> Registry:

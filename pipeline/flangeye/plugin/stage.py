@@ -143,6 +143,10 @@ PARTS: Mapping[str, PartKind] = {
     "guide": PartKind(
         "a guided procedure with the devices of a recipe", "flangeye.recipe.guide:Guide"
     ),
+    "controller": PartKind(
+        "what leads tool and torch along a seam in weld.tactile",
+        "flangeye.motion.seam_following:ControllerPart",
+    ),
     "sensor": PartKind(
         "a tactile sensor that weld.tactile can read", "flangeye.models.contracts:SensorPart"
     ),
@@ -220,10 +224,12 @@ class Part(Plugin):
     Attributes:
         simulated: A robot part whose arm moves nothing, and whose time is not this computer's.
         interactive: A robot part that talks to a person at the terminal; nothing it does is urgent.
+        simulation_only: A controller part that is known to diverge; a real arm is refused with it.
     """
 
     simulated: bool = False
     interactive: bool = False
+    simulation_only: bool = False
 
     @property
     def can_only_read(self) -> bool:
@@ -290,9 +296,14 @@ class Choose:
     """Annotation of a parameter that chooses a part: ``cost: Annotated[Chosen, Choose("cost")]``.
 
     In YAML it is the part's name, or a mapping of the name to the part's parameters.
+
+    Attributes:
+        kind: The parts' kind.
+        words: What may stand there instead of a part, and is kept as it is.
     """
 
     kind: str
+    words: tuple[str, ...] = ()
 
     def __get_pydantic_core_schema__(
         self, _source: Any, _handler: GetCoreSchemaHandler
@@ -300,15 +311,16 @@ class Choose:
         return core_schema.with_info_plain_validator_function(
             self._choose,
             serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda chosen: chosen.to_yaml()
+                lambda chosen: chosen.to_yaml() if isinstance(chosen, BoundPart) else chosen
             ),
         )
 
     def __get_pydantic_json_schema__(self, _schema: Any, _handler: Any) -> dict[str, Any]:
-        return {"x-flangeye-part": self.kind}
+        part = {"x-flangeye-part": self.kind}
+        return {"anyOf": [{"enum": list(self.words)}, part]} if self.words else part
 
-    def _choose(self, value: Any, info: ValidationInfo) -> BoundPart:
-        if isinstance(value, BoundPart):
+    def _choose(self, value: Any, info: ValidationInfo) -> BoundPart | str:
+        if isinstance(value, BoundPart) or (isinstance(value, str) and value in self.words):
             return value
         if isinstance(value, str):
             value = {value: {}}
@@ -321,7 +333,8 @@ class Choose:
         try:
             chosen = lookup.part(f"{self.kind}.{name}")
         except LookupError as error:
-            raise ValueError(str(error)) from None
+            others = f"; or write {' or '.join(self.words)}" if self.words else ""
+            raise ValueError(f"{error}{others}") from None
         if chosen.params is None:
             if raw:
                 raise ValueError(f"{chosen.name} takes no parameters")
@@ -388,6 +401,7 @@ def part(
     *,
     simulated: bool = False,
     interactive: bool = False,
+    simulation_only: bool = False,
 ) -> Callable[[Callable[..., Any]], Part]:
     """Declare a function as the part ``name``, for example ``cost.translation``.
 
@@ -396,6 +410,7 @@ def part(
         formerly: Names it had, which recipes may still use for one version.
         simulated: For a robot: its arm moves nothing, and its time is not this computer's.
         interactive: For a robot: it talks to a person at the terminal.
+        simulation_only: For a controller: it is known to diverge and must not move a real arm.
 
     Raises:
         TypeError: The kind before the dot is not known, or the signature breaks its contract.
@@ -407,6 +422,7 @@ def part(
             formerly=tuple(formerly),
             simulated=simulated,
             interactive=interactive,
+            simulation_only=simulation_only,
         )
         if declared.kind not in PARTS:
             raise TypeError(f"part '{name}': no kind '{declared.kind}'; kinds: {', '.join(PARTS)}")

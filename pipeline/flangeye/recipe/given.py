@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from flangeye.errors import RecipeError
 from flangeye.files.validation import sentence
-from flangeye.plugin.registry import Registry
-from flangeye.plugin.stage import Params, Part, Plugin, Siblings
+from flangeye.plugin.registry import Lookup, Registry
+from flangeye.plugin.stage import Params, Plugin
 from flangeye.recipe.overrides import apply_override
-
-
-@dataclass(frozen=True)
-class _Lookup:
-    """The context of their validation: paths start at the shell's folder."""
-
-    registry: Registry
-    folder: Path = Path()
-
-    def part(self, name: str) -> Part:
-        return self.registry.part(name)
-
-    def siblings(self, part: Part) -> Siblings:
-        return self.registry.siblings(part)
 
 
 def params_given(plugin: Plugin, values: Sequence[str], registry: Registry) -> Params | None:
@@ -44,7 +28,7 @@ def params_given(plugin: Plugin, values: Sequence[str], registry: Registry) -> P
             raise RecipeError(f"{plugin.name} takes no parameters")
         return None
     try:
-        return plugin.params.model_validate(data, context=_Lookup(registry))
+        return plugin.params.model_validate(data, context=Lookup(registry))
     except ValidationError as error:
         model = plugin.params
         raise RecipeError(

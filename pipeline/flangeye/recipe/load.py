@@ -19,8 +19,8 @@ from flangeye.files.bundled import bundled
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
 from flangeye.files.yaml_lines import MAX_BYTES, Document, parse_yaml, read_yaml
-from flangeye.plugin.registry import PluginNotFoundError, Registry
-from flangeye.plugin.stage import Params, Part, Siblings, Stage
+from flangeye.plugin.registry import Lookup, PluginNotFoundError, Registry
+from flangeye.plugin.stage import Params, Stage
 from flangeye.recipe.context import Context, context_of
 from flangeye.recipe.header import Header
 from flangeye.recipe.overrides import apply_override
@@ -135,23 +135,14 @@ def parse_recipe(text: str, name: str, registry: Registry, overrides: Sequence[s
 
 
 class _Checker:
-    """Collects every mistake of one recipe; also the context of its validation."""
+    """Collects every mistake of one recipe."""
 
     def __init__(self, document: Document, registry: Registry, folder: Path) -> None:
-        self.folder = folder
+        self._lookup = Lookup(registry, folder)
         self._document = document
-        self._registry = registry
         self._overridden: list[tuple[Hashable, ...]] = []
         self._left_out: list[tuple[Hashable, ...]] = []
         self._mistakes: list[str] = []
-
-    def part(self, name: str) -> Part:
-        """Return a part by name; parameters that choose parts ask here."""
-        return self._registry.part(name)
-
-    def siblings(self, part: Part) -> Siblings:
-        """Return the other parts of a part's kind; parts that have to know them ask here."""
-        return self._registry.siblings(part)
 
     def check(self, name: str, text: str, overrides: Sequence[str]) -> Recipe:
         data = self._document.data
@@ -179,7 +170,7 @@ class _Checker:
         rest = deepcopy(data)
         while True:
             try:
-                return Header.model_validate(rest, context=self)
+                return Header.model_validate(rest, context=self._lookup)
             except ValidationError as error:
                 new = [e for e in error.errors() if not self._follows(e["loc"])]
                 self._explain((), new, Header)
@@ -200,7 +191,7 @@ class _Checker:
             if not (len(keys) == 1 and keys[0] in broken):
                 self.complain(keys, message)
 
-        context = context_of(header, self.folder, complain)
+        context = context_of(header, self._lookup.folder, complain)
         for offered, source in SECTIONS.items():
             if broken.intersection(source.sections):
                 context.setdefault(offered, None)
@@ -252,7 +243,7 @@ class _Checker:
 
     def _stage(self, index: int, name: str) -> Stage | None:
         try:
-            return self._registry.stage(name)
+            return self._lookup.registry.stage(name)
         except PluginNotFoundError as error:
             self.complain(("steps", index), str(error))
             return None
@@ -267,7 +258,7 @@ class _Checker:
             self.complain(at, "parameters are a mapping, for example {inlier: 0.2 mm}")
             return None
         try:
-            return stage.params.model_validate(raw, context=self)
+            return stage.params.model_validate(raw, context=self._lookup)
         except ValidationError as error:
             self._explain(at, error.errors(), stage.params)
             return None

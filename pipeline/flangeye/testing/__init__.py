@@ -18,7 +18,12 @@ from flangeye.testing.sources import (
     ReaderConformance,
     ViewConformance,
 )
-from flangeye.testing.welding import ScanConformance, SeamConformance, WeldConformance
+from flangeye.testing.welding import (
+    ControllerConformance,
+    ScanConformance,
+    SeamConformance,
+    WeldConformance,
+)
 
 KITS = {
     "acquire": AcquireConformance,
@@ -38,6 +43,7 @@ KITS = {
     "error": ErrorConformance,
     "robot": RobotConformance,
     "scanner": ScannerConformance,
+    "controller": ControllerConformance,
     "sensor": SensorConformance,
     "replay": ReplayConformance,
     "guide": GuideConformance,
@@ -51,6 +57,7 @@ __all__ = [
     "AcquireConformance",
     "CheckConformance",
     "Conformance",
+    "ControllerConformance",
     "CostConformance",
     "ErrorConformance",
     "ExportConformance",

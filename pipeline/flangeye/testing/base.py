@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
 from types import NoneType
 from typing import Any, ClassVar, get_args
 
@@ -13,21 +12,12 @@ from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.targets import Flange, plate_of
-from flangeye.plugin.registry import load_registry
-from flangeye.plugin.stage import KINDS, PARTS, Params, Part, Plugin
+from flangeye.plugin.registry import Lookup, load_registry
+from flangeye.plugin.stage import KINDS, PARTS, Params, Plugin
 from flangeye.testing.judge import require
 
 LONGEST_SUMMARY = 110
 """Of the first line of a docstring: ``flangeye stages`` shows it on one line."""
-
-
-class _Lookup:
-    """What parameters that choose parts by name are validated with, as in a recipe."""
-
-    folder = Path()
-
-    def part(self, name: str) -> Part:
-        return load_registry().part(name)
 
 
 class Conformance:
@@ -125,7 +115,7 @@ class Conformance:
         model, given = self.plugin.params, self.params
         if isinstance(given, Params) or model is None:
             return given if isinstance(given, Params) else None
-        return model.model_validate(dict(given or {}), context=_Lookup())
+        return model.model_validate(dict(given or {}), context=Lookup(load_registry()))
 
     # What every plugin must do ------------------------------------------------------------------
 

@@ -1,12 +1,13 @@
-"""``scan``, ``seam`` and ``weld`` stages. What they need differs much: ``context`` gives it."""
+"""``scan``, ``seam`` and ``weld`` stages (``context`` gives what they need), and controllers."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from flangeye import types as t
+from flangeye.motion.seam_following import Command, FollowingTask, Phase, ToolPose, Touch
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import plain, require, require_covariance, require_round_trip
 from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
@@ -86,3 +87,61 @@ class WeldConformance(OnceConformance):
 
     kind = "weld"
     gives = t.WeldReport
+
+
+PERIOD = 8e-3
+"""Between two cycles of a controller [s]."""
+
+
+def straight_task() -> FollowingTask:
+    """Return a seam of 0.1 m along x, to be followed at 5 mm/s with 2 mm of deflection."""
+    along = np.arange(0.0, 0.1 + 1e-9, 0.5e-3)
+    points = np.column_stack([along, 0 * along, 0 * along])
+    return FollowingTask(
+        points, np.tile([1.0, 0.0], (len(points), 1)), step=0.5e-3, torch_distance=40e-3, side=1.0,
+        speed=5e-3, deflection=2e-3, preload=1.5e-3, servo_gain=3.0, height_gain=3.0,
+        lateral_speed=5e-3, turn_rate=np.deg2rad(20.0),
+    )  # fmt: skip
+
+
+class ControllerConformance(Conformance):
+    """A ``controller`` part: pose and touches in, one command a cycle out.
+
+    It is led along the plan for ten seconds, the tip deflected as was asked; where it would go is
+    not judged.
+    """
+
+    kind = "controller"
+
+    def commands(self) -> list[Command]:
+        """Return what it commands."""
+        controller, task = self.call(None, straight_task()), straight_task()
+        felt, given = np.array([0.0, -task.deflection, -task.preload]), []
+        for i in range(round(10.0 / PERIOD)):
+            time = i * PERIOD
+            pose = ToolPose(time, np.array([task.speed * time, 0.0, 0.0]), 0.0)
+            given.append(controller.step(pose, [Touch(time, felt)]))
+            require(
+                controller.phase in get_args(Phase),
+                f"phase '{controller.phase}' is none of {', '.join(get_args(Phase))}",
+            )
+        return given
+
+    def test_it_commands_the_same_twice(self) -> None:
+        """Equal input, equal commands, to the last bit."""
+        first, again = ([(*c.velocity, c.turn) for c in self.commands()] for _ in range(2))
+        require(first == again, "two runs with equal input differ")
+
+    def test_its_commands_are_finite_and_turn_no_faster_than_allowed(self) -> None:
+        """Three velocities [m/s] and a turn [rad/s], in every cycle."""
+        limit = straight_task().turn_rate
+        for command in self.commands():
+            require(
+                np.shape(command.velocity) == (3,)
+                and bool(np.isfinite([*command.velocity, command.turn]).all()),
+                f"commanded {command}: three finite velocities and a turn are expected",
+            )
+            require(
+                abs(command.turn) <= limit * (1 + 1e-9),
+                f"commanded a turn of {command.turn:.3g} rad/s, {limit:.3g} are allowed",
+            )

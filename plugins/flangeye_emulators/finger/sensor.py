@@ -12,6 +12,7 @@ from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger
 from flangeye.models.workpiece import CadSeam, WorkpiecePath, load_workpiece
+from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image, Seed, Transform
 from flangeye.units import Angle, Duration, Length, param
@@ -23,7 +24,6 @@ from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.motion import ToolPose
 
 
 class SectionParams(Params):

@@ -7,9 +7,9 @@ from collections import deque
 
 import numpy as np
 
+from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.settings import ArmTruth
-from flangeye_plugins.weld.motion import Command, ToolPose
 
 
 class ArmError:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.models.finger import Finger
+from flangeye.motion.seam_following import Controller
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.conditions import Condition
 from flangeye_emulators.weld_world.groove import Section, Tip
@@ -16,7 +17,6 @@ from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import Body, body_from
 from flangeye_plugins.weld.checks import check_tool
-from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.going_on import controller_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from flangeye.motion.seam_following import ToolPose, turned
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.settings import ToolTruth
 from flangeye_plugins.weld.body import leaning
-from flangeye_plugins.weld.motion import ToolPose, turned
 
 
 class TrueTool:

@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.arm import ArmResponse
 from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.settings import WorldParams
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
-from flangeye_plugins.weld.controller import Controller
-from flangeye_plugins.weld.motion import Command, ToolPose, Touch
 
 
 class Row(NamedTuple):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flangeye.motion.seam_following import ToolPose
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.arm import ArmError
 from flangeye_emulators.weld_world.finger import TrueFinger
@@ -14,7 +15,6 @@ from flangeye_emulators.weld_world.heat import Distortion
 from flangeye_emulators.weld_world.settings import WorldParams
 from flangeye_emulators.weld_world.tool import TrueTool
 from flangeye_emulators.weld_world.workpiece import true_groove
-from flangeye_plugins.weld.motion import ToolPose
 
 
 @dataclass(frozen=True, eq=False)

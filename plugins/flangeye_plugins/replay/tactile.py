@@ -11,13 +11,13 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.log.read import Note, read_notes
 from flangeye.models.finger import Finger
+from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import part
 from flangeye.run.replay import ReplayedStep
 from flangeye_plugins.sensor.recorded import piece_of
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import Reader
 from flangeye_plugins.weld.going_on import controller_from
-from flangeye_plugins.weld.motion import ToolPose
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
 SAME = 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.devices import DeviceError
 from flangeye.models.finger import Finger
-from flangeye_plugins.weld.motion import ToolPose
+from flangeye.motion.seam_following import ToolPose
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement

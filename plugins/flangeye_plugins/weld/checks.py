@@ -9,13 +9,13 @@ from flangeye.errors import StageError
 from flangeye.maths.seam_geometry import tube_radii
 from flangeye.models.finger import Finger
 from flangeye.motion.limits import MotionLimits
+from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
 from flangeye_plugins.weld.belief import LIMIT, Belief
 from flangeye_plugins.weld.body import Body
-from flangeye_plugins.weld.controller import Controller, SimulationOnly
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
-from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.settings import Following, Mode
 from flangeye_plugins.weld.weave import Weave
 
 LEAN = np.deg2rad(15.0)
@@ -55,16 +55,16 @@ def check_finger(finger: Finger, settings: Following) -> None:
         )
 
 
-def check_controller(controller: Controller, driver: RobotDriver) -> None:
-    """Refuse a controller that must not move a real arm.
+def check_controller(mode: Mode, driver: RobotDriver) -> None:
+    """Refuse a controller that is declared to run on a simulated arm only with any other.
 
     Raises:
         StageError: The driver does not declare that its arm is simulated.
     """
-    if isinstance(controller, SimulationOnly) and not driver.simulated:
+    if isinstance(mode, BoundPart) and mode.part.simulation_only and not driver.simulated:
         raise StageError(
-            f"weld.tactile: mode {controller.mode} is known to diverge and runs on a simulated arm "
-            f"only, {driver.name} is none; use mode: tactile"
+            f"weld.tactile: {mode.part.name} is known to diverge and runs on a simulated arm "
+            f"only; {driver.name} is not one; use mode: tactile"
         )
 
 

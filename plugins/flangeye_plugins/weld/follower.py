@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
 from flangeye_plugins.weld.consistency import Seating
 from flangeye_plugins.weld.contact import Contact, Release
-from flangeye_plugins.weld.controller import STILL, Phase
-from flangeye_plugins.weld.motion import Command, Felt, ToolPose, Touch, Track, turned
+from flangeye_plugins.weld.motion import Felt, Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
 from flangeye_plugins.weld.refined import RefinedPath

@@ -6,9 +6,9 @@ import numpy as np
 
 from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Finger
+from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.weld.body import Body, body_from
-from flangeye_plugins.weld.motion import Command, ToolPose
 
 UPRIGHT_GAIN = 1.0
 """How fast the tool is brought back to the plane's normal [1/s]."""

@@ -14,12 +14,12 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.log.read import Note, read_notes
+from flangeye.motion.seam_following import Controller, FollowingTask, ToolPose, Touch
+from flangeye.plugin.registry import Lookup, load_registry
+from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
-from flangeye_plugins.weld.as_printed import AsPrinted
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.follower import Follower, Kept
-from flangeye_plugins.weld.motion import ToolPose, Touch
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
@@ -35,10 +35,30 @@ def controller_of(
     plan: Path, belief: Belief, settings: Following, mode: Mode, kept: Kept | None = None
 ) -> Controller:
     """Return the controller of the mode that was asked for."""
-    if mode == "as_printed":
-        return AsPrinted(plan, belief.distance, settings)
+    if isinstance(mode, BoundPart):
+        controller: Controller = mode(task_of(plan, belief.distance, settings))
+        return controller
     root = Follower(plan, belief, settings, mode == "tactile", kept)
     return Passes(root, plan, belief, settings) if settings.passes and mode == "tactile" else root
+
+
+def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
+    """Return what a plugin's controller is asked to do, the torch ``distance`` behind the tip."""
+    return FollowingTask(
+        plan.points, plan.tangents, plan.step, distance,
+        side=1.0 if settings.side == "left" else -1.0,
+        **settings.model_dump(include=set(FollowingTask.__dataclass_fields__) - {"side"}),
+    )  # fmt: skip
+
+
+def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
+    """Return the mode that a log names; the plugin of its controller has to be installed."""
+    if logged in ("tactile", "vision"):
+        return logged
+    ((name, given),) = {logged: {}}.items() if isinstance(logged, str) else logged.items()
+    lookup = Lookup(load_registry())
+    part = lookup.part(f"controller.{name}")
+    return part.bind(part.params.model_validate(given, context=lookup) if part.params else None)
 
 
 def follower_of(controller: Controller) -> Follower | None:
@@ -54,7 +74,7 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     settings = Following.model_validate(start["settings"])
     kept = start.get("kept")
     return controller_of(
-        Path(np.array(start["points"])), belief, settings, start["mode"],
+        Path(np.array(start["points"])), belief, settings, _mode_of(start["mode"]),
         None if kept is None else Kept(np.array(kept["samples"]), kept["torch"]),
     )  # fmt: skip
 

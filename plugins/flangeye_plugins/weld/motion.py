@@ -1,4 +1,4 @@
-"""Where the tool is, was, and shall go, in the plane of the work."""
+"""Where the seam was measured, and where the tool was when it was."""
 
 from __future__ import annotations
 
@@ -7,42 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import islice
 
-import numpy as np
-
-from flangeye.types import Floats
-
-
-@dataclass(frozen=True, eq=False)
-class ToolPose:
-    """The tool at one time.
-
-    Attributes:
-        time: [s].
-        position: (3,) of the robot's end point P_r: where the tip would be, undeformed [m].
-        angle: Angle of the tool's direction t_d from the plane's x [rad], continuous over turns.
-    """
-
-    time: float
-    position: Floats
-    angle: float
-
-    @property
-    def direction(self) -> Floats:
-        """(2,) t_d: from the torch to the tip."""
-        return np.array([np.cos(self.angle), np.sin(self.angle)])
-
-
-@dataclass(frozen=True, eq=False)
-class Touch:
-    """One measurement of the tip.
-
-    Attributes:
-        time: Middle of the image's exposure [s].
-        displacement: (3,) of the tip from where it rests, along the tool's axes [m].
-    """
-
-    time: float
-    displacement: Floats
+from flangeye.motion.seam_following import ToolPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,19 +21,6 @@ class Felt:
 
     offset: float
     height: float
-
-
-@dataclass(frozen=True, eq=False)
-class Command:
-    """What the robot shall do until the next cycle.
-
-    Attributes:
-        velocity: (3,) of the end point P_r [m/s].
-        turn: Angular velocity about the plane's normal [rad/s].
-    """
-
-    velocity: Floats
-    turn: float
 
 
 class Track:
@@ -95,9 +47,3 @@ class Track:
         share = (time - before.time) / (after.time - before.time)
         position = before.position + share * (after.position - before.position)
         return ToolPose(time, position, before.angle + share * (after.angle - before.angle))
-
-
-def turned(vector: Floats, angle: float) -> Floats:
-    """Return a vector (3,) along the tool's axes in the plane's: turned about its normal."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]])

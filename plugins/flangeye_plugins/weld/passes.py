@@ -15,11 +15,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
-from flangeye_plugins.weld.controller import STILL, Phase
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.motion import Command, ToolPose, Touch
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Seam, WeldReport
 from flangeye_plugins.weld.body import Body
-from flangeye_plugins.weld.controller import Controller
 from flangeye_plugins.weld.frame import WorkPlane
 from flangeye_plugins.weld.going_on import follower_of
-from flangeye_plugins.weld.motion import turned
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.weld_log import WeldLog, columns
 
@@ -58,12 +57,17 @@ def report_of(  # noqa: PLR0913  all that a weld had
         along=np.array(every["torch"])[kept],
         phases=tuple(every["phase"][i] for i in kept),
         figures={**_figures(weld_log), **learned_figures(controller)},
-        sigma=np.array(every["sigma"])[kept],
-        bound=np.array(every["bound"])[kept],
-        band=np.array(every["band"])[kept],
+        sigma=_stated(np.array(every["sigma"])[kept]),
+        bound=_stated(np.array(every["bound"])[kept]),
+        band=_stated(np.array(every["band"])[kept]),
         true_torch=np.zeros((0, 3)) if truth is None else _at(cycle["time"], *truth),
         loop=_loop(weld_log),
     )
+
+
+def _stated(deviations: Floats) -> Floats:
+    """Return deviations (K,), or none where the controller states no finite ones."""
+    return deviations if np.isfinite(deviations).all() else np.zeros(0)
 
 
 def _at(times: Floats, known: Floats, points: Floats) -> Floats:

@@ -13,8 +13,8 @@ from collections import deque
 import numpy as np
 from scipy.signal import lfilter
 
+from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.motion import Command, ToolPose
 
 DEAD_TIMES = np.arange(0.0, 0.161, 0.02)
 LAGS = np.array([1e-3, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3])

@@ -13,7 +13,8 @@ from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Angle, AngularSpeed, Duration, Force, Length, Speed, param
 from flangeye_plugins.weld.joint import JointKind
 
-Mode = Literal["tactile", "as_printed", "vision"]
+Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
+"""By touch, by the plan alone, or as a controller of a plugin decides."""
 
 
 class PassParams(Params):
@@ -169,8 +170,8 @@ class WeldTactileParams(Following):
     )
     mode: Mode = Field(
         "tactile",
-        description="tactile, or for comparison: as_printed (the paper's Algorithm 2), or vision "
-        "(the plan alone, nothing is touched).",
+        description="tactile: follow the seam by touch. For comparison: vision follows the plan "
+        "alone and touches nothing; any other name is that of a controller plugin.",
     )
     log_images: bool = Field(
         True, description="Log what was read of every image, 17 kB each; replaying needs it."

@@ -80,8 +80,8 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     checks.check_tool(body, belief, params)
     passage = SeamReach(Task(model, allowed, finger, tool, plan, params, belief.set_down(params)))
     simulated = driver.simulated
+    checks.check_controller(params.mode, driver)
     controller = controller_of(plan, belief, params, params.mode, kept)
-    checks.check_controller(controller, driver)
     if not (motion.allowed or simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
@@ -128,7 +128,7 @@ def start_of(
         "base_T_plane": plane.base_T_plane.matrix.tolist(),
         "finger": finger.model_dump(mode="json"),
         "belief": asdict(belief),
-        "mode": params.mode,
+        "mode": params.model_dump(mode="json", include={"mode"})["mode"],
         "kept": None if kept is None else {"samples": kept.samples.tolist(), "torch": kept.torch},
         "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
     }

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from flangeye.motion.seam_following import Command, ToolPose
 from flangeye_emulators.weld_world.arm import ArmError, ArmResponse
 from flangeye_emulators.weld_world.bench import SECTION, try_condition
 from flangeye_emulators.weld_world.clock import Shutter
@@ -21,7 +22,6 @@ from flangeye_emulators.weld_world.settings import (
 )
 from flangeye_emulators.weld_world.tool import TrueTool
 from flangeye_emulators.weld_world.workpiece import true_groove
-from flangeye_plugins.weld.motion import Command, ToolPose
 from flangeye_plugins.weld.path import Path
 
 LINE = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])

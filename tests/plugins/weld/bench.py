@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flangeye.motion.seam_following import ToolPose, Touch, turned
 from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
-from flangeye_plugins.weld.as_printed import AsPrinted
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower
-from flangeye_plugins.weld.motion import ToolPose, Touch, turned
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 
@@ -70,8 +69,6 @@ class Weld:
 
 
 def make(mode, plan, settings):
-    if mode == "as_printed":
-        return AsPrinted(Path(plan), DISTANCE, settings)
     return Follower(Path(plan), Belief(DISTANCE), settings, mode == "tactile")
 
 

@@ -10,13 +10,14 @@ from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
+from flangeye.motion.seam_following import Command, ToolPose, turned
 from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Contact as Tip3D
 from flangeye_emulators.weld_world.groove import Groove, Section, Tip
 from flangeye_plugins.weld.consistency import Seating
 from flangeye_plugins.weld.contact import DWELL, LOST, REGAINED, SMOOTHING, Contact, Release
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.motion import Command, ToolPose, Track, turned
+from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.refined import RefinedPath
 from tests.plugins.weld.bench import curved, misplaced, straight

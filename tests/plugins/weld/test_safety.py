@@ -12,11 +12,11 @@ from flangeye.errors import RunStopped, StageError
 from flangeye.files.bundled import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
+from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import LatestState
-from flangeye_plugins.weld.motion import ToolPose
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement

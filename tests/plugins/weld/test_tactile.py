@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import NothingMoved, StageError
 from flangeye.maths.seam_geometry import torch_deviation
+from flangeye.motion.seam_following import Controller, FollowingTask
+from flangeye.plugin.registry import Lookup, load_registry
+from flangeye.plugin.stage import BoundPart, part
 from flangeye.types import Seam
+from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, planning_error, run, true_line
 
 SHORT = 0.06
@@ -165,13 +170,34 @@ def test_a_real_arm_does_not_move_unasked() -> None:
     )
 
 
-def test_algorithm_2_as_printed_does_not_run_on_a_real_arm() -> None:
+@part("controller.astray", simulation_only=True)
+def astray(task: FollowingTask) -> Controller:
+    """A controller that is declared to diverge."""
+    raise AssertionError("made")
+
+
+@pytest.mark.parametrize("name", ["robot.simulated", "robot.ur_rtde"])
+def test_a_controller_that_diverges_does_not_run_on_a_real_arm(name: str) -> None:
     def never():
         raise AssertionError("opened")
 
-    real = RobotDriver("robot.simulated", never)  # by declaration, not by a name
-    with pytest.raises(StageError, match="known to diverge and runs on a simulated arm only"):
-        run(planned("v-straight", end=SHORT), driver=real, mode="as_printed")
+    real = RobotDriver(name, never)  # by declaration, not by a name
+    mode = BoundPart(astray, None)
+    with pytest.raises((StageError, AssertionError)) as told:
+        run(planned("v-straight", end=SHORT), driver=real, mode=mode)
+    assert str(told.value) == (
+        f"weld.tactile: controller.astray is known to diverge and runs on a simulated arm only; "
+        f"{name} is not one; use mode: tactile"
+    )
+
+
+def test_a_mode_that_no_plugin_offers_is_named_with_those_that_are_there() -> None:
+    with pytest.raises(ValidationError) as told:
+        WeldTactileParams.model_validate(
+            {"sensor": {"opencv": {"device": 0}}, "mode": "tactil"}, context=Lookup(load_registry())
+        )
+    assert "no part 'controller.tactil'" in str(told.value)
+    assert "; or write tactile or vision" in str(told.value)
 
 
 def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() -> None:

@@ -1,0 +1,149 @@
+"""What follows a seam, one decision a cycle: the contract of ``controller`` parts, and its types.
+
+Arrays and plain values in the plane of the work: its z is the height above it. No devices, no
+clock. A controller that is known to diverge says so where it is declared,
+``@part("controller.…", simulation_only=True)``, and is refused with a real arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from flangeye.types import Floats
+
+Phase = Literal[
+    "seeking", "probing", "following", "bridging", "ending", "returning", "passing", "done",
+    "stopped",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPose:
+    """The tool at one time.
+
+    Attributes:
+        time: [s].
+        position: (3,) of the robot's end point P_r: where the tip would be, undeformed [m].
+        angle: Angle of the tool's direction t_d from the plane's x [rad], continuous over turns.
+    """
+
+    time: float
+    position: Floats
+    angle: float
+
+    @property
+    def direction(self) -> Floats:
+        """(2,) t_d: from the torch to the tip."""
+        return np.array([np.cos(self.angle), np.sin(self.angle)])
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """One measurement of the tip.
+
+    Attributes:
+        time: Middle of the image's exposure [s].
+        displacement: (3,) of the tip from where it rests, along the tool's axes [m].
+    """
+
+    time: float
+    displacement: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """What the robot shall do until the next cycle.
+
+    Attributes:
+        velocity: (3,) of the end point P_r [m/s].
+        turn: Angular velocity about the plane's normal [rad/s].
+    """
+
+    velocity: Floats
+    turn: float
+
+
+STILL = Command(np.zeros(3), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FollowingTask:
+    """What a controller is asked to do.
+
+    Attributes:
+        points: (M, 3) of the planned seam, evenly spaced in the plane [m].
+        tangents: (M, 2) its unit tangents in the plane.
+        step: Arc length between two of the points [m].
+        torch_distance: From the torch to the tip in front of it [m].
+        side: 1 where the left wall is pressed, -1 for the right one.
+        speed: Of the tip along the seam [m/s].
+        deflection: Of the tip against the wall [m].
+        preload: Displacement of the tip into the groove [m].
+        servo_gain: Of the deflection's control [1/s].
+        height_gain: Of the preload's control [1/s].
+        lateral_speed: Largest speed across the seam, and in height [m/s].
+        turn_rate: Largest angular velocity of the tool [rad/s].
+    """
+
+    points: Floats
+    tangents: Floats
+    step: float
+    torch_distance: float
+    side: float
+    speed: float
+    deflection: float
+    preload: float
+    servo_gain: float
+    height_gain: float
+    lateral_speed: float
+    turn_rate: float
+
+
+class Controller(Protocol):
+    """What moves the tool along a seam.
+
+    Attributes:
+        mode: Its name, for people.
+        side: 1 for the left wall, -1 for the right one.
+        phase: What it is doing.
+        reason: Why it stopped.
+        tip: Arc length of the tip's progress on the plan [m].
+        torch: Arc length of the torch's progress [m].
+        wanted: Deflection asked of the tip at present [m].
+        sigma: Standard deviation of the torch's place across the seam [m].
+        bound: What its distance from the seam does not exceed [m].
+        band: The same for 95 % of the seam [m].
+    """
+
+    mode: str
+    side: float
+    phase: Phase
+    reason: str
+    tip: float
+    torch: float
+    wanted: float
+    sigma: float
+    bound: float
+    band: float
+
+    def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
+        """Return the command for this cycle; ``touches`` are the measurements not yet given."""
+        ...
+
+
+class ControllerPart(Protocol):
+    """``controller``: makes what follows one seam."""
+
+    def __call__(self, task: FollowingTask) -> Controller:
+        """Return a controller at the start of its task."""
+        ...
+
+
+def turned(vector: Floats, angle: float) -> Floats:
+    """Return a vector (3,) along the tool's axes in the plane's: turned about its normal."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]])
