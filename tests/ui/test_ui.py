@@ -301,6 +301,46 @@ def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None
     assert any("STOP" in str(text).upper() for text in reached)
 
 
+def press_until(page: Any, name: str, key: str = "Tab") -> None:
+    """Press a key until what is focused has this text or label; in a row of tabs, ArrowRight."""
+    focused = "[document.activeElement.innerText, document.activeElement.ariaLabel]"
+    for _ in range(120):
+        page.keyboard.press(key)
+        if name.upper() in [str(text).strip().upper() for text in page.evaluate(focused)]:
+            return
+    raise AssertionError(f"no {key} leads to {name}")
+
+
+@pytest.mark.slow
+def test_a_calibration_by_keyboard_alone(browser: Any, served: Served) -> None:
+    page = opened(browser, served)
+    press_until(page, "Recipe in YAML")
+    page.keyboard.press("Control+A")
+    page.keyboard.insert_text(SMALL)
+    page.get_by_text("The recipe is sound.").wait_for()
+    press_until(page, "Run")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Run", exact=True).wait_for()
+    press_until(page, "Start")
+    page.keyboard.press("Enter")
+    page.get_by_text("done (exit code 0)").wait_for(timeout=300_000)
+    press_until(page, "Verdict")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Verdict", exact=True).wait_for()
+    page.get_by_text("Verified: ").wait_for()
+    press_until(page, "Verdict")  # the link to this page; then the first of its tabs
+    press_until(page, "Verdict")
+    press_until(page, "Export", "ArrowRight")
+    page.keyboard.press("Enter")
+    press_until(page, "abb")
+    press_until(page, "ur", "ArrowRight")
+    page.keyboard.press("Enter")
+    press_until(page, "Write the file")
+    page.keyboard.press("Enter")
+    page.get_by_text("exports/").first.wait_for()
+    assert page.problems == []
+
+
 @pytest.mark.slow
 def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, served: Served) -> None:
     page = opened(browser, served)
