@@ -107,6 +107,9 @@ def _newest_from(
 ) -> tuple[tuple[float, float], ...]:
     """Return how far aside and up the newest are from a line, each with its sigma [m].
 
+    The line is known as well as the samples have it: at its middle by their number, beyond by
+    their slope (the variance of a prediction; Draper and Smith 1998, 1.4).
+
     Args:
         before: (K, 3) rows of arc length, offset and height that the line goes through [m].
         newest: (M, 3) the same.
@@ -115,10 +118,14 @@ def _newest_from(
     middle = before.mean(axis=0)
     from_middle = before - middle
     along = from_middle[:, 0]
-    slopes = along @ from_middle[:, 1:] / max(float(along @ along), 1e-18)
+    spread = max(float(along @ along), 1e-18)
+    slopes = along @ from_middle[:, 1:] / spread
     slopes = np.clip(slopes, -np.array(steepest), steepest)
     left = from_middle[:, 1:] - along[:, None] * slopes
     newest_from = newest.mean(axis=0) - middle
     off = newest_from[1:] - newest_from[0] * slopes
-    sigma = np.sqrt(np.mean(left**2, axis=0) / len(newest))
+    scatter = np.sqrt(np.mean(left**2, axis=0))
+    slope_sigma = np.minimum(scatter / np.sqrt(spread), steepest)
+    mean = scatter * np.sqrt(1.0 / len(newest) + 1.0 / len(before))
+    sigma = np.hypot(mean, newest_from[0] * slope_sigma)
     return (float(off[0]), float(sigma[0])), (float(off[1]), float(sigma[1]))

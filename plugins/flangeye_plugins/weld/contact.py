@@ -79,17 +79,18 @@ class Release:
     """Whether the tip is still between the walls while it is let go of.
 
     Where the robot is, and what was felt before, say by how much it should be deflected. When it is
-    not, its wall is gone; when it is deflected to the other side, the other wall holds it, whatever
-    was expected.
+    not, its wall is gone; when it is deflected to the other side by more than friction can give,
+    the other wall holds it, whatever was expected.
 
     Attributes:
         loose: Whether what the tip does says nothing of the seam.
         other: Whether the other wall holds it.
     """
 
-    def __init__(self, two_walls: bool) -> None:
+    def __init__(self, two_walls: bool, sliding: float = 0.0) -> None:
+        """Begin; friction alone displaces a tip that no wall holds by ``sliding`` [m]."""
         self.loose = self.other = False
-        self._two_walls = two_walls
+        self._two_walls, self._sliding = two_walls, sliding
         self._newest: deque[tuple[float, float]] = deque(maxlen=NEWEST)
 
     def judge(self, deflection: float, expected: float, sigma: float) -> None:
@@ -105,7 +106,8 @@ class Release:
             return
         deflection, expected = (sum(column) / NEWEST for column in zip(*self._newest, strict=True))
         least = LEANING + SURE * sigma / math.sqrt(NEWEST)
-        self.other = self._two_walls and deflection < -least
+        # A tip that goes along and drags agrees with every place the robot leads it to.
+        self.other = self._two_walls and deflection < -max(least, self._sliding)
         if self.other:
             self.loose = False
         elif expected > least and deflection < LOST * expected:

@@ -18,7 +18,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
 from flangeye_plugins.weld.refined import RefinedPath
 from flangeye_plugins.weld.response import Response
-from flangeye_plugins.weld.search import Search
+from flangeye_plugins.weld.search import STEEPER, Search
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
 from flangeye_plugins.weld.weave import Sway, Weave
@@ -136,7 +136,8 @@ class Follower:
         self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
-        self._release, self._latency = Release(belief.two_walls), 0.0
+        self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
+        self._latency = 0.0
         self._place = plan.at(self.tip)
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
@@ -368,6 +369,7 @@ class Follower:
         if self.phase in ("following", "bridging") and self.tip >= self._pressing_ends:
             self._enter("ending")
         elif self.phase == "seeking" and state == "held" and self._search.seated:
+            self._probing.begin(float(self._search.sigma[1]))
             self._enter("probing" if settings.probing else "following")
         elif self.phase == "probing" and self._probing.over:
             self._learn()

@@ -59,6 +59,18 @@ LARGEST_PLAY = 0.1e-3
 FEWEST = 15
 """Samples of a sweep without which it says nothing."""
 
+KNEE = 0.8
+"""A tip that leaves its seat does so beyond this share of the deflection, or shows less anyway."""
+
+RESTS = 0.4
+"""After so long the tip has come to rest where it met the wall [s]."""
+
+TOLD = 0.03e-3
+"""So well the mean of what is felt where the tip is pressed hardest is to be known [m]."""
+
+LONGEST = 4.0
+"""No longer is it pressed for that [s]."""
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -101,23 +113,50 @@ class Probing:
         # It ends outwards: play and hysteresis are then where the weld keeps them.
         self._turns = [reach, back, ENDS * settings.deflection]
         self._two_walls = belief.two_walls
-        self._side, self._wanted, self._noise = side, settings.deflection, belief.noise
+        self._side, self._noise = side, belief.noise
         self._deflection, self._flat = settings.deflection, belief.flat(side)
+        self._preload = settings.preload
+        self._wanted: float | None = None
+        self._pressed: tuple[float, int] | None = None
         self.over, self._time = False, 0.0
         self._cycles: list[tuple[float, float, float]] = []
         self._felt: list[tuple[float, float, float, float]] = []
 
+    def begin(self, noise: float) -> None:
+        """Begin, with a finger of which one measurement across scatters by ``noise`` [m]."""
+        self._noise = (max(self._noise[0], noise), self._noise[1])
+
     def velocity(self, elapsed: float) -> float:
         """Return the velocity of the sweep in this cycle, to the left [m/s]."""
         goal, self._time = self._turns[0], self._time + elapsed
+        if self._wanted is None:  # contact is found on the way to it: first it comes to rest
+            self._wanted = self._rested()
+            return 0.0
         # At one speed a delay would look like play: both then shift the tag by the same.
         rate = self._rate * (SLOWEST + (1.0 - SLOWEST) * math.sin(math.pi * self._time / BEAT) ** 2)
         step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
         self._wanted += step
-        if abs(goal - self._wanted) < 1e-9:
+        if abs(goal - self._wanted) < 1e-9 and self._told():
             self._turns.pop(0)
             self.over = not self._turns
         return self._side * step / elapsed if elapsed else 0.0
+
+    def _rested(self) -> float | None:
+        """Return by how much the tip is pressed where the sweep begins [m]; None before."""
+        rested = [-self._side * sample[1] for sample in self._felt[len(self._felt) // 2 :]]
+        if self._time < RESTS or (len(rested) < self._enough and self._time < LONGEST):
+            return None
+        return float(np.mean(rested)) if rested else self._deflection
+
+    def _told(self) -> bool:
+        """Return whether enough was felt where the tip is pressed hardest; later ends say less."""
+        since, before = self._pressed = self._pressed or (self._time, len(self._felt))
+        return len(self._felt) - before >= self._enough or self._time - since > LONGEST
+
+    @property
+    def _enough(self) -> float:
+        """Measurements whose mean is known as well as it has to be."""
+        return (self._noise[0] / TOLD) ** 2
 
     def note(self, time: float, told: float, lateral: float) -> None:
         """Remember a cycle: what was told [m/s] and where the end point was, to the left [m]."""
@@ -200,7 +239,52 @@ class Probing:
                 f"the finger shows {-found.gain:.0%} less than its file says, or the tip climbs "
                 "the wall, and it is too noisy to tell; calibrate it again, or raise 'preload'"
             )
+        return self._hardly_held(felt, at, found)
+
+    def _hardly_held(self, felt: Floats, at: Floats, found: Learned) -> str | None:
+        """Say that the tip leaves its seat where it is pressed hardest, or that it may."""
+        rise, sigma = self._knee(felt, at, found)
+        if rise > CLIMBED + 3 * sigma:
+            return (
+                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
+                "'deflection' or raise 'preload'"
+            )
+        # What a tip does that is just held at the deflection, and pressed harder by the margin.
+        ratio = self._preload / self._deflection
+        if rise + 2 * sigma > (MARGIN - 1.0) * self._preload / (ratio * self._flat + 1.0):
+            return (
+                f"whether the tip climbs the wall is known to {sigma * 1e3:.2f} mm only; raise "
+                "'preload' or lower 'deflection', or see to it that the tag is read better"
+            )
         return None
+
+    def _knee(self, felt: Floats, at: Floats, found: Learned) -> tuple[float, float]:
+        """Return how far the tip has risen at the hard end of the sweep, and its sigma [m].
+
+        A tip that leaves its seat goes aside and up from there on: the finger then shows less, by
+        a bend that gain, play and delay do not have. Both are fitted together, each by its noise.
+        """
+        pressed = self._side * at
+        pressed -= np.median(pressed + self._side * felt[:, 1] / (1.0 + found.gain))
+        beyond = (pressed / self._deflection - KNEE) / (MARGIN - KNEE)
+        share, one = np.maximum(beyond, 0.0), np.ones_like(at)
+        if np.count_nonzero(share) < 3:
+            return 0.0, math.inf
+        noise = math.hypot(found.noise, found.unexplained)
+        high = max(_scatter(felt[:, 2]), self._noise[1])
+        none, best = np.zeros((len(at), 3)), (math.inf, 0.0, math.inf)
+        heights = np.column_stack([none, none[:, 0], one, share]) / high
+        for width in REVERSALS:
+            reversal = (_dragged(at[None], np.array([width]))[0] - at) / width
+            aside = self._side * self._flat * share
+            across = np.column_stack([one, -at, reversal, 0.0 * one, 0.0 * one, aside]) / noise
+            rows = np.vstack([across, heights])
+            said = np.concatenate([felt[:, 1] / noise, felt[:, 2] / high])
+            solved = np.linalg.lstsq(rows, said, rcond=None)[0]
+            left = float(np.sum((said - rows @ solved) ** 2))
+            sigma = math.sqrt(float(np.linalg.pinv(rows.T @ rows)[-1, -1]))
+            best = min(best, (left, float(solved[-1]), sigma))
+        return best[1:]
 
 
 def _scatter(values: Floats) -> float:

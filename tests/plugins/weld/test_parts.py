@@ -325,8 +325,8 @@ def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
 # --- whether the tip is where the seam is ---------------------------------------------------------
 
 
-def released(deflections, expected, two_walls=True, sigma=10e-6):
-    release = Release(two_walls)
+def released(deflections, expected, two_walls=True, sigma=10e-6, sliding=0.0):
+    release = Release(two_walls, sliding)
     for deflection, wanted in zip(deflections, expected, strict=True):
         release.judge(deflection, wanted, sigma)
     return release.loose
@@ -344,6 +344,9 @@ def test_the_other_wall_tells_where_the_seam_is_though_the_wall_seemed_lost() ->
     pressed_back = [0.0] * 5 + [-0.5e-3] * 5
     assert not released(pressed_back, [0.5e-3] * 10)
     assert released(pressed_back, [0.5e-3] * 10, two_walls=False)
+    # What friction alone may give is no wall: a tip that drags agrees with any place.
+    assert released(pressed_back, [0.5e-3] * 10, sliding=0.9e-3)
+    assert not released([0.0] * 5 + [-1e-3] * 5, [0.5e-3] * 10, sliding=0.9e-3)
 
 
 def climbing(aside, lifted):
@@ -361,3 +364,11 @@ def test_a_tip_that_may_have_climbed_a_little_is_doubted_by_so_much() -> None:
     assert climbing(0.3e-3, 0.3e-3) == pytest.approx(0.3e-3, abs=0.05e-3)
     assert climbing(0.0, 1.5e-3) < 0.05e-3  # a tack weld
     assert climbing(0.3e-3, 0.0) < 0.05e-3  # the seam turns aside
+
+
+def test_a_noisy_tip_on_a_short_line_is_not_taken_for_one_that_is_lifted() -> None:
+    for seed in range(20):
+        seating, rng = Seating(1.0, 1.0), np.random.default_rng(seed)
+        for i in range(90):  # the line goes through 1 to 20 mm of what was felt
+            noise = 0.6e-3 * rng.standard_normal(2)
+            assert seating.judge(i * 0.33e-3, noise[0], noise[1]) is None
