@@ -58,6 +58,7 @@ class WatchedArm:
         """
         self._wire, self._told = wire, told
         self._unheard: deque[Report] = deque()
+        self._asked = False
         opened = self._hear(patience, "does not answer")
         self.name, self.period, state = opened.content
         self._state: RobotState = state
@@ -83,6 +84,26 @@ class WatchedArm:
             self._told(self._state)
         self._state = report.content
         self._told(self._state)
+        return self._state
+
+    def lead(self, how: str, *motion: Any) -> None:
+        """Tell an arm that is led how to go on: ``velocity`` or ``linear``, and its arguments."""
+        self._say(how, motion)
+        self._asked = how == "velocity"  # who says a velocity waits for the next cycle
+
+    def cycle(self) -> RobotState:
+        """Return the state of the controller's next cycle.
+
+        Raises:
+            DeviceError: The arm was stopped for a safety fault: the reason.
+            RunStopped: The operator stopped it.
+        """
+        if not self._asked:
+            self._say("cycle")
+        self._asked = False
+        while (report := self._hear(PATIENCE, "does not answer")).what != "cycle":
+            pass  # that it is under way, or has arrived, who waits for each cycle sees itself
+        self._state = report.content
         return self._state
 
     def during(self, start_ns: int, end_ns: int) -> list[Sample]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,10 +23,3 @@ def keys() -> Iterator[int | None]:
         yield keyboard
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
-
-
-def space_pressed(keyboard: int | None) -> bool:
-    """Return whether the space bar was pressed since the last look; never waits."""
-    if keyboard is None or not select.select([keyboard], [], [], 0)[0]:
-        return False
-    return b" " in os.read(keyboard, 64)

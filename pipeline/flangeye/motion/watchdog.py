@@ -3,7 +3,8 @@
 It runs in a process of its own, where no computation of the program can delay it. It hears of
 Ctrl-C through a pipe that the interpreter's signal handler writes to at once, whatever the program
 is busy with; the space bar it reads itself; when the program dies its end of the wire closes. Each
-of these stops the arm within one cycle.
+of these stops the arm within one cycle. A program that leads the arm by velocities is told every
+cycle it asks for; when it says nothing any more, the arm is stopped too.
 """
 
 from __future__ import annotations
@@ -18,15 +19,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
+from flangeye.devices import GRACE, DeviceError, MovedByHand, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import Leg, Route
+from flangeye.motion.route import Leg
 from flangeye.motion.supervision import SafetyFault, Sample, Watch
 
 TOLD_NS = 200_000_000
 """Between two states told to the program while the arm is under way [ns]."""
+
+SILENT, HUNG = 2.0 * GRACE, 10.0 * GRACE
+"""A program that leads the arm and says nothing: the arm is stopped, and is led no more [s]."""
+
+LISTENING = 0.5
+"""Share of a cycle in which a guard that is asked for states waits for the next word."""
 
 
 class Charge(NamedTuple):
@@ -51,8 +58,8 @@ class Report(NamedTuple):
     """What a guard tells the program.
 
     Attributes:
-        what: ``opened``, ``state``, ``arrived``, ``samples``, ``stopped`` (by the operator) or
-            ``fault``.
+        what: ``opened``, ``state``, ``cycle`` (a state that was asked for), ``arrived``,
+            ``samples``, ``stopped`` (by the operator) or ``fault``.
         content: A state, samples, or text for people.
     """
 
@@ -92,11 +99,15 @@ class Watchdog:
         self._told_ns = 0
         self._barred: str | None = None
         self._wanted: tuple[int, int] | None = None
+        self._asked, self._listens = False, 0.0
+        self._led_ns: int | None = None
+        self._paused = False
 
     def run(self) -> None:
         """Watch the arm, cycle by cycle, until the program closes the wire."""
         self._open()
         while self._obey():
+            self._keep_led()
             self._cycle()
             self._tell_samples()
 
@@ -117,13 +128,35 @@ class Watchdog:
                 self._halt()
                 self._wire.send(Report("stopped", by))
             state = self._robot.state()
-            if self._watch.judge(state):
+            arrived = self._watch.judge(state)
+            self._tell_cycle(state)
+            if arrived:
                 self._next_leg(state)
             elif self._legs and state.time_ns - self._told_ns > TOLD_NS:
                 self._told_ns = state.time_ns
                 self._wire.send(Report("state", state))
         except (SafetyFault, DeviceError) as fault:
             self._bar(str(fault))
+
+    def _tell_cycle(self, state: RobotState) -> None:
+        """Answer who waits for the next cycle: never unasked, a full wire would hold the guard."""
+        if self._asked:
+            self._asked, self._listens = False, LISTENING * self._robot.period
+            self._wire.send(Report("cycle", state))
+
+    def _keep_led(self) -> None:
+        """Stop an arm that is led by a program that says nothing any more."""
+        if self._led_ns is None:
+            return
+        silent = 1e-9 * (self._watch.samples[-1].time_ns - self._led_ns)
+        if silent > HUNG:
+            self._bar(f"the program that leads the arm said nothing for {HUNG:.0f} s")
+        elif silent > SILENT and not self._paused:
+            self._paused = True  # the driver brakes by itself, and before: not on that alone
+            try:
+                self._robot.stop()
+            except DeviceError as lost:
+                self._bar(str(lost))
 
     def _next_leg(self, state: RobotState) -> None:
         self._legs.pop(0)
@@ -139,13 +172,13 @@ class Watchdog:
         self._robot.move_joints(leg.joints, leg.speed, leg.acceleration)
 
     def _halt(self) -> None:
-        self._legs = []
+        self._legs, self._led_ns = [], None
         self._watch.halted()
         self._robot.stop()
 
     def _bar(self, reason: str) -> None:
         """Stop, and move no more: a safety fault is not outlived."""
-        self._legs = []
+        self._legs, self._led_ns = [], None
         self._watch.halted()
         try:
             self._robot.stop()
@@ -166,17 +199,39 @@ class Watchdog:
 
     def _obey(self) -> bool:
         """Do what the program asks; return whether it is still there."""
-        while self._wire.poll(0):
+        while self._wire.poll(self._listens):
             request, content = self._wire.recv()
             if request == "close":
                 return False
-            if request == "go" and self._barred is None:
-                self._go(content)
-            elif request == "stop":
+            if request == "stop":
                 self._halt_if_possible()
             elif request == "samples":
                 self._wanted = content
+            elif self._barred is None and request != "cycle":
+                self._command(request, content)
+            if request in ("cycle", "velocity"):
+                # A program that leads waits for each cycle and answers it within: one word does.
+                self._asked, self._listens = True, 0.0
+                return True
+        self._listens = 0.0
         return True
+
+    def _command(self, request: str, content: Any) -> None:
+        """Move the arm as asked, in any of the three ways."""
+        try:
+            if request == "go":
+                self._legs, self._led_ns = list(content.legs), None
+                self._set_off()
+            elif request == "velocity":
+                self._watch.led()
+                self._led_ns, self._paused = self._watch.samples[-1].time_ns, False
+                self._robot.move_velocity(*content)
+            elif request == "linear":
+                self._watch.led()
+                self._led_ns = None
+                self._robot.move_linear(*content)
+        except DeviceError as lost:
+            self._bar(str(lost))
 
     def _tell_samples(self) -> None:
         """Answer for an interval once it is over, or when no more will come of it."""
@@ -188,13 +243,6 @@ class Watchdog:
         if over or self._barred is not None:
             self._wire.send(Report("samples", _during(samples, start_ns, end_ns)))
             self._wanted = None
-
-    def _go(self, route: Route) -> None:
-        self._legs = list(route.legs)
-        try:
-            self._set_off()
-        except DeviceError as lost:
-            self._bar(str(lost))
 
     def _halt_if_possible(self) -> None:
         try:

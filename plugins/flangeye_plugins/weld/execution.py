@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ from flangeye_plugins.weld.finger_camera import FingerCameraReader
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog
+
+SWITCH = 0.2e-3
+"""Longest time for which another thread keeps the interpreter while the loop wants it [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +98,20 @@ class Clock:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Collect garbage before and after, and not in a cycle: that takes tens of milliseconds."""
-    enabled = gc.isenabled()
+    """Let nothing of this process hold up a cycle for long.
+
+    Garbage is collected before and after, not in between: that takes tens of milliseconds. A cycle
+    waits several times, and each time the thread that reads images may keep the interpreter for
+    a switch interval: a short one.
+    """
+    enabled, interval = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
     gc.disable()
+    sys.setswitchinterval(SWITCH)
     try:
         yield
     finally:
+        sys.setswitchinterval(interval)
         if enabled:
             gc.enable()
 

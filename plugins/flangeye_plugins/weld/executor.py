@@ -7,9 +7,7 @@ from contextlib import suppress
 import numpy as np
 
 from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
-from flangeye.errors import RunStopped
 from flangeye.models.robots import RobotModel
-from flangeye.motion.keyboard import space_pressed
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Route
 from flangeye.motion.supervision import STANDING, SafetyFault, Watch
@@ -23,9 +21,9 @@ PATIENT = 10.0
 class Executor:
     """An open arm under watch.
 
-    The watch is that of :mod:`flangeye.motion`. It runs here, in the loop, because the
-    loop commands a velocity in each cycle: where this process hangs or dies, the next velocity is
-    late and the driver brakes (:data:`flangeye.devices.GRACE`).
+    A real arm is owned and watched by a guard in a process of its own
+    (:func:`flangeye.motion.leading.led`), which stops it where this process hangs or dies. The same
+    watch runs here, in the loop: in simulated time it is the only one.
 
     Attributes:
         robot: The arm.
@@ -39,9 +37,8 @@ class Executor:
         latest: LatestState,
         model: RobotModel,
         limits: MotionLimits,
-        keyboard: int | None = None,
     ) -> None:
-        """Begin to watch an open arm; the space bar of ``keyboard``, a descriptor, stops it.
+        """Begin to watch an open arm.
 
         Raises:
             DeviceError: It is not the model's, has a tool set that nobody knows of, or is moved by
@@ -50,7 +47,7 @@ class Executor:
         if isinstance(robot, MovedByHand):
             raise DeviceError(f"{robot.name}: is moved by hand; a weld needs an arm that drives")
         self.robot, self.latest, self.limits = robot, latest, limits
-        self._watch, self._keyboard = Watch(model, limits), keyboard
+        self._watch = Watch(model, limits)
         state = robot.state()
         latest.tell(state)
         try:
@@ -114,9 +111,6 @@ class Executor:
 
     def _judged(self) -> tuple[RobotState, bool]:
         """Return the newest state, and whether the leg under way has ended."""
-        if space_pressed(self._keyboard):
-            self.stop()
-            raise RunStopped("the operator stopped the arm (the space bar)")
         state = self.robot.state()
         self.latest.tell(state)
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict
 from typing import Any
 
@@ -11,7 +11,7 @@ from flangeye.errors import NothingMoved
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
-from flangeye.motion.keyboard import keys
+from flangeye.motion.leading import led
 from flangeye.motion.limits import limits_of
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
@@ -85,14 +85,13 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     if not (motion.allowed or simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
-        robot: Robot = opened.enter_context(driver.open())
+        robot: Robot = opened.enter_context(led(driver, model, allowed))
         latest = LatestState(robot.state())
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
         weld_log = opened.enter_context(WeldLog(journal, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        keyboard = opened.enter_context(nullcontext() if simulated else keys())
-        drive = Executor(robot, latest, model, allowed, keyboard)
+        drive = Executor(robot, latest, model, allowed)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
         approach(cell, passage, weld_log, params.mode)
         passes = 1 + 2 * len(params.passes)  # there and back

@@ -1,5 +1,6 @@
 """weld.tactile in real time: velocities through the real client to a controller on loopback."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +39,7 @@ def test_the_torch_stays_in_the_seam_in_real_time(tmp_path: Path) -> None:
     journal = []
     with Process("--joints", "180 -90 90 -90 -90 0 deg", model="ur10e") as controller:
         driver = RobotDriver(
-            "robot.ur_rtde",
-            lambda: robot_ur_rtde.function(MODEL, UrRtdeParams(host=controller.host)),
+            "robot.ur_rtde", partial(robot_ur_rtde, MODEL, UrRtdeParams(host=controller.host))
         )
         report = weld_tactile.function(
             None, seam, MODEL, driver, LimitsSection.model_validate({"box": BOX}),

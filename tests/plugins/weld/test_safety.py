@@ -1,6 +1,5 @@
 """The arm while it welds: its way is checked before, and it is watched in every cycle."""
 
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from flangeye.devices import DeviceError, RobotDriver
-from flangeye.errors import RunStopped, StageError
+from flangeye.errors import StageError
 from flangeye.files.bundled import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
@@ -185,19 +184,6 @@ def test_beyond_the_bounds(displacement: list[Any], lateral: float, told: str) -
     with pytest.raises(DeviceError) as error:
         check(displacement, lateral)
     assert str(error.value) == told
-
-
-def test_the_space_bar_stops_the_arm() -> None:
-    robot, (ours, theirs) = StandIn(), os.pipe()
-    drive = Executor(robot, LatestState(robot.state()), STAND_IN, LIMITS, ours)
-    drive.lead()
-    os.write(theirs, b"x")
-    drive.tick()
-    os.write(theirs, b" ")
-    with pytest.raises(RunStopped) as told:
-        drive.tick()
-    assert str(told.value) == "the operator stopped the arm (the space bar)"
-    assert "stop" in robot.commands()
 
 
 def test_an_arm_that_moves_unasked_is_stopped() -> None:

@@ -1,0 +1,27 @@
+"""A program that leads an arm on loopback sideways for ever: python -m tests.motion.leader HOST."""
+
+import sys
+from functools import partial
+
+import numpy as np
+
+from flangeye.devices import RobotDriver
+from flangeye.motion.leading import led
+from tests.motion.stand_in import LIMITS, MODEL
+from tests.plugins.robot.cell import open_ur
+
+
+def main(host):
+    """Lead until this process is ended, or the guard ends it; say where it has got to."""
+    driver = RobotDriver("robot.ur_rtde", partial(open_ur, host))
+    with led(driver, MODEL, LIMITS) as arm:
+        print("leading", flush=True)
+        began = arm.state().time_ns
+        while True:
+            arm.wait_cycle()
+            turn = 0.3 * (arm.state().time_ns - began) * 1e-9  # to and fro, within the box
+            arm.move_velocity(np.array([0.0, 0.05 * np.cos(turn), 0.0, 0.0, 0.0, 0.0]), 0.5)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

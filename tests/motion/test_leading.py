@@ -1,0 +1,146 @@
+"""An arm that is led from cycle to cycle: the guard answers, watches, and ends a silence."""
+
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError, RobotDriver
+from flangeye.errors import RunStopped
+from flangeye.motion.arm import WatchedArm
+from flangeye.motion.leading import LedArm, led
+from flangeye.motion.route import Leg, Route
+from flangeye.motion.watchdog import HUNG, SILENT, Charge, Report, Watchdog
+from tests.motion.stand_in import LIMITS, MODEL, StandIn, driver_of
+from tests.motion.test_guard import Wire, outside, protected
+
+SIDEWAYS = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
+
+
+def guarded(robot, requests):
+    """Return what a guard reports while the program says this; each at its cycle."""
+    wire: Any = Wire(robot, [*requests, (2000, ("close", None))])
+    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    return wire.heard
+
+
+def velocities(first, last):
+    """What a program says that leads an arm: it waits for each cycle and answers it."""
+    return [(first, ("cycle", None))] + [
+        (cycle, ("velocity", (SIDEWAYS, 0.5))) for cycle in range(first + 1, last)
+    ]
+
+
+def test_each_cycle_that_is_asked_for_is_told_once_and_none_besides() -> None:
+    robot = StandIn()
+    heard = guarded(robot, velocities(100, 150))
+    states = [report.content for report in heard if report.what == "cycle"]
+    assert len(states) == 50
+    assert len({state.time_ns for state in states}) == 50
+    assert {report.what for report in heard} == {"opened", "cycle", "fault"}
+
+
+def test_a_program_that_leads_and_says_nothing_any_more_is_ended() -> None:
+    robot = StandIn()
+    heard = guarded(robot, [*velocities(100, 150), (1000, ("velocity", (SIDEWAYS, 0.5)))])
+    (fault,) = [report.content for report in heard if report.what == "fault"]
+    assert fault == "the program that leads the arm said nothing for 1 s"
+    stopped = [cycle for name, cycle in robot.asked if name == "stop"]
+    assert stopped == pytest.approx([149 + t / robot.period for t in (SILENT, HUNG)], abs=3)
+    assert robot.arm.standing  # a safety fault is not outlived
+
+
+def test_a_program_that_was_held_up_goes_on_from_rest() -> None:
+    robot = StandIn()
+    heard = guarded(robot, [*velocities(100, 150), *velocities(350, 400), (400, ("stop", None))])
+    assert "fault" not in {report.what for report in heard}
+    first, _ = [cycle for name, cycle in robot.asked if name == "stop"]
+    assert first == pytest.approx(149 + SILENT / robot.period, abs=3)
+
+
+def test_a_program_that_has_stopped_the_arm_may_be_silent() -> None:
+    robot = StandIn()
+    heard = guarded(robot, [*velocities(100, 150), (150, ("stop", None))])
+    assert "fault" not in {report.what for report in heard}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (outside, "the arm is outside the box: z is"),
+        (protected, "the controller reports protective stop: collision of joint 2"),
+    ],
+)
+def test_the_guard_watches_an_arm_that_is_led(change: Any, told: str) -> None:
+    robot = StandIn(lambda arm, state: change(arm, state) if arm.cycles > 120 else state)
+    heard = guarded(robot, velocities(100, 150))
+    faults = [report.content for report in heard if report.what == "fault"]
+    assert faults[0].startswith(told)
+    assert ("stop", 121) in robot.asked
+
+
+def test_an_arm_that_cannot_be_told_any_more_is_barred() -> None:
+    class Deaf(StandIn):
+        def move_velocity(self, twist, acceleration):
+            raise DeviceError("the controller did not take the command")
+
+    heard = guarded(Deaf(), velocities(100, 102))
+    assert Report("fault", "the controller did not take the command") in heard
+
+
+# --- the program's side ---------------------------------------------------------------------------
+
+
+def led_arm(*reports):
+    """Return an arm that is led, the guard's end of its wire, and the first state."""
+    ours, theirs = multiprocessing.Pipe()
+    state = StandIn().state()
+    for report in (Report("opened", ("ur5e", 2e-3, state)), *reports):
+        theirs.send(report)
+    return LedArm(WatchedArm(ours, lambda _: None)), theirs, state
+
+
+def test_it_is_a_robot_whose_words_go_to_the_guard() -> None:
+    arm, guard, state = led_arm()
+    assert (arm.name, arm.period, arm.state().time_ns) == ("ur5e", 2e-3, state.time_ns)
+    arm.move_velocity(SIDEWAYS, 0.5)
+    arm.move_linear(state.base_T_flange, 0.1, 0.5)
+    goal = state.joints + 0.3
+    arm.move_joints(goal, 0.6, 1.2)
+    arm.close()
+    said = [guard.recv() for _ in range(4)]
+    assert [request for request, _ in said] == ["velocity", "linear", "go", "stop"]
+    np.testing.assert_array_equal(said[0][1][0], SIDEWAYS)
+    route: Route = said[2][1]
+    (leg,) = route.legs
+    assert isinstance(leg, Leg)
+    assert leg.seconds == pytest.approx(0.3 / 0.6 + 0.6 / 1.2)
+
+
+def test_it_hears_the_state_of_the_cycle_it_waits_for() -> None:
+    later = StandIn()
+    later.wait_cycle()
+    arm, guard, _ = led_arm(Report("arrived", None), Report("cycle", later.state()))
+    arm.wait_cycle()
+    assert arm.state().time_ns == later.state().time_ns
+    assert guard.recv() == ("cycle", None)
+
+
+def test_a_fault_and_the_operator_s_stop_end_the_wait() -> None:
+    arm, _, _ = led_arm(Report("fault", "the arm is outside the box"))
+    with pytest.raises(DeviceError, match="^the arm is outside the box$"):
+        arm.wait_cycle()
+    arm, _, _ = led_arm(Report("stopped", "the space bar"))
+    with pytest.raises(RunStopped, match=r"^the operator stopped the arm \(the space bar\)$"):
+        arm.wait_cycle()
+
+
+def test_a_simulated_arm_and_one_moved_by_hand_are_opened_here() -> None:
+    robot = StandIn()
+    with led(driver_of(robot), MODEL, LIMITS) as arm:
+        assert arm is robot
+    assert robot.closed
+    driver = RobotDriver("robot.stand_in", lambda: robot, simulated=True)
+    with led(driver, MODEL, LIMITS) as arm:
+        assert arm is robot
