@@ -100,5 +100,4 @@ def test_the_scheduler_knows_of_a_little_work(
     own: bool, chunks: int, length: int, asks: bool
 ) -> None:
     client: Any = Workers(2, "ours" if own else None)
-    waiting = [Chunk(0, [session for _, session in sessions(length)])] * chunks
-    assert Pace(client, 1000).asks(waiting) == asks
+    assert Pace(client, 1000).asks(chunks, chunks * length) == asks

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from itertools import groupby, islice
@@ -33,6 +33,9 @@ CONNECT_SECONDS = 5.0
 
 AHEAD = 3
 """Chunks that the scheduler is to know of for each worker."""
+
+REFILL = 0.7
+"""It is told of further ones when it knows of less than so much of that."""
 
 WINDOW = 256
 """Sessions that a scheduler elsewhere is to know of at least: its workers may only be starting."""
@@ -212,12 +215,11 @@ class Pace:
         wanted = min(CHUNK_SECONDS / mean, self._left / (2 * self.workers()), MOST)
         return max(1, int(wanted))
 
-    def asks(self, waiting: Collection[Chunk]) -> bool:
-        """Return whether the scheduler is to know of more than these."""
-        if len(waiting) < AHEAD * self.workers():
+    def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
+        """Return whether the scheduler is to know of more than so much, or than a share of it."""
+        if chunks < share * AHEAD * self.workers():
             return True
-        elsewhere = self._client.cluster is None
-        return elsewhere and sum(len(chunk.sessions) for chunk in waiting) < WINDOW
+        return self._client.cluster is None and sessions < share * WINDOW
 
     def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
         """Yield chunks, as long as is right when each is asked for."""
@@ -258,13 +260,19 @@ def run_all(
     done = as_completed()
 
     def submit() -> None:
-        while pace.asks(waiting.values()):
+        held = sum(len(chunk.sessions) for chunk in waiting.values())
+        if not pace.asks(len(waiting), held, REFILL):
+            return  # many at once cost the scheduler less than one after the other
+        some: list[Chunk] = []
+        while pace.asks(len(waiting) + len(some), held):
             chunk = again.pop() if again else next(chunks, None)
             if chunk is None:
-                return
-            future = client.submit(run_chunk, job, chunk, pure=False)
-            waiting[future.key] = chunk
-            done.add(future)
+                break
+            some.append(chunk)
+            held += len(chunk.sessions)
+        futures = client.map(run_chunk, [job] * len(some), some, pure=False)
+        waiting.update(zip((future.key for future in futures), some, strict=True))
+        done.update(futures)
 
     submit()
     for future in done:
