@@ -19,7 +19,7 @@ from flangeye.handeye.arm import (
 from flangeye.handeye.candidates import Model, considered, understated, with_nuisance
 from flangeye.handeye.certificate import told_of
 from flangeye.handeye.consensus import find_consensus
-from flangeye.handeye.distortion import distortion_of
+from flangeye.handeye.distortion import distortion_of, edges_of
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
@@ -312,11 +312,16 @@ def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list
 
 
 def _distortion(model: Model, cell: Cell, options: Options) -> Nuisance | None:
-    """Return the scanner's distortion; None where nothing is known of it, or none is seen."""
+    """Return the scanner's distortion; None where nothing is known of it, or none is seen.
+
+    With what it does to edges, where a circle's place is unknown: elsewhere that is a few percent.
+    """
     seen = np.array([by_depth(o.feature) for o in cell.observations])
     if cell.scanner is None or not options.scanner_distortion or not seen.any():
         return None
-    return distortion_of(cell.scanner, model.problem.measurements, seen)
+    s = model.problem.measurements
+    distortion = distortion_of(cell.scanner, s, seen)
+    return distortion.and_also(edges_of(s, seen)) if model.problem.loop.z else distortion
 
 
 def _note_of_distortion(model: Model, cell: Cell, options: Options) -> tuple[str, ...]:

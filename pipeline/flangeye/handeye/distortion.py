@@ -29,6 +29,8 @@ RADIUS = 30e-3
 """A target is turned by what it is bent over so much to each side [m]."""
 NEGLIGIBLE = 0.05
 """Ways to move the targets of a session that are, by their rms, this share of the largest."""
+LEAST_TILT = 1e-3
+"""Circles that all face the camera to this [rad] are seen alike."""
 LEVER = 0.3
 """A turn counts like what it does so far away [m]."""
 
@@ -47,6 +49,36 @@ def distortion_of(scanner: ScannerModel, measurements: Measurements, seen: Mask)
     kept = ways[sizes > NEGLIGIBLE * sizes[0]].T
     still = np.zeros((len(measurements), 6, kept.shape[1]))
     return nuisance_of(still, still, 1.0, seen=moves @ kept)
+
+
+def edges_of(measurements: Measurements, seen: Mask) -> Nuisance:
+    """Return how the centres of circles may move all alike with the view of them.
+
+    Where the wall behind an edge is in view, a scanner rounds the edge off; on the other side it
+    breaks off. So a centre lies too far from the camera's side, by the more the more the face is
+    tilted. Tilting also is what tells how far away a circle is whose place is unknown: no residual
+    shows the one in the other. The size is what the fits state of their centres in the face, as if
+    all of it were this.
+
+    Args:
+        measurements: N of them.
+        seen: (N,) which were measured by the scanner's depth.
+    """
+    s, seen = measurements, seen & measurements.has_normal
+    normals, to_camera = s.rotations[:, :, 2], -s.centres
+    to_camera = to_camera / np.linalg.norm(to_camera, axis=1)[:, None]
+    along = to_camera - (to_camera * normals).sum(axis=1)[:, None] * normals
+    own = s.covariances[:, 3:, 3:]
+    across = np.einsum("na,nab,nb->n", normals, own, normals)
+    in_face = np.trace(own, axis1=1, axis2=2) - across
+    tilts = (along[seen] ** 2).sum()
+    size = (
+        float(np.sqrt(in_face[seen].sum() / tilts)) if tilts > LEAST_TILT**2 * seen.sum() else 0.0
+    )
+    moves = np.zeros((len(s), 6, 1))
+    moves[seen, 3:, 0] = along[seen]
+    still = np.zeros_like(moves)
+    return nuisance_of(still, still, size, seen=moves)
 
 
 @dataclass(frozen=True)

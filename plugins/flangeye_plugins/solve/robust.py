@@ -94,7 +94,8 @@ class RobustParams(Params):
         "consider",
         description="Whether the scanner's smooth distortion is part of the model, as large as the "
         "scanner's file has it (calibration_error): found as far as the poses show it, and in the "
-        "covariance.",
+        "covariance. With it, where a circle's place is unknown, how it rounds the edges of a "
+        "tilted face.",
     )
     translation_limit: Length = param(
         "20 mm", gt=0, description="A translation known less well is not observable."
