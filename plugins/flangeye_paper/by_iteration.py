@@ -20,12 +20,12 @@ from flangeye_plugins.solve.observations import residuals_of
 class ByIterationParams(Params):
     """Parameters of ``verify.algorithm_1_by_iteration``: those of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, description="Poses the answer is computed from.")
+    pool: int = Field(4, ge=3, description="Number of poses in the pool.")
     error: Annotated[BoundPart, Choose("error")] = param(
-        {"icp_as_in_paper": {}}, description="How a candidate's error is measured."
+        {"icp_as_in_paper": {}}, description="Measure of a candidate's error."
     )
     cost: Annotated[BoundPart, Choose("cost")] = param(
-        {"translation": {"at": "camera"}}, description="What of that error is minimised."
+        {"translation": {"at": "camera"}}, description="Cost of that error, to be minimised."
     )
 
 
@@ -33,7 +33,7 @@ class ByIterationParams(Params):
 def verify_by_iteration(
     calibration: HandEye, views: Views | None, flange: Flange | None, params: ByIterationParams
 ) -> Verification:
-    """Run Algorithm 1 over the calibration's poses, in their order, and tell its error by pose.
+    """Run Algorithm 1 over the calibration's poses in order and report its error by pose.
 
     It measures and does not judge: every run passes. The calibration itself stays as it is.
 

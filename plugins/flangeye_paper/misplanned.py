@@ -40,8 +40,12 @@ def scan_as_laid(params: LaidParams) -> WorkpieceScan:
 class MisplannedParams(LaidParams):
     """Parameters of ``seam.misplanned``."""
 
-    shift: Length = param("3 mm", ge=0, description="In a direction of the plane drawn anew.")
-    turn: Angle = param("1 deg", ge=0, description="About the opening, to a side drawn anew.")
+    shift: Length = param(
+        "3 mm", ge=0, description="Size of the shift, in a random direction of the plane."
+    )
+    turn: Angle = param(
+        "1 deg", ge=0, description="Size of the rotation about the opening, to a random side."
+    )
 
 
 @stage("seam.misplanned")

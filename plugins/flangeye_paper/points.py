@@ -43,9 +43,9 @@ class PointsParams(Params):
         "1 mm", gt=0, description="Standard deviation of each coordinate, equation (18)."
     )
     outliers: float = Field(0.0, ge=0, lt=1, description="Share of centres 50 to 150 mm off.")
-    poses: int = Field(POSES, ge=3, le=POSES, description="How many of the grid's poses come.")
+    poses: int = Field(POSES, ge=3, le=POSES, description="Number of the grid's poses to use.")
     told_noise: Length = param(
-        "0.1 mm", gt=0, description="What each centre claims to be good to, whatever its noise."
+        "0.1 mm", gt=0, description="Standard deviation stated for each centre, whatever its noise."
     )
 
 

@@ -83,7 +83,7 @@ class PublishedView(VerificationView):
 class PublishedParams(CentresParams):
     """Parameters of ``acquire.published_centres``."""
 
-    shuffle: bool = Field(False, description="Give the poses in an order drawn by the seed.")
+    shuffle: bool = Field(False, description="Shuffle the poses with the seed.")
 
 
 @stage("acquire.published_centres")

@@ -29,7 +29,7 @@ WORKSPACE = Box(CENTRE, SIZE).grid()
 class RealisationsParams(Params):
     """Parameters of ``verify.realisations``."""
 
-    count: int = Field(100, ge=2, description="Realisations of poses and noise.")
+    count: int = Field(100, ge=2, description="Number of realisations of poses and noise.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from flangeye.cli.app import app, say
 
 @app.command()
 def robots() -> None:
-    """List the arms that are known: joints, plate, and what their values come from."""
+    """List the robot models: joints, flange plate, and source of the values."""
     from flangeye.models.loading import load_model, model_names
 
     for name in model_names("robots"):
@@ -23,7 +23,7 @@ def robots() -> None:
 
 @app.command()
 def scanners() -> None:
-    """List the scanners that are known: principle, range, resolution, noise."""
+    """List the scanner models: principle, range, resolution, noise."""
     from flangeye.models.loading import load_model, model_names
 
     for name in model_names("scanners"):
@@ -37,7 +37,7 @@ def scanners() -> None:
 
 @app.command()
 def standards() -> None:
-    """List the flange plates that are known: diameters, threads, and whether sources agree."""
+    """List the flange plates: diameters, threads, and whether sources agree."""
     from flangeye.models.standards import known_standards
 
     for plate in known_standards():
@@ -54,22 +54,27 @@ Out = Annotated[Path | None, typer.Option(help="File to write; default NAME.yaml
 
 @app.command("new-robot")
 def new_robot(  # noqa: PLR0913  one for each option
-    name: Annotated[str, typer.Argument(help="What to call the arm.")],
-    urdf: Annotated[Path | None, typer.Option(help="Its URDF, xacro expanded.")] = None,
-    base: Annotated[str | None, typer.Option(help="With --urdf: the base's link.")] = None,
-    flange: Annotated[str | None, typer.Option(help="With --urdf: the flange's link.")] = None,
-    maker: Annotated[str, typer.Option(help="Who makes it.")] = "",
+    name: Annotated[str, typer.Argument(help="Name of the new robot model.")],
+    urdf: Annotated[Path | None, typer.Option(help="URDF file, xacro already expanded.")] = None,
+    base: Annotated[str | None, typer.Option(help="With --urdf: link of the base.")] = None,
+    flange: Annotated[str | None, typer.Option(help="With --urdf: link of the flange.")] = None,
+    maker: Annotated[str, typer.Option(help="Manufacturer.")] = "",
     convention: Annotated[
-        str, typer.Option(help="Of --joint: standard or modified (Denavit-Hartenberg), urdf.")
+        str,
+        typer.Option(
+            help="Convention of --joint: standard or modified (Denavit-Hartenberg), or urdf."
+        ),
     ] = "standard",
     joint: Annotated[
         list[str] | None,
-        typer.Option(help="One joint, base first: 'd: 89.159 mm, alpha: 90 deg'."),
+        typer.Option(help="One joint per option, base first: 'd: 89.159 mm, alpha: 90 deg'."),
     ] = None,
-    standard: Annotated[str | None, typer.Option(help="Plate: ISO 9409-1-50-4-M6.")] = None,
+    standard: Annotated[
+        str | None, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")
+    ] = None,
     out: Out = None,
 ) -> None:
-    """Write the file of an arm: from its URDF, or from its joints, given or asked for."""
+    """Create a robot model from a URDF, or from its joints, given or asked for."""
     from flangeye.models.new_model import robot_of_joints, write_robot
     from flangeye.models.urdf import robot_from_urdf
 
@@ -94,21 +99,31 @@ def _ask_joints() -> list[str]:
 
 @app.command("new-scanner")
 def new_scanner(  # noqa: PLR0913  one for each option
-    name: Annotated[str, typer.Argument(help="What to call the scanner.")],
-    near: Annotated[str | None, typer.Option(help="Nearest it sees: '300 mm'.")] = None,
-    far: Annotated[str | None, typer.Option(help="Farthest it sees: '900 mm'.")] = None,
-    principle: Annotated[
-        str | None, typer.Option(help="structured light, time of flight, …")
+    name: Annotated[str, typer.Argument(help="Name of the new scanner model.")],
+    near: Annotated[
+        str | None, typer.Option(help="Minimum working distance, for example '300 mm'.")
     ] = None,
-    pixels: Annotated[tuple[int, int] | None, typer.Option(help="Columns and rows.")] = None,
+    far: Annotated[
+        str | None, typer.Option(help="Maximum working distance, for example '900 mm'.")
+    ] = None,
+    principle: Annotated[
+        str | None, typer.Option(help="Measuring principle: structured light, time of flight, …")
+    ] = None,
+    pixels: Annotated[
+        tuple[int, int] | None, typer.Option(help="Resolution: columns and rows.")
+    ] = None,
     field: Annotated[
         tuple[str, str] | None, typer.Option(help="Field of view: '75 deg' '65 deg'.")
     ] = None,
-    noise: Annotated[str | None, typer.Option(help="Of a pixel at mid range: '0.1 mm'.")] = None,
-    error: Annotated[str | None, typer.Option(help="Smooth distortion, rms: '0.1 mm'.")] = None,
+    noise: Annotated[
+        str | None, typer.Option(help="Noise of a pixel at mid range, for example '0.1 mm'.")
+    ] = None,
+    error: Annotated[
+        str | None, typer.Option(help="Smooth distortion, rms, for example '0.1 mm'.")
+    ] = None,
     out: Out = None,
 ) -> None:
-    """Write the file of a scanner: a range is enough for archives, all options for simulations."""
+    """Create a scanner model; archives need only the range, simulation all options."""
     from flangeye.models.new_model import write_scanner
 
     columns, rows = pixels or (None, None)

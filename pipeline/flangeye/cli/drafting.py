@@ -11,49 +11,65 @@ from flangeye.cli.app import app, load_plugins, say
 from flangeye.errors import RecipeError
 
 Columns = Annotated[
-    str | None, typer.Option(help="Of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6.")
+    str | None,
+    typer.Option(help="Columns of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6."),
 ]
 
 
 @app.command()
 def init(  # noqa: PLR0913  one for each option
-    folder: Annotated[Path, typer.Argument(help="Where the recordings are.")] = Path(),
+    folder: Annotated[Path, typer.Argument(help="Folder with the recordings.")] = Path(),
     robot: Annotated[
-        str | None, typer.Option(help="Name of the arm, its .urdf or .yaml, or none.")
+        str | None, typer.Option(help="Robot model, its .urdf or .yaml file, or none.")
     ] = None,
-    plate: Annotated[str | None, typer.Option(help="Plate: ISO 9409-1-50-4-M6.")] = None,
-    scanner: Annotated[str | None, typer.Option(help="Name of the scanner, or none.")] = None,
-    camera: Annotated[str | None, typer.Option(help="What carries it: base or flange.")] = None,
+    plate: Annotated[
+        str | None, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")
+    ] = None,
+    scanner: Annotated[str | None, typer.Option(help="Scanner model, or none.")] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Where the camera is mounted: base or flange.")
+    ] = None,
     target: Annotated[
         str | None,
         typer.Option(
-            help="What is seen: flange; 'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: "
-            "…}' and so on, with the parameters of that fit."
+            help="Target: flange; 'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' "
+            "and so on, with the parameters of that fit."
         ),
     ] = None,
-    table: Annotated[str | None, typer.Option(help="Which table has the arm's poses.")] = None,
+    table: Annotated[str | None, typer.Option(help="Table with the arm's poses.")] = None,
     columns: Columns = None,
     rotation: Annotated[
-        str | None, typer.Option(help="kuka, fanuc, vector, xyzw, …: flangeye stages reader.table")
+        str | None,
+        typer.Option(
+            help="Rotation format: kuka, fanuc, vector, xyzw, …; see flangeye stages reader.table"
+        ),
     ] = None,
     length: Annotated[str | None, typer.Option(help="Unit of the positions: m or mm.")] = None,
     angle: Annotated[str | None, typer.Option(help="Unit of the angles: deg or rad.")] = None,
-    pose: Annotated[str | None, typer.Option(help="base_T_flange, or flange_T_base.")] = None,
-    target_columns: Annotated[
-        str | None, typer.Option(help="Columns of what the camera saw: a point or a pose.")
+    pose: Annotated[
+        str | None, typer.Option(help="Direction of the poses: base_T_flange or flange_T_base.")
     ] = None,
-    target_rotation: Annotated[str | None, typer.Option(help="As --rotation.")] = None,
-    target_length: Annotated[str | None, typer.Option(help="As --length.")] = None,
-    target_angle: Annotated[str | None, typer.Option(help="As --angle.")] = None,
+    target_columns: Annotated[
+        str | None, typer.Option(help="Columns of the target in the camera: a point or a pose.")
+    ] = None,
+    target_rotation: Annotated[
+        str | None, typer.Option(help="Rotation format of the target, as for --rotation.")
+    ] = None,
+    target_length: Annotated[
+        str | None, typer.Option(help="Unit of the target's positions: m or mm.")
+    ] = None,
+    target_angle: Annotated[
+        str | None, typer.Option(help="Unit of the target's angles: deg or rad.")
+    ] = None,
     reader: Annotated[
-        str | None, typer.Option(help="The reader, as a recipe has it, instead of all of these.")
+        str | None, typer.Option(help="Reader as written in a recipe; replaces the options above.")
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nothing: take the defaults, and tell them.")
+        bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")
     ] = False,
-    out: Annotated[Path, typer.Option(help="The recipe to write.")] = Path("recipe.yaml"),
+    out: Annotated[Path, typer.Option(help="Recipe file to write.")] = Path("recipe.yaml"),
 ) -> None:
-    """Look at recordings, ask what they do not show, and write a recipe for them."""
+    """Create a recipe for recordings: inspect them and ask for what they do not show."""
     from flangeye.recipe.draft import Questions, draft_recipe, look
     from flangeye.recipe.load import load_recipe
 

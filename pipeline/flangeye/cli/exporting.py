@@ -23,16 +23,19 @@ def export(
         typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the format: parent=base."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="File to write, - to print; default RUN/exports/.")
+        Path | None, typer.Option(help="File to write, or - to print; default RUN/exports/.")
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="Of a cell: which camera, for formats that carry one.")
+        str | None, typer.Option(help="Camera to export, for a cell with several.")
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Export a refused calibration too; the file says so.")
+        bool,
+        typer.Option(
+            "--anyway", help="Export even if the calibration was refused; the file says so."
+        ),
     ] = False,
 ) -> None:
-    """Write the calibration as another program takes it; 'flangeye stages' lists the formats.
+    """Export the calibration for another program; 'flangeye stages export' lists the formats.
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
@@ -48,10 +51,10 @@ def export(
 
 @app.command()
 def tables(
-    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap; of a cell.")],
-    out: Annotated[Path | None, typer.Option(help="Folder; default RUN/tables.")] = None,
+    run: Annotated[Path, typer.Argument(help="A cell's run: its folder or run.mcap.")],
+    out: Annotated[Path | None, typer.Option(help="Output folder; default RUN/tables.")] = None,
 ) -> None:
-    """Write a cell's session as tables: of each arm and camera, with a recipe that reads them."""
+    """Write a cell's session as tables, one per arm and camera, with a recipe that reads them."""
     from flangeye.log.read import read_run
     from flangeye.run.tables import write_tables
 

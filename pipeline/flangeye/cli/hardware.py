@@ -9,7 +9,7 @@ import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
 
-tactile = typer.Typer(no_args_is_help=True, help="Tactile fingers: find out how one moves.")
+tactile = typer.Typer(no_args_is_help=True, help="Calibrate tactile fingers.")
 app.add_typer(tactile, name="tactile")
 
 
@@ -21,10 +21,13 @@ def tactile_group() -> None:
 @tactile.command("calibrate")
 def tactile_calibrate(
     recipe: RecipeName,
-    out: Annotated[Path, typer.Option(help="The finger's file to write.")] = Path("finger.yaml"),
+    out: Annotated[Path, typer.Option(help="Finger file to write.")] = Path("finger.yaml"),
     overrides: Overrides = None,
-    move: Annotated[bool, typer.Option("--move", help="Move the arm, by millimetres.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
+    move: Annotated[
+        bool,
+        typer.Option("--move", help="Move the arm, by a few millimetres; without it, a dry run."),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for confirmation.")] = False,
     body: Annotated[
         bool,
         typer.Option(
@@ -34,7 +37,7 @@ def tactile_calibrate(
         ),
     ] = False,
 ) -> None:
-    """Find a finger's rest pose, gain and stiffness, with the arm and the sensor of a recipe."""
+    """Calibrate a finger's rest pose, gain and stiffness with a recipe's arm and sensor."""
     from flangeye.devices import MotionAllowed
 
     registry = load_plugins()
@@ -54,23 +57,24 @@ def touch(
     run: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
     seen: Annotated[
         list[str],
-        typer.Option(metavar="X,Y,Z", help="A point in the camera: '12 mm, -40 mm, 702 mm'."),
+        typer.Option(metavar="X,Y,Z", help="Point in the camera frame: '12 mm, -40 mm, 702 mm'."),
     ],
     tip: Annotated[
-        str, typer.Option(metavar="X,Y,Z", help="Of the tool in the flange: '0 mm, 0 mm, 152 mm'.")
+        str,
+        typer.Option(metavar="X,Y,Z", help="Tool tip in the flange frame: '0 mm, 0 mm, 152 mm'."),
     ],
     move: Annotated[
         bool,
         typer.Option(
-            "--move", help="Let the arm go to 5 mm before each; without it: jog it there."
+            "--move", help="Move the arm to 5 mm before each point; without it, jog it there."
         ),
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter.")] = False,
-    out: Annotated[Path, typer.Option(help="The step to write.")] = Path("touch.yaml"),
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for confirmation.")] = False,
+    out: Annotated[Path, typer.Option(help="Recipe step to write.")] = Path("touch.yaml"),
 ) -> None:
-    """Touch points that the scanner saw, and compare: predicted and actual, as verify.touch does.
+    """Touch points the scanner measured and compare predicted and actual positions.
 
-    The arm, if it goes, goes at 20 mm/s, in the orientation that it has.
+    With --move the arm moves at 20 mm/s and keeps its orientation.
     """
     from flangeye.cli.touching import touch_points
 
@@ -94,7 +98,7 @@ def emulator(  # noqa: PLR0913  one for each option
         typer.Option(
             "--fault",
             metavar="NAME[=DURATION][@WHEN]",
-            help="Let something go wrong, for example 'freeze=3 s@moving'.",
+            help="Inject a fault, for example 'freeze=3 s@moving'.",
         ),
     ] = None,
     floor: Annotated[
@@ -103,17 +107,20 @@ def emulator(  # noqa: PLR0913  one for each option
     ] = None,
     joints: Annotated[
         str | None,
-        typer.Option(help="Where the arm starts, for example '0 -90 90 -90 -90 0 deg'."),
+        typer.Option(help="Initial joint angles, for example '0 -90 90 -90 -90 0 deg'."),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Give the arm errors of its joints' zeros, drawn with this seed."),
+        typer.Option(min=0, help="Add random joint zero errors, drawn with this seed."),
     ] = None,
     with_input: Annotated[
-        bool, typer.Option("--with-input", help="End when standard input does, as a child process.")
+        bool,
+        typer.Option(
+            "--with-input", help="Exit when standard input closes, for use as a child process."
+        ),
     ] = False,
 ) -> None:
-    """Be a robot's controller on loopback, for its own driver to connect to."""
+    """Emulate a robot controller on loopback, for the robot's driver to connect to."""
     from flangeye.models.emulator import EmulatorOptions, find_emulator, read_height, read_joints
     from flangeye.models.loading import load_model
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @app.command()
 def show(log: LogFile) -> None:
-    """Say what happened in a run, step by step; also for a run that was killed."""
+    """Show what happened in a run, step by step; also for a run that was killed."""
     from rich.console import Console
 
     from flangeye.cli.terminal import print_log
@@ -30,9 +30,9 @@ def show(log: LogFile) -> None:
 
 @app.command()
 def outlook(log: LogFile) -> None:
-    """Say what the poses so far are worth: residuals, error to expect, coverage, what is missing.
+    """Assess the poses so far: residuals, expected error, coverage, missing views.
 
-    Of a run that goes, was killed, or is done, by its own recipe.
+    Works on a run that is under way, was killed, or is complete, with its own recipe.
     """
     from flangeye.log.read import read_run
     from flangeye.run.outlook import outlook_of_log
@@ -51,9 +51,11 @@ def outlook(log: LogFile) -> None:
 @app.command()
 def report(
     log: LogFile,
-    out: Annotated[Path | None, typer.Option(help="Default: report.html beside the log.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; default report.html beside the log.")
+    ] = None,
 ) -> None:
-    """Make the HTML report of a run from its log alone."""
+    """Write the HTML report of a run from its log."""
     from flangeye.log.read import read_run
     from flangeye.report import write_report
 
@@ -71,21 +73,27 @@ def report(
 def certificate(  # noqa: PLR0913  one argument an option
     run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap.")],
     out: Annotated[
-        Path | None, typer.Option(help="Default: certificate.html beside the log.")
+        Path | None, typer.Option(help="File to write; default certificate.html beside the log.")
     ] = None,
     temperature: Annotated[
-        float | None, typer.Option(metavar="DEGC", help="Of the air, in degrees Celsius.")
+        float | None, typer.Option(metavar="DEGC", help="Air temperature in degrees Celsius.")
     ] = None,
     spread: Annotated[
         float | None,
-        typer.Option(metavar="KELVIN", min=0.0, help="From the coldest to the warmest in use."),
+        typer.Option(
+            metavar="KELVIN", min=0.0, help="Temperature range in use, coldest to warmest."
+        ),
     ] = None,
-    place: Annotated[str, typer.Option(help="Where it was done.")] = "",
-    operator: Annotated[str, typer.Option(help="Who did it.")] = "",
-    camera: Annotated[str | None, typer.Option(help="Of a cell: which camera.")] = None,
-    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Print it with Chromium.")] = True,
+    place: Annotated[str, typer.Option(help="Place of the calibration.")] = "",
+    operator: Annotated[str, typer.Option(help="Name of the operator.")] = "",
+    camera: Annotated[
+        str | None, typer.Option(help="Camera to certify, for a cell with several.")
+    ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf/--no-pdf", help="Also print it to PDF with Chromium.")
+    ] = True,
 ) -> None:
-    """State a calibration and its uncertainty after the GUM, on a page to print and sign."""
+    """Write a certificate: the calibration and its uncertainty (GUM), to print and sign."""
     from flangeye.report.certificate import Conditions, print_pdf, write_certificate
 
     conditions = Conditions(temperature, spread, place, operator)
@@ -126,12 +134,12 @@ def of_foreign(path: Path, what: str) -> Iterator[None]:
 
 @app.command()
 def layout(
-    viewer: Annotated[str, typer.Argument(help="foxglove (Lichtblick too) or rerun.")],
+    viewer: Annotated[str, typer.Argument(help="foxglove (also for Lichtblick) or rerun.")],
     out: Annotated[
-        Path | None, typer.Option(help="File; flangeye.json or flangeye.rbl if not given.")
+        Path | None, typer.Option(help="File to write; default flangeye.json or flangeye.rbl.")
     ] = None,
 ) -> None:
-    """Write a layout with which another viewer shows a run.mcap: the cell, images, messages."""
+    """Write a viewer layout for run.mcap files: the cell, images, messages."""
     from flangeye.errors import StageError
     from flangeye.log.layouts import foxglove_layout, write_rerun_blueprint
 
@@ -148,7 +156,7 @@ def layout(
 
 @app.command("replay")
 def replay_log(log: LogFile) -> None:
-    """Make the decisions in a log again, from what was measured, and compare."""
+    """Repeat the decisions in a log from its measurements, and compare them."""
     from flangeye.run.replay import replay_steps
 
     same = True
@@ -167,17 +175,19 @@ def replay_log(log: LogFile) -> None:
 def watch(
     run: Annotated[
         Path | None,
-        typer.Argument(metavar="[RUN]", help="A run's folder or log; the newest in ./runs."),
+        typer.Argument(
+            metavar="[RUN]", help="A run's folder or log; default the newest in ./runs."
+        ),
     ] = None,
     foxglove: Annotated[
         int | None,
-        typer.Option(metavar="PORT", help="Serve Foxglove on this port too, 8765 by custom."),
+        typer.Option(metavar="PORT", help="Also serve Foxglove on this port, usually 8765."),
     ] = None,
     patience: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Give up when nothing new came for so long.")
+        float, typer.Option(metavar="SECONDS", help="Stop after this long without new data.")
     ] = 60.0,
 ) -> None:
-    """Watch a run as it goes: arm, captures, uncertainty so far."""
+    """Follow a run live: arm, captures, uncertainty so far."""
     from rich.console import Console
 
     from flangeye.log.watch import watch_run
@@ -187,15 +197,17 @@ def watch(
 
 @app.command()
 def doctor(
-    archive: Annotated[Path, typer.Argument(help="A run.mcap, or recordings that a reader knows.")],
+    archive: Annotated[
+        Path, typer.Argument(help="A run.mcap, or recordings in a format that a reader supports.")
+    ],
     recipe: Annotated[
         str | None,
-        typer.Option(help="The recipe that would run on it: a file, or the name of a bundled one."),
+        typer.Option(help="Recipe to check it against: a file, or the name of a bundled one."),
     ] = None,
     overrides: Overrides = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
-    """Name what is wrong with recordings, with the evidence and the recipe's line to change.
+    """Diagnose recordings: each mistake with its evidence and the recipe line to change.
 
     Exit codes: 0 nothing found, 1 something was, 2 the archive cannot be read.
     """

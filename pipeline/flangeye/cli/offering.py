@@ -12,7 +12,7 @@ from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_reci
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
-    """Check a recipe without running it: every mistake, with its line; what it has to find."""
+    """Check a recipe without running it: print every mistake with its line, and the unknowns."""
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
     from flangeye.recipe.load import find_recipe
@@ -40,7 +40,7 @@ def stages(
         str | None, typer.Argument(help="A stage or part, or a kind such as solve.")
     ] = None,
 ) -> None:
-    """List stages and parts, or those of a kind; with NAME parameters, units, defaults."""
+    """List stages and parts, or those of a kind; with NAME, its parameters, units and defaults."""
     if name is None:
         from flangeye.plugin.stage_list import list_stages
 
@@ -53,7 +53,7 @@ def stages(
 
 @app.command()
 def plugins() -> None:
-    """List the installed plugins, what each offers, and those that could not be loaded."""
+    """List the installed plugins, what each provides, and which could not be loaded."""
     registry = load_plugins()
     registry.everything()
     for plugin, version in registry.versions().items():
@@ -65,10 +65,12 @@ def plugins() -> None:
 
 @app.command()
 def schema(
-    result: Annotated[bool, typer.Option("--result", help="The schema of result.json.")] = False,
+    result: Annotated[
+        bool, typer.Option("--result", help="Print the schema of result.json instead.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="File to write instead of printing.")] = None,
 ) -> None:
-    """Print the JSON Schema of recipes, for editors that check YAML while you type."""
+    """Print the JSON Schema of recipes, for editors with YAML validation."""
     import json
 
     from flangeye.files.written import write_whole
@@ -87,11 +89,11 @@ def schema(
 
 @app.command("new-plugin")
 def new_plugin(
-    name: Annotated[str, typer.Argument(help="Of the plugin, for example acme_hull.")],
-    kind: Annotated[str, typer.Option(help="What it is: scanner, fit, solve, …")],
-    into: Annotated[Path, typer.Option(help="Where its folder is made.")] = Path(),
+    name: Annotated[str, typer.Argument(help="Name of the plugin, for example acme_hull.")],
+    kind: Annotated[str, typer.Option(help="Kind of plugin: scanner, fit, solve, …")],
+    into: Annotated[Path, typer.Option(help="Folder in which to create the package.")] = Path(),
 ) -> None:
-    """Write an installable package with one plugin, a stand-in whose tests pass at once."""
+    """Create an installable package with one example plugin and its passing tests."""
     from flangeye.plugin.scaffold import write_plugin
 
     folder = write_plugin(name, kind, into)

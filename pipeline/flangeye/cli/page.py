@@ -13,12 +13,14 @@ from flangeye.cli.app import app, load_plugins
 
 @app.command("ui")
 def local_page(
-    folder: Annotated[Path, typer.Argument(help="Where recipes and runs are.")] = Path(),
+    folder: Annotated[Path, typer.Argument(help="Folder with recipes and runs.")] = Path(),
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.")] = 8090,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open one.")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
+    ] = True,
 ) -> None:
-    """Open a page that guides through a calibration: cell, plan, run, verdict, archive."""
+    """Open the web page that guides through a calibration: cell, plan, run, verdict, archive."""
     from flangeye.errors import StageError
 
     try:

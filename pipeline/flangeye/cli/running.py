@@ -31,7 +31,7 @@ Recordings = Annotated[
     str | None,
     typer.Option(
         metavar="PATH|URL",
-        help="Recordings to run on, for recipes that start with acquire.archive; "
+        help="Recordings to use, for recipes that start with acquire.archive; "
         "s3://, gs://, az://, https:// and zip:// are streamed.",
     ),
 ]
@@ -48,31 +48,30 @@ FromLog = Annotated[
 ]
 AtStep = Annotated[
     str | None,
-    typer.Option(metavar="STEP", help="First step to do again, for example solve.svd."),
+    typer.Option(metavar="STEP", help="First step to run again, for example solve.svd."),
 ]
 Move = Annotated[
     bool,
     typer.Option(
         "--move",
-        help="Move the arm; without it the arm is only read, the plan checked and shown.",
+        help="Move the arm; without it, a dry run: the arm is only read, the plan checked and "
+        "shown.",
     ),
 ]
 Offline = Annotated[
-    bool, typer.Option("--offline", help="Without --move: plan without asking the arm at all.")
+    bool, typer.Option("--offline", help="Without --move: plan without connecting to the arm.")
 ]
 Resume = Annotated[
     str | None,
-    typer.Option(
-        metavar="RUN", help="Go on with a run that ended early: its folder or log, or a URL."
-    ),
+    typer.Option(metavar="RUN", help="Resume a run that ended early: its folder, log or URL."),
 ]
 Retake = Annotated[
     list[str] | None,
-    typer.Option(metavar="ID", help="With --resume: take this capture again."),
+    typer.Option(metavar="ID", help="With --resume: repeat this capture."),
 ]
 LeaveOut = Annotated[
     list[str] | None,
-    typer.Option(metavar="ID", help="With --from: do without this capture."),
+    typer.Option(metavar="ID", help="With --from: leave out this capture."),
 ]
 
 
@@ -228,39 +227,41 @@ def batch(  # noqa: PLR0913  one argument an option
         list[str] | None,
         typer.Argument(
             metavar="[PATH|URL]...",
-            help="Recordings, a session each; none for recipes that simulate.",
+            help="Recordings, one session each; none for simulated recipes.",
         ),
     ] = None,
     overrides: Overrides = None,
     grid: Annotated[
         list[str] | None,
         typer.Option(
-            "--set-grid", metavar="PATH=A,B,C", help="Run with each value; may be repeated."
+            "--set-grid",
+            metavar="PATH=A,B,C",
+            help="Run with each of these values; may be repeated.",
         ),
     ] = None,
-    repeat: Annotated[int | None, typer.Option(min=1, help="Run with so many seeds.")] = None,
-    vary: Annotated[str, typer.Option(help="What --repeat counts up.")] = "seed",
+    repeat: Annotated[int | None, typer.Option(min=1, help="Number of seeds to run.")] = None,
+    vary: Annotated[str, typer.Option(help="Value that --repeat increments.")] = "seed",
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes on this machine; default one for each core."),
+        typer.Option(min=1, help="Worker processes on this machine; default one per core."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="tls://HOST:PORT", help="A running dask scheduler to use instead."),
+        typer.Option(metavar="tls://HOST:PORT", help="Use a running dask scheduler instead."),
     ] = None,
     tls_ca: Annotated[
-        Path | None, typer.Option(help="Certificate (PEM) that signed the scheduler's and ours.")
+        Path | None, typer.Option(help="CA certificate (PEM) of the scheduler and of this client.")
     ] = None,
-    tls_cert: Annotated[Path | None, typer.Option(help="Our certificate (PEM).")] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Client certificate (PEM).")] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(help="Its key (PEM): who has it may use the workers.")
+        Path | None, typer.Option(help="Client key (PEM); whoever has it can use the workers.")
     ] = None,
     out: Annotated[
         str | None,
-        typer.Option(metavar="PATH|URL", help="Folder for everything; default batches/<recipe>."),
+        typer.Option(metavar="PATH|URL", help="Output folder; default batches/<recipe>."),
     ] = None,
     report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Make each session's report.html.")
+        bool, typer.Option("--report/--no-report", help="Write report.html for each session.")
     ] = True,
 ) -> None:
     """Run a recipe over archives, values and seeds, and compare the sessions.
@@ -289,18 +290,18 @@ def batch(  # noqa: PLR0913  one argument an option
 @app.command()
 def regress(
     folder: Annotated[
-        Path | None, typer.Argument(help="Of manifests; those that come with it if not given.")
+        Path | None, typer.Argument(help="Folder of manifests; default the bundled ones.")
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes on this machine; default one for each core."),
+        typer.Option(min=1, help="Worker processes on this machine; default one per core."),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the runs.")] = Path("regressions"),
+    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("regressions"),
 ) -> None:
-    """Run known recordings and compare: status, closure, and what the doctor finds.
+    """Regression test on known recordings: status, closure, and the doctor's findings.
 
-    A manifest says where a recording lies, how it is read and what is expected; one whose
-    recording is absent is skipped, and said so. Exit codes: 0 all as expected, 1 one differs,
+    A manifest says where a recording is, how to read it and what to expect; missing
+    recordings are reported as skipped. Exit codes: 0 all as expected, 1 one differs,
     2 a manifest is wrong.
     """
     from rich.console import Console

@@ -21,31 +21,34 @@ def monitor(  # noqa: PLR0913  one argument an option
     calibration: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
     archive: Annotated[
         list[Path] | None,
-        typer.Option(help="Later scans in which the flange appears, a check each; oldest first."),
+        typer.Option(help="Later scans that show the flange, one check per file, oldest first."),
     ] = None,
     more: Annotated[
-        list[Path] | None, typer.Argument(metavar="[NEW]...", help="More of these.")
+        list[Path] | None,
+        typer.Argument(metavar="[NEW]...", help="More archives, as with --archive."),
     ] = None,
     live: Annotated[
-        bool, typer.Option("--live", help="Take the scans with the arm, as the recipe drives it.")
+        bool, typer.Option("--live", help="Take new scans with the recipe's arm and scanner.")
     ] = False,
-    scans: Annotated[int, typer.Option(min=1, help="How many with --live.")] = 3,
+    scans: Annotated[int, typer.Option(min=1, help="Number of scans with --live.")] = 3,
     move: Annotated[
-        bool, typer.Option("--move", help="Move the arm; without it: the plan.")
+        bool,
+        typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
     ] = False,
     history: Annotated[
-        Path | None, typer.Option(help="Default: monitor.parquet beside the calibration's log.")
+        Path | None,
+        typer.Option(help="History file; default monitor.parquet beside the calibration's log."),
     ] = None,
     false_alarms: Annotated[
-        float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm at a check.")
+        float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm per check.")
     ] = 2e-4,
-    limit: Annotated[str, typer.Option(help="Slow drift that counts as moved.")] = "0.4 mm",
+    limit: Annotated[str, typer.Option(help="Smallest slow drift reported as MOVED.")] = "0.4 mm",
     opcua: Annotated[
         str | None,
-        typer.Option(metavar="URL,NODE", help="Write the state into an OPC UA node."),
+        typer.Option(metavar="URL,NODE", help="Write the state to an OPC UA node."),
     ] = None,
 ) -> None:
-    """Say whether a calibration still holds: OK, DEGRADED or MOVED, since when, and which part.
+    """Check whether a calibration still holds: OK, DEGRADED or MOVED, since when, which part.
 
     One JSON line a check. Exit codes, by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could
     be checked: a script that stops the cell on 2 is safe either way.

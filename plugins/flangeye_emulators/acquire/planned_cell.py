@@ -40,7 +40,11 @@ FEWEST = 3
 class CellSessionParams(Params):
     """What simulated sessions of cells have in common."""
 
-    sightings: int = Field(60, ge=3, description="How many, dealt evenly to who sees whom.")
+    sightings: int = Field(
+        60,
+        ge=3,
+        description="Number of sightings, evenly distributed over the pairs of camera and target.",
+    )
     places: dict[str, PlaceParams] = Field(
         default_factory=dict,
         description="Where everything that the cell leaves unknown truly is, by frame; the base of "
@@ -60,8 +64,14 @@ class CellSessionParams(Params):
     facing: Angle = param(
         "50 deg", gt=0, description="Largest angle between a target's z and the view."
     )
-    robot_rotation: Angle = param("0.01 deg", ge=0, description="Noise of a reported pose.")
-    robot_position: Length = param("0.05 mm", ge=0, description="And of its place.")
+    robot_rotation: Angle = param(
+        "0.01 deg",
+        ge=0,
+        description="Standard deviation of a reported pose's rotation about each axis.",
+    )
+    robot_position: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of its position along each axis."
+    )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
         description="How far the arms are from what their controllers say; by default by the "

@@ -73,11 +73,15 @@ class PlaceParams(Params):
 class SessionParams(Params):
     """What simulated sessions have in common."""
 
-    poses: int = Field(20, ge=3, description="How many captures.")
+    poses: int = Field(20, ge=3, description="Number of captures.")
     home: tuple[Angle, ...] = param(HOME, description="Joints of the first arm at the first pose.")
-    second_home: tuple[Angle, ...] = param(HOME, description="Those of the second arm.")
+    second_home: tuple[Angle, ...] = param(
+        HOME, description="Joints of the second arm at the first pose."
+    )
     spread: Angle = param("17 deg", gt=0, description="Largest change of a joint from there.")
-    distance: Length = param("650 mm", gt=0, description="Camera to target at the first pose.")
+    distance: Length = param(
+        "650 mm", gt=0, description="Distance from camera to target at the first pose."
+    )
     camera: PlaceParams | None = Field(
         None,
         description="The camera's true place in what carries it; by default wherever it has to be "
@@ -92,19 +96,25 @@ class SessionParams(Params):
         "50 deg", gt=0, description="Largest angle between the target's z and the view."
     )
     robot_rotation: Angle = param(
-        "0.0115 deg", ge=0, description="Noise of a reported pose about each axis; 0.2 mrad."
+        "0.0115 deg",
+        ge=0,
+        description="Standard deviation of a reported rotation about each axis; 0.2 mrad.",
     )
-    robot_position: Length = param("0.05 mm", ge=0, description="And along each axis.")
+    robot_position: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of a reported position along each axis."
+    )
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
         description="How far the arms are from what their controllers say; by default by the "
         "noise of the pose alone.",
     )
     four_axes: bool = Field(
-        False, description="The first arm's flange only moves, and turns about the vertical."
+        False,
+        description="The first arm has four axes (SCARA): the flange turns about the vertical.",
     )
     in_turns: bool = Field(
-        False, description="With two arms, one rests at its first pose while the other moves."
+        False,
+        description="With two arms, only one moves at a time; the other rests at its first pose.",
     )
 
 

@@ -67,7 +67,7 @@ class SimulatedParams(Params):
     """Parameters of ``acquire.simulated``."""
 
     poses: Annotated[BoundPart, Choose("plan")] = param(
-        {"grid": {}}, description="Where the robot goes."
+        {"grid": {}}, description="Poses the robot visits."
     )
     camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     verification: int = Field(
@@ -77,7 +77,8 @@ class SimulatedParams(Params):
         1.0, ge=0, description="Scale of the arm's errors and of its repeatability."
     )
     arm: ArmErrors = Field(
-        default_factory=ArmErrors, description="How far the arm is from what its controller says."
+        default_factory=ArmErrors,
+        description="Errors of the arm that its controller does not know of.",
     )
     noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
     resolution: float = Field(

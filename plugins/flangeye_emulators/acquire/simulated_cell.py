@@ -47,12 +47,20 @@ from flangeye_emulators.world.session import View
 class SimulatedCellParams(CellSessionParams):
     """Parameters of ``acquire.simulated_cell``."""
 
-    field: tuple[Angle, Angle] = param(("50 deg", "40 deg"), description="Cameras' angles of view.")
+    field: tuple[Angle, Angle] = param(
+        ("50 deg", "40 deg"), description="Horizontal and vertical field of view of the cameras."
+    )
     near: Length = param("300 mm", gt=0, description="Nearest that cameras see.")
-    far: Length = param("2 m", gt=0, description="Farthest.")
-    target_rotation: Angle = param("0.05 deg", gt=0, description="Noise of a target's pose.")
-    target_position: Length = param("0.1 mm", gt=0, description="And of its place.")
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are wrong.")
+    far: Length = param("2 m", gt=0, description="Farthest that cameras see.")
+    target_rotation: Angle = param(
+        "0.05 deg",
+        gt=0,
+        description="Standard deviation of a target's measured rotation about each axis.",
+    )
+    target_position: Length = param(
+        "0.1 mm", gt=0, description="Standard deviation of its position along each axis."
+    )
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of sightings that are outliers.")
 
     @property
     def view(self) -> View:
@@ -62,7 +70,7 @@ class SimulatedCellParams(CellSessionParams):
 
 @stage("acquire.simulated_cell")
 def acquire_simulated_cell(cell: Cell, seed: Seed, params: SimulatedCellParams) -> Observations:
-    """Let every camera of a cell see every target that comes into its view, arms moving at random.
+    """Simulate sightings of every target by every camera of a cell, with random arm poses.
 
     Each sighting is of a moment of its own; its pose has noise, as a marker's has.
 
@@ -105,7 +113,7 @@ class CellScanParams(CellSessionParams):
 def acquire_simulated_cell_scans(
     cell: Cell, scanner: ScannerModel, flange: Flange, seed: Seed, params: CellScanParams
 ) -> Captures:
-    """Let every scanner of a cell scan the flanges that come into its view, arms moving at random.
+    """Simulate scans of every flange by every scanner of a cell, with random arm poses.
 
     All scanners are of the recipe's model, each with a distortion of its own.
 

@@ -46,7 +46,7 @@ class BoardParams(Params):
     square: Length = param("30 mm", gt=0, description="Edge of a square, or of the marker.")
     marker: Length = param("22 mm", gt=0, description="Edge of a ChArUco board's markers.")
     dictionary: Dictionary = Field("4X4_50", description="Family of the markers.")
-    id: int = Field(0, ge=0, description="Which marker, where it is one alone.")
+    id: int = Field(0, ge=0, description="Number of the marker, for a single marker.")
 
     @model_validator(mode="after")
     def _fits(self) -> BoardParams:
@@ -69,9 +69,11 @@ class LensParams(Params):
     """The camera: what it is told to be is what it is."""
 
     size: tuple[int, int] = Field((1280, 1024), description="Columns and rows of the image [px].")
-    focal_length: float = Field(1400.0, gt=0, description="In both directions [px].")
+    focal_length: float = Field(1400.0, gt=0, description="Focal length in both directions [px].")
     distortion: tuple[float, ...] = Field(
-        (-0.12, 0.08, 0.0005, -0.0003, 0.0), max_length=14, description="OpenCV's coefficients."
+        (-0.12, 0.08, 0.0005, -0.0003, 0.0),
+        max_length=14,
+        description="Distortion coefficients as in OpenCV.",
     )
 
     def camera(self, blur: float, noise: float, shade: float) -> BoardCamera:
@@ -84,7 +86,7 @@ class LensParams(Params):
 class ImagesParams(SessionParams):
     """Parameters of ``acquire.simulated_images``."""
 
-    board: BoardParams = Field(default_factory=BoardParams, description="The print, as it is.")
+    board: BoardParams = Field(default_factory=BoardParams, description="The board as printed.")
     lens: LensParams = Field(
         default_factory=LensParams, description="The camera; the scanner's own with depth."
     )
@@ -96,13 +98,16 @@ class ImagesParams(SessionParams):
     resolution: float = Field(
         1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
     )
-    blur: float = Field(0.7, gt=0, description="Standard deviation of the lens's blur [px].")
+    blur: float = Field(0.7, gt=0, description="Standard deviation of the lens blur [px].")
     noise: float = Field(3.0, ge=0, description="Standard deviation of a pixel's grey value.")
     shade: float = Field(
-        0.4, ge=0, lt=1, description="Share of the light missing at the darker side of each image."
+        0.4, ge=0, lt=1, description="Loss of light at the darker side of each image, as a share."
     )
     covered: float = Field(
-        0.15, ge=0, le=1, description="Share of captures in which a side of the target is covered."
+        0.15,
+        ge=0,
+        le=1,
+        description="Share of captures in which one side of the target is occluded.",
     )
 
 

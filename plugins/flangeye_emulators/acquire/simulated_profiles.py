@@ -35,7 +35,9 @@ PASSES = (0.5, 0.95)
 class ProfilesParams(SessionParams):
     """Parameters of ``acquire.simulated_profiles``."""
 
-    distance: Length = param("240 mm", gt=0, description="Scanner to sphere at the first pose.")
+    distance: Length = param(
+        "240 mm", gt=0, description="Distance from scanner to sphere at the first pose."
+    )
     camera: PlaceParams | None = Field(
         default_factory=lambda: PlaceParams.model_validate(IN_THE_HAND),
         description="The scanner's true place on what carries it.",
@@ -43,14 +45,18 @@ class ProfilesParams(SessionParams):
     near: Length = param("190 mm", gt=0, description="Nearest that the scanner sees.")
     far: Length = param("290 mm", gt=0, description="Farthest that the scanner sees.")
     fan: Angle = param("28 deg", gt=0, description="Full angle of the laser's fan.")
-    points: int = Field(1280, ge=50, description="Points of a profile.")
+    points: int = Field(1280, ge=50, description="Number of points in a profile.")
     receiver: Length = param(
         "-90 mm",
         description="Where the receiver is beside the laser's plane, along y; from there the "
         "sphere hides what is behind it.",
     )
-    noise: Length = param("0.03 mm", ge=0, description="Of a point, along its ray.")
-    table: Length = param("40 mm", gt=0, description="How far under the sphere the table is.")
+    noise: Length = param(
+        "0.03 mm", ge=0, description="Standard deviation of a point along its ray."
+    )
+    table: Length = param(
+        "40 mm", gt=0, description="Height of the sphere's centre above the table."
+    )
 
 
 @dataclass(frozen=True)

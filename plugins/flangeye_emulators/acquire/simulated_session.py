@@ -51,10 +51,18 @@ from flangeye_emulators.world.session import (
 class MarkerParams(SessionParams):
     """Parameters of ``acquire.simulated_marker``."""
 
-    field: tuple[Angle, Angle] = param(("50 deg", "40 deg"), description="Angles of view.")
-    marker_rotation: Angle = param("0.05 deg", gt=0, description="Noise of the marker's pose.")
-    marker_position: Length = param("0.1 mm", gt=0, description="And of its place.")
-    outliers: float = Field(0.0, ge=0, lt=1, description="Share of captures that see it wrongly.")
+    field: tuple[Angle, Angle] = param(
+        ("50 deg", "40 deg"), description="Horizontal and vertical field of view."
+    )
+    marker_rotation: Angle = param(
+        "0.05 deg", gt=0, description="Standard deviation of the marker's rotation about each axis."
+    )
+    marker_position: Length = param(
+        "0.1 mm", gt=0, description="Standard deviation of its position along each axis."
+    )
+    outliers: float = Field(
+        0.0, ge=0, lt=1, description="Share of captures with a wrong marker pose."
+    )
 
 
 class ScanParams(SessionParams):

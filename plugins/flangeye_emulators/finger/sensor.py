@@ -48,15 +48,13 @@ class SimulatedFingerParams(Params):
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
     )
-    leg: int | None = Field(
-        None, ge=1, description="Of a seam with sharp corners, the leg that is felt."
-    )
+    leg: int | None = Field(None, ge=1, description="Leg of a seam with sharp corners.")
     section: SectionParams | None = Field(
         None, description="The joint's true cross-section, where it is not the file's groove."
     )
     gaps: tuple[GapParams, ...] = Field((), description="Pieces of a wall that are missing.")
     rate: float = Field(30.0, gt=0, le=200, description="Images per second.")
-    latency: Duration = param("30 ms", ge=0, description="From the exposure to the image.")
+    latency: Duration = param("30 ms", ge=0, description="Time from the exposure to the image.")
     jitter: Duration = param("5 ms", ge=0, description="Standard deviation of the latency.")
     dropped: float = Field(0.02, ge=0, lt=1, description="Share of images that never arrive.")
     noise: float = Field(

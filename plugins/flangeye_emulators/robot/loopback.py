@@ -35,13 +35,13 @@ class LoopbackParams(Params):
         None, description="Address the controller listens on; the driver's host when not given."
     )
     joints: tuple[Angle, ...] | None = Field(
-        None, description="Where the arm stands at first; the controller's own choice if not given."
+        None, description="Initial joint angles; the controller's default if not given."
     )
     joint_errors: int | None = Field(
-        None, ge=0, description="Seed of the errors of the joints' zeros; none when not given."
+        None, ge=0, description="Seed of the joint zero errors; none if not given."
     )
     faults: tuple[str, ...] = Field(
-        (), description="What shall go wrong, for example 'protective-stop@moving'."
+        (), description="Faults to inject, for example 'protective-stop@moving'."
     )
 
 

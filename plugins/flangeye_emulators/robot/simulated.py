@@ -22,10 +22,11 @@ class SimulatedParams(Params):
     """Parameters of ``robot.simulated``."""
 
     joints: tuple[Angle, ...] | None = param(
-        None, description="Where it stands at first; flange down, half a metre from the base."
+        None,
+        description="Initial joint angles; by default flange down, half a metre from the base.",
     )
-    period: Duration = param("2 ms", gt=0, description="Length of one cycle.")
-    joint_speed: AngularSpeed = param("180 deg/s", gt=0, description="What a joint can do at most.")
+    period: Duration = param("2 ms", gt=0, description="Control cycle time.")
+    joint_speed: AngularSpeed = param("180 deg/s", gt=0, description="Maximum joint speed.")
     joint_errors: int | None = param(
         None,
         ge=0,
@@ -141,5 +142,5 @@ class SimulatedRobot:
 
 @part("robot.simulated", simulated=True)
 def robot_simulated(model: RobotModel, params: SimulatedParams) -> Robot:
-    """An arm in simulated time: nothing is needed, nothing moves but numbers."""
+    """A simulated arm in simulated time; needs no hardware."""
     return SimulatedRobot(model, params)

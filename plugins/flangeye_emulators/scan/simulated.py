@@ -31,8 +31,10 @@ class SimulatedScanParams(Params):
     rpy: tuple[Angle, Angle, Angle] = param(
         ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
     )
-    clutter: int = Field(6, ge=0, description="Things that lie about on the bench.")
-    covered: float = Field(0.0, ge=0, lt=1, description="Share of it under a sheet, at one end.")
+    clutter: int = Field(6, ge=0, description="Number of other objects on the bench.")
+    covered: float = Field(
+        0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
+    )
 
     @property
     def base_T_part(self) -> Any:

@@ -35,9 +35,11 @@ class LoopbackParams(Params):
     """Parameters of ``scanner.emulator``."""
 
     host: str = Field(
-        AUTO, description="Where the controller listens; auto: where this run's own does."
+        AUTO, description="Address of the controller; auto: that of this run's emulator."
     )
-    robot: str = Field("ur5e", description="What it moves: a model of data/robots, or a file.")
+    robot: str = Field(
+        "ur5e", description="Robot model of the controller: one of data/robots, or a file."
+    )
     camera: CameraPose = Field(default_factory=CameraPose, description="The scanner's true pose.")
     workspace: tuple[Length, Length, Length] = param(
         ("300 mm", "300 mm", "200 mm"), description="The wall and the stand are beside this box."
@@ -45,13 +47,15 @@ class LoopbackParams(Params):
     seed: int = Field(0, ge=0, description="Draws noise, distortion and dropped frames.")
     noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
     resolution: float = Field(
-        0.35, gt=0, le=1, description="Scale of columns and rows; 1 takes seconds a scan."
+        0.35, gt=0, le=1, description="Scale of columns and rows; at 1 a scan takes seconds."
     )
-    exposure: Duration = param("300 ms", ge=0, le=2.0, description="While it must stand still.")
+    exposure: Duration = param(
+        "300 ms", ge=0, le=2.0, description="Exposure time, during which the arm must stand still."
+    )
     latency: Duration = param(
-        "200 ms", ge=0, le=3.0, description="From the end of the exposure to the data."
+        "200 ms", ge=0, le=3.0, description="Time from the end of the exposure to the data."
     )
-    dropped: float = Field(0.0, ge=0, le=1, description="Share of the exposures that get lost.")
+    dropped: float = Field(0.0, ge=0, le=1, description="Share of exposures that are lost.")
     lost_after: int | None = Field(
         None, ge=0, description="Exposures after which the scanner is gone, as if unplugged."
     )

@@ -65,7 +65,7 @@ class LiveParams(Params):
         description="Where the scanner roughly is: {guess: {position: …}} or {shown: {joints: …}}."
     )
     poses: Annotated[BoundPart, Choose("plan")] = param(
-        {"next_best": {}}, description="Where the robot goes."
+        {"next_best": {}}, description="Poses the robot visits."
     )
     verification: int = Field(
         1, ge=0, description="Captures that are kept from solving, near the workspace's middle."

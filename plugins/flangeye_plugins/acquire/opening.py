@@ -48,7 +48,7 @@ class OpeningParams(Params):
         None, description="The archive; --archive on the command line comes before it."
     )
     reader: Annotated[BoundPart, Choose("reader")] = param(
-        "auto", description="Layout of the archive; auto finds out and reports it."
+        "auto", description="Layout of the archive; auto detects and reports it."
     )
     leave_out: tuple[str, ...] = Field((), description="Ids of poses to leave out.")
 

@@ -38,7 +38,7 @@ class SamplesParams(OpeningParams):
         "0.5 mm", gt=0, description="Standard deviation of a marker's position along each axis."
     )
     angle_noise: Angle = param(
-        "0.2 deg", gt=0, description="Standard deviation of its rotation about each axis."
+        "0.2 deg", gt=0, description="Standard deviation of the marker's rotation about each axis."
     )
 
 

@@ -72,7 +72,7 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
 
 @part("check.tool")
 def tool(session: RecordedSession) -> Findings:
-    """The poses are those of a tool: what is seen is off by a constant in the flange's frame."""
+    """The poses are those of a tool (TCP): a constant offset in the flange frame."""
     _require_known_place(session)
     null = fit_of(session)
     found = fit(equations_of(session).with_free_place())

@@ -25,7 +25,7 @@ OFFSET = 1e-3
 
 @part("check.motion")
 def motion(session: RecordedSession) -> Findings:
-    """The poses leave the camera's place open: too little rotation, or all on a line."""
+    """The poses do not determine the camera's pose: too little rotation, or all on a line."""
     session.require_samples()
     null = fit_of(session)
     turn, shift = _uncertainty(session, null)

@@ -38,7 +38,7 @@ class Alternative(NamedTuple):
 
 @part("check.order")
 def order(session: RecordedSession) -> Findings:
-    """Each scan belongs to the pose before or after its own, from the start or from some scan."""
+    """Scans are paired with the pose before or after their own, from the start or some scan."""
     session.require_samples()
     tried = list(_shifts(session))
     others = [_shifted(session, *each) for each in tried]

@@ -30,7 +30,7 @@ MOST = 0.5
 
 @part("check.outlier")
 def outlier(session: RecordedSession) -> Findings:
-    """One sample is far off where the others agree."""
+    """One sample disagrees with all the others."""
     session.require_samples()
     null = fit_of(session)
     distances = ((null.lengths[0] / null.scales[0]) ** 2).sum(axis=-1)

@@ -19,7 +19,7 @@ MOVED = 1e-3
 
 @part("check.identity")
 def identity(session: RecordedSession) -> Findings:
-    """A driver that had nothing to give gave the identity: for a robot pose, or for a marker's."""
+    """A driver without data returned the identity as a robot pose or a marker's pose."""
     for whose, poses in _reported(session):
         robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
         if robot.any():
@@ -55,7 +55,7 @@ def _robots(session: RecordedSession, wrong: Mask, whose: str) -> str:
 
 @part("check.repeated")
 def repeated(session: RecordedSession) -> Findings:
-    """A pose or a detection came twice, while the other side shows that the arm had moved."""
+    """A pose or a detection was repeated although the arm had moved."""
     reported = [poses[:, :3].reshape(len(poses), 12) for _, poses in _reported(session)]
     yield from _repeats(session, np.concatenate(reported, axis=1), session.centres, "robot pose")
     places = np.concatenate([poses[:, :3, 3] for _, poses in _reported(session)], axis=1)

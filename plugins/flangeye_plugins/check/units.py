@@ -49,7 +49,7 @@ class Alternative(NamedTuple):
 
 @part("check.units")
 def units(session: RecordedSession) -> Findings:
-    """Positions of the arm or of the target are in another unit than was said."""
+    """Positions of the arm or the target are in another unit than stated."""
     session.require_samples()
     tried = list(_alternatives(session))
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))

@@ -27,16 +27,16 @@ class AxesParams(Params):
     """Parameters of ``cost.axes``."""
 
     axes: tuple[Literal["x", "y", "z"], ...] = Field(
-        ("x", "y"), min_length=1, description="The axes that count."
+        ("x", "y"), min_length=1, description="Axes to use."
     )
-    frame: Literal["base", "camera"] = Field("base", description="Whose axes they are.")
+    frame: Literal["base", "camera"] = Field("base", description="Frame of the axes.")
     at: Place = Field("work", description=_AT)
 
 
 class WorkRadiusParams(Params):
     """Parameters of ``cost.work_radius``."""
 
-    radius: Length = param("300 mm", ge=0, description="How far from there the work reaches.")
+    radius: Length = param("300 mm", ge=0, description="Radius of the work about that point.")
     at: Place = Field("work", description=_AT)
 
 

@@ -9,7 +9,7 @@ from flangeye_plugins.export.writing import NamedParams, labelled
 
 @stage("export.mech_mind")
 def export_mech_mind(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
-    """Write position and quaternion to type into Mech-Mind's dialogs; it is not a file of its."""
+    """Write position and quaternion for Mech-Mind's dialogs; not a file of its own format."""
     lines = "\n".join(labelled("quaternion_wxyz", pose, ": "))
     text = f"{pose.comment('#')}{params.name}: metres, quaternion w x y z\n{lines}\n"
     use = "type the numbers in, and mind the unit that the dialog shows"

@@ -42,7 +42,7 @@ class TargetParams(Params):
         "never, or always.",
     )
     corner_noise: float = Field(
-        0.1, gt=0, description="Standard deviation to expect of a corner's coordinate [px]."
+        0.1, gt=0, description="Expected standard deviation of a corner's coordinate [px]."
     )
     scanner_error: Length = param(
         "0.06 mm",
@@ -98,10 +98,10 @@ class CheckerboardParams(TargetParams):
 class CirclesParams(TargetParams):
     """Parameters of ``fit.circles``."""
 
-    columns: int = Field(ge=2, description="Circles of a row.")
+    columns: int = Field(ge=2, description="Circles per row.")
     rows: int = Field(ge=3, description="Rows, every other one shifted by half a step; odd.")
     spacing: Length = param(gt=0, description="Distance of two rows, measured on the print.")
-    diameter: Length = param(gt=0, description="Of the circles, measured on the print.")
+    diameter: Length = param(gt=0, description="Diameter of the circles, measured on the print.")
 
     @model_validator(mode="after")
     def _asymmetric(self) -> CirclesParams:
@@ -134,7 +134,7 @@ def fit_charuco(capture: Capture, params: CharucoParams) -> PoseFeature | Reject
 
 @stage("fit.checkerboard")
 def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeature | Rejected:
-    """Find a checkerboard, all of it, that looks different after half a turn.
+    """Find a complete checkerboard that looks different after half a turn.
 
     The frame has its origin in the middle of the board, x right, y up, z towards the camera; the
     square at the top left is black.
@@ -146,7 +146,7 @@ def fit_checkerboard(capture: Capture, params: CheckerboardParams) -> PoseFeatur
 
 @stage("fit.circles")
 def fit_circles(capture: Capture, params: CirclesParams) -> PoseFeature | Rejected:
-    """Find an asymmetric grid of circles, all of it.
+    """Find a complete asymmetric grid of circles.
 
     The frame has its origin in the middle of the grid, x right, y up, z towards the camera; the
     first row begins half a step further to the left than the second.

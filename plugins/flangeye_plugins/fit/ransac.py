@@ -27,11 +27,11 @@ class RansacCircleParams(Params):
         gt=0,
         description="R, the largest radius a circle may have; the flange's if not given.",
     )
-    e_r: Length = param("1 mm", gt=0, description="How much smaller than R a radius may be.")
+    e_r: Length = param("1 mm", gt=0, description="Largest difference of a radius below R.")
     e_d: Length = param(
         "0.3 mm", gt=0, description="Largest distance of a point from the sphere about the centre."
     )
-    k_max: int = Field(10_000, ge=1, description="Number of three-point samples that are drawn.")
+    k_max: int = Field(10_000, ge=1, description="Number of three-point samples.")
     plane: Length = param(
         "1 mm", gt=0, description="Largest distance of a point from the face's plane."
     )

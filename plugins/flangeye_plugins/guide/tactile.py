@@ -52,7 +52,7 @@ HOLD = "Set the tip into a punch mark or a cone, so that it cannot slide; then k
 def guide_tactile(
     recipe: Recipe, motion: MotionAllowed, ask: Callable[[str], None], out: Path
 ) -> str:
-    """Calibrate the finger of a recipe's weld.tactile step, and write its file anew.
+    """Calibrate the finger of a recipe's weld.tactile step and write its file.
 
     Raises:
         StageError: The recipe has no such step, or the readings allow no calibration.

@@ -30,12 +30,12 @@ class GridParams(Params):
         "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
     )
     shuffled: bool = Field(True, description="Whether to visit the grid in random order.")
-    attempts: int = Field(25, ge=1, description="Orientations tried at a grid point.")
+    attempts: int = Field(25, ge=1, description="Orientations tried per grid point.")
 
 
 @part("plan.grid")
 def grid(site: Site, rng: np.random.Generator, params: GridParams) -> Plan:
-    """Visit a grid, at each point in a random orientation that faces the scanner.
+    """Visit a grid of points, each in a random orientation facing the scanner.
 
     The paper's plan (section 3.1: 5 x 5 x 3 points over 0.3 x 0.3 x 0.2 m; roll, pitch and yaw
     below 0.3 rad in 3.2.1). A grid point where no orientation is possible is left out.

@@ -41,17 +41,21 @@ class NextBestParams(Params):
     facing: Angle = param(
         "35 deg", gt=0, description="Largest angle between the flange's normal and the view."
     )
-    count: int = Field(30, ge=3, description="Poses after which it ends.")
-    candidates: int = Field(400, ge=10, description="Poses that are compared for each choice.")
+    count: int = Field(30, ge=3, description="Number of poses.")
+    candidates: int = Field(400, ge=10, description="Candidate poses compared for each choice.")
     noise: Length = param(
-        "0.15 mm", gt=0, description="Expected of a centre along each axis: scanner, fit and arm."
+        "0.15 mm",
+        gt=0,
+        description="Expected standard deviation of a centre per axis: scanner, fit and arm.",
     )
-    normal_noise: Angle = param("0.1 deg", gt=0, description="Expected of a normal.")
+    normal_noise: Angle = param(
+        "0.1 deg", gt=0, description="Expected standard deviation of a normal."
+    )
 
 
 @part("plan.next_best")
 def next_best(site: Site, rng: np.random.Generator, params: NextBestParams) -> Plan:
-    """Choose each pose when it is asked for: the one that will reduce the error at the work most.
+    """Choose each next pose to reduce the expected error at the work most.
 
     Greedy A-optimal design (Pukelsheim 1993): of many poses drawn in the region, the one that
     leaves the smallest expected square error over the work, given the poses visited before. Poses

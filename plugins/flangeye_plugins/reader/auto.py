@@ -19,7 +19,7 @@ BUILT_IN: Siblings = {"ancorasir": ancorasir, "folder": folder}
 
 @part("reader.auto")
 def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
-    """Try every reader that is installed and take the one that knows the path; says which."""
+    """Detect the layout: try every installed reader and report the one that fits."""
     bound = {name: _bound(reader) for name, reader in siblings.items()}
     found, missed = _tried({name: reader for name, reader in bound.items() if reader}, path)
     if len(found) == 1:

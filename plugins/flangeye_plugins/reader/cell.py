@@ -65,7 +65,7 @@ class AxisTableParams(Params):
 
     file: str = Field(description="The table's name, beside the others.")
     column: Column = Field(description="Column of the value.")
-    unit: Literal["m", "mm", "rad", "deg"] = Field(description="Its unit.")
+    unit: Literal["m", "mm", "rad", "deg"] = Field(description="Unit of the value.")
     number: Column | None = Field(None, description=NUMBER)
     time: Column | None = Field(None, description="Column of the time.")
     time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
@@ -74,8 +74,8 @@ class AxisTableParams(Params):
 class SightingsParams(OwnTableParams):
     """One target as one camera saw it; empty cells where it did not."""
 
-    camera: str = Field(description="The camera's name in the recipe's cell.")
-    target: str = Field(description="The target's name there.")
+    camera: str = Field(description="Name of the camera in the recipe's cell.")
+    target: str = Field(description="Name of the target in the recipe's cell.")
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Whose pose it is. rotation: point gives its place alone."
     )
@@ -89,8 +89,8 @@ class SightingsParams(OwnTableParams):
 class ScansParams(Params):
     """The scans that one camera took of one target."""
 
-    camera: str = Field(description="The camera's name in the recipe's cell.")
-    target: str = Field(description="The target's name there.")
+    camera: str = Field(description="Name of the camera in the recipe's cell.")
+    target: str = Field(description="Name of the target in the recipe's cell.")
     file: str = Field(description="The table that names them, beside the others.")
     scan: Column = Field("scan", description="Column of the scans' files, beside the table.")
     number: Column | None = Field(None, description=NUMBER)
@@ -100,18 +100,17 @@ class CellParams(Params):
     """Which tables there are, each in a stated convention."""
 
     arms: dict[str, ArmTableParams] = Field(
-        default_factory=dict, description="Of each arm, by its name in the recipe's cell."
+        default_factory=dict,
+        description="Tables of the arms' poses, by arm name in the recipe's cell.",
     )
     axes: dict[str, AxisTableParams] = Field(
-        default_factory=dict, description="Of each rail and positioner."
+        default_factory=dict, description="Tables of the rails and positioners, by name."
     )
     sightings: tuple[SightingsParams, ...] = Field(
-        (), description="Poses or points that cameras measured."
+        (), description="Tables of target poses or points measured by cameras."
     )
-    scans: tuple[ScansParams, ...] = Field((), description="Scans that cameras took.")
-    join: PairingParams = param(
-        PairingParams(), description="How they are joined where they have times."
-    )
+    scans: tuple[ScansParams, ...] = Field((), description="Tables of scans taken by cameras.")
+    join: PairingParams = param(PairingParams(), description="How tables with times are joined.")
 
     @model_validator(mode="after")
     def _says_what_was_seen(self) -> CellParams:

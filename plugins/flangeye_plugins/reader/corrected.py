@@ -40,21 +40,23 @@ class CorrectedParams(Params):
     """What was wrong; one level undoes it in the order of this list."""
 
     reader: Annotated[BoundPart, Choose("reader")] = param(
-        description="Reads the archive as it was recorded."
+        description="Reader of the archive as it was recorded."
     )
     arms: Arms = Field(
         "both", description="Whose poses, where there are two arms; one arm alone is 'both'."
     )
-    read_as: str | None = Field(None, description="How that reader read the rotations.")
+    read_as: str | None = Field(
+        None, description="Convention in which that reader read the rotations."
+    )
     written_as: str | None = Field(
         None, description=f"How they were written: one of {', '.join(ROTATIONS[:3])}, or axes."
     )
     transposed: bool = Field(False, description="The rotations' matrices were transposed.")
-    scale: float = Field(1.0, gt=0, description="What the robot's positions are multiplied with.")
+    scale: float = Field(1.0, gt=0, description="Factor for the robot's positions.")
     target_scale: float = Field(
         1.0,
         gt=0,
-        description="What positions of ready-made centres and markers are multiplied with.",
+        description="Factor for the positions of ready-made centres and markers.",
     )
     inverted: bool = Field(False, description="The poses are flange_T_base.")
     target_inverted: bool = Field(False, description="Markers' poses are target_T_camera.")
@@ -62,9 +64,9 @@ class CorrectedParams(Params):
         ("0 mm", "0 mm", "0 mm"),
         description="What was seen, from the point whose poses were recorded, in its frame.",
     )
-    shift: int = Field(0, description="A scan belongs to the pose recorded so many later.")
+    shift: int = Field(0, description="Number of poses by which each scan's pose follows it.")
     shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
-    delay: Duration = param("0 ms", description="The scans were taken so long after their poses.")
+    delay: Duration = param("0 ms", description="Time from a pose to its scan.")
 
     @field_validator("read_as", "written_as")
     @classmethod

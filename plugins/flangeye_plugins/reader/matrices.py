@@ -28,9 +28,9 @@ class TargetArrays(WrittenParams):
     """The target as the camera measured it."""
 
     at: str = Field(description="Where they are: FILE, FILE:ARRAY, or a pattern of either.")
-    rotation: str = Field("matrix", description="As for the arm; point gives its place alone.")
+    rotation: str = Field("matrix", description="As for the arm; point: position only.")
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
-        "camera_T_target", description="Whose pose it is."
+        "camera_T_target", description="Direction of the pose."
     )
 
     @classmethod
@@ -45,7 +45,7 @@ class MatricesParams(WrittenParams):
     robot: str = Field(description="Where the arm's poses are: FILE, FILE:ARRAY, or a pattern.")
     rotation: str = Field("matrix", description="matrix, or of rows of numbers as in reader.table.")
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
-        "base_T_flange", description="Whose pose it is."
+        "base_T_flange", description="Direction of the pose."
     )
     target: TargetArrays | None = Field(
         None, description="The target as the camera measured it; scans of the folder if not given."

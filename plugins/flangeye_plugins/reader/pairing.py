@@ -41,7 +41,9 @@ class PairingParams(Params):
         gt=0,
         description="For an arm that never stands still: distance between the poses taken.",
     )
-    angle: Angle = param("2 deg", gt=0, description="The same for turning; either will do.")
+    angle: Angle = param(
+        "2 deg", gt=0, description="Rotation between the poses taken; either is enough."
+    )
 
 
 @dataclass(frozen=True, eq=False)

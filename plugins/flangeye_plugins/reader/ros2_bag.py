@@ -77,7 +77,7 @@ class BagParams(Params):
         "of tf with camera.",
     )  # fmt: skip
     camera: str | None = Field(None, description="The camera's frame, for a target in tf.")
-    join: PairingParams = param(PairingParams(), description="How poses and clouds are paired.")
+    join: PairingParams = param(PairingParams(), description="Pairing of poses and clouds by time.")
 
 
 @dataclass

@@ -51,7 +51,7 @@ class OtherParams(ColumnsParams):
         "time.",
     )  # fmt: skip
     columns: tuple[Column, ...] = Field(
-        (), description="As for the arm; must be given where it is in the same table."
+        (), description="As for the arm; required when the target is in the same table."
     )
 
     @model_validator(mode="after")
@@ -78,7 +78,7 @@ class SecondParams(OtherParams):
     """The second arm."""
 
     pose: Literal["base2_T_flange2", "flange2_T_base2"] = Field(
-        "base2_T_flange2", description="Whose pose it is."
+        "base2_T_flange2", description="Direction of the pose."
     )
 
 
@@ -98,9 +98,7 @@ class TableParams(ColumnsParams):
         None, description="The target as the camera measured it, in place of scans."
     )
     second: SecondParams | None = Field(None, description="A second arm's pose.")
-    join: PairingParams = param(
-        PairingParams(), description="How tables of their own are joined by time."
-    )
+    join: PairingParams = param(PairingParams(), description="Joining of separate tables by time.")
     cloud_unit: LengthUnit | None = Field(
         None, description="Unit of the clouds; found by the scanner's range if not given."
     )

@@ -49,19 +49,21 @@ ONE_ORIENTATION = np.radians(10.0)
 class ArmParams(Params):
     """Parameters of ``refine.arm``."""
 
-    zeros: Angle = param("5 mrad", gt=0, description="Deviation of a joint's zero to expect.")
+    zeros: Angle = param(
+        "5 mrad", gt=0, description="Expected standard deviation of a joint's zero."
+    )
     lengths: Length = param(
         "0.5 mm",
         ge=0,
-        description="Standard deviation to expect of a link length or offset; 0: zeros alone.",
+        description="Expected standard deviation of a link length or offset; 0: joint zeros only.",
     )
     twists: Angle = param(
         "1 mrad",
         ge=0,
-        description="Standard deviation to expect of a link's twist; 0: left as they are.",
+        description="Expected standard deviation of a link's twist; 0: not estimated.",
     )
     propose: int = Field(
-        6, ge=0, description="How many poses to propose that would tell more of the arm."
+        6, ge=0, description="Number of further poses to propose for identifying the arm."
     )
 
     @property

@@ -26,7 +26,7 @@ class ToolOffset(Params):
 
     position: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
     rotation: tuple[Angle, Angle, Angle] = param(
-        ("0 rad", "0 rad", "0 rad"), description="As the pendant shows it."
+        ("0 rad", "0 rad", "0 rad"), description="Orientation as shown on the pendant."
     )
 
     def flange_T_tool(self, convention: PoseConvention) -> Floats:

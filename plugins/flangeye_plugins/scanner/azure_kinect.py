@@ -51,7 +51,9 @@ class AzureKinectParams(Params):
     recording: RecipePath | None = Field(
         None, description="An MKV recording to play instead, one capture an exposure."
     )
-    device: int = Field(0, ge=0, description="Which camera, if there are several.")
+    device: int = Field(
+        0, ge=0, description="Serial number or index of the camera, if there are several."
+    )
     depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
         Field("NFOV_UNBINNED", description="Depth mode of the camera; a recording has its own.")
     )

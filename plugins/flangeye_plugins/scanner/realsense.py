@@ -39,7 +39,9 @@ class RealsenseParams(Params):
     recording: RecipePath | None = Field(
         None, description="A .db3 or .bag recording to play instead, one frame an exposure."
     )
-    serial: str | None = Field(None, description="Which camera, if there are several.")
+    serial: str | None = Field(
+        None, description="Serial number or index of the camera, if there are several."
+    )
     timeout: Duration = param("2 s", gt=0, le=PATIENCE, description="Longest wait for a frame.")
 
 

@@ -34,16 +34,18 @@ class WatchedFolderParams(Params):
 
     path: RecipePath = Field(description="Folder that the scanner's software exports into.")
     unit: LengthUnit = Field(description="Unit of the files' coordinates; files do not say.")
-    pattern: str = Field("*", description="Names to look for, for example 'scan_*.ply'.")
+    pattern: str = Field("*", description="File name pattern, for example 'scan_*.ply'.")
     settle: Duration = param(
-        "500 ms", ge=0, description="A file that did not change for so long may be whole."
+        "500 ms",
+        ge=0,
+        description="Time without change after which a file is taken to be complete.",
     )
     timeout: Duration = param("60 s", gt=0, description="Longest wait for the next file.")
 
 
 @part("scanner.watched_folder")
 def scanner_watched_folder(model: ScannerModel | None, params: WatchedFolderParams) -> Scanner:
-    """Take each new cloud that appears in a folder, once it is whole.
+    """Read each new cloud that appears in a folder, once it is complete.
 
     What lies there when the recipe starts is left alone. Trigger the scan in the scanner's own
     software when the arm stands; files are taken in the order in which they appear.

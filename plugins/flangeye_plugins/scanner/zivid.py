@@ -30,7 +30,9 @@ class ZividParams(Params):
     settings: RecipePath | None = Field(
         None, description="Settings saved by Zivid Studio (.yml); one default acquisition if none."
     )
-    serial: str | None = Field(None, description="Which camera, if there are several.")
+    serial: str | None = Field(
+        None, description="Serial number or index of the camera, if there are several."
+    )
     file_camera: RecipePath | None = Field(
         None, description="A file camera (.zfc) to capture from instead."
     )

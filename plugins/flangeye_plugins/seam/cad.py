@@ -35,10 +35,13 @@ class CadParams(ArmParams):
     workpiece: WorkpiecePath = Field(
         description="One of data/workpieces, or a .yaml file of one's own with CAD and seams."
     )
-    seam: str | None = Field(None, description="Which of its seams, by name, if it has several.")
-    spacing: Length = param("2 mm", gt=0, description="Between the planned points.")
+    seam: str | None = Field(None, description="Name of the seam, if the workpiece has several.")
+    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
     min_seen: float = Field(
-        0.35, gt=0, lt=1, description="Least share of the CAD's surface towards the scanner, seen."
+        0.35,
+        gt=0,
+        lt=1,
+        description="Smallest share of the CAD's surface facing the scanner that must be seen.",
     )
     max_refuted: float = Field(
         0.05, gt=0, lt=1, description="Largest share of it, and at the seam, that is not there."
@@ -50,7 +53,10 @@ class CadParams(ArmParams):
         "2 mm", gt=0, description="Largest standard deviation of the registration at the seam."
     )
     distinct: float = Field(
-        0.03, gt=0, lt=1, description="How much less the second-best pose must agree."
+        0.03,
+        gt=0,
+        lt=1,
+        description="Smallest margin by which the best pose must beat the second-best.",
     )
 
 

@@ -40,17 +40,19 @@ class GrooveParams(ArmParams):
     """Parameters of ``seam.groove``."""
 
     near: tuple[Length, Length, Length] | None = Field(
-        None, description="In base: of several grooves, the one nearest to this is meant."
+        None, description="Point in base; of several grooves the nearest to it is used."
     )
     backwards: bool = Field(
-        False, description="Start at the end further from the robot's base, not at the nearer."
+        False, description="Start at the end farther from the robot's base instead of the nearer."
     )
-    spacing: Length = param("2 mm", gt=0, description="Between the planned points.")
-    max_width: Length = param("30 mm", gt=0, description="Across the groove, at its shoulders.")
+    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
+    max_width: Length = param(
+        "30 mm", gt=0, description="Largest width of the groove at its shoulders."
+    )
     max_depth: Length = param(
         "25 mm", gt=0, description="Largest depth of the root below the face."
     )
-    min_length: Length = param("40 mm", gt=0, description="Least length of the groove.")
+    min_length: Length = param("40 mm", gt=0, description="Smallest length of the groove.")
     max_residual: Length = param(
         "0.5 mm",
         gt=0,

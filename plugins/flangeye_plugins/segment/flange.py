@@ -36,7 +36,9 @@ class SegmentParams(Params):
         "five times the scan's noise if that is more.",
     )
     margin: Length = param(
-        "2 mm", gt=0, description="How far off the face, and outside its circle, points are kept."
+        "2 mm",
+        gt=0,
+        description="Distance from the face, and beyond its circle, up to which points are kept.",
     )
 
 

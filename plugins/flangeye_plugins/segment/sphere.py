@@ -47,7 +47,9 @@ class SegmentSphereParams(Params):
     tolerance: Length = param(
         "1 mm", gt=0, description="Largest distance of a coarse point from the sphere's surface."
     )
-    margin: Length = param("2 mm", gt=0, description="How far off the surface points are kept.")
+    margin: Length = param(
+        "2 mm", gt=0, description="Distance from the surface up to which points are kept."
+    )
 
 
 class Candidate(NamedTuple):

@@ -25,7 +25,9 @@ class OpenCVParams(Params):
         "(rtsp, http, https).",
     )
     latency: Duration = param(
-        "15 ms", ge=0, description="From the middle of an exposure to when its image is here."
+        "15 ms",
+        ge=0,
+        description="Time from the middle of the exposure to the arrival of its image.",
     )
 
 

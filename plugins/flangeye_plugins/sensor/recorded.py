@@ -29,7 +29,7 @@ class ImageFolderParams(Params):
     """Parameters of ``sensor.image_folder``."""
 
     path: RecipePath = param(description="Folder of images; they are taken in order of their names")
-    period: Duration = param("33 ms", gt=0, description="Between two images.")
+    period: Duration = param("33 ms", gt=0, description="Time between two images.")
 
 
 class McapParams(Params):

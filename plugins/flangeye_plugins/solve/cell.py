@@ -21,7 +21,7 @@ class CellParams(Params):
         "2 deg", gt=0, description="Refuse when a rotation has a larger standard deviation."
     )
     translation_limit: Length = param(
-        "20 mm", gt=0, description="Refuse when a place has a larger standard deviation."
+        "20 mm", gt=0, description="Refuse when a position has a larger standard deviation."
     )
     required: Length | None = param(
         None,
@@ -42,7 +42,7 @@ class CellParams(Params):
 def solve_cell(
     observations: Observations, cell: Cell, params: CellParams, journal: Journal | None = None
 ) -> HandEye:
-    """Find every place that the recipe's cell leaves unknown, from all sightings at once.
+    """Estimate every unknown transform of the recipe's cell from all sightings at once.
 
     Takes whole poses, centres with normals, or centres alone, of any target by any camera, each
     with its covariance. The noise of what moves is found from the residuals; sightings beyond it

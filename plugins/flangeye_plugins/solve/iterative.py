@@ -44,19 +44,21 @@ from flangeye_plugins.solve.observations import (
 class IterativeParams(Params):
     """Parameters of ``solve.iterative``."""
 
-    pool: int = Field(4, ge=3, description="Poses the answer is computed from.")
+    pool: int = Field(4, ge=3, description="Number of poses in the pool.")
     required: Length = param(
         "0.3 mm", ge=0, description="Stop acquiring once the cost is this small."
     )
-    k_max: int = Field(100, ge=0, description="Poses to try at most, after the first pool.")
+    k_max: int = Field(
+        100, ge=0, description="Largest number of poses tried after the initial pool."
+    )
     reserve: int = Field(
         0, ge=0, description="First poses kept from the pool, for error.holdout to measure on."
     )
     error: Annotated[BoundPart, Choose("error")] = param(
-        {"icp": {}}, description="How a candidate's error is measured."
+        {"icp": {}}, description="Measure of a candidate's error."
     )
     cost: Annotated[BoundPart, Choose("cost")] = param(
-        {"translation": {}}, description="What of that error is minimised."
+        {"translation": {}}, description="Cost of that error, to be minimised."
     )
 
 
@@ -85,7 +87,7 @@ class Search:
 def solve_iterative(
     observations: Observations, views: Views | None, flange: Flange | None, params: IterativeParams
 ) -> HandEye:
-    """Keep a pool of poses; let each new pose replace the one whose loss helps most.
+    """Algorithm 1: keep a pool of poses; each new pose replaces the one whose removal helps most.
 
     Algorithm 1, its errata mended: k advances; a pose enters the pool once; while no pool can be
     measured (cost +infinity) the oldest pose makes way. It stops pulling observations, and so

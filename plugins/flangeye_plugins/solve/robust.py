@@ -83,7 +83,7 @@ class RobustParams(Params):
         "as the robot's file has it (joint_accuracy).",
     )
     joint_prior: Angle = param(
-        "0.5 deg", gt=0, description="Standard deviation of a joint's offset to expect."
+        "0.5 deg", gt=0, description="Expected standard deviation of a joint's offset."
     )
     smooth_error: Literal["auto", "off"] = Field(
         "auto",
@@ -149,7 +149,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     configuration: Configuration | None = None,
     scanner: ScannerModel | None = None,
 ) -> HandEye:
-    """Find the poses that agree, and whatever the configuration leaves unknown, most likely.
+    """Robust maximum likelihood: reject outlier poses and estimate every unknown transform.
 
     Takes whole poses, centres with normals, or centres alone, each with its covariance. Gross
     outliers are found by graduated non-convexity on truncated least squares (Yang et al. 2020) and

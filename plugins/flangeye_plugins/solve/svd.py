@@ -42,7 +42,7 @@ class SvdParams(Params):
 
 @stage("solve.svd")
 def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
-    """Fit the camera's pose to all centres by least squares, each weighing the same.
+    """Fit the camera's pose to all centres by equally weighted least squares.
 
     Equations (8) to (10) of the paper with scale one. The noise is taken as equal in every
     coordinate of every centre and estimated from the residuals; the covariance is widened for

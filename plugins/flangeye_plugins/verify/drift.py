@@ -17,7 +17,7 @@ class DriftParams(Params):
     """Parameters of ``verify.drift``."""
 
     reference: RecipePath = Field(description="The run.mcap of the earlier calibration.")
-    limit: Length = param("0.4 mm", gt=0, description="The work may not be further off than this.")
+    limit: Length = param("0.4 mm", gt=0, description="Largest shift at the work that passes.")
     false_alarms: float = Field(
         2e-4, gt=0, lt=0.1, description="Probability that a cell that did not move is refused."
     )
@@ -25,7 +25,7 @@ class DriftParams(Params):
 
 @stage("verify.drift")
 def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
-    """Say whether the scanner still stands where an earlier calibration found it.
+    """Check whether the scanner is still where an earlier calibration found it.
 
     The poses that this run used are held against the earlier matrix and its covariance. It fails
     when the cell has moved, so that a robot program with the old matrix is stopped; this run's own

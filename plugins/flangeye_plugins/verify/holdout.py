@@ -48,9 +48,7 @@ from flangeye.units import Length, param
 class HoldoutParams(Params):
     """Parameters of ``verify.holdout``."""
 
-    folds: int = Field(
-        5, ge=2, description="Parts the poses are dealt into; each is held out once."
-    )
+    folds: int = Field(5, ge=2, description="Number of folds; each is held out once.")
     max_rms: Length = param("1 mm", gt=0, description="Largest held-out error that passes, rms.")
     max_outliers: float = Field(
         0.3, ge=0, lt=1, description="Largest share of poses the solver may set aside as wrong."
@@ -90,7 +88,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     cell: Cell | None = None,
     seed: Seed = Seed(0),  # noqa: B008  a NewType is the int itself
 ) -> Verification:
-    """Deal the poses into folds, solve without each in turn, and measure the error on it.
+    """k-fold cross-validation over poses: solve without each fold and measure the error on it.
 
     ``rms``, ``median``, ``p95`` and ``max`` are over all poses, of the pose for the arm as its
     controller reports it. Poses that the solver itself set aside and whose held-out error lies

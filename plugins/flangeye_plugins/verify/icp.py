@@ -52,7 +52,9 @@ class IcpSettings(Params):
     cad: CadCloud | None = Field(
         None, description="The flange's shape; by default made from its dimensions."
     )
-    reach: Length = param("20 mm", gt=0, description="How far off a calibration may be for ICP.")
+    reach: Length = param(
+        "20 mm", gt=0, description="Largest initial error from which ICP is started."
+    )
     distance: Length = param(
         "1 mm", gt=0, description="Points further from the surface are not the flange, in the end."
     )

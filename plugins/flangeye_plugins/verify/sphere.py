@@ -18,9 +18,11 @@ from flangeye.units import Length, param
 class Bar(Params):
     """Two balls at a known distance, as one scan shows them."""
 
-    first: tuple[Length, Length, Length] = Field(description="Centre of a ball, in the camera.")
-    second: tuple[Length, Length, Length] = Field(description="And of the other.")
-    length: Length = Field(gt=0, description="Distance of the centres, as it was calibrated.")
+    first: tuple[Length, Length, Length] = Field(
+        description="Centre of one ball, in the camera frame."
+    )
+    second: tuple[Length, Length, Length] = Field(description="Centre of the other ball.")
+    length: Length = Field(gt=0, description="Calibrated distance of the centres.")
 
 
 class SphereParams(Params):
@@ -34,10 +36,8 @@ class SphereParams(Params):
     max_error: Length = param(
         "1 mm", gt=0, description="Largest error of a distance that passes, 95 % of the pairs."
     )
-    shortest: Length = param(
-        "50 mm", gt=0, description="Pairs nearer than this say nothing of scale."
-    )
-    fewest: int = Field(10, ge=3, description="Pairs of the arm's poses that are needed.")
+    shortest: Length = param("50 mm", gt=0, description="Pairs closer than this are not used.")
+    fewest: int = Field(10, ge=3, description="Smallest number of pairs of the arm's poses.")
 
 
 @stage("verify.sphere")
@@ -47,7 +47,7 @@ def verify_sphere(
     robot: RobotModel | None = None,
     journal: Journal | None = None,
 ) -> Verification:
-    """Compare distances that the scanner saw with those that the arm drove, or that are known.
+    """Compare distances measured by the scanner with those of the arm, or with known ones.
 
     After the manner of the sphere-spacing error of VDI/VDE 2634 and ISO 10360-13; it is not that
     test. The target is a ball on the flange (``fit.sphere``), or the flange's own circle, with the

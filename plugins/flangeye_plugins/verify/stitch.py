@@ -21,7 +21,7 @@ class StitchParams(Params):
     """Parameters of ``verify.stitch``."""
 
     max_spread: Length = param("0.5 mm", gt=0, description="Largest spread that passes, rms.")
-    fewest: int = Field(5, ge=1, description="Points of a view in a cell for it to count.")
+    fewest: int = Field(5, ge=1, description="Smallest number of points of a view in a cell.")
 
 
 @stage("verify.stitch")
@@ -32,7 +32,7 @@ def verify_stitch(
     robot: RobotModel | None = None,
     journal: Journal | None = None,
 ) -> Verification:
-    """Lay the clouds of all verification views over each other, and measure how they spread.
+    """Overlay the clouds of all verification views and measure their spread.
 
     It can show that the views disagree: rotation errors of the matrix, the arm's errors from pose
     to pose, a bent scanner. It cannot show an error that all views share, such as a shift of the

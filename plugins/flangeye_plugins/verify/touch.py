@@ -15,7 +15,9 @@ from flangeye.units import Angle, Length, param
 class Touch(Params):
     """One point, seen and touched."""
 
-    seen: tuple[Length, Length, Length] = Field(description="In the camera, from a scan.")
+    seen: tuple[Length, Length, Length] = Field(
+        description="Point in the camera frame, from a scan."
+    )
     position: tuple[Length, Length, Length] = Field(
         description="Position of the flange in the base, by the pendant, with the tip on the point."
     )
@@ -28,13 +30,15 @@ class TouchParams(Params):
     """Parameters of ``verify.touch``."""
 
     tip: tuple[Length, Length, Length] = Field(
-        description="Position of the tool in the flange frame, as its own calibration has it."
+        description="Tool tip in the flange frame, from the tool's own calibration."
     )
     touches: tuple[Touch, ...] = Field(
         min_length=1, description="Three or more at different places and heights tell most."
     )
     accuracy: Length = param(
-        "0.2 mm", gt=0, description="Standard deviation a coordinate of jogging to a point by eye."
+        "0.2 mm",
+        gt=0,
+        description="Standard deviation per coordinate of jogging to a point by eye.",
     )
     max_error: Length = param("1 mm", gt=0, description="Largest distance that passes.")
 
@@ -43,7 +47,7 @@ class TouchParams(Params):
 def verify_touch(
     calibration: HandEye, params: TouchParams, journal: Journal | None = None
 ) -> Verification:
-    """Compare where the matrix puts seen points with where a tip touched them.
+    """Compare the predicted positions of scanned points with those a tip touched.
 
     It can show that scanner, matrix, arm and tip agree at these places, which is what the work
     needs. It cannot tell which of them is wrong when they do not, nor anything finer than the eye

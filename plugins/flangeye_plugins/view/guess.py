@@ -23,7 +23,7 @@ class GuessParams(Params):
     """Parameters of ``view.guess``."""
 
     position: tuple[Length, Length, Length] = Field(
-        description="Position of the scanner, in the base."
+        description="Rough position of the scanner in the base."
     )
     rpy: tuple[Angle, Angle, Angle] = param(
         ("180 deg", "0 deg", "-90 deg"), description="Roll, pitch, yaw; the default looks down."
@@ -32,7 +32,7 @@ class GuessParams(Params):
 
 @part("view.guess")
 def view_guess(arm: Arm, scanner: ScannerModel, params: GuessParams) -> Floats:
-    """Take the person's guess of where the scanner stands: a tape measure is good enough.
+    """Use the operator's estimate of the scanner's position; a tape measure is good enough.
 
     Returns:
         (4, 4) base_T_camera.
@@ -52,7 +52,7 @@ class ShownParams(Params):
 
 @part("view.shown")
 def view_shown(arm: Arm, scanner: ScannerModel, params: ShownParams) -> Floats:
-    """Find the scanner from poses a person drove to, each with the flange facing the scanner.
+    """Estimate the scanner's pose from jogged poses in which the flange faces it.
 
     The scanner stands where the flanges' axes come closest to one another; where they are nearly
     parallel, ahead of the flanges' middle by the distance it works at. Its turn about the view is

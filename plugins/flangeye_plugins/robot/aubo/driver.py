@@ -67,7 +67,7 @@ class AuboParams(Params):
     )
     tool: ToolOffset = Field(
         default_factory=ToolOffset,
-        description="What the controller's tool is set to; no tool when not given.",
+        description="Tool (TCP) set in the controller; none if not given.",
     )
 
 

@@ -50,7 +50,7 @@ class FrankyParams(Params):
 
     host: str = Field(min_length=1, description="Address of the controller: 172.16.0.2.")
     realtime: bool = Field(
-        True, description="Insist on a real-time kernel; without one, moves may be cut short."
+        True, description="Require a real-time kernel; without one, moves may be aborted."
     )
     tool: ToolOffset = Field(
         default_factory=ToolOffset, description="The end effector set in Desk; none when not given."

@@ -36,9 +36,15 @@ class ManualParams(Params):
         None, description="Unit of the pendant's positions, where it is not the usual one."
     )
     distance: Length = param(
-        "20 mm", gt=0, description="A pose farther from the one asked for is asked about."
+        "20 mm",
+        gt=0,
+        description="Distance from the requested pose beyond which the entry is queried.",
     )
-    angle: Angle = param("5 deg", gt=0, description="The same, for how the flange is turned.")
+    angle: Angle = param(
+        "5 deg",
+        gt=0,
+        description="Rotation from the requested pose beyond which the entry is queried.",
+    )
 
     @field_validator("convention")
     @classmethod
@@ -50,7 +56,7 @@ class ManualParams(Params):
 
 @part("robot.manual", interactive=True)
 def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
-    """An arm that a person moves: poses are printed, and typed or pasted as the pendant shows them.
+    """An arm jogged by hand: poses are printed, and entered as the pendant shows them.
 
     Opening it waits for the person to say where the arm stands. Text comes from standard input, so
     a file of poses can be piped in; a pose that makes no sense is asked about, with the probable

@@ -43,7 +43,7 @@ class UrRtdeParams(Params):
     host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
     tool: ToolOffset = Field(
         default_factory=ToolOffset,
-        description="What the controller's tool is set to; no tool when not given.",
+        description="Tool (TCP) set in the controller; none if not given.",
     )
 
 
