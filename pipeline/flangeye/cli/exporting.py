@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import app, load_plugins, say
+from flangeye.cli.app import LogFile, app, load_plugins, say
 from flangeye.files.written import write_whole
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap.")],
+    run: LogFile,
     to: Annotated[str, typer.Option(help="The format, for example ros2_launch, ur or kuka.")],
     values: Annotated[
         list[str] | None,

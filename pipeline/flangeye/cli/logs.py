@@ -71,7 +71,7 @@ def report(
 
 @app.command()
 def certificate(  # noqa: PLR0913  one argument an option
-    run: Annotated[Path, typer.Argument(help="A run's folder, or its run.mcap.")],
+    run: LogFile,
     out: Annotated[
         Path | None, typer.Option(help="File to write; default certificate.html beside the log.")
     ] = None,

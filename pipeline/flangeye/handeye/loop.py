@@ -7,7 +7,7 @@ the measured one, in the same way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,8 +216,3 @@ def weights_of(measurements: Measurements, linear: Linear, noise: Noise) -> Floa
     covariance = own * np.outer(scale, scale) + extra
     p = measurements.projectors
     return np.asarray(p @ np.linalg.inv(p @ covariance @ p + (np.eye(6) - p)) @ p)
-
-
-def without_extra(noise: Noise) -> Noise:
-    """Return the noise with nothing beside the stated covariances."""
-    return replace(noise, pose=0.0, tilt=0.0)

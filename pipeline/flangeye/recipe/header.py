@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     GetJsonSchemaHandler,
     field_validator,
@@ -14,20 +12,12 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
-from flangeye.plugin.stage import BoundPart, Choose
+from flangeye.plugin.stage import BoundPart, Choose, Params
 from flangeye.units import Acceleration, Angle, AngularSpeed, Length, Speed, param
 
 
-class Section(BaseModel):
+class Section(Params):
     """Base of a recipe's sections."""
-
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        validate_default=True,
-        arbitrary_types_allowed=True,
-        defer_build=True,
-    )
 
 
 Positive = Annotated[Length, Field(gt=0)]

@@ -117,6 +117,13 @@ class SolvingConformance(Conformance):
             t.Box: t.Box(t.Transform(t.BASE, t.BASE, motion).apply(WORK), SIZE),
         }
 
+    def _hand_eye(self, given: dict[Any, Any]) -> t.HandEye:
+        """Return the stage's calibration."""
+        answer = self.call(given)
+        require(isinstance(answer, t.HandEye), f"gave {type(answer).__name__}, not a HandEye")
+        assert isinstance(answer, t.HandEye)  # noqa: S101  for type checkers
+        return answer
+
     def _require_pose(self, answer: t.HandEye, expected: Floats, within: float, what: str) -> None:
         """Compare where the work is, not the camera's origin: that is what a pose is for."""
         found = answer.base_T_camera.transform
@@ -137,10 +144,7 @@ class SolveConformance(SolvingConformance):
 
     def solved(self, observations: Sequence[t.Observation]) -> t.HandEye:
         """Return the stage's answer."""
-        answer = self.call(self.known(observations))
-        require(isinstance(answer, t.HandEye), f"gave {type(answer).__name__}, not a HandEye")
-        assert isinstance(answer, t.HandEye)  # noqa: S101  for type checkers
-        return answer
+        return self._hand_eye(self.known(observations))
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal observations and seed, equal calibration, to the last bit."""
@@ -224,10 +228,7 @@ class RefineConformance(SolvingConformance):
     def refined(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> t.HandEye:
         """Return the stage's answer to the plain calibration of some observations."""
         given = {t.HandEye: reference_solution(observations), **self.known(observations, motion)}
-        answer = self.call(given)
-        require(isinstance(answer, t.HandEye), f"gave {type(answer).__name__}, not a HandEye")
-        assert isinstance(answer, t.HandEye)  # noqa: S101  for type checkers
-        return answer
+        return self._hand_eye(given)
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal input and seed, equal output, to the last bit."""

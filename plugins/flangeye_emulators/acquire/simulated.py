@@ -19,7 +19,7 @@ from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange, Sphere, plate_of
 from flangeye.motion.planning import Plan, Site, poses_near
 from flangeye.motion.reach import Reach
-from flangeye.plugin.stage import BoundPart, Choose, Params, stage
+from flangeye.plugin.stage import BoundPart, Choose, stage
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -43,7 +43,7 @@ from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import Cell
 from flangeye_emulators.world.raycast import Body, Image
-from flangeye_emulators.world.scanner import CameraPose, before_camera, scanner_of
+from flangeye_emulators.world.scanner import CameraPose, ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
@@ -63,7 +63,7 @@ VERSION = 1
 """Raised whenever the same parameters would give other captures."""
 
 
-class SimulatedParams(Params):
+class SimulatedParams(ScannerQuality):
     """Parameters of ``acquire.simulated``."""
 
     poses: Annotated[BoundPart, Choose("plan")] = param(
@@ -79,10 +79,6 @@ class SimulatedParams(Params):
     arm: ArmErrors = Field(
         default_factory=ArmErrors,
         description="Errors of the arm that its controller does not know of.",
-    )
-    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
-    resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
     )
     outliers: float = Field(
         0.0, ge=0, le=1, description="Share of the captures in which the flange is covered."

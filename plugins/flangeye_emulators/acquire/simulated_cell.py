@@ -40,7 +40,7 @@ from flangeye_emulators.acquire.planned_cell import (
 from flangeye_emulators.acquire.planned_session import VERSION
 from flangeye_emulators.world import cell as world
 from flangeye_emulators.world.raycast import Body
-from flangeye_emulators.world.scanner import before_camera, scanner_of
+from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import View
 
 
@@ -100,13 +100,8 @@ def _seen(
         yield seen[-1]
 
 
-class CellScanParams(CellSessionParams):
+class CellScanParams(ScannerQuality, CellSessionParams):
     """Parameters of ``acquire.simulated_cell_scans``."""
-
-    noise: float = Field(1.0, ge=0, description="Scale of the scanners' noise and distortion.")
-    resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the scanners' columns and rows."
-    )
 
 
 @stage("acquire.simulated_cell_scans")

@@ -41,7 +41,7 @@ from flangeye_emulators.world import materials
 from flangeye_emulators.world.cell import Cell
 from flangeye_emulators.world.flange_mesh import flange_mesh
 from flangeye_emulators.world.raycast import Body
-from flangeye_emulators.world.scanner import before_camera, scanner_of
+from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.session import (
     View,
     seen_from,
@@ -65,13 +65,8 @@ class MarkerParams(SessionParams):
     )
 
 
-class ScanParams(SessionParams):
+class ScanParams(ScannerQuality, SessionParams):
     """Parameters of ``acquire.simulated_session``."""
-
-    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
-    resolution: float = Field(
-        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
-    )
 
 
 @stage("acquire.simulated_marker")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from pydantic import Field
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.scanners import ScannerModel
@@ -30,6 +31,15 @@ class CameraPose(Params):
     def base_T_camera(self) -> Floats:
         """(4, 4), translation in [m]."""
         return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+
+
+class ScannerQuality(Params):
+    """How good a simulated scanner is, beside its model."""
+
+    noise: float = Field(1.0, ge=0, description="Scale of the scanner's noise and distortion.")
+    resolution: float = Field(
+        1.0, gt=0, le=1, description="Scale of the scanner's columns and rows."
+    )
 
 
 def scanner_of(

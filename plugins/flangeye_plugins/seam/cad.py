@@ -14,7 +14,7 @@ from flangeye.types import Box, Floats, Seam, Seed, VerifiedHandEye, WorkpieceSc
 from flangeye.units import Length, param
 from flangeye_plugins.seam.part import CadPart
 from flangeye_plugins.seam.planned import (
-    ArmParams,
+    SeamParams,
     answer_for,
     cloud_around,
     for_the_controller,
@@ -29,14 +29,13 @@ SEED = 11
 """Tells this use of the recipe's seed from others."""
 
 
-class CadParams(ArmParams):
+class CadParams(SeamParams):
     """Parameters of ``seam.cad``."""
 
     workpiece: WorkpiecePath = Field(
         description="One of data/workpieces, or a .yaml file of one's own with CAD and seams."
     )
     seam: str | None = Field(None, description="Name of the seam, if the workpiece has several.")
-    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
     min_seen: float = Field(
         0.35,
         gt=0,

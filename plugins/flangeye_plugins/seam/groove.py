@@ -15,7 +15,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.types import Box, Floats, HandEye, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Length, param
 from flangeye_plugins.seam.planned import (
-    ArmParams,
+    SeamParams,
     answer_for,
     cloud_around,
     for_the_controller,
@@ -36,7 +36,7 @@ wall by their own height, which leans it a little. Monte Carlo finds 0.4 (tests/
 FEWEST = 1000
 
 
-class GrooveParams(ArmParams):
+class GrooveParams(SeamParams):
     """Parameters of ``seam.groove``."""
 
     near: tuple[Length, Length, Length] | None = Field(
@@ -45,7 +45,6 @@ class GrooveParams(ArmParams):
     backwards: bool = Field(
         False, description="Start at the end farther from the robot's base instead of the nearer."
     )
-    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
     max_width: Length = param(
         "30 mm", gt=0, description="Largest width of the groove at its shoulders."
     )

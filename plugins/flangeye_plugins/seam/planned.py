@@ -30,8 +30,8 @@ CLOUD_POINTS = 20_000
 """Points of the scan that are kept for people."""
 
 
-class ArmParams(Params):
-    """For which arm a seam is planned."""
+class SeamParams(Params):
+    """What the stages that plan a seam share."""
 
     arm: Literal["as-reported", "corrected"] = Field(
         "as-reported",
@@ -42,6 +42,7 @@ class ArmParams(Params):
     tool: Length = param(
         "0 mm", ge=0, description="corrected: from the flange to the tool's tip, along its z."
     )
+    spacing: Length = param("2 mm", gt=0, description="Distance between the planned points.")
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
@@ -74,7 +75,7 @@ def in_base(
     return mapped, rotation @ covariances @ rotation.T + of_pose
 
 
-def answer_for(stage: str, calibration: HandEye, params: ArmParams) -> HandEye:
+def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
     """Return the answer for the arm that shall follow the seam.
 
     Raises:
@@ -92,7 +93,7 @@ def answer_for(stage: str, calibration: HandEye, params: ArmParams) -> HandEye:
 
 
 def for_the_controller(
-    seam: Seam, calibration: HandEye, robot: RobotModel | None, params: ArmParams
+    seam: Seam, calibration: HandEye, robot: RobotModel | None, params: SeamParams
 ) -> Seam:
     """Return a seam with each point where the controller has to be told to go to reach it.
 

@@ -13,14 +13,14 @@ from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.types import ArmCorrection, CorrectedArm, Seam
-from flangeye_plugins.seam.planned import ArmParams, answer_for, for_the_controller
+from flangeye_plugins.seam.planned import SeamParams, answer_for, for_the_controller
 from tests.plugins.seam.scenes import hand_eye
 
 UR5 = load_model("robots", "ur5")
 HOME = np.radians([0, -90, 90, -90, -90, 0])
 OFFSETS = np.array([0.0, 4.0, -3.0, 5.0, -4.0, 0.0]) * 1e-3
 CORRECTION = ArmCorrection(np.zeros(3), OFFSETS, HOME)
-CORRECTED = ArmParams(arm="corrected", tool="150 mm")
+CORRECTED = SeamParams(arm="corrected", tool="150 mm")
 
 
 def calibration(correction=CORRECTION):
@@ -50,7 +50,7 @@ def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam() -> None:
 
 
 def test_the_arm_as_reported_needs_nothing() -> None:
-    planned, params = seam(), ArmParams()
+    planned, params = seam(), SeamParams()
     answer = answer_for("seam.cad", calibration(), params)
     assert answer.correction is None
     assert for_the_controller(planned, answer, UR5, params) is planned
