@@ -101,7 +101,7 @@ def compared_again(name, sequence, redraws):
     ours = [error(draw) for draw in draws]
     theirs = [references(draw) for draw in draws]
     medians = {k: np.median([each[k] for each in theirs]) for k in theirs[0]}
-    best = min(medians, key=medians.get)
+    best = min(medians, key=medians.__getitem__)
     found = [each for each in ours if not isinstance(each, str)]
     return f"| {name} | {np.median(found):.2f} | {medians[best]:.2f} | {best} |"
 
