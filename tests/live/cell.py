@@ -50,17 +50,17 @@ class Cell:
         path.write_text(RECIPE.format(host=host, count=count, scanner=scanner, speed=speed))
         return path
 
-    def start(self, *words):
-        """Start ``flangeye run`` in the background."""
+    def start(self, *words, command="run"):
+        """Start a command, ``flangeye run`` unless told otherwise, in the background."""
         return subprocess.Popen(
-            [sys.executable, "-m", "flangeye.cli", "run", *map(str, words)],
+            [sys.executable, "-m", "flangeye.cli", command, *map(str, words)],
             cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             stdin=subprocess.DEVNULL,
         )  # fmt: skip
 
-    def run(self, *words, patience=150):
-        """Return exit code, output and errors of ``flangeye run``."""
-        process = self.start(*words)
+    def run(self, *words, command="run", patience=150):
+        """Return exit code, output and errors of a command, ``flangeye run`` unless told otherwise."""
+        process = self.start(*words, command=command)
         out, err = process.communicate(timeout=patience)
         return process.returncode, out, err
 

@@ -69,6 +69,43 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
     assert [o["id"] for o in result["observations"]] == cell.captures("again")
 
 
+TIP = np.array([0.0, 0.0, 0.15])
+"""A tip on the flange's axis [m]."""
+
+
+def test_a_capture_is_taken_again_and_the_calibration_is_touched(cell: Any) -> None:
+    code, _, err = cell.run(cell.recipe(), "--move", "--out", "run")
+    assert code == 0, err
+
+    code, _, err = cell.run("--resume", "run", "--retake", "0002", "--move", "--out", "again")
+    assert code == 0, err
+    assert sorted(cell.captures("again")) == sorted(cell.captures("run"))
+    before, after = (
+        {o.id: o.feature.centre for o in cell.log(run).observations()} for run in ("run", "again")
+    )
+    assert [i for i in before if not np.array_equal(before[i], after[i])] == ["0002"]
+    assert cell.result("again")["status"] == "verified"
+
+    ahead = cell.control.truth().base_T_flange @ [*TIP + [0.0, 0.0, 0.06], 1.0]
+    camera = (
+        np.linalg.inv(np.asarray(cell.log("again").calibration().base_T_camera.transform.matrix))
+        @ ahead
+    )
+    words = ("--seen", metres(camera[:3]), "--tip", metres(TIP), "--move", "--yes")
+    start = cell.control.truth().base_T_flange[:3, 3]
+    code, out, err = cell.run("again", *words, command="touch")
+    assert code == 0, err
+    assert cell.standing()
+    gone = np.linalg.norm(cell.control.truth().base_T_flange[:3, 3] - start)
+    assert gone == pytest.approx(0.06 - 0.005, abs=1e-3)  # it stops 5 mm before the point
+    assert "predicted is off by" in out
+    assert (cell.folder / "touch.yaml").exists()
+
+
+def metres(point: np.ndarray) -> str:
+    return ", ".join(f"{x:.6f} m" for x in point)
+
+
 @pytest.mark.slow
 def test_a_run_that_is_killed_leaves_a_standing_arm_and_a_readable_log(cell: Any) -> None:
     process = cell.start(cell.recipe(), "--move", "--out", "run")
