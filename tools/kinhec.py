@@ -51,6 +51,7 @@ def error(sequence):
     hand = sequence.eye_in_hand
     cell = Configuration("eye-in-hand", FLANGE, BASE) if hand else Configuration()
     name = "flange_T_camera" if hand else "flange_T_target"
+    # Whose camera sees no distances is known to whoever mounts it; the manifest says it so.
     size = "known" if sequence.scale == 1.0 else "unknown"
     try:
         params = RobustParams(target_size=size)

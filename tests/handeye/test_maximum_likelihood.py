@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.starts import size_of
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
 from flangeye.types import CAMERA, TARGET, PoseFeature, Transform
 from flangeye_plugins.solve.maximum_likelihood import (
     MaximumLikelihoodParams,
@@ -294,15 +297,30 @@ def resized(made, factor):
     return replace(made, observations=seen)  # fmt: skip
 
 
-def test_a_size_that_is_unknown_is_found() -> None:
+@pytest.mark.parametrize("factor", [2.0, 7.2, 0.1])
+def test_a_size_that_is_unknown_is_found(factor: float) -> None:
     made = session(MARKER, np.random.default_rng(17), n=20)
-    assert "target_size: unknown finds it" in refusal(resized(made, 2.0))
-    found = solve(resized(made, 2.0), target_size="unknown")
+    found = solve(resized(made, factor), target_size="unknown")
     (note,) = [n for n in found.notes if "times as large" in n]
     told, _, sigma = note.split("target is ")[1].split()[:3]
-    assert abs(float(told) - 0.5) < 4 * float(sigma) < 0.01
+    assert abs(float(told) - 1 / factor) < 4 * float(sigma) < 0.02 / factor
     error = errors(found.camera, made.truth["flange_T_camera"])
     assert error @ np.linalg.solve(found.camera.covariance, error) < 30
+
+
+def test_a_size_that_is_a_little_off_is_refused_and_what_finds_it_is_named() -> None:
+    made = session(MARKER, np.random.default_rng(17), n=20)
+    assert "target_size: unknown finds it" in refusal(resized(made, 2.0))
+
+
+@pytest.mark.parametrize("name", ["eye-in-hand, marker", "eye-on-base, marker", "two arms, marker"])
+def test_a_first_size_is_told_beside_poses_that_are_mistaken(name: str) -> None:
+    made = resized(session(CONFIGURATIONS[name], np.random.default_rng(5), n=24), 4.0)
+    first, second = made.observations[:3], made.observations[3:6]
+    mispaired = [replace(a, feature=b.feature) for a, b in zip(first, second, strict=True)]
+    measured = measurements_of(mispaired + made.observations[3:], made.configuration, Arm(ROBOT))
+    size = size_of(measured, loop_of(made.configuration), np.random.default_rng(0))
+    assert size == pytest.approx(0.25, rel=0.05)
 
 
 def test_a_size_that_the_motion_does_not_tell_is_refused() -> None:

@@ -37,6 +37,7 @@ from flangeye.handeye.observability import (
     require_turns,
     unobservable,
 )
+from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import longer_distances, require_size, told_factor
 from flangeye.handeye.wander import with_wander
 from flangeye.maths.geometry import rigid
@@ -167,11 +168,16 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     problem = _problem(cell, options)
     require_enough(problem)
     require_turns(problem)
+    size = 1.0
+    if options.finds_size and problem.measurements.are_poses:
+        size = size_of(problem.measurements, problem.loop, np.random.default_rng(0))
+        cell = cell.resized(size)
+        problem = _problem(cell, options)
     model = Model(find_consensus(problem, options.limits.rotation))
     weak = unobservable(model.problem, model.found, options.limits)
     model, weak = _with_shared(model, cell, weak)
     if options.finds_size and model.problem.measurements.are_poses:
-        cell, model = _with_size(cell, model, options)
+        cell, model = _with_size(cell, model, options, size)
     else:
         require_size(model.problem, model.found, options.size_limit)
     model = _with_depth(model)
@@ -196,9 +202,15 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     )
 
 
-def _with_size(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]:
-    """Return the cell as it is with the target's size found, and what is then agreed on."""
-    size = 1.0
+def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple[Cell, Model]:
+    """Return the cell as it is with the target's size found, and what is then agreed on.
+
+    Args:
+        cell: The cell, its target so many times as large as was said already.
+        model: What is agreed on there.
+        options: How to solve it.
+        size: That factor.
+    """
     for _ in range(SIZES):
         longer = longer_distances(model.problem.measurements)
         told = told_factor(model.problem, model.found, longer)
@@ -214,8 +226,10 @@ def _with_size(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]
     longer = longer_distances(model.problem.measurements)
     still = np.zeros_like(longer)
     known = with_nuisance(model, nuisance_of(still, still, np.inf, seen=longer)) or model
+    sigma = size * told.sigma
+    digits = max(4, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 4
     return cell, known.noted(
-        f"by the arm's own motion the target is {size:.4f} +- {size * told.sigma:.4f} times as "
+        f"by the arm's own motion the target is {size:.{digits}f} +- {sigma:.{digits}f} times as "
         "large as was said where it was fitted, and is taken to be"
     )
 

@@ -22,6 +22,10 @@ GOOD_ENOUGH = np.radians(1.0)
 RESTARTS = 20
 ROUNDS = 200
 """Steps of each further search; slower than that it is at the wrong place."""
+DRAWS, DRAWN = 60, 8
+"""Sets of poses that a target's size is told from, and the poses of each."""
+SIZES = 0.01, 100.0
+"""No target is so many times as large as was said."""
 
 
 def fewest(measurements: Measurements, loop: Loop) -> int:
@@ -50,6 +54,53 @@ def start_of(
     """
     x, y, z = _start(measurements, loop, rng, restarts)
     return Unknowns(x, y, z, np.zeros(2))
+
+
+def size_of(measurements: Measurements, loop: Loop, rng: np.random.Generator) -> float:
+    """Return how many times as large as was said the target of whole poses is, about; else 1.
+
+    Rotations do not depend on it, and once they are known the loop's translations are linear in the
+    places and the size (Andreff et al. 2001). Of small sets of poses that is taken which explains
+    the better half of all poses best.
+    """
+    n, least, size = len(measurements), np.inf, 1.0
+    for _ in range(DRAWS):
+        chosen = rng.choice(n, min(DRAWN, n), replace=False)
+        try:
+            at = start_of(measurements.where(chosen), loop, rng, restarts=0)
+        except (np.linalg.LinAlgError, CalibrationRefused):
+            continue
+        equations, wanted = _sized_translations(measurements, loop, at)
+        found = np.linalg.lstsq(
+            equations[chosen].reshape(-1, equations.shape[2]), wanted[chosen].ravel(), rcond=None
+        )[0]
+        median = float(np.median(np.linalg.norm(equations @ found - wanted, axis=1)))
+        if median < least and SIZES[0] < found[-1] < SIZES[1]:
+            least, size = median, float(found[-1])
+    return size
+
+
+def _sized_translations(
+    measurements: Measurements, loop: Loop, at: Unknowns
+) -> tuple[Floats, Floats]:
+    """Return (N, 3, k + 1) equations of the unknown places, then the size, and (N, 3) their sides.
+
+    Of the loop ``a x s = y b z``, whose s has its translation so many times as long.
+    """
+    a, b, n = measurements.a, measurements.b, len(measurements)
+    turned_y = at.y[:3, :3] @ b[:, :3, :3]
+    wanted = b[:, :3, 3] @ at.y[:3, :3].T - a[:, :3, 3]
+    columns = [a[:, :3, :3]]
+    if loop.y:
+        columns.append(np.broadcast_to(-np.eye(3), (n, 3, 3)))
+    else:
+        wanted = wanted + at.y[:3, 3]
+    if loop.z:
+        columns.append(-turned_y)
+    else:
+        wanted = wanted + turned_y @ at.z[:3, 3]
+    seen = a[:, :3, :3] @ (measurements.centres @ at.x[:3, :3].T)[..., None]
+    return np.concatenate([*columns, seen], axis=2), wanted
 
 
 def _start(
