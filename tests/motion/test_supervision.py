@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.devices import RobotState
 from flangeye.motion.route import Leg
-from flangeye.motion.supervision import SafetyFault, Watch
+from flangeye.motion.supervision import SafetyFault, Supervisor
 from tests.motion.stand_in import LIMITS, MODEL, StandIn, elsewhere, turned
 
 SECOND = 1_000_000_000
@@ -26,7 +26,7 @@ def moving(at, speed=1.0):
 
 
 def halted_at(at):
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     watch.judge(moving(at, 0.0))
     watch.halted()
     return watch
@@ -66,7 +66,7 @@ def test_who_else_moves_it_and_that_it_goes_on_is_said() -> None:
 
 
 def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     watch.led()
     fast = 1.3 * LIMITS.joint_speed
     state = moving(SECOND, 0.0)
@@ -79,9 +79,9 @@ AT_HOME = moving(5 * SECOND, 0.0)
 GOAL = turned(AT_HOME.joints, j2=0.4)
 
 
-def sent(goal: Any = GOAL, seconds: float = 4.0) -> Watch:
+def sent(goal: Any = GOAL, seconds: float = 4.0) -> Supervisor:
     """Return a watch on an arm that was sent on a leg at 5 s."""
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     watch.judge(AT_HOME)
     watch.set_off(Leg(goal, 0.1, 0.1, seconds))
     return watch
@@ -182,7 +182,7 @@ def test_three_millimetres_outside_the_box_are_allowed_and_no_more() -> None:
 
 def test_a_joint_may_be_a_twentieth_of_a_degree_beyond_its_limit() -> None:
     limits = replace(LIMITS, upper=AT_HOME.joints + 0.1)
-    watch = Watch(MODEL, limits)
+    watch = Supervisor(MODEL, limits)
     watch.judge(AT_HOME)
     watch.led()
     watch.judge(at(0.1, turned(AT_HOME.joints, j4=0.1 + 0.049 * DEGREE)))
@@ -191,7 +191,7 @@ def test_a_joint_may_be_a_twentieth_of_a_degree_beyond_its_limit() -> None:
 
 
 def test_who_is_led_may_move_and_has_never_arrived() -> None:
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     watch.judge(AT_HOME)
     watch.led()
     assert not watch.judge(at(9.0, AT_HOME.joints, 0.3))
@@ -207,7 +207,7 @@ def test_a_controller_that_is_not_ready_is_a_fault(mode: Any) -> None:
 
 
 def test_an_arm_moved_by_hand_is_there_when_the_person_says_so() -> None:
-    watch = Watch(MODEL, LIMITS, by_hand=True)
+    watch = Supervisor(MODEL, LIMITS, by_hand=True)
     far = turned(AT_HOME.joints, j2=1.0)
     assert not watch.judge(at(0.1, far, 2.0))
     watch.set_off(Leg(GOAL, 0.1, 0.1, 4.0))
@@ -216,14 +216,14 @@ def test_an_arm_moved_by_hand_is_there_when_the_person_says_so() -> None:
 
 
 def test_a_centimetre_from_the_model_is_allowed_and_no_more() -> None:
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     watch.check_model(replace(AT_HOME, base_T_flange=elsewhere(AT_HOME, [9.9e-3, 0.0, 0.0])))
     with pytest.raises(SafetyFault, match="the controller's flange is 10 mm from"):
         watch.check_model(replace(AT_HOME, base_T_flange=elsewhere(AT_HOME, [0.0, 10.1e-3, 0.0])))
 
 
 def test_twenty_seconds_are_remembered() -> None:
-    watch = Watch(MODEL, LIMITS)
+    watch = Supervisor(MODEL, LIMITS)
     for seconds in (0.0, 0.1, 20.0, 20.1):
         watch.judge(at(seconds, AT_HOME.joints))
     assert len(watch.samples) == 3

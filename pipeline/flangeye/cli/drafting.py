@@ -76,8 +76,8 @@ def init(  # noqa: PLR0913  one for each option
     if out.exists():
         raise RecipeError(f"{out}: is there already; take another name with --out")
     registry = load_plugins()
-    sights = look(folder)
-    for line in sights.lines():
+    survey = look(folder)
+    for line in survey.lines():
         say(line)
     given = {
         "robot": robot, "plate": plate, "scanner": scanner, "camera": camera, "target": target,
@@ -87,7 +87,7 @@ def init(  # noqa: PLR0913  one for each option
         "target-angle": target_angle, "reader": reader,
     }  # fmt: skip
     questions = Questions(given, None if yes else _prompt)
-    draft = draft_recipe(sights, out, questions, registry)
+    draft = draft_recipe(survey, out, questions, registry)
     out.write_text(draft.text, "utf-8")
     try:
         checked = load_recipe(out, registry)

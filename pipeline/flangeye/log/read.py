@@ -107,7 +107,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Note:
-    """One line of a step's journal.
+    """One line of a step's log.
 
     Attributes:
         step: Its label, such as ``7.weld.tactile``.
@@ -135,7 +135,7 @@ class RunLog:
         rejections: Captures set aside.
         finished: Ids of the captures that went through.
         messages: Log lines for people.
-        noted: Steps that wrote into their journals, by label; see :func:`read_notes`.
+        noted: Steps that wrote into their logs, by label; see :func:`read_notes`.
         damage: What could not be read, and why, a sentence each.
     """
 
@@ -321,7 +321,7 @@ def read_run(path: Path) -> RunLog:
 
 
 def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[Note]:
-    """Yield what steps wrote into their journals, in order, as far as the log goes.
+    """Yield what steps wrote into their logs, in order, as far as the log goes.
 
     Args:
         path: The log.

@@ -14,7 +14,7 @@ topic                         schema                      content
 /tf                           foxglove.FrameTransform     base -> flange, carrier -> camera, …
 /step/N.stage                 flangeye.<type> (JSON)      what the step gave, lossless
 /step/N.stage/cloud           foxglove.PointCloud         the points of that value, lossless
-/note/N.stage/name            flangeye.<type> (JSON)      what a step wrote into its journal
+/note/N.stage/name            flangeye.<type> (JSON)      what a step wrote into its log
 /note/N.stage/name            foxglove.CompressedImage    the same, for images
 /scene                        foxglove.SceneUpdate        fitted circles; the seam and its tube
 /circle                       foxglove.PointCloud         the fitted circles again, as points
@@ -175,7 +175,7 @@ class Recorder:
 
     @hookimpl
     def flangeye_noted(self, step: str, name: str, value: Any) -> None:
-        """Log a line of a step's journal."""
+        """Log a line of a step's log."""
         topic = f"/note/{step}/{name}"
         if isinstance(value, t.Image):
             self._proto(topic, foxglove.compressed_image(value, time.time_ns()))

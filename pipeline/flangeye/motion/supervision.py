@@ -57,7 +57,7 @@ class Sample(NamedTuple):
     joints: Floats
 
 
-class Watch:
+class Supervisor:
     """What is expected of an arm, and what it does.
 
     Attributes:

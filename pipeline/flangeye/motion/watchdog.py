@@ -24,7 +24,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
-from flangeye.motion.supervision import SafetyFault, Sample, Watch
+from flangeye.motion.supervision import SafetyFault, Sample, Supervisor
 
 TOLD_NS = 200_000_000
 """Between two states told to the program while the arm is under way [ns]."""
@@ -94,7 +94,7 @@ class Watchdog:
 
     def __init__(self, robot: Robot, wire: Connection, charge: Charge) -> None:
         self._robot, self._wire, self._charge = robot, wire, charge
-        self._watch = Watch(charge.model, charge.limits, isinstance(robot, MovedByHand))
+        self._supervisor = Supervisor(charge.model, charge.limits, isinstance(robot, MovedByHand))
         self._legs: list[Leg] = []
         self._told_ns = 0
         self._barred: str | None = None
@@ -114,8 +114,8 @@ class Watchdog:
     def _open(self) -> None:
         try:
             state = self._robot.state()
-            self._watch.judge(state)
-            self._watch.check_model(state)
+            self._supervisor.judge(state)
+            self._supervisor.check_model(state)
             self._wire.send(Report("opened", (self._robot.name, self._robot.period, state)))
         except (SafetyFault, DeviceError) as fault:
             self._bar(str(fault))
@@ -128,7 +128,7 @@ class Watchdog:
                 self._halt()
                 self._wire.send(Report("stopped", by))
             state = self._robot.state()
-            arrived = self._watch.judge(state)
+            arrived = self._supervisor.judge(state)
             self._tell_cycle(state)
             if arrived:
                 self._next_leg(state)
@@ -148,7 +148,7 @@ class Watchdog:
         """Stop an arm that is led by a program that says nothing any more."""
         if self._led_ns is None:
             return
-        silent = 1e-9 * (self._watch.samples[-1].time_ns - self._led_ns)
+        silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
         if silent > HUNG:
             self._bar(f"the program that leads the arm said nothing for {HUNG:.0f} s")
         elif silent > SILENT and not self._paused:
@@ -163,23 +163,23 @@ class Watchdog:
         if self._legs:
             self._set_off()
         else:
-            self._watch.halted()
+            self._supervisor.halted()
             self._wire.send(Report("arrived", state))
 
     def _set_off(self) -> None:
         leg = self._legs[0]
-        self._watch.set_off(leg)
+        self._supervisor.set_off(leg)
         self._robot.move_joints(leg.joints, leg.speed, leg.acceleration)
 
     def _halt(self) -> None:
         self._legs, self._led_ns = [], None
-        self._watch.halted()
+        self._supervisor.halted()
         self._robot.stop()
 
     def _bar(self, reason: str) -> None:
         """Stop, and move no more: a safety fault is not outlived."""
         self._legs, self._led_ns = [], None
-        self._watch.halted()
+        self._supervisor.halted()
         try:
             self._robot.stop()
         except DeviceError as lost:
@@ -223,11 +223,11 @@ class Watchdog:
                 self._legs, self._led_ns = list(content.legs), None
                 self._set_off()
             elif request == "velocity":
-                self._watch.led()
-                self._led_ns, self._paused = self._watch.samples[-1].time_ns, False
+                self._supervisor.led()
+                self._led_ns, self._paused = self._supervisor.samples[-1].time_ns, False
                 self._robot.move_velocity(*content)
             elif request == "linear":
-                self._watch.led()
+                self._supervisor.led()
                 self._led_ns = None
                 self._robot.move_linear(*content)
         except DeviceError as lost:
@@ -238,7 +238,7 @@ class Watchdog:
         if self._wanted is None:
             return
         start_ns, end_ns = self._wanted
-        samples = self._watch.samples
+        samples = self._supervisor.samples
         over = bool(samples) and samples[-1].time_ns >= end_ns
         if over or self._barred is not None:
             self._wire.send(Report("samples", _during(samples, start_ns, end_ns)))

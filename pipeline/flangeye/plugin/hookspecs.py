@@ -57,7 +57,7 @@ def flangeye_stage_finished(step: str, capture: str | None, value: Any, seconds:
 
 @hookspec
 def flangeye_noted(step: str, name: str, value: Any) -> None:
-    """A step that is under way wrote ``value`` into its journal, under ``name``."""
+    """A step that is under way wrote ``value`` into its log, under ``name``."""
 
 
 @hookspec

@@ -142,7 +142,7 @@ class StepOrder:
         self._circles = True
         self._complain = complain
         self._lost = False
-        self._have: set[Any] = {*given, t.ArchivePath, t.Box, t.Journal, MotionAllowed}
+        self._have: set[Any] = {*given, t.ArchivePath, t.Box, t.StageLog, MotionAllowed}
         self._rank = 0
         self._kinds: list[str] = []
 

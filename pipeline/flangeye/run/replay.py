@@ -1,4 +1,4 @@
-"""Decisions made again from the journal of the step that made them."""
+"""Decisions made again from the log of the step that made them."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ class Runner:
     def _may_work_ahead(self, stream: t.Captures) -> bool:
         steps = (*self._steps("segment"), *self._steps("fit"))
         needs = [need for step in steps for need in step.stage.needs.values()]
-        return stream.recorded and cores() > 1 and t.Journal not in needs
+        return stream.recorded and cores() > 1 and t.StageLog not in needs
 
     def _ahead(self, stream: t.Captures) -> Iterator[t.Capture | t.Rejection]:
         """Yield the captures; the next ones are segmented and fitted meanwhile, on all cores."""
@@ -345,7 +345,7 @@ class Runner:
         return value
 
     def _arguments(self, step: Step, given: Mapping[Any, Any]) -> dict[str, Any]:
-        values = {**self._values, t.Journal: partial(self._noted, step.label), **given}
+        values = {**self._values, t.StageLog: partial(self._noted, step.label), **given}
         arguments = {
             name: _given(step, need, values.get(bare(need)))
             for name, need in step.stage.needs.items()

@@ -98,7 +98,7 @@ class Conformance:
             t.Seed: t.Seed(0),
             t.Views: t.Views(),
             t.ArchivePath: t.ArchivePath(),
-            t.Journal: lambda name, value: None,
+            t.StageLog: lambda name, value: None,
         }
 
     def _value(self, values: Mapping[Any, Any], name: str, need: Any) -> Any:

@@ -53,7 +53,7 @@ from flangeye.types.frames import (
     TransformEstimate,
     by_frame,
 )
-from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed
+from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed, StageLog
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, WorkpieceScan
 from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
 from flangeye.types.welding import Seam, WeldReport
@@ -107,6 +107,7 @@ __all__ = [
     "SmoothField",
     "Solver",
     "Source",
+    "StageLog",
     "Stream",
     "Transform",
     "TransformEstimate",

@@ -16,8 +16,8 @@ class ArchivePath:
     path: Path | None = None
 
 
-class Journal(Protocol):
-    """Logs a value under a name, at once, with the step that asked for the journal.
+class StageLog(Protocol):
+    """Logs a value under a name, at once, with the step that asked for it.
 
     For what a stage does while it runs: where the arm is, what a loop measured and commanded.
     """
@@ -25,6 +25,10 @@ class Journal(Protocol):
     def __call__(self, name: str, value: Any) -> None:
         """Log ``value``: a dataclass of ours, an :class:`Image`, or plain JSON data."""
         ...
+
+
+Journal = StageLog
+"""Its former name, which goes with version 0.3."""
 
 
 @dataclass(frozen=True)

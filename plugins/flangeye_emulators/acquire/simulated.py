@@ -28,12 +28,12 @@ from flangeye.types import (
     Capture,
     Captures,
     Floats,
-    Journal,
     Observation,
     PointCloud,
     Role,
     Seed,
     Source,
+    StageLog,
     Transform,
     Truth,
     by_frame,
@@ -93,7 +93,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     seed: Seed,
     params: SimulatedParams,
     sphere: Sphere | None = None,
-    journal: Journal | None = None,
+    stage_log: StageLog | None = None,
 ) -> Captures:
     """Scan a simulated arm that moves its flange through the scanner's view.
 
@@ -108,7 +108,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
         seed: Decides poses, errors and noise.
         params: See :class:`SimulatedParams`.
         sphere: A calibration sphere on the flange, where the recipe's feature has one.
-        journal: Hears what a plan that chooses its poses expects of the next one.
+        stage_log: Hears what a plan that chooses its poses expects of the next one.
 
     Raises:
         StageError: Fewer than three poses are possible.
@@ -142,18 +142,18 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     )
     look = partial(session.look, rng=_rng(later))
     whys = [*([""] * len(checks)), *(pose.why for pose in poses)]
-    captures = _explained(session.captures(noise), whys, journal)
+    captures = _explained(session.captures(noise), whys, stage_log)
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
     return Captures(captures, source, len(session.joints), look, recorded=not any(whys))
 
 
 def _explained(
-    captures: Iterator[Capture], whys: Sequence[str], journal: Journal | None
+    captures: Iterator[Capture], whys: Sequence[str], stage_log: StageLog | None
 ) -> Iterator[Capture]:
     """Yield the captures; before each, say what the plan expects of it, where it does."""
     for index, why in enumerate(whys):
-        if why and journal:
-            journal("next", {"id": f"{index:04d}", "why": why})
+        if why and stage_log:
+            stage_log("next", {"id": f"{index:04d}", "why": why})
         yield next(captures)
 
 

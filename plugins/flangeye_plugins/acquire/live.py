@@ -44,11 +44,11 @@ from flangeye.types import (
     Capture,
     Captures,
     Floats,
-    Journal,
     Rejection,
     Resumed,
     Seed,
     Source,
+    StageLog,
     Transform,
     by_frame,
 )
@@ -100,7 +100,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
     limits: LimitsSection,
     motion: MotionAllowed,
     seed: Seed,
-    journal: Journal,
+    stage_log: StageLog,
     params: LiveParams,
     resumed: Resumed | None = None,
 ) -> Captures:
@@ -119,7 +119,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         limits: What the arm must keep to.
         motion: Whether it may move at all; if not, the arm is only read, and the plan is shown.
         seed: Decides the poses.
-        journal: Hears where the arm is.
+        stage_log: Hears where the arm is.
         params: See :class:`LiveParams`.
         resumed: What an earlier run already took.
 
@@ -140,13 +140,13 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
         raise NothingMoved("\n".join([planned(start).shown(start), how, HOW_TO_MOVE]))
     with ExitStack() as opening:
-        guard = opening.enter_context(watched(arm, robot, allowed, partial(journal, "arm")))
+        guard = opening.enter_context(watched(arm, robot, allowed, partial(stage_log, "arm")))
         require_inside(guard.state, allowed)
         opened = opening.enter_context(eye.open())
         itinerary = planned(guard.state.joints)
         release = opening.pop_all()
     done = resumed.done if resumed else frozenset()
-    session = LiveSession(itinerary, guard, opened, params.moved, done, journal)
+    session = LiveSession(itinerary, guard, opened, params.moved, done, stage_log)
     return LiveCaptures(session, _source(session, arm, eye), release)
 
 
@@ -235,7 +235,7 @@ class LiveSession:
         scanner: What looks at the flange.
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
-        journal: Hears where the arm goes next, and why there.
+        stage_log: Hears where the arm goes next, and why there.
     """
 
     itinerary: Itinerary
@@ -243,7 +243,7 @@ class LiveSession:
     scanner: Scanner
     moved: float
     done: frozenset[str]
-    journal: Journal
+    stage_log: StageLog
 
     def captures(self) -> Iterator[Capture | Rejection]:
         """Take the captures; while one is transferred and fitted the arm is under way again."""
@@ -255,7 +255,7 @@ class LiveSession:
             if isinstance(way, Barred):
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
-            self.journal("next", {"id": stop.id, "why": stop.pose.why})
+            self.stage_log("next", {"id": stop.id, "why": stop.pose.why})
             self.arm.go(way)
             if taken:
                 yield taken()

@@ -27,12 +27,12 @@ SAME = 1e-9
 @part("replay.tactile")
 def replay_tactile(log: FilePath, step: str) -> ReplayedStep:
     """Detect the tag in the logged images and decide every cycle of a weld again."""
-    again: Again | None = None
+    again: WeldReplay | None = None
     for note in read_notes(log):
         if note.step != step:
             continue
         if note.name == "start":
-            again = Again(note.value)
+            again = WeldReplay(note.value)
         elif again is not None:
             again.take(note)
     if again is None:
@@ -40,8 +40,8 @@ def replay_tactile(log: FilePath, step: str) -> ReplayedStep:
     return again.account()
 
 
-class Again:
-    """Goes through the journal of a weld in its order."""
+class WeldReplay:
+    """Goes through the log of a weld in its order."""
 
     def __init__(self, start: Mapping[str, Any]) -> None:
         """Set up controller and finger as they were."""
@@ -55,7 +55,7 @@ class Again:
         self._worst_feeling = self._worst_command = 0.0
 
     def take(self, note: Note) -> None:
-        """Take in the next line of the journal."""
+        """Take in the next line of the log."""
         if note.name == "image":
             self._pixels = note.value
         elif note.name == "sight":

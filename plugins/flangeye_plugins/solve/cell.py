@@ -7,7 +7,7 @@ from flangeye.handeye.cell import calibrate_cell, solve_so_far
 from flangeye.handeye.cell_plan import errors_at_work, is_foretold
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import CELL
-from flangeye.types import HandEye, Journal, Observation, Observations, Progress
+from flangeye.types import HandEye, Observation, Observations, Progress, StageLog
 from flangeye.units import Angle, Length, param
 
 CONFIRMED = 3
@@ -40,7 +40,7 @@ class CellParams(Params):
 
 @stage("solve.cell", serves=(CELL,))
 def solve_cell(
-    observations: Observations, cell: Cell, params: CellParams, journal: Journal | None = None
+    observations: Observations, cell: Cell, params: CellParams, stage_log: StageLog | None = None
 ) -> HandEye:
     """Estimate every unknown transform of the recipe's cell from all sightings at once.
 
@@ -56,7 +56,7 @@ def solve_cell(
     if params.required is None or observations.whole:
         pulled = list(observations)
     else:
-        pulled = _pull(observations, cell, params, params.required, journal)
+        pulled = _pull(observations, cell, params, params.required, stage_log)
     return calibrate_cell(pulled, cell, params.limits, "solve.cell")
 
 
@@ -65,7 +65,7 @@ def _pull(
     cell: Cell,
     params: CellParams,
     required: float,
-    journal: Journal | None,
+    stage_log: StageLog | None,
 ) -> list[Observation]:
     """Take sightings until nothing is off by more than ``required`` [m] at its work.
 
@@ -79,8 +79,8 @@ def _pull(
         pulled.append(observation)
         found = solve_so_far(pulled, cell, params.limits, found)
         error = None if found is None else max(errors_at_work(found, cell, pulled).values())
-        if journal:
-            journal("progress", Progress(len(pulled), error, required))
+        if stage_log:
+            stage_log("progress", Progress(len(pulled), error, required))
         if error is not None and error <= required and foretold >= CONFIRMED:
             break
     return pulled

@@ -21,12 +21,12 @@ from flangeye.types import (
     Box,
     CircleFeature,
     HandEye,
-    Journal,
     Observation,
     Observations,
     Progress,
     Solver,
     Source,
+    StageLog,
 )
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.solve.svd import check_poses
@@ -145,7 +145,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     params: RobustParams,
     workspace: Box | None = None,
     robot: RobotModel | None = None,
-    journal: Journal | None = None,
+    stage_log: StageLog | None = None,
     configuration: Configuration | None = None,
     scanner: ScannerModel | None = None,
 ) -> HandEye:
@@ -171,7 +171,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
 
     if params.required is None:
         return solve(list(observations))
-    return solve(pull(observations, solve, params.required, workspace, journal))
+    return solve(pull(observations, solve, params.required, workspace, stage_log))
 
 
 def pull(
@@ -179,7 +179,7 @@ def pull(
     solve: Solver,
     required: float,
     workspace: Box | None,
-    journal: Journal | None = None,
+    stage_log: StageLog | None = None,
 ) -> list[Observation]:
     """Take observations until no point of the workspace is off by more than ``required`` [m]."""
     pulled: list[Observation] = []
@@ -188,9 +188,9 @@ def pull(
         if len(pulled) < FEWEST_ONLINE:
             continue
         error = _error_at_work(pulled, solve, workspace, observations.source)
-        if journal:
+        if stage_log:
             told = error if np.isfinite(error) else None
-            journal("progress", Progress(len(pulled), told, required))
+            stage_log("progress", Progress(len(pulled), told, required))
         if error <= required:
             break
     return pulled

@@ -11,7 +11,7 @@ from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.types import Floats, HandEye, Journal, Verification
+from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Length, param
 
 
@@ -45,7 +45,7 @@ def verify_sphere(
     calibration: HandEye,
     params: SphereParams,
     robot: RobotModel | None = None,
-    journal: Journal | None = None,
+    stage_log: StageLog | None = None,
 ) -> Verification:
     """Compare distances measured by the scanner with those of the arm, or with known ones.
 
@@ -67,10 +67,10 @@ def verify_sphere(
     else:
         measured, lengths = _of_poses(calibration, params, Arm(robot) if robot else None)
     figures = _figures(measured - lengths, measured, lengths)
-    if journal:
+    if stage_log:
         points = 1e3 * np.column_stack([lengths, measured - lengths])
         told = {"x": "distance [mm]", "y": "seen less true [mm]", "series": {"": points.tolist()}}
-        journal("comparison", told)
+        stage_log("comparison", told)
     passed = figures["p95"] <= params.max_error
     sign = "within" if passed else "above"
     reason = (

@@ -10,7 +10,7 @@ from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.types import Floats, HandEye, Image, Journal, Verification, Views
+from flangeye.types import Floats, HandEye, Image, StageLog, Verification, Views
 from flangeye.units import Length, param
 
 CELLS = 48
@@ -30,7 +30,7 @@ def verify_stitch(
     views: Views,
     params: StitchParams,
     robot: RobotModel | None = None,
-    journal: Journal | None = None,
+    stage_log: StageLog | None = None,
 ) -> Verification:
     """Overlay the clouds of all verification views and measure their spread.
 
@@ -65,8 +65,8 @@ def verify_stitch(
         "max": float(seen.max()),
         "slide": float(np.sqrt(np.mean(slides**2))),
     }
-    if journal:
-        journal("spread", _picture(spread, params.max_spread))
+    if stage_log:
+        stage_log("spread", _picture(spread, params.max_spread))
     passed = max(figures["spread"], figures["slide"]) <= params.max_spread
     sign = "within" if passed else "above"
     reason = (

@@ -8,7 +8,7 @@ from pydantic import Field
 from flangeye import Params, stage
 from flangeye.maths.geometry import covariance_at, rigid, rotation_from_rpy
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.types import Floats, HandEye, Journal, Verification
+from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Angle, Length, param
 
 
@@ -45,7 +45,7 @@ class TouchParams(Params):
 
 @stage("verify.touch")
 def verify_touch(
-    calibration: HandEye, params: TouchParams, journal: Journal | None = None
+    calibration: HandEye, params: TouchParams, stage_log: StageLog | None = None
 ) -> Verification:
     """Compare the predicted positions of scanned points with those a tip touched.
 
@@ -73,8 +73,8 @@ def verify_touch(
         "explained": float(np.mean(squares <= chi2_quantile(0.95, 3))),
     }
     per_point = {f"touch {i + 1}": float(length) for i, length in enumerate(lengths)}
-    if journal:
-        journal("comparison", _compared(errors))
+    if stage_log:
+        stage_log("comparison", _compared(errors))
     passed = figures["max"] <= params.max_error
     return Verification(passed, _told(figures, params.max_error, passed), figures, per_point)
 

@@ -10,7 +10,7 @@ from flangeye.devices import DeviceError, MovedByHand, Robot, RobotState
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Route
-from flangeye.motion.supervision import STANDING, SafetyFault, Watch
+from flangeye.motion.supervision import STANDING, SafetyFault, Supervisor
 from flangeye.types import Transform
 from flangeye_plugins.weld.finger_camera import LatestState
 
@@ -47,12 +47,12 @@ class Executor:
         if isinstance(robot, MovedByHand):
             raise DeviceError(f"{robot.name}: is moved by hand; a weld needs an arm that drives")
         self.robot, self.latest, self.limits = robot, latest, limits
-        self._watch = Watch(model, limits)
+        self._supervisor = Supervisor(model, limits)
         state = robot.state()
         latest.tell(state)
         try:
-            self._watch.judge(state)
-            self._watch.check_model(state)
+            self._supervisor.judge(state)
+            self._supervisor.check_model(state)
         except SafetyFault as fault:
             raise DeviceError(f"{robot.name}: {fault}") from None
 
@@ -77,16 +77,16 @@ class Executor:
             DeviceError: The arm was stopped for a safety fault: the reason.
         """
         for leg in route.legs:
-            self._watch.set_off(leg)
+            self._supervisor.set_off(leg)
             self.robot.move_joints(leg.joints, leg.speed, leg.acceleration)
             self.robot.wait_cycle()
             while not self._judged()[1]:
                 self.robot.wait_cycle()
-        self._watch.halted()
+        self._supervisor.halted()
 
     def lead(self) -> None:
         """Expect velocities from now on, and watch the limits alone."""
-        self._watch.led()
+        self._supervisor.led()
 
     def shift(self, base_T_flange: Transform, speed: float) -> RobotState:
         """Move the flange a little, straight to a pose; return when the arm stands there.
@@ -94,7 +94,7 @@ class Executor:
         Raises:
             DeviceError: The arm was stopped for a safety fault: the reason.
         """
-        self._watch.led()
+        self._supervisor.led()
         self.robot.move_linear(
             base_T_flange, min(speed, self.limits.speed), self.limits.acceleration
         )
@@ -114,7 +114,7 @@ class Executor:
         state = self.robot.state()
         self.latest.tell(state)
         try:
-            return state, self._watch.judge(state)
+            return state, self._supervisor.judge(state)
         except SafetyFault as fault:
             self.stop()
             raise DeviceError(f"{self.robot.name}: {fault}") from None

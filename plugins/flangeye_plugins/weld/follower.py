@@ -13,7 +13,7 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
 from flangeye_plugins.weld.consistency import Seating
 from flangeye_plugins.weld.contact import Contact, Release
-from flangeye_plugins.weld.motion import Felt, Track
+from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
 from flangeye_plugins.weld.refined import RefinedPath
@@ -61,7 +61,7 @@ LATE_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class ResumePoint:
     """What a stopped weld leaves to who goes on with it.
 
     Attributes:
@@ -99,7 +99,7 @@ class Follower:
         belief: Belief,
         settings: Following,
         touch: bool = True,
-        before: Kept | None = None,
+        before: ResumePoint | None = None,
     ) -> None:
         """Prepare to follow ``plan``.
 
@@ -133,7 +133,7 @@ class Follower:
         self.lit: float | None = None
         self.side = 1.0 if settings.side == "left" else -1.0
         self._track = Track()
-        self._felt: Felt | None = None if touch else Felt(0.0, 0.0)
+        self._felt: SeamReading | None = None if touch else SeamReading(0.0, 0.0)
         self._time: float | None = None
         self._seen = self._bridge = 0.0
         self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
@@ -147,9 +147,9 @@ class Follower:
         self._elapsed = self._began = 0.0
         self._swept: list[tuple[ToolPose, Touch]] = []
 
-    def kept(self) -> Kept | None:
+    def kept(self) -> ResumePoint | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
-        return None if self.lit is None else Kept(self.refined.samples(), self.torch)
+        return None if self.lit is None else ResumePoint(self.refined.samples(), self.torch)
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""
@@ -270,13 +270,13 @@ class Follower:
         else:
             self._believe(touch.time, s, felt, deflection, pose.angle)
 
-    def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, Felt, float]:
+    def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, SeamReading, float]:
         """Return where on the plan the tip is, the seam there, and the deflection to the wall."""
         tip = pose.position + turned(self._corrected(touch.displacement), pose.angle)
         s = self._plan.foot(tip[:2], self.tip)
         place = self._plan.at(s)
         beside = float((tip[:2] - place.point) @ place.normal) - self._belief.beside
-        felt = Felt(beside, float(tip[2]) - place.height)
+        felt = SeamReading(beside, float(tip[2]) - place.height)
         return s, felt, self.side * float((pose.position - tip)[:2] @ place.normal)
 
     def _corrected(self, displacement: Floats) -> Floats:
@@ -296,18 +296,20 @@ class Follower:
             return 1.0
         return 1.0 - min((self._settings.deflection - self.wanted) / width, 2.0)
 
-    def _smoothed(self, felt: Felt) -> Felt:
+    def _smoothed(self, felt: SeamReading) -> SeamReading:
         """Return a mean over as many measurements as their scatter asks for."""
         before = self._felt
         if before is None:
             return felt
         share = min(1.0, max((STEADY / self.refined.noise) ** 2, 0.1))
-        return Felt(
+        return SeamReading(
             before.offset + share * (felt.offset - before.offset),
             before.height + share * (felt.height - before.height),
         )
 
-    def _believe(self, time: float, s: float, felt: Felt, deflection: float, angle: float) -> None:
+    def _believe(
+        self, time: float, s: float, felt: SeamReading, deflection: float, angle: float
+    ) -> None:
         """Keep what the tip felt, unless contact is doubtful."""
         if not self._tells(s, felt, deflection):
             return
@@ -321,7 +323,7 @@ class Follower:
             self.refined.add(time, s, felt.offset, angle, self._seating.doubt)
         self.refined.confirm(time - BELIEF)
 
-    def _tells(self, s: float, felt: Felt, deflection: float) -> bool:
+    def _tells(self, s: float, felt: SeamReading, deflection: float) -> bool:
         """Return whether a wall holds the tip, so that it tells where the seam is."""
         if self.phase == "ending":
             self._notice_loss(s, felt, deflection)
@@ -345,14 +347,14 @@ class Follower:
                 "the rest as a seam of its own"
             )
 
-    def _watch(self, s: float, felt: Felt) -> None:
+    def _watch(self, s: float, felt: SeamReading) -> None:
         """Stop where the tip does not sit in the groove any more."""
         wrong = self._seating.judge(s, felt.offset, felt.height)
         if wrong is not None and self.phase == "following":
             self.refined.forget_pending()
             self._stop(wrong)
 
-    def _notice_loss(self, s: float, felt: Felt, deflection: float) -> None:
+    def _notice_loss(self, s: float, felt: SeamReading, deflection: float) -> None:
         """Notice that the wall is gone while the tip is let go of: it then goes with the robot."""
         if self.refined.empty:
             return
@@ -527,13 +529,13 @@ class Follower:
         place = self._place
         return float((pose.position[:2] - place.point) @ place.normal) - self._belief.beside
 
-    def _seam_at_tip(self) -> Felt:
+    def _seam_at_tip(self) -> SeamReading:
         """Return the seam at the tip: as felt, or as predicted while nothing is felt."""
         felt = self._felt
         if felt is None:
-            return Felt(0.0, 0.0)
+            return SeamReading(0.0, 0.0)
         if self.phase in ("bridging", "ending") and not self.refined.empty:
-            return Felt(self.refined.offset(self.tip), felt.height)
+            return SeamReading(self.refined.offset(self.tip), felt.height)
         return felt
 
 

@@ -19,7 +19,7 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower, Kept
+from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
@@ -32,7 +32,7 @@ PRESSING = 5e-3
 
 
 def controller_of(
-    plan: Path, belief: Belief, settings: Following, mode: Mode, kept: Kept | None = None
+    plan: Path, belief: Belief, settings: Following, mode: Mode, kept: ResumePoint | None = None
 ) -> Controller:
     """Return the controller of the mode that was asked for."""
     if isinstance(mode, BoundPart):
@@ -75,11 +75,11 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     kept = start.get("kept")
     return controller_of(
         Path(np.array(start["points"])), belief, settings, _mode_of(start["mode"]),
-        None if kept is None else Kept(np.array(kept["samples"]), kept["torch"]),
+        None if kept is None else ResumePoint(np.array(kept["samples"]), kept["torch"]),
     )  # fmt: skip
 
 
-def kept_of(log: FilePath, points: Floats) -> Kept | None:
+def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
     """Return what a stopped weld has left; None where its torch had not been on the seam.
 
     Args:
@@ -105,7 +105,7 @@ def kept_of(log: FilePath, points: Floats) -> Kept | None:
 
 
 class _Again:
-    """Steps a controller through the journal of its weld."""
+    """Steps a controller through the log of its weld."""
 
     def __init__(self, controller: Controller) -> None:
         self.controller = controller
@@ -135,7 +135,7 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
 
 
 def set_back(
-    params: WeldTactileParams, plan: Path, distance: float, kept: Kept
+    params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint
 ) -> WeldTactileParams:
     """Return the parameters with which the tip is set down so that the torch overlaps.
 

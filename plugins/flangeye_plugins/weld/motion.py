@@ -11,7 +11,7 @@ from flangeye.motion.seam_following import ToolPose
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class SeamReading:
     """The seam at the tip: measured while it touches, predicted while it does not.
 
     Attributes:

@@ -15,7 +15,7 @@ from flangeye.motion.leading import led
 from flangeye.motion.limits import limits_of
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
-from flangeye.types import Floats, Journal, Seam, Seed, VerifiedHandEye, WeldReport
+from flangeye.types import Floats, Seam, Seed, StageLog, VerifiedHandEye, WeldReport
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
@@ -31,9 +31,9 @@ from flangeye_plugins.weld.finger_camera import (
     SteppedReader,
     ThreadedReader,
 )
-from flangeye_plugins.weld.follower import Kept
+from flangeye_plugins.weld.follower import ResumePoint
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.going_on import controller_of, kept_of, set_back
+from flangeye_plugins.weld.going_on import controller_of, resume_point_of, set_back
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
@@ -50,7 +50,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     limits: LimitsSection,
     motion: MotionAllowed,
     seed: Seed,
-    journal: Journal,
+    stage_log: StageLog,
     params: WeldTactileParams,
 ) -> WeldReport:
     """Follow the planned seam by touch: the tip feels it, the torch follows behind.
@@ -73,7 +73,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     checks.check_finger(finger, params)
     checks.check_seam(seam, plan, body.distance, params)
     checks.check_speeds(finger, params, allowed)
-    kept = None if params.resume is None else kept_of(params.resume, points)
+    kept = None if params.resume is None else resume_point_of(params.resume, points)
     if kept is not None:
         params = set_back(params, plan, body.distance, kept)
     belief = belief_of(finger, body, seam.half_angle, params)
@@ -89,7 +89,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         latest = LatestState(robot.state())
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
         eyes = opened.enter_context(_eyes(sensor, reader, simulated))
-        weld_log = opened.enter_context(WeldLog(journal, not simulated, params.log_images))
+        weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
         drive = Executor(robot, latest, model, allowed)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
@@ -119,7 +119,7 @@ def start_of(
     finger: Finger,
     belief: Belief,
     params: WeldTactileParams,
-    kept: Kept | None,
+    kept: ResumePoint | None,
 ) -> dict[str, Any]:
     """Return all that the decisions of a weld follow from, besides what was measured."""
     return {

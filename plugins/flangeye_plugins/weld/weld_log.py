@@ -1,6 +1,6 @@
 """What a weld leaves in the log while it runs: images, feelings, and every cycle's decision.
 
-Cycles go to the journal in blocks, column by column. In real time a thread of its own writes, so
+Cycles go to the step's log in blocks, column by column. In real time a thread of its own writes, so
 that the loop never waits for the disk.
 """
 
@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
-from flangeye.types import Journal
+from flangeye.types import StageLog
 from flangeye_plugins.weld.finger_camera import TagObservation
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
@@ -58,7 +58,7 @@ class Cycle(NamedTuple):
 
 
 class WeldLog:
-    """Collects a weld, and writes it into the step's journal.
+    """Collects a weld, and writes it into the step's log.
 
     Attributes:
         cycles: All so far.
@@ -66,16 +66,16 @@ class WeldLog:
         felt: Number of an image -> what was felt in it.
     """
 
-    def __init__(self, journal: Journal, beside: bool, images: bool = True) -> None:
-        """Write into ``journal``: at once, or in a thread ``beside`` the loop; images if asked."""
+    def __init__(self, stage_log: StageLog, beside: bool, images: bool = True) -> None:
+        """Write into ``stage_log`` at once, or in a thread ``beside`` the loop; images if asked."""
         self._images = images
         self.cycles: list[Cycle] = []
         self.sights = 0
         self.felt: dict[int, TipDisplacement] = {}
-        self._journal = journal
+        self._log = stage_log
         self._block: list[Cycle] = []
         self._queue: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write, name="journal") if beside else None
+        self._thread = threading.Thread(target=self._write, name="stage log") if beside else None
 
     def __enter__(self) -> Self:
         if self._thread:
@@ -134,7 +134,7 @@ class WeldLog:
             self._put(*item)
 
     def _put(self, name: str, value: Any) -> None:
-        self._journal(name, columns(value) if name == "cycles" else value)
+        self._log(name, columns(value) if name == "cycles" else value)
 
 
 def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:

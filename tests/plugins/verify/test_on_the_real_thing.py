@@ -84,7 +84,7 @@ def test_touch_finds_a_shift_of_the_matrix() -> None:
 def test_stitch_finds_a_turn_of_the_matrix_and_draws_it() -> None:
     pictures: dict[str, Any] = {}
     right, wrong = (
-        verify_stitch(calibration(turn=a), views(), StitchParams(), journal=pictures.__setitem__)
+        verify_stitch(calibration(turn=a), views(), StitchParams(), stage_log=pictures.__setitem__)
         for a in [(0, 0, 0), (0.05, 0, 0)]
     )
     assert right.passed and right.figures["spread"] < 1e-6
@@ -118,7 +118,7 @@ def test_two_balls_at_a_known_distance_show_the_scanners_scale_alone() -> None:
     drawn: dict[str, Any] = {}
     # The arm is of another scale, which must not matter.
     found = verify_sphere(
-        calibration(scale=1.05), SphereParams(bars=bars), journal=drawn.__setitem__
+        calibration(scale=1.05), SphereParams(bars=bars), stage_log=drawn.__setitem__
     )
     assert found.passed and found.figures["pairs"] == 20
     assert found.figures["scale"] == pytest.approx(
@@ -129,7 +129,7 @@ def test_two_balls_at_a_known_distance_show_the_scanners_scale_alone() -> None:
 
 def test_touch_draws_what_was_predicted_less_what_was_touched() -> None:
     drawn: dict[str, Any] = {}
-    verify_touch(calibration(shift=(2e-3, 0, 0)), touches(3), journal=drawn.__setitem__)
+    verify_touch(calibration(shift=(2e-3, 0, 0)), touches(3), stage_log=drawn.__setitem__)
     series = drawn["comparison"]["series"]
     assert [x for x, _ in series["along x"]] == [1, 2, 3]
     assert [y for _, y in series["along x"]] == pytest.approx([2.0] * 3, abs=1e-5)

@@ -11,9 +11,9 @@ from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_plugins.weld.follower import Kept
+from flangeye_plugins.weld.follower import ResumePoint
 from flangeye_plugins.weld.frame import WorkPlane
-from flangeye_plugins.weld.going_on import kept_of, set_back
+from flangeye_plugins.weld.going_on import resume_point_of, set_back
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.bench import curved
@@ -57,27 +57,27 @@ def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(
 ) -> None:
     torn = tmp_path / "run.mcap"
     torn.write_bytes(stopped[1].read_bytes()[:-200_000])
-    whole, part = kept_of(stopped[1], PLAN), kept_of(torn, PLAN)
+    whole, part = resume_point_of(stopped[1], PLAN), resume_point_of(torn, PLAN)
     assert 0.0 < part.torch < whole.torch
     assert len(part.samples) < len(whole.samples)
 
 
 def test_what_cannot_be_gone_on_with_is_refused(stopped: Any, tmp_path: Any) -> None:
     with pytest.raises(StageError, match="was of another plan"):
-        kept_of(stopped[1], PLAN + 1e-3)
+        resume_point_of(stopped[1], PLAN + 1e-3)
     with pytest.raises(StageError, match="holds no weld by touch"):
-        kept_of(logged([], tmp_path / "empty.mcap"), PLAN)
+        resume_point_of(logged([], tmp_path / "empty.mcap"), PLAN)
 
 
 def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any) -> None:
     hidden = {"hidden": ("12 s", "60 s")}
     _, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
-    assert kept_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
+    assert resume_point_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 
 
 def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it() -> None:
     plan = Path(curved(0.15))
     params = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
-    params = set_back(params, plan, 0.04, Kept(np.zeros((0, 4)), 0.06))
+    params = set_back(params, plan, 0.04, ResumePoint(np.zeros((0, 4)), 0.06))
     tip, torch = plan.at(params.inset).point, plan.at(0.03).point
     assert np.linalg.norm(tip - torch) == pytest.approx(0.04, abs=0.6e-3)

@@ -2,6 +2,6 @@
 
 from flangeye.recipe.draft.questions import Questions
 from flangeye.recipe.draft.recipe import Draft, draft_recipe
-from flangeye.recipe.draft.sights import look
+from flangeye.recipe.draft.survey import look
 
 __all__ = ["Draft", "Questions", "draft_recipe", "look"]

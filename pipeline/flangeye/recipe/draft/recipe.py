@@ -23,7 +23,7 @@ from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
 from flangeye.recipe.draft.questions import Questions
-from flangeye.recipe.draft.sights import Sights
+from flangeye.recipe.draft.survey import FolderSurvey
 from flangeye.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"
@@ -46,11 +46,13 @@ class Draft:
     told: Sequence[str]
 
 
-def draft_recipe(sights: Sights, out: Path, questions: Questions, registry: Registry) -> Draft:
+def draft_recipe(
+    survey: FolderSurvey, out: Path, questions: Questions, registry: Registry
+) -> Draft:
     """Return a recipe for what was seen.
 
     Args:
-        sights: What the folder holds.
+        survey: What the folder holds.
         out: Where the recipe will be; its paths start there.
         questions: For what cannot be seen.
         registry: The plugins on offer.
@@ -59,11 +61,11 @@ def draft_recipe(sights: Sights, out: Path, questions: Questions, registry: Regi
         FlangeyeError: Something is missing that no answer gives; says which line to add.
     """
     robot = _robot(questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", NONE))
-    reader = _reader(sights, questions, registry, robot)
-    archive = _bound(reader, registry)(sights.folder)
+    reader = _reader(survey, questions, registry, robot)
+    archive = _bound(reader, registry)(survey.folder)
     stage, target = _what(archive, questions)
-    head = _head(sights.folder, robot, target, questions)
-    first: dict[str, Any] = {"path": os.path.relpath(sights.folder, out.parent)}
+    head = _head(survey.folder, robot, target, questions)
+    first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target) if stage == "acquire.images" else {}
     data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
@@ -80,24 +82,24 @@ def _robot(answer: str) -> dict[str, Any]:
 
 
 def _reader(
-    sights: Sights, questions: Questions, registry: Registry, robot: Mapping[str, Any]
+    survey: FolderSurvey, questions: Questions, registry: Registry, robot: Mapping[str, Any]
 ) -> Any:
     """Return the reader as a recipe writes it: given, known by the layout, or made for a table."""
     given = questions.given.get("reader")
     if given is not None:
         return parse_value(given, "--reader")
     try:
-        _bound("auto", registry)(sights.folder)
+        _bound("auto", registry)(survey.folder)
     except StageError as error:
         reason = str(error)
     else:
         return "auto"
-    if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in sights.files):
+    if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
-    if sights.tables:
-        scans = bool(sights.of(CLOUDS) or sights.of(IMAGES))
-        return {"table": table_params(sights.tables, questions, _maker(robot), scans)}
-    raise StageError(_missing(sights, reason))
+    if survey.tables:
+        scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
+        return {"table": table_params(survey.tables, questions, _maker(robot), scans)}
+    raise StageError(_missing(survey, reason))
 
 
 def _bound(reader: Any, registry: Registry) -> BoundPart:
@@ -117,23 +119,23 @@ def _maker(robot: Mapping[str, Any]) -> str | None:
     return load_model("robots", robot["model"]).maker if "model" in robot else None
 
 
-def _missing(sights: Sights, reason: str) -> str:
+def _missing(survey: FolderSurvey, reason: str) -> str:
     """Say what is missing, and the line that would bring it."""
-    scans = sights.of(CLOUDS) or sights.of(IMAGES)
-    if sights.arrays:
-        first, *others = (array.partition(" ")[0] for array in sights.arrays)
+    scans = survey.of(CLOUDS) or survey.of(IMAGES)
+    if survey.arrays:
+        first, *others = (array.partition(" ")[0] for array in survey.arrays)
         target = f', target: {{at: "{others[0]}", length: m}}' if others else ""
         return (
-            f"{sights.folder}: holds arrays; say which are the arm's poses: --reader 'matrices: "
+            f"{survey.folder}: holds arrays; say which are the arm's poses: --reader 'matrices: "
             f'{{robot: "{first}", length: m{target}}}\''
         )
     if scans:
         return (
-            f"{sights.folder}: holds {len(scans)} scans, but nothing that says where the flange "
+            f"{survey.folder}: holds {len(scans)} scans, but nothing that says where the flange "
             f"was; put poses.csv beside them, its first line: {POSES_LINE}; then a line for each, "
             f"{scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
-    return f"{sights.folder}: holds no scans and no table of poses; {reason}"
+    return f"{survey.folder}: holds no scans and no table of poses; {reason}"
 
 
 # --- what is in it

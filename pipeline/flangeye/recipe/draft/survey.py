@@ -20,7 +20,7 @@ FEWEST_ROWS, FEWEST_COLUMNS = 3, 6
 
 
 @dataclass(frozen=True)
-class Sights:
+class FolderSurvey:
     """What was seen.
 
     Attributes:
@@ -55,7 +55,7 @@ class Sights:
         return [*told, *(f"array: {array}" for array in self.arrays)]
 
 
-def look(folder: Path) -> Sights:
+def look(folder: Path) -> FolderSurvey:
     """Return what a folder holds.
 
     Raises:
@@ -67,7 +67,7 @@ def look(folder: Path) -> Sights:
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
     tables = [table for p in files if (table := _table(p)) is not None]
-    return Sights(folder, files, tables, [name for p in files for name in _arrays(p)])
+    return FolderSurvey(folder, files, tables, [name for p in files for name in _arrays(p)])
 
 
 def _table(file: Path) -> TextTable | None:
