@@ -39,6 +39,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.realtime)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Let the programs that a test starts find the tests, whatever a command did before.
+
+    A command that runs in the tests' own process keeps the current folder from its children.
+    """
+    os.environ.pop("PYTHONSAFEPATH", None)
+
+
 RECORDINGS = Path(__file__).parents[1].parent / "shared" / "data" / "ancorasir"
 
 
