@@ -10,64 +10,73 @@ import typer
 from flangeye.cli.app import app, load_plugins, say
 from flangeye.errors import RecipeError
 
+Answer = str | None
+"""To a question that a person is asked otherwise."""
+
+Folder = Annotated[Path, typer.Argument(help="Folder with the recordings.")]
+Robot = Annotated[Answer, typer.Option(help="Robot model, its .urdf or .yaml file, or none.")]
+Plate = Annotated[Answer, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")]
+Scanner = Annotated[Answer, typer.Option(help="Scanner model, or none.")]
+Camera = Annotated[Answer, typer.Option(help="Where the camera is mounted: base or flange.")]
+Target = Annotated[
+    Answer,
+    typer.Option(
+        help="Target: flange; 'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' "
+        "and so on, with the parameters of that fit."
+    ),
+]
+Table = Annotated[Answer, typer.Option(help="Table with the arm's poses.")]
 Columns = Annotated[
-    str | None,
+    Answer,
     typer.Option(help="Columns of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6."),
 ]
+Rotation = Annotated[
+    Answer,
+    typer.Option(
+        help="Rotation format: kuka, fanuc, vector, xyzw, …; see flangeye stages reader.table"
+    ),
+]
+Length = Annotated[Answer, typer.Option(help="Unit of the positions: m or mm.")]
+Angle = Annotated[Answer, typer.Option(help="Unit of the angles: deg or rad.")]
+Pose = Annotated[
+    Answer, typer.Option(help="Direction of the poses: base_T_flange or flange_T_base.")
+]
+TargetColumns = Annotated[
+    Answer, typer.Option(help="Columns of the target in the camera: a point or a pose.")
+]
+TargetRotation = Annotated[
+    Answer, typer.Option(help="Rotation format of the target, as for --rotation.")
+]
+TargetLength = Annotated[Answer, typer.Option(help="Unit of the target's positions: m or mm.")]
+TargetAngle = Annotated[Answer, typer.Option(help="Unit of the target's angles: deg or rad.")]
+Reader = Annotated[
+    Answer, typer.Option(help="Reader as written in a recipe; replaces the options above.")
+]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")]
+Out = Annotated[Path, typer.Option(help="Recipe file to write.")]
 
 
 @app.command()
 def init(  # noqa: PLR0913  one for each option
-    folder: Annotated[Path, typer.Argument(help="Folder with the recordings.")] = Path(),
-    robot: Annotated[
-        str | None, typer.Option(help="Robot model, its .urdf or .yaml file, or none.")
-    ] = None,
-    plate: Annotated[
-        str | None, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")
-    ] = None,
-    scanner: Annotated[str | None, typer.Option(help="Scanner model, or none.")] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Where the camera is mounted: base or flange.")
-    ] = None,
-    target: Annotated[
-        str | None,
-        typer.Option(
-            help="Target: flange; 'sphere: {diameter: …, centre: […]}'; 'charuco: {columns: …}' "
-            "and so on, with the parameters of that fit."
-        ),
-    ] = None,
-    table: Annotated[str | None, typer.Option(help="Table with the arm's poses.")] = None,
+    folder: Folder = Path(),
+    robot: Robot = None,
+    plate: Plate = None,
+    scanner: Scanner = None,
+    camera: Camera = None,
+    target: Target = None,
+    table: Table = None,
     columns: Columns = None,
-    rotation: Annotated[
-        str | None,
-        typer.Option(
-            help="Rotation format: kuka, fanuc, vector, xyzw, …; see flangeye stages reader.table"
-        ),
-    ] = None,
-    length: Annotated[str | None, typer.Option(help="Unit of the positions: m or mm.")] = None,
-    angle: Annotated[str | None, typer.Option(help="Unit of the angles: deg or rad.")] = None,
-    pose: Annotated[
-        str | None, typer.Option(help="Direction of the poses: base_T_flange or flange_T_base.")
-    ] = None,
-    target_columns: Annotated[
-        str | None, typer.Option(help="Columns of the target in the camera: a point or a pose.")
-    ] = None,
-    target_rotation: Annotated[
-        str | None, typer.Option(help="Rotation format of the target, as for --rotation.")
-    ] = None,
-    target_length: Annotated[
-        str | None, typer.Option(help="Unit of the target's positions: m or mm.")
-    ] = None,
-    target_angle: Annotated[
-        str | None, typer.Option(help="Unit of the target's angles: deg or rad.")
-    ] = None,
-    reader: Annotated[
-        str | None, typer.Option(help="Reader as written in a recipe; replaces the options above.")
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")
-    ] = False,
-    out: Annotated[Path, typer.Option(help="Recipe file to write.")] = Path("recipe.yaml"),
+    rotation: Rotation = None,
+    length: Length = None,
+    angle: Angle = None,
+    pose: Pose = None,
+    target_columns: TargetColumns = None,
+    target_rotation: TargetRotation = None,
+    target_length: TargetLength = None,
+    target_angle: TargetAngle = None,
+    reader: Reader = None,
+    yes: Yes = False,
+    out: Out = Path("recipe.yaml"),
 ) -> None:
     """Create a recipe for recordings: inspect them and ask for what they do not show."""
     from flangeye.recipe.draft import Questions, draft_recipe, look

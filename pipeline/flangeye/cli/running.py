@@ -42,6 +42,18 @@ Results = Annotated[
         help="Folder for the run's files; default runs/<time>_<recipe>.",
     ),
 ]
+Sessions = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[PATH|URL]...", help="Recordings, one session each; none for simulated recipes."
+    ),
+]
+Grid = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set-grid", metavar="PATH=A,B,C", help="Run with each of these values; may be repeated."
+    ),
+]
 FromLog = Annotated[
     Path | None,
     typer.Option("--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."),
@@ -223,22 +235,9 @@ def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:
 @app.command()
 def batch(  # noqa: PLR0913  one argument an option
     recipe: RecipeName,
-    archives: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[PATH|URL]...",
-            help="Recordings, one session each; none for simulated recipes.",
-        ),
-    ] = None,
+    archives: Sessions = None,
     overrides: Overrides = None,
-    grid: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set-grid",
-            metavar="PATH=A,B,C",
-            help="Run with each of these values; may be repeated.",
-        ),
-    ] = None,
+    grid: Grid = None,
     repeat: Annotated[int | None, typer.Option(min=1, help="Number of seeds to run.")] = None,
     vary: Annotated[str, typer.Option(help="Value that --repeat increments.")] = "seed",
     workers: Annotated[

@@ -16,17 +16,25 @@ if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
 
 
+Later = Annotated[
+    list[Path] | None,
+    typer.Option(help="Later scans that show the flange, one check per file, oldest first."),
+]
+More = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[NEW]...", help="More archives, as with --archive."),
+]
+HistoryFile = Annotated[
+    Path | None,
+    typer.Option(help="History file; default monitor.parquet beside the calibration's log."),
+]
+
+
 @app.command()
 def monitor(  # noqa: PLR0913  one argument an option
     calibration: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
-    archive: Annotated[
-        list[Path] | None,
-        typer.Option(help="Later scans that show the flange, one check per file, oldest first."),
-    ] = None,
-    more: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[NEW]...", help="More archives, as with --archive."),
-    ] = None,
+    archive: Later = None,
+    more: More = None,
     live: Annotated[
         bool, typer.Option("--live", help="Take new scans with the recipe's arm and scanner.")
     ] = False,
@@ -35,10 +43,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         bool,
         typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
     ] = False,
-    history: Annotated[
-        Path | None,
-        typer.Option(help="History file; default monitor.parquet beside the calibration's log."),
-    ] = None,
+    history: HistoryFile = None,
     false_alarms: Annotated[
         float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm per check.")
     ] = 2e-4,
