@@ -2,8 +2,9 @@
 
 import os
 import signal
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ import pluggy
 import pytest
 from hypothesis import settings
 
-from flangeye.plugin import hookspecs
+from flangeye import cli
+from flangeye.plugin import hookspecs, registry
 from flangeye.plugin.registry import Registry
 from tests import toy
 
@@ -62,10 +64,10 @@ def ancorasir() -> Path:
 def _registry_with(*modules: tuple[str, object]) -> Registry:
     hooks = pluggy.PluginManager(hookspecs.NAME)
     hooks.add_hookspecs(hookspecs)
-    registry = Registry(hooks)
+    made = Registry(hooks)
     for name, module in modules:
-        registry.register(name, module)
-    return registry
+        made.register(name, module)
+    return made
 
 
 @pytest.fixture
@@ -100,6 +102,44 @@ def toy_recipe(tmp_path: Path) -> Path:
     path = tmp_path / "toy.yaml"
     path.write_text(TOY_RECIPE)
     return path
+
+
+Call = Callable[..., tuple[str | int | None, str, str]]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """Call the command line in this process; return its exit code and what it wrote."""
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
+        code: str | int | None = 0
+        try:
+            cli.main()
+        except SystemExit as exit_:
+            code = exit_.code
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def flangeye(
+    command: Call, monkeypatch: pytest.MonkeyPatch, toy_registry: Registry, tmp_path: Path
+) -> Call:
+    """Call the command line in an empty folder with the toy stages; return code, out, err."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "load_registry", lambda: toy_registry)
+
+    def call(*words):
+        told = command(*words)
+        for plugin in list(toy_registry.hooks.get_plugins()):
+            if toy_registry.hooks.get_name(plugin) != "toy":
+                toy_registry.hooks.unregister(plugin)
+        return told
+
+    return call
 
 
 @contextmanager

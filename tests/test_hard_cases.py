@@ -7,7 +7,6 @@ import os
 import resource
 import struct
 import subprocess
-import sys
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -38,7 +37,7 @@ from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
 from flangeye.run.session import Start, record_run
 from flangeye_plugins.scanner.azure_kinect import AzureKinectParams, scanner_azure_kinect
-from tests.conftest import TOY_RECIPE, toy_plugins
+from tests.conftest import TOY_RECIPE, Call, toy_plugins
 from tests.crafted import bomb, only, rewritten
 
 SAMPLE = bundled("data") / "samples" / "ur5_phoxi-m"
@@ -58,23 +57,10 @@ steps:
 
 
 @pytest.fixture
-def flangeye(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Any]:
+def flangeye(command: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
     """Call the command line in an empty folder; return the exit code and what it wrote."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
-        code: str | int | None = 0
-        try:
-            cli.main()
-        except SystemExit as exit_:
-            code = exit_.code
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
+    return command
 
 
 def one_line(told, code=2):

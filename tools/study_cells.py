@@ -7,6 +7,7 @@ many sightings drawn at random, and how many chosen by the whole graph's covaria
 """
 
 import sys
+from typing import cast
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe, recipe_names
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
+from flangeye_emulators.acquire.planned_cell import CellSessionParams
 
 CELLS = ("two-scanners", "hand-and-wall", "arm-on-rail", "two-arms-three-scanners")
 GRID_SIGHTINGS = 40
@@ -32,7 +34,7 @@ def stream(cell, plan, seed):
         [f"steps.0.plan={plan}", f"steps.0.sightings={GRID_SIGHTINGS}", f"seed={seed}"],
     )
     seen = Runner(recipe, registry, ArchivePath(None)).observe()
-    (places,) = (getattr(step.params, "places") for step in recipe.steps[:1])  # noqa: B009
+    places = cast(CellSessionParams, recipe.steps[0].params).places
     return recipe.context[Cell], seen, {name: place.matrix for name, place in places.items()}
 
 

@@ -146,7 +146,7 @@ class Panel:
         if run is None or (other and run.code is not None):
             self._state.text = _nothing(left, other)
             return
-        self._state.text = told(run, self._project.owner == self._me)
+        self._state.text = status_line(run, self._project.owner == self._me)
         self._show(run)
 
     def _show(self, run: RunProcess) -> None:
@@ -250,7 +250,7 @@ def _nothing(left: Path | None, other: Path | None) -> str:
     return "Nothing runs."
 
 
-def told(run: RunProcess, mine: bool) -> str:
+def status_line(run: RunProcess, mine: bool) -> str:
     """Return how the run stands, in one line."""
     if run.code is None:
         where = "" if mine else "; another page started it"

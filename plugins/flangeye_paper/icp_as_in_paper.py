@@ -76,7 +76,7 @@ def verify_icp_as_in_paper(
     error = _pose_error(transform, view, fit)
     figures = {**figures_of(error), "rms": fit.rms / view.per_metre, "share": fit.share}
     figures["iterations"] = float(fit.iterations)
-    return Verification(True, _told(figures), figures)
+    return Verification(True, _summary(figures), figures)
 
 
 def published_view(views: Views) -> PublishedView:
@@ -132,7 +132,7 @@ def _in_file_unit(matrix: Floats, view: PublishedView) -> Floats:
     return scaled
 
 
-def _told(figures: dict[str, float]) -> str:
+def _summary(figures: dict[str, float]) -> str:
     shift = ", ".join(f"{figures[axis] * 1e3:+.3f}" for axis in "xyz")
     turn = ", ".join(f"{np.degrees(figures[axis]):+.3f}" for axis in ("roll", "pitch", "yaw"))
     return (

@@ -79,7 +79,7 @@ def verify_realisations(
     if not outcomes:
         return Verification(False, f"all {params.count} realisations were refused", {})
     figures = _figures(outcomes, params.count)
-    return Verification(True, _told(figures), figures)
+    return Verification(True, _summary(figures), figures)
 
 
 def _outcomes(source: PointSource, solve: Solver, count: int) -> Iterator[RealisationOutcome]:
@@ -126,7 +126,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _told(figures: dict[str, float]) -> str:
+def _summary(figures: dict[str, float]) -> str:
     return (
         f"{figures['workspace_rms'] * 1e3:.3f} mm rms over the workspace in "
         f"{figures['realisations']:.0f} realisations; no estimate is better than "

@@ -2,7 +2,6 @@
 
 import io
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,12 @@ from rich.console import Console
 
 from flangeye.batch import Request, run_batch
 from flangeye.plugin.registry import load_registry
+from tests.conftest import TOY_RECIPE, Call
 
 ROOT = Path(__file__).parents[2]
 SITE = Path(__file__).parent / "site"
 
-RECIPE = """\
-title: Toy
-seed: 3
-steps:
-  - acquire.toy: {count: 6, noise: 0.1 mm}
-  - segment.toy
-  - fit.toy
-  - solve.work
-  - verify.toy: {max_rms: 2 mm}
-"""
+RECIPE = TOY_RECIPE.replace("solve.toy", "solve.work")
 ARCHIVE_RECIPE = RECIPE.replace("acquire.toy: {count: 6, noise: 0.1 mm}", "acquire.toy_archive")
 
 
@@ -81,20 +72,6 @@ def batch(recipe: Path, registry: Any) -> Callable[..., Any]:
 
 
 @pytest.fixture
-def flangeye(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Any]:
+def flangeye(command: Call) -> Call:
     """Call the command line; return code, out, err."""
-    from flangeye import cli
-
-    def call(*words):
-        monkeypatch.setattr(sys, "argv", ["flangeye", *map(str, words)])
-        code: str | int | None = 0
-        try:
-            cli.main()
-        except SystemExit as exit_:
-            code = exit_.code
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
+    return command

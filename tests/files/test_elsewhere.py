@@ -23,7 +23,7 @@ from flangeye.files.elsewhere import (
     is_url,
     print_of,
     results_at,
-    told,
+    with_urls,
 )
 from flangeye.types import CAMERA, PointCloud
 
@@ -60,7 +60,7 @@ def test_scans_are_fetched_one_at_a_time_and_let_go(bucket: Any, archive: Path) 
             assert is_elsewhere(scan) and scan.stat().st_size == 0
             assert read_cloud(scan).xyz[0, 0, 0] == 0.5 + i
             assert scan.stat().st_size == 0
-        assert told(f"{root}/scans") == "s3://cell/monday/scans"
+        assert with_urls(f"{root}/scans") == "s3://cell/monday/scans"
     assert not root.exists()
 
 

@@ -53,8 +53,8 @@ def test_the_flanges_are_in_base_once_solved(messages: Any) -> None:
     assert np.allclose(points_of(seen), toy.BASE_T_CAMERA.apply(first), atol=1e-3)
 
 
-def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in: Any, tmp_path: Path) -> None:
-    assert flangeye_in("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
+def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path: Path) -> None:
+    assert flangeye("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
     layout = json.loads((tmp_path / "l.json").read_text())
     shown = layout["configById"]["3D!cell"]["topics"]
     assert set(CLOUDS) <= set(shown)
@@ -62,12 +62,12 @@ def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye_in: Any, tmp_pa
     assert all(panel in named for panel in layout["configById"])
 
 
-def test_a_rerun_blueprint_is_written(flangeye_in: Any, tmp_path: Path) -> None:
+def test_a_rerun_blueprint_is_written(flangeye: Any, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    assert flangeye_in("layout", "rerun", "--out", tmp_path / "l.rbl")[0] == 0
+    assert flangeye("layout", "rerun", "--out", tmp_path / "l.rbl")[0] == 0
     assert (tmp_path / "l.rbl").read_bytes()[:4] == b"RRF2"
 
 
-def test_another_viewer_is_not_known(flangeye_in: Any) -> None:
-    code, _, err = flangeye_in("layout", "rviz")
+def test_another_viewer_is_not_known(flangeye: Any) -> None:
+    code, _, err = flangeye("layout", "rviz")
     assert (code, err) == (2, "error: no layout for 'rviz'; known: foxglove, rerun\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,7 @@ import pytest
 from flangeye.log.read import RunLog
 from flangeye.report import write_report
 from flangeye_plugins.export import EXPORTS
-
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--no-first-run",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
-]  # fmt: skip
+from tests.chromium import chromium
 
 PAINTED = """[...document.querySelectorAll(".gl-container canvas")].map(from => {
   const to = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
@@ -32,14 +25,8 @@ PAINTED = """[...document.querySelectorAll(".gl-container canvas")].map(from => 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("no chromium on this machine: apt-get install chromium")
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+    with chromium() as launched:
         yield launched
-        launched.close()
 
 
 @pytest.mark.parametrize(

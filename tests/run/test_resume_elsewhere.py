@@ -2,11 +2,10 @@
 
 from typing import Any
 
-from tests.cli.conftest import flangeye  # noqa: F401  a fixture
-from tests.run.test_retake import Call, done  # noqa: F401  a fixture
+from tests.conftest import Call
 
 
-def test_a_run_in_a_bucket_is_gone_on_with(done: Call, bucket: Any) -> None:  # noqa: F811
+def test_a_run_in_a_bucket_is_gone_on_with(done: Call, bucket: Any) -> None:
     bucket.put("done/", "cell/done/", recursive=True)
     words = ("--resume", "s3://cell/done", "--retake", "003", "--out", "s3://cell/again")
     code, _, err = done("run", *words)

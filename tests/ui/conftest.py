@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -17,11 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.report.test_browser import FLAGS
-
-LOCAL = [f for f in FLAGS if "host-resolver" not in f] + [
-    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
-]
+from tests.chromium import chromium
 
 
 @dataclass
@@ -88,11 +83,5 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("no chromium on this machine: apt-get install chromium")
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=chromium, args=LOCAL)
+    with chromium("127.0.0.1") as launched:
         yield launched
-        launched.close()

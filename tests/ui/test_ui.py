@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from pluggy import PluginManager
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
@@ -411,14 +412,14 @@ def test_without_a_browser_the_address_is_printed(
     monkeypatch.setattr("flangeye_ui.server.app.add_middleware", lambda *a, **k: None)
     for each in (cell_page, plan_page, run_page, verdict_page, archive_page):
         monkeypatch.setattr(each, "add", lambda project: None)
-    server.serve(tmp_path, Registry(None), "127.0.0.1", 8090, browser=True)  # type: ignore[arg-type]
+    server.serve(tmp_path, Registry(PluginManager("flangeye")), "127.0.0.1", 8090, browser=True)
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("open http://127.0.0.1:8090/?token=")
     assert second == "no browser was found here; open the address yourself"
 
 
 def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path) -> None:
-    project = Project(tmp_path, Registry(None))  # type: ignore[arg-type]
+    project = Project(tmp_path, Registry(PluginManager("flangeye")))
     log = tmp_path / "runs" / "monday" / "run.mcap"
     log.parent.mkdir(parents=True)
     log.write_bytes(b"")
@@ -442,7 +443,7 @@ def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> No
     assert project.run is not None
     project.run._process.kill()
     project.run._process.wait(10)
-    assert run_page.told(project.run, True).endswith("_ui: ended early (exit code -9).")
+    assert run_page.status_line(project.run, True).endswith("_ui: ended early (exit code -9).")
 
 
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:

@@ -147,7 +147,7 @@ def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
     except OSError:  # a timeout is one too
         kind = f"no answer within {CONNECT_SECONDS:g} s"
     except Exception as error:  # what answers may be anything
-        kind = _told(error)
+        kind = _error_line(error)
     if kind != "Scheduler":
         raise BatchError(
             f"--scheduler {address}: no dask scheduler answers there ({kind}); the address is "
@@ -299,13 +299,13 @@ def _outcome(future: Future, job: Job, chunk: Chunk) -> ChunkTold | None:
         except FlangeyeError:
             raise
         except Exception as error:  # of dask: the worker's own are in the outcome
-            reason = WORKER_DIED if type(error).__name__ == "KilledWorker" else _told(error)
+            reason = WORKER_DIED if type(error).__name__ == "KilledWorker" else _error_line(error)
             if len(chunk.sessions) > 1:
                 return None
     crashed = SessionOutcome("crashed", reason)
     return write_rows(job, chunk, [crashed] * len(chunk.sessions))
 
 
-def _told(error: BaseException) -> str:
+def _error_line(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__

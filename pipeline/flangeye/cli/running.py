@@ -138,9 +138,9 @@ def _advise(log: Path, registry: Registry) -> None:
     """Say what to do about a refusal: the doctor's command, and what it finds first."""
     from flangeye.cli.logs import of_foreign
     from flangeye.doctor import examine, open_session
-    from flangeye.files.elsewhere import told
+    from flangeye.files.elsewhere import with_urls
 
-    say(told(f"\nwhat to do: flangeye doctor {log}"))
+    say(with_urls(f"\nwhat to do: flangeye doctor {log}"))
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
         with of_foreign(log, "it cannot be examined"):
@@ -199,7 +199,7 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
     from rich.console import Console
 
     from flangeye.cli.terminal import ProgressBar, print_result
-    from flangeye.files.elsewhere import told
+    from flangeye.files.elsewhere import with_urls
     from flangeye.run.restart import restart_hint, resumable
     from flangeye.run.session import record_run
 
@@ -209,16 +209,19 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
-            say(told(f"what was gathered is in {folder.log}"), err=True)
-            say(told(f"with other parameters: {restart_hint(recipe, folder.log)}"), err=True)
+            say(with_urls(f"what was gathered is in {folder.log}"), err=True)
+            say(with_urls(f"with other parameters: {restart_hint(recipe, folder.log)}"), err=True)
             if resumable(recipe):
                 moving = " --move" if start.motion.allowed else ""
-                say(told(f"go on with it: flangeye run --resume {folder.path}{moving}"), err=True)
+                say(
+                    with_urls(f"go on with it: flangeye run --resume {folder.path}{moving}"),
+                    err=True,
+                )
         raise
     print_result(Console(), result)
     names = ("report.html", "calibration.yaml", "result.json", "run.mcap")
     written = [name for name in names if (folder.path / name).exists()]
-    say(told(f"\n{folder.path}/: {'  '.join(written)}"))
+    say(with_urls(f"\n{folder.path}/: {'  '.join(written)}"))
     return result
 
 

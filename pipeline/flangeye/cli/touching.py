@@ -57,7 +57,7 @@ def touch_points(
     touched = []
     for each in _toucher(recipe, tip, ask).touch(predicted, move):
         touched.append(each)
-        yield _told(len(touched), each)
+        yield _touched_line(len(touched), each)
     write_whole(out, _step(seen, tip, touched))
     sizes = [float(np.linalg.norm(t.error)) for t in touched]
     yield f"off by {1e3 * max(sizes):.2f} mm at most; {out}: the step, to put into the recipe"
@@ -81,7 +81,7 @@ def _point(option: str, text: str) -> Floats:
         raise StageError(f"{option} '{text}': {error}; write '12 mm, -40 mm, 702 mm'") from None
 
 
-def _told(number: int, touched: Touched) -> str:
+def _touched_line(number: int, touched: Touched) -> str:
     at = ", ".join(f"{1e3 * x:.2f}" for x in touched.actual)
     off = ", ".join(f"{1e3 * x:+.2f}" for x in touched.error)
     size = 1e3 * float(np.linalg.norm(touched.error))

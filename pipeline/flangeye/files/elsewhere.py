@@ -50,7 +50,7 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
             stand_in.lay_out()
             yield root
         except FlangeyeError as error:
-            error.args = tuple(told(str(each)) for each in error.args)
+            error.args = tuple(with_urls(str(each)) for each in error.args)
             raise
         finally:
             del _STANDING_IN[root]
@@ -76,7 +76,7 @@ def results_at(place: str | None) -> Iterator[Path | None]:
         try:
             yield local
         except FlangeyeError as error:
-            error.args = tuple(told(str(each)) for each in error.args)
+            error.args = tuple(with_urls(str(each)) for each in error.args)
             raise
         finally:
             if local.is_dir():
@@ -111,7 +111,7 @@ def digest_elsewhere(path: Path) -> str | None:
     return _state(stand_in.later[path]) if stand_in and path in stand_in.later else None
 
 
-def told(text: str) -> str:
+def with_urls(text: str) -> str:
     """Return a text with URLs for the folders that stand for them."""
     for root, stand_in in _STANDING_IN.items():
         text = text.replace(str(root), stand_in.url.rstrip("/"))
@@ -161,7 +161,7 @@ class _StandIn:
 
     def fetch(self, path: Path) -> None:
         """Bring a file here."""
-        with reaching(told(str(path))):
+        with reaching(with_urls(str(path))):
             self._system.get_file(self._names[path], str(path))
 
     def _name_of(self, path: str) -> str:

@@ -17,7 +17,7 @@ from flangeye.handeye.arm import (
     with_tool_offset,
 )
 from flangeye.handeye.candidates import Model, considered, understated, with_nuisance
-from flangeye.handeye.certificate import told_of
+from flangeye.handeye.certificate import certificate_note
 from flangeye.handeye.consensus import find_consensus
 from flangeye.handeye.distortion import distortion_of, edges_of
 from flangeye.handeye.estimates import (
@@ -38,7 +38,7 @@ from flangeye.handeye.observability import (
     unobservable,
 )
 from flangeye.handeye.starts import size_of
-from flangeye.handeye.target_size import longer_distances, require_size, told_factor
+from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
 from flangeye.handeye.wander import with_wander
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
@@ -189,7 +189,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     if not weak.shape[1]:
         notes = (*notes, *_note_of_distortion(model, cell, options))
     if options.certify:
-        notes = (*notes, told_of(reported.problem, reported.found))
+        notes = (*notes, certificate_note(reported.problem, reported.found))
     return HandEye(
         camera,
         _pairs(reported, model, cell),
@@ -213,7 +213,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     """
     for _ in range(SIZES):
         longer = longer_distances(model.problem.measurements)
-        told = told_factor(model.problem, model.found, longer)
+        told = estimated_factor(model.problem, model.found, longer)
         if not 0.1 < 1 + told.share < 10 or told.sigma > LOOSEST_SIZE:
             raise CalibrationRefused(
                 f"the target's size is told to {told.sigma:.1%} only: move the arm further between "

@@ -74,7 +74,7 @@ class Certificate:
     optimal: bool
 
 
-def told_of(problem: Problem, found: Solution) -> str:
+def certificate_note(problem: Problem, found: Solution) -> str:
     """Return in words whether the poses that agree have no better answer than the one found."""
     s, loop, kept = problem.measurements.where(found.inliers), problem.loop, found.inliers
     if not s.are_poses or loop.y == loop.z:

@@ -38,7 +38,7 @@ def require_size(problem: Problem, found: Solution, limit: float) -> None:
     if not problem.measurements.are_poses:
         return
     longer = longer_distances(problem.measurements)
-    size, focal = (told_factor(problem, found, moves) for moves in (longer, deeper(longer)))
+    size, focal = (estimated_factor(problem, found, moves) for moves in (longer, deeper(longer)))
     told, is_size = (size, True) if size.score >= focal.score else (focal, False)
     if abs(told.share) <= limit or not told.is_certain:
         return
@@ -57,7 +57,7 @@ def require_size(problem: Problem, found: Solution, limit: float) -> None:
 
 
 @dataclass(frozen=True)
-class ToldFactor:
+class EstimatedFactor:
     """What the arm's motion tells of a factor on the camera's distances.
 
     Attributes:
@@ -81,7 +81,7 @@ class ToldFactor:
         return self.score > f_quantile(CERTAIN, 1, self.freedom)
 
 
-def told_factor(problem: Problem, found: Solution, moves: Floats) -> ToldFactor:
+def estimated_factor(problem: Problem, found: Solution, moves: Floats) -> EstimatedFactor:
     """Return the factor that poses of a target tell, with all else unknown, the noise as well.
 
     The noise of a fit without the factor would take what the factor does for noise, and where only
@@ -103,7 +103,7 @@ def told_factor(problem: Problem, found: Solution, moves: Floats) -> ToldFactor:
     told = (fit.weights[fit.inliers] @ linear.residuals[..., None])[..., 0]
     scores = np.einsum("nai,na->ni", linear.jacobian, told) @ row
     sigma = float(np.sqrt(row[-1] * correlation(scores)))
-    return ToldFactor(float(fit.at.nuisance[-1]), sigma, fit.freedom)
+    return EstimatedFactor(float(fit.at.nuisance[-1]), sigma, fit.freedom)
 
 
 def longer_distances(measurements: Measurements) -> Floats:

@@ -253,7 +253,7 @@ class RunLog:
             except Exception as error:  # what a foreign log holds can be wrong in any way
                 if capture in self.poses:
                     step = self.poses[capture]["step"].partition(".")[2]
-                    yield t.Rejection(capture, step, _told(message, error))
+                    yield t.Rejection(capture, step, _error_line(message, error))
 
     def _logged_capture(
         self, capture: str, data: bytes, scan: t.Singles | None = None, pixels: Any = None
@@ -338,7 +338,7 @@ def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[Note]:
             try:
                 yield _note(message)
             except Exception as error:  # what a foreign log holds can be wrong in any way
-                raise StageError(f"{path}: {_told(message, error)}") from None
+                raise StageError(f"{path}: {_error_line(message, error)}") from None
 
 
 def _note(message: Message) -> Note:
@@ -359,7 +359,7 @@ def take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None
     try:
         _take(log, message, clouds)
     except Exception as error:  # what a foreign log holds can be wrong in any way
-        log.damage.append(_told(message, error))
+        log.damage.append(_error_line(message, error))
 
 
 def _take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:
@@ -437,7 +437,7 @@ def _no_number(text: str) -> None:
     raise DamageError(f"it holds {text}, which is no number")
 
 
-def _told(message: Message, error: Exception) -> str:
+def _error_line(message: Message, error: Exception) -> str:
     return f"message {message.number} on {message.channel.topic}: {reason_of(error)}"
 
 

@@ -84,7 +84,7 @@ class StructuredLight:
         """
         hits = scene.look(self.pixels)
         np.minimum(hits.depth, np.float32(2 * self.scanner.far), out=hits.depth)
-        measured = self._lit(scene, hits.depth)
+        measured = self._illuminated(scene, hits.depth)
         grain = correlated_normal(hits.depth.shape, self._grain, rng)
         width = hits.depth * np.float32(self.pixels.size)
         beside = edges.steps(hits.depth, width)
@@ -103,7 +103,7 @@ class StructuredLight:
         depth[~measured] = np.nan
         return self._distortion.points(depth)
 
-    def _lit(self, scene: Scene, depth: Image) -> Mask:
+    def _illuminated(self, scene: Scene, depth: Image) -> Mask:
         """Return which points (H, W) are in range and see the projector's light."""
         seen = np.empty(depth.shape, dtype=bool)
         for rows in edges.bands(depth.shape):

@@ -148,7 +148,9 @@ class Itinerary:
         pose = stop.pose.base_T_flange
         tilt = angle_between(pose[:3, 2], self._site.eye - pose[:3, 3])
         place = " ".join(f"{1e3 * x:7.1f}" for x in pose[:3, 3])
-        return f"{stop.id}  {stop.role:12}  {place}  {np.degrees(tilt):3.0f} deg  {_told(way)}"
+        return (
+            f"{stop.id}  {stop.role:12}  {place}  {np.degrees(tilt):3.0f} deg  {_route_line(way)}"
+        )
 
     def _lost(self) -> set[int]:
         """Return the places in the plan of poses that told nothing."""
@@ -188,7 +190,7 @@ def itinerary_of(
     return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
 
 
-def _told(way: Route | Barred | None) -> str:
+def _route_line(way: Route | Barred | None) -> str:
     if way is None:
         return "not known"
     if isinstance(way, Barred):

@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from flangeye import BoundPart, Choose, Params, RecipePath, StageError
-from flangeye.files.elsewhere import told
+from flangeye.files.elsewhere import with_urls
 from flangeye.files.recording import (
     Archive,
     Recording,
@@ -76,7 +76,7 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     archive: Archive = params.reader(path)
     check_ids(archive)
     recordings = [with_companion(recording) for recording in archive.recordings]
-    notes = tuple(told(note) for note in archive.notes)
+    notes = tuple(with_urls(note) for note in archive.notes)
     archive = replace(archive, recordings=recordings, notes=notes)
     if not params.leave_out:
         return archive
@@ -91,7 +91,7 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
 
 def archive_note(archive: Archive) -> str:
     """Return the note that says which archive it is."""
-    return told(f"archive: {archive.layout}, {archive.root}")
+    return with_urls(f"archive: {archive.layout}, {archive.root}")
 
 
 def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:

@@ -86,7 +86,7 @@ def fit(equations: Equations) -> VariantFits:
         unknowns = _moved(unknowns, _solved(information, gradient))
         blocks = _blocks(equations, unknowns)
         scales = [_scale(b, w) for b, w in zip(blocks, weights, strict=True)]
-    return _told(blocks, scales, unknowns, information)
+    return _score(blocks, scales, unknowns, information)
 
 
 def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
@@ -230,7 +230,7 @@ def _moved_base(other: Floats, step: Floats) -> Floats:
     return out
 
 
-def _told(
+def _score(
     blocks: list[Block], scales: list[Floats], unknowns: VariantUnknowns, information: Floats
 ) -> VariantFits:
     likelihood = count = np.zeros(1)

@@ -90,7 +90,7 @@ def with_body(finger: Finger, found: Pivoted) -> Finger:
     return placed.model_copy(update=told)
 
 
-def told_of(found: Pivoted) -> list[str]:
+def summary_lines(found: Pivoted) -> list[str]:
     """Return what was found, for people."""
     return [_line("tip", found.tip), _line("torch", found.torch)]
 

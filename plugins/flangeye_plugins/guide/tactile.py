@@ -22,7 +22,7 @@ from flangeye.plugin.stage import part
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
-from flangeye_plugins.guide.pivoting import Hand, Pivoted, told_of, with_body
+from flangeye_plugins.guide.pivoting import Hand, Pivoted, summary_lines, with_body
 from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams
@@ -118,12 +118,12 @@ def _guided(
     text = yaml.safe_dump(calibrated.model_dump(mode="json", exclude_none=True), sort_keys=False)
     write_whole(out, text)
     counts = f"{len(rest)} readings at rest, {len(held)} with the tip held"
-    points = [] if pivoted is None else told_of(pivoted)
+    points = [] if pivoted is None else summary_lines(pivoted)
     use = f"{out}: weld with it: finger: {out.name}"
-    return "\n".join([counts, *_told(found, measured), *points, use])
+    return "\n".join([counts, *_summary_lines(found, measured), *points, use])
 
 
-def _told(found: Calibration, measured: bool) -> list[str]:
+def _summary_lines(found: Calibration, measured: bool) -> list[str]:
     """Return what was found, for people."""
     noise = ", ".join(f"{x * 1e3:.4f}" for x in found.noise)
     rest = ", ".join(f"{x * 1e3:.3f}" for x in found.rest)

@@ -48,7 +48,7 @@ def read_aubo(folder: Path) -> Archive:
             Recording(_AUBO_VERIFICATION, {FLANGE: pose}, cloud, role="verification"),
             *recordings,
         ]
-    _refuse_strays(clouds, poses, poses_file)
+    _refuse_unpaired(clouds, poses, poses_file)
     files = [poses_file, *_centre_files(folder)]
     return Archive("ancorasir aubo", folder, recordings, files, cloud_unit="m")
 
@@ -62,7 +62,7 @@ def read_ur(folder: Path) -> Archive:
         for i, matrix in enumerate(matrices)
     }
     clouds = _clouds(folder)
-    _refuse_strays(clouds, poses, poses_file)
+    _refuse_unpaired(clouds, poses, poses_file)
     recordings = _with_centres(folder, poses, clouds, MM)
     files = [poses_file, *_centre_files(folder)]
     return Archive(f"ancorasir {folder.name}", folder, recordings, files, cloud_unit="mm")
@@ -77,7 +77,7 @@ def read_franka(folder: Path) -> Archive:
         for i, row in enumerate(rows)
     }
     clouds = _clouds(folder)
-    _refuse_strays(clouds, poses, poses_file)
+    _refuse_unpaired(clouds, poses, poses_file)
     recordings = _with_centres(folder, poses, clouds, MM)
     notes = ["the Franka's poses are those it was sent to, not those it measured"]
     files = [poses_file, *_centre_files(folder)]
@@ -190,7 +190,7 @@ def _clouds(folder: Path) -> dict[str, Path]:
     return {p.stem.removeprefix("tool0_"): p for p in sorted(folder.glob("tool0_*.pcd"))}
 
 
-def _refuse_strays(clouds: Mapping[str, Path], poses: Poses, poses_file: Path) -> None:
+def _refuse_unpaired(clouds: Mapping[str, Path], poses: Poses, poses_file: Path) -> None:
     for name, cloud in clouds.items():
         if name not in poses:
             raise StageError(

@@ -42,7 +42,7 @@ from flangeye_plugins.reader.folder_poses import SECOND, ArmPose, PoseRow, read_
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
 
 POSE_FILES = ("poses.csv", "poses.yaml", "poses.yml", "poses.json")
-STRAY_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
+UNPAIRED_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz")
 """A file that ends so and that no pose names is a scan somebody forgot."""
 
 
@@ -65,7 +65,7 @@ def folder(path: Path, params: FolderParams) -> Archive:
         for row, line in zip(poses.poses, lines, strict=True)
     ]
     if recordings:  # without any, that is what there is to say
-        _refuse_strays(file, recordings)
+        _refuse_unpaired(file, recordings)
     layout = f"folder, {file.name}"
     return Archive(layout, file.parent, recordings, [file], cloud_unit=poses.cloud_unit)
 
@@ -110,7 +110,7 @@ def _poses_file(path: Path) -> Path:
         return path
     found = [path / name for name in POSE_FILES if (path / name).is_file()]
     if not found:
-        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in STRAY_SUFFIXES)
+        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in UNPAIRED_SUFFIXES)
         but = f"clouds ({clouds}), but " if clouds else ""
         raise NotThisLayout(f"{path}: holds {but}none of {', '.join(POSE_FILES)}")
     if len(found) > 1:
@@ -147,10 +147,10 @@ def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
     return pose_from_rotation_vector(where, position, row.rotation_vector_rad or ())
 
 
-def _refuse_strays(file: Path, recordings: Iterable[Recording]) -> None:
+def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
     known = {recording.cloud for recording in recordings}
     for path in sorted(file.parent.iterdir()):
-        if path.suffix.lower() in STRAY_SUFFIXES and path not in known:
+        if path.suffix.lower() in UNPAIRED_SUFFIXES and path not in known:
             raise StageError(
                 f"{path}: {file.name} has no pose for it; add it, or move the cloud away"
             )

@@ -102,10 +102,13 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
     found = _best(before, arm, prior)
     errors = _held_out(before, arm, found, prior)
     known = identified(found.fit, prior)
-    told = [_told(known, combinations(found.fit, prior), found), *_listed(known, found.fit, prior)]
-    told += _proposed(arm, found, prior, params.propose)
+    about_arm = [
+        _identifiability(known, combinations(found.fit, prior), found),
+        *_listed(known, found.fit, prior),
+    ]
+    about_arm += _proposed(arm, found, prior, params.propose)
     compared = f"held-out error {errors[1] * 1e3:.3f} mm with it, {errors[0] * 1e3:.3f} mm without"
-    notes = (*before.notes, *told)
+    notes = (*before.notes, *about_arm)
     if errors[1] > HELPFUL * errors[0]:
         left = f"the arm's parameters left out, for they do not help ({compared})"
         return replace(before, notes=(*notes, left))
@@ -201,7 +204,7 @@ def _symmetric(covariance: Floats) -> Floats:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _told(known: Mask, combined: int, found: _Found) -> str:
+def _identifiability(known: Mask, combined: int, found: _Found) -> str:
     """Say how much the poses tell of the arm."""
     turns = found.session.poses[:, :3, :3]
     cosine = (np.einsum("nij,mij->nm", turns, turns).min() - 1) / 2
@@ -226,16 +229,16 @@ def _told(known: Mask, combined: int, found: _Found) -> str:
 def _listed(known: Mask, fit: ArmFit, prior: Floats) -> list[str]:
     """Name what is identified, with value and deviation, and what is not."""
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[6:], 0.0)).reshape(prior.shape)
-    told: list[str] = []
-    not_told: list[str] = []
+    single: list[str] = []
+    combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(known):
         name, (unit, scale) = f"joint {joint + 1} {NAMES[which]}", UNITS[which]
         value, deviation = fit.parameters[joint, which] * scale, sigma[joint, which] * scale
-        (told if singly else not_told).append(
+        (single if singly else combined_only).append(
             f"{name} {value:+.2f} ± {deviation:.2f} {unit}" if singly else name
         )
-    lines = [f"identified: {'; '.join(told)}"] if told else []
-    return lines + ([f"not identified singly: {', '.join(not_told)}"] if not_told else [])
+    lines = [f"identified: {'; '.join(single)}"] if single else []
+    return lines + ([f"not identified singly: {', '.join(combined_only)}"] if combined_only else [])
 
 
 def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:

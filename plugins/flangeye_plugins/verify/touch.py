@@ -76,7 +76,7 @@ def verify_touch(
     if stage_log:
         stage_log("comparison", _compared(errors))
     passed = figures["max"] <= params.max_error
-    return Verification(passed, _told(figures, params.max_error, passed), figures, per_point)
+    return Verification(passed, _summary(figures, params.max_error, passed), figures, per_point)
 
 
 def _compared(errors: Floats) -> dict[str, object]:
@@ -93,7 +93,7 @@ def _touched(touch: Touch, tip: tuple[float, float, float]) -> Floats:
     return np.asarray(flange[:3, :3] @ np.array(tip) + flange[:3, 3])
 
 
-def _told(figures: dict[str, float], limit: float, passed: bool) -> str:
+def _summary(figures: dict[str, float], limit: float, passed: bool) -> str:
     sign = "within" if passed else "above"
     return (
         f"{figures['points']:.0f} touched points are {figures['max'] * 1e3:.2f} mm off at most, "

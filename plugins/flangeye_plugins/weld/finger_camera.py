@@ -53,13 +53,15 @@ class Reader:
             if reading is not None:
                 break
         self._region.follow(piece, None if reading is None else reading.corners)
-        return self._sight(piece, frame.time_ns, reading)
+        return self._observation(piece, frame.time_ns, reading)
 
     def reread(self, piece: Piece, time_ns: int) -> TagObservation:
         """Return what is felt in a piece that was read before, from a log."""
-        return self._sight(piece, time_ns, self._detector.find(piece.image))
+        return self._observation(piece, time_ns, self._detector.find(piece.image))
 
-    def _sight(self, piece: Piece, time_ns: int, reading: TagReading | None) -> TagObservation:
+    def _observation(
+        self, piece: Piece, time_ns: int, reading: TagReading | None
+    ) -> TagObservation:
         if reading is None or reading.confidence < CONFIDENT:
             return TagObservation(time_ns, piece, None)
         return TagObservation(time_ns, piece, self._interpreter.feel(reading, time_ns))

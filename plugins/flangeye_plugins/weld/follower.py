@@ -166,7 +166,7 @@ class Follower:
         if self.phase in ("done", "stopped") or self._felt is None or waiting:
             return STILL
         command = self._probe(pose) if self.phase == "probing" else self._lead(pose, coming)
-        self._response.told(pose.time, command)
+        self._response.record(pose.time, command)
         return command
 
     def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:

@@ -107,7 +107,7 @@ class Passes:
             return self._root_step(pose, touches)
         coming = self._response.ahead(pose)
         command = self._return(coming) if self.phase == "returning" else self._weld(coming)
-        self._response.told(pose.time, command)
+        self._response.record(pose.time, command)
         return command
 
     def _root_step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:

@@ -136,7 +136,7 @@ class Probing:
         rate = self._rate * (SLOWEST + (1.0 - SLOWEST) * math.sin(math.pi * self._time / BEAT) ** 2)
         step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
         self._wanted += step
-        if abs(goal - self._wanted) < 1e-9 and self._told():
+        if abs(goal - self._wanted) < 1e-9 and self._settled():
             self._turns.pop(0)
             self.over = not self._turns
         return self._side * step / elapsed if elapsed else 0.0
@@ -148,7 +148,7 @@ class Probing:
             return None
         return float(np.mean(rested)) if rested else self._deflection
 
-    def _told(self) -> bool:
+    def _settled(self) -> bool:
         """Return whether enough was felt where the tip is pressed hardest; later ends say less."""
         since, before = self._pressed = self._pressed or (self._time, len(self._felt))
         return len(self._felt) - before >= self._enough or self._time - since > LONGEST

@@ -35,7 +35,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     kept = kept[kept >= 0]
     cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
-    tip, deflection = _felt(weld_log, plan, body, kept)
+    tip, deflection = _tip_displacements(weld_log, plan, body, kept)
     torch = robot + np.array([turned(body.torch, angle) for angle in cycle["angle"]]).reshape(-1, 3)
     to_base = plane.base_T_plane.apply
     velocity = cycle["velocity"].reshape(-1, 3)
@@ -91,7 +91,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
     }
 
 
-def _felt(
+def _tip_displacements(
     weld_log: WeldLog, plan: Path, body: Body, kept: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
     """Return where the tip was (K, 3) in the plane, and its deflection to the wall (K,).

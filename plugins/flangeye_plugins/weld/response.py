@@ -42,7 +42,7 @@ class Response:
         """Both together [s]."""
         return self.dead_time + self.lag
 
-    def told(self, time: float, command: Command) -> None:
+    def record(self, time: float, command: Command) -> None:
         """Remember a command given at ``time`` [s]."""
         if not self.delay:
             return

@@ -88,7 +88,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         robot: Robot = opened.enter_context(led(driver, model, allowed))
         latest = LatestState(robot.state())
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
-        eyes = opened.enter_context(_eyes(sensor, reader, simulated))
+        eyes = opened.enter_context(_tag_reader(sensor, reader, simulated))
         weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
         drive = Executor(robot, latest, model, allowed)
@@ -101,7 +101,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
 
 
-def _eyes(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:
+def _tag_reader(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:
     return SteppedReader(sensor, reader) if simulated else ThreadedReader(sensor, reader)
 
 

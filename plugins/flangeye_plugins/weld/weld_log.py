@@ -100,7 +100,7 @@ class WeldLog:
         """Write an image and what was felt in it; return its number."""
         number, self.sights = self.sights, self.sights + 1
         felt = sight.feeling
-        self._note_sight(number, sight)
+        self._note_observation(number, sight)
         if felt is not None:
             self.felt[number] = felt
             self.note("feeling", felt)
@@ -108,9 +108,9 @@ class WeldLog:
 
     def before(self, sight: TagObservation) -> None:
         """Write an image that was looked at before anything moved; it has no number."""
-        self._note_sight(-1, sight)
+        self._note_observation(-1, sight)
 
-    def _note_sight(self, number: int, sight: TagObservation) -> None:
+    def _note_observation(self, number: int, sight: TagObservation) -> None:
         piece = sight.piece
         if self._images:
             self.note("image", piece.image)

@@ -11,7 +11,6 @@ from flangeye_plugins.scanner.genicam import GenicamParams, scanner_genicam
 from flangeye_plugins.scanner.realsense import RealsenseParams, scanner_realsense
 from tests.emulators.controllers.process import Process
 from tests.plugins.scanner.test_loopback import shown
-from tests.plugins.scanner.test_realsense import recording  # noqa: F401  a fixture
 
 
 @pytest.fixture(scope="class")
@@ -31,7 +30,7 @@ class TestGenicam(ScannerConformance):
 
 
 @pytest.fixture
-def recorded(request: pytest.FixtureRequest, recording: Path) -> None:  # noqa: F811
+def recorded(request: pytest.FixtureRequest, recording: Path) -> None:
     request.cls.params = {"recording": str(recording), "timeout": "1 s"}
 
 

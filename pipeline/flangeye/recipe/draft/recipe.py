@@ -69,7 +69,7 @@ def draft_recipe(
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target) if stage == "acquire.images" else {}
     data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
-    return Draft(_yaml(data), _told(archive, reader))
+    return Draft(_yaml(data), _summary(archive, reader))
 
 
 def _robot(answer: str) -> dict[str, Any]:
@@ -233,7 +233,7 @@ def _steps(stage: str, target: Mapping[str, Any]) -> list[Any]:
 # --- what to tell
 
 
-def _told(archive: Archive, reader: Any) -> list[str]:
+def _summary(archive: Archive, reader: Any) -> list[str]:
     records = archive.recordings
     seen = {
         "a cloud": sum(r.cloud is not None for r in records),
