@@ -49,7 +49,7 @@ class Form:
         """Say whether the recipe can run, and everything that is wrong with it."""
         _, mistakes = self._project.check()
         if not mistakes:
-            ui.label("The recipe is sound.").classes("text-positive").props('role="status"')
+            ui.label("The recipe is valid.").classes("text-positive").props('role="status"')
         for each in mistakes:
             mistake(f"line {each.line}: {each.path}: {each.text}" if each.line else each.text)
 

@@ -57,7 +57,7 @@ def add(project: Project) -> None:
             ui.label("Nothing moves on this page.")
             recipe, mistakes = project.check()
             if recipe is None:
-                mistake(f"The recipe has {len(mistakes)} mistakes; see the page Cell.")
+                mistake(f"The recipe has {len(mistakes)} errors; see the Cell page.")
                 return
             Planner(project, recipe)
 
@@ -73,7 +73,7 @@ class Planner:
                 self._draw()
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()
-                ui.button("Check every pose and way", on_click=self._plan)
+                ui.button("Check every pose and path", on_click=self._plan)
                 self._told = ui.column().classes("w-full")
         command_line(project.command("run", project.recipe_path.name))
 
@@ -110,7 +110,9 @@ class Planner:
         """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
         view = (_first(self._project.data()) or {}).get("view")
         if self._view() is None or not isinstance(view, dict):
-            ui.label("This recipe guesses no place of the scanner, so there is nothing to drag.")
+            ui.label(
+                "This recipe has no first guess of the scanner's pose, so there is nothing to drag."
+            )
             return
         position = (view.get("guess") or {}).get("position") or ()
         place = ui.input(
@@ -153,7 +155,7 @@ class Planner:
         with self._told:
             ui.spinner()
         if self._recipe.steps[0].stage.name != "acquire.live":
-            text = "this recipe drives no arm: its poses are those of its recordings or simulation"
+            text = "this recipe drives no arm: its poses come from its recordings or its simulation"
         else:
             words = ["run", self._project.recipe_path.name]
             text = await asyncio.to_thread(self._project.run_command, words)
@@ -176,7 +178,7 @@ class Planner:
                 colour = "#d64545" if stop.barred else "#2e9e5b"
                 self._scene.sphere(0.012).move(*stop.place.tolist()).material(colour)
         if any(stop.barred for stop in stops):
-            ui.label("Red poses are barred; the last column says why.")
+            ui.label("Red poses cannot be reached; the last column says why.")
 
 
 def stops_of(text: str) -> list[Stop]:

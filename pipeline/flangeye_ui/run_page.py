@@ -48,7 +48,7 @@ class Panel:
         self._recipe = recipe
         self._live = bool(recipe) and recipe.steps[0].stage.name == "acquire.live"  # type: ignore[union-attr]
         if mistakes:
-            mistake(f"The recipe has {len(mistakes)} mistakes; see the page Cell.")
+            mistake(f"The recipe has {len(mistakes)} errors; see the Cell page.")
         self._buttons(sound=not mistakes)
         self._state = ui.label().props('role="status"').classes("text-subtitle1")
         with ui.row().classes("w-full gap-4 items-start"):
@@ -67,7 +67,7 @@ class Panel:
             self._start.set_enabled(sound)
             stop = ui.button("Stop (space bar)", on_click=self._stop, color="negative")
             stop.props('aria-keyshortcuts="Space"').classes("text-h6")
-            self._go_on = ui.button("Go on with it", on_click=self._resume).props("outline")
+            self._resume_button = ui.button("Resume", on_click=self._resume).props("outline")
         ui.keyboard(on_key=self._key)
 
     def _pictures(self) -> None:
@@ -111,7 +111,7 @@ class Panel:
         if self._running or self._project.elsewhere():
             ui.notify("a run is under way; stop it first", type="warning")
             return
-        question = "The arm will move. Is its space free of people?"
+        question = "The arm will move. Is its workspace clear of people?"
         if not moves or await confirmed(question, "Move the arm"):
             self._project.begin(words, moves, self._me)
             self._shown = -1
@@ -141,7 +141,7 @@ class Panel:
         if self._running and time.monotonic() - self._heard > SILENCE:
             self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
         left = self._project.unfinished()
-        self._go_on.set_visibility(left is not None)
+        self._resume_button.set_visibility(left is not None)
         other = self._project.elsewhere()
         if run is None or (other and run.code is not None):
             self._state.text = _nothing(left, other)
@@ -246,7 +246,7 @@ def _nothing(left: Path | None, other: Path | None) -> str:
     if other:
         return f"{other.name} runs elsewhere: flangeye watch runs/{other.name}"
     if left:
-        return f"Nothing runs. {left.name} ended before its result; it can be gone on with."
+        return f"Nothing runs. {left.name} ended before its result; it can be resumed."
     return "Nothing runs."
 
 

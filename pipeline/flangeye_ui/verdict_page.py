@@ -33,7 +33,7 @@ def add(project: Project) -> None:
             runs = project.runs()
             chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
             if chosen is None:
-                ui.label("There is no run yet; start one on the page Run.")
+                ui.label("There is no run yet; start one on the Run page.")
                 return
             ui.select(
                 [r.name for r in runs], value=chosen.name, label="Run",
@@ -171,7 +171,7 @@ class Doctor:
     def _apply(self, line: dict[str, Any]) -> None:
         for name, params in line.items():
             self._project.write_line(name, params)
-        ui.notify("written into the recipe; look at the page Cell, then run it again")
+        ui.notify("written into the recipe; look at the Cell page, then run it again")
 
 
 def _certificate(project: Project, run: Path) -> None:

@@ -173,7 +173,7 @@ def test_ctrl_c_keeps_what_came_so_far(recipe: Path, tmp_path: Path) -> None:
         os.killpg(process.pid, signal.SIGINT)
         said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert said.strip() == "stopped; the same command goes on from here"
+    assert said.strip() == "stopped; run the same command again to continue"
     assert 0 < len(rows(tmp_path / "out")) < 100
     assert (tmp_path / "out" / "summary.html").exists()
 

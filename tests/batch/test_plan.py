@@ -86,7 +86,7 @@ def test_a_recipe_alone_is_one_session(sessions: Callable[..., Any]) -> None:
          "--vary steps.0.count: only the seed can be repeated with; for other values write "
          "--set-grid steps.0.count=a,b,c"),
         ({"grid": ("steps.2.inlier=0.2 mm,0.0002 m",)},
-         "the same session is asked for twice: toy.yaml steps.2.inlier=0.2 mm and "
+         "the same session is requested twice: toy.yaml steps.2.inlier=0.2 mm and "
          "toy.yaml steps.2.inlier=0.0002 m"),
     ],
 )  # fmt: skip
@@ -112,7 +112,7 @@ def test_an_archive_for_a_recipe_that_simulates(
 def test_the_same_archive_twice(
     sessions: Callable[..., Any], archive_recipe: Path, archives: Any
 ) -> None:
-    with pytest.raises(BatchError, match="asked for twice: /.*one.txt and /.*one.txt"):
+    with pytest.raises(BatchError, match="requested twice: /.*one.txt and /.*one.txt"):
         sessions(archive_recipe, archives=(str(archives[0]),) * 2)
 
 

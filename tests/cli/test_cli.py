@@ -235,10 +235,10 @@ def test_ctrl_c_keeps_what_was_gathered(
         (("toy.yaml", "--resume", "done"),
          "error: name a recipe, or --resume RUN, which brings its own"),
         (("--resume", "done", "--set", "seed=4"),
-         "error: --set and --resume: a run goes on with the recipe it began with"),
+         "error: --set and --resume: a resumed run keeps the recipe it started with"),
         (("--resume", "nowhere"), "error: nowhere: cannot be read: No such file or directory"),
         (("--resume", "done"),
-         "error: done/run.mcap: this run came to its end; there is nothing to go on with "
+         "error: done/run.mcap: this run is complete; there is nothing to resume "
          "(--retake ID takes a capture again)"),
         (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
     ],

@@ -178,9 +178,9 @@ def test_the_link_between_two_parts_that_is_missing_is_named() -> None:
 
 
 def test_frames_that_lead_to_two_roots_are_refused() -> None:
-    with pytest.raises(StageError, match="stand on base and floor, which nothing ties"):
+    with pytest.raises(StageError, match="stand on base and floor, which nothing connects"):
         solve_graph({"a": Frame("base"), "b": Frame("floor")}, [])
-    with pytest.raises(StageError, match="stands on itself"):
+    with pytest.raises(StageError, match="is its own parent"):
         solve_graph({"a": Frame("b"), "b": Frame("a")}, [])
 
 

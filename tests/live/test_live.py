@@ -54,7 +54,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
         "what was gathered is in run/run.mcap",
         "with other parameters: flangeye run cell --from run/run.mcap --at fit.rim --set PATH=VALUE "
         "(to do segment.flange again, record with --set log.clouds=full)",
-        "go on with it: flangeye run --resume run --move",
+        "resume it: flangeye run --resume run --move",
         "error: stopped by Ctrl-C",
     ]
     taken = cell.captures("run")
@@ -139,7 +139,7 @@ def test_a_doubt_ends_the_run_and_nothing_gathered_is_lost(
     assert process.returncode == 2
     assert "Traceback" not in err
     assert err.splitlines()[-1].startswith(f"error: {line}")
-    assert "go on with it: flangeye run --resume run --move" in err
+    assert "resume it: flangeye run --resume run --move" in err
     taken, finished = cell.captures(), cell.finished()
     assert len(finished) >= 2
     assert taken == finished
@@ -182,7 +182,7 @@ def test_an_arm_outside_its_limits_is_not_moved(tmp_path: Path) -> None:
         code, _, err = cell.run(cell.recipe(), "--move", "--out", "run")
         assert code == 2
         assert err.splitlines()[-1] == (
-            "error: the arm stands beyond robot.limits, outside the box: x is -492 mm, allowed -50 "
-            "to 950 mm: move it inside by its pendant, or widen the limits"
+            "error: the arm is outside robot.limits, outside the box: x is -492 mm, allowed -50 "
+            "to 950 mm: jog it inside with its pendant, or widen the limits"
         )
         assert not (tmp_path / "run").exists()

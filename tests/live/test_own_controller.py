@@ -86,7 +86,7 @@ def test_an_arm_that_does_not_answer_is_named_and_the_plan_shown(
     out, _ = run.communicate(timeout=60)
     assert run.returncode == 0
     assert (
-        "the arm was not read, so the way to the first stop is not known: ur5e at 127.0.0.254: its "
+        "the arm was not read, so the path to the first stop is not known: ur5e at 127.0.0.254: its "
         "dashboard server does not answer"
     ) in out
 

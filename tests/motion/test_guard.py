@@ -118,7 +118,7 @@ def protected(robot, state):
     ("misbehaviour", "line"),
     [
         (lost, "no sample for 100 ms: the controller is gone"),
-        (moved_aside, "the arm is 5.7 deg away from the way it was sent"),
+        (moved_aside, "the arm is 5.7 deg away from its commanded path"),
         (rushing, "a joint turns at 115 deg/s, allowed 30 deg/s"),
         (outside, "the arm is outside the box: z is"),
         (protected, "the controller reports protective stop: collision of joint 2"),
@@ -157,7 +157,7 @@ def test_an_arm_that_never_arrives_is_noticed() -> None:
     robot = GoesHalfWay()
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.3))
-        with pytest.raises(DeviceError, match="the arm is not there after"):
+        with pytest.raises(DeviceError, match="the arm has not arrived after"):
             arm.wait()
 
 
@@ -169,7 +169,7 @@ def test_an_arm_that_moves_untold_is_noticed() -> None:
     robot = StandIn(pushed)
     with (
         watched(driver_of(robot), MODEL, LIMITS) as arm,
-        pytest.raises(DeviceError, match="the arm moves, and was not told to"),
+        pytest.raises(DeviceError, match="the arm moves without a command from here"),
     ):
         arm.wait()
 

@@ -71,7 +71,7 @@ def test_rails_and_positioners_move_along_and_about_their_axis() -> None:
         ),
         (
             TWO.replace("arm: ur5", "arm: {model: ur5, on: arm}"),
-            "r.yaml:2: cell: 'arm' stands on itself; everything leads to base",
+            "r.yaml:2: cell: 'arm' is its own parent; everything leads to base",
         ),
         (
             "robot: ur5\n" + TWO,

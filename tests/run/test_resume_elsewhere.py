@@ -13,7 +13,7 @@ def test_a_run_in_a_bucket_is_gone_on_with(done: Call, bucket: Any) -> None:
     assert bucket.exists("cell/again/run.mcap") and bucket.exists("cell/again/result.json")
 
     code, _, err = done("run", "--resume", "s3://cell/done/run.mcap")
-    line = "s3://cell/done/run.mcap: this run came to its end; there is nothing to go on with "
+    line = "s3://cell/done/run.mcap: this run is complete; there is nothing to resume "
     assert code == 2
     assert err.splitlines()[-1] == f"error: {line}(--retake ID takes a capture again)"
 

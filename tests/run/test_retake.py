@@ -40,7 +40,7 @@ def test_a_capture_is_left_out_and_named_so(done: Call) -> None:
         (("toy.yaml", "--leave-out", "003"),
          "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP"),
         (("--resume", "done"),
-         "done/run.mcap: this run came to its end; there is nothing to go on with "
+         "done/run.mcap: this run is complete; there is nothing to resume "
          "(--retake ID takes a capture again)"),
         (("--resume", "done", "--retake", "9"),
          "--retake 9: done/run.mcap has no such capture; it has 000, 001, 002, 003, 004, 005"),

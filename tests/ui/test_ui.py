@@ -123,7 +123,7 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     shot(page, "cell_mistake")
     page.evaluate("window.scrollTo(0, 0)")
     write_recipe(page, SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     shot(page, "cell")
     go(page, "Run")
     page.get_by_role("button", name="Start", exact=True).click()
@@ -158,7 +158,7 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
 def test_a_pose_is_left_out_by_the_command_that_is_shown(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     write_recipe(page, SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Run")
     if not page.get_by_text("done (exit code 0)").count():
         page.get_by_role("button", name="Start", exact=True).click()
@@ -180,7 +180,7 @@ def test_the_doctors_button_mends_the_recipe(browser: Any, served: Served) -> No
     write(served.folder / "samples", session.with_poses(inverted(session.poses)))
     page = opened(browser, served)
     write_recipe(page, SAMPLES)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Run")
     page.get_by_role("button", name="Start", exact=True).click()
     page.get_by_text("refused (exit code 1)").wait_for()
@@ -204,7 +204,7 @@ def test_the_doctors_button_mends_the_recipe(browser: Any, served: Served) -> No
 def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     write_recipe(page, find_recipe("ur5e_phoxi-m_loopback").read_text())
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Plan")
     place = page.get_by_label("Where the scanner stands (x, y, z in the base)")
     place.fill("600 mm, 0 mm, 950 mm")
@@ -230,7 +230,7 @@ def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
     (served.folder / "kr6.urdf").write_text(URDF)
     page = opened(browser, served)
     write_recipe(page, SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     page.get_by_text("Import an arm").click()
     page.get_by_label("Its name").fill("kr6")
     page.get_by_label("Its URDF file, in this folder").fill("nowhere.urdf")
@@ -283,7 +283,7 @@ def _answer(served: Served) -> float:
 def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None:
     page = opened(browser, served, color_scheme="dark")
     write_recipe(page, SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     page.set_viewport_size({"width": 390, "height": 800})
     for name in ("Cell", "Plan", "Run"):
         go(page, name)
@@ -318,7 +318,7 @@ def test_a_calibration_by_keyboard_alone(browser: Any, served: Served) -> None:
     press_until(page, "Recipe in YAML")
     page.keyboard.press("Control+A")
     page.keyboard.insert_text(SMALL)
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     press_until(page, "Run")
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="Run", exact=True).wait_for()
@@ -347,7 +347,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     page = opened(browser, served)
     before = len(list(served.folder.glob("runs/*")))
     write_recipe(page, SMALL.replace("0.25", "1.0"))
-    page.get_by_text("The recipe is sound.").wait_for()
+    page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Run")
     page.get_by_role("button", name="Start", exact=True).click()
     page.get_by_text("runs.").wait_for()
@@ -431,7 +431,7 @@ def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path)
     assert project.elsewhere() is None
     assert project.unfinished() == log.parent
     said = run_page._nothing(log.parent, None)
-    assert said == "Nothing runs. monday ended before its result; it can be gone on with."
+    assert said == "Nothing runs. monday ended before its result; it can be resumed."
     (log.parent / "result.json").write_text("{}")
     assert project.unfinished() is None
 
@@ -523,7 +523,7 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             go(page, "Run")
             page.get_by_text("the page was closed").wait_for()
             page.reload()
-            page.get_by_role("button", name="Go on with it").click()
+            page.get_by_role("button", name="Resume", exact=True).click()
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
             page.get_by_role("button", name="Move the arm").click()

@@ -174,4 +174,4 @@ def _refuse(made: Plan, *same: tuple[Variant, str | None]) -> None:
         " ".join([archive or made.recipe.name, *_written(variant.varied)])
         for variant, archive in same
     )
-    raise BatchError(f"the same session is asked for twice: {' and '.join(told)}")
+    raise BatchError(f"the same session is requested twice: {' and '.join(told)}")

@@ -170,7 +170,7 @@ def _recipe_of(
         raise StageError("name a recipe, or --resume RUN, which brings its own")
     if resume is not None:
         if overrides:
-            raise StageError("--set and --resume: a run goes on with the recipe it began with")
+            raise StageError("--set and --resume: a resumed run keeps the recipe it started with")
         return earlier_run(resume, registry, retake)
     return read_recipe(str(name), registry, overrides), None
 
@@ -214,7 +214,7 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
             if resumable(recipe):
                 moving = " --move" if start.motion.allowed else ""
                 say(
-                    with_urls(f"go on with it: flangeye run --resume {folder.path}{moving}"),
+                    with_urls(f"resume it: flangeye run --resume {folder.path}{moving}"),
                     err=True,
                 )
         raise
@@ -282,7 +282,7 @@ def batch(  # noqa: PLR0913  one argument an option
     try:
         done = run_batch(request, load_plugins(), Console(stderr=True))
     except KeyboardInterrupt:
-        sys.stderr.write("stopped; the same command goes on from here\n")
+        sys.stderr.write("stopped; run the same command again to continue\n")
         raise typer.Exit(130) from None
     say(summary_text(done))
     if not done.accepted:

@@ -16,7 +16,7 @@ class Frame:
     """What stands on what.
 
     Attributes:
-        parent: The frame it stands on.
+        parent: Its parent frame.
         place: (4, 4) parent_T_frame where it is known and still; (M, 4, 4) where it is measured at
             M times; None where it is still and to be found.
     """
@@ -29,12 +29,12 @@ def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
     """Return the frames from the root to one, the root left out.
 
     Raises:
-        StageError: A frame stands on itself.
+        StageError: A frame is its own parent.
     """
     path: list[str] = []
     while name in frames:
         if name in path:
-            raise StageError(f"frame '{name}' stands on itself; every frame leads to one root")
+            raise StageError(f"frame '{name}' is its own parent; every frame leads to one root")
         path.insert(0, name)
         name = frames[name].parent
     return path
@@ -49,7 +49,7 @@ def root_of(frames: Mapping[str, Frame]) -> str:
     roots = sorted({frames[chain(frames, name)[0]].parent for name in frames})
     if len(roots) != 1:
         raise StageError(
-            f"the frames stand on {' and '.join(roots)}, which nothing ties; say on what they stand"
+            f"the frames stand on {' and '.join(roots)}, which nothing connects; give each a parent"
         )
     return roots[0]
 

@@ -137,7 +137,7 @@ class Supervisor:
         moves = np.abs(state.joint_speeds).max() > 10 * STANDING
         if moves and (state.time_ns - self._halted_ns) * 1e-9 > BRAKING:
             raise SafetyFault(
-                "the arm moves, and was not told to: another program drives it and goes on; "
+                "the arm moves without a command from here: another program drives it and goes on; "
                 "stop it at the controller, then start again"
             )
 
@@ -159,14 +159,14 @@ class Supervisor:
         share = np.clip(along / max(float(way @ way), 1e-12), 0.0, 1.0)
         off = float(np.abs(state.joints - self._from - share * way).max())
         if off > OFF_ROUTE:
-            raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from the way it was sent")
+            raise SafetyFault(f"the arm is {np.degrees(off):.1f} deg away from its commanded path")
         waited = (state.time_ns - self._since_ns) * 1e-9
         set_off = np.abs(state.joints - self._from).max() > ARRIVED
         if waited > START and not set_off and np.abs(way).max() > 2 * ARRIVED:
             raise SafetyFault(f"the arm has not set off {START:.0f} s after it was told to")
         if waited > 2.0 * leg.seconds + 2.0:
             raise SafetyFault(
-                f"the arm is not there after {waited:.1f} s; {leg.seconds:.1f} s were expected"
+                f"the arm has not arrived after {waited:.1f} s; {leg.seconds:.1f} s were expected"
             )
 
     def _settled(self, state: RobotState, leg: Leg) -> bool:

@@ -90,7 +90,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
         try:
             chain(_frames(section), name)
         except StageError:
-            yield (), f"'{name}' stands on itself; everything leads to base"
+            yield (), f"'{name}' is its own parent; everything leads to base"
 
 
 def _at_one_place(section: CellSection) -> Iterator[Mistake]:

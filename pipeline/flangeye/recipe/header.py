@@ -58,7 +58,7 @@ class NamedSection(Section):
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        what = "A model's name." if cls.word == "model" else "The frame it stands on."
+        what = "A model's name." if cls.word == "model" else "Its parent frame."
         word = {"type": "string", "description": what}
         return {"anyOf": [handler(core_schema), word]}
 
@@ -202,7 +202,7 @@ class ConfigurationSection(Section):
 
 
 FrameName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", min_length=1)]
-ON = "What it stands on: base, or an arm, a rail or a positioner of the cell by name."
+ON = "What it is mounted on: base, or an arm, a rail or a positioner of the cell by name."
 KNOWN: Any = Field(
     "known",
     description="Where its base is on that: known (at its origin), unknown (to be found), or "
@@ -283,7 +283,7 @@ class Header(Section):
     """A recipe, its steps not yet checked."""
 
     title: str = Field(description="One line for people.")
-    description: str = Field("", description="More lines for people.")
+    description: str = Field("", description="A longer description.")
     robot: RobotSection | None = None
     second_robot: SecondRobotSection | None = None
     scanner: ScannerSection | None = None

@@ -293,12 +293,12 @@ def earlier_run(
     ended = log.result is not None and not _stopped_in_weld(log.result)
     if ended and not retaken:
         raise StageError(
-            f"{log.path}: this run came to its end; there is nothing to go on with "
+            f"{log.path}: this run is complete; there is nothing to resume "
             "(--retake ID takes a capture again)"
         )
     text = log.text("recipe.resolved.yaml")
     if text is None:
-        raise StageError(f"{log.path}: holds no recipe; it cannot be gone on with")
+        raise StageError(f"{log.path}: holds no recipe; it cannot be resumed")
     name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
     recipe = parse_recipe(text, name, registry)
     weld = None if retaken else _begun_weld(log, recipe)

@@ -82,7 +82,7 @@ class LiveParams(Params):
     )
     home: tuple[JointPosition, ...] | None = Field(
         None,
-        description="Joint angles at which the arm stands before a run; a plan that does not ask "
+        description="Joint angles of the arm before a run; a plan that does not ask "
         "the arm (--offline) begins there.",
     )
     moved: Length = param(
@@ -170,7 +170,7 @@ def require_inside(state: RobotState, allowed: MotionLimits) -> None:
     where = allowed.outside(state.base_T_flange.translation) or allowed.beyond(state.joints)
     if where:
         raise StageError(
-            f"the arm stands beyond robot.limits, {where}: move it inside by its pendant, or widen "
+            f"the arm is outside robot.limits, {where}: jog it inside with its pendant, or widen "
             "the limits"
         )
 
@@ -180,7 +180,7 @@ def _read(arm: RobotDriver, allowed: MotionLimits) -> tuple[Floats | None, str]:
     try:
         name, state = read_state(arm)
     except DeviceError as error:
-        return None, f"the arm was not read, so the way to the first stop is not known: {error}"
+        return None, f"the arm was not read, so the path to the first stop is not known: {error}"
     require_inside(state, allowed)
     return state.joints, f"{name} was read: no program was started on it, nothing was commanded"
 
@@ -196,7 +196,7 @@ def _offline(
     if resumed is not None and resumed.joints is not None:
         return resumed.joints, "offline: the plan begins where the arm stood at its last capture"
     if params.home is None:
-        return None, "offline: no home in acquire.live, so the way to the first stop is not known"
+        return None, "offline: no home in acquire.live, so the path to the first stop is not known"
     if len(params.home) != len(robot.joints):
         raise StageError(
             f"acquire.live: home has {len(params.home)} angles, a {robot.model} has "

@@ -66,14 +66,14 @@ def require_model(name: str, state: RobotState, model: RobotModel) -> None:
     if len(state.joints) != len(model.joints):
         raise DeviceError(
             f"{name}: it has {len(state.joints)} joints and a {model.model} {len(model.joints)}: "
-            "is robot.model the arm that stands there?"
+            "is robot.model the right one?"
         )
     expected = Arm(model).flange(state.joints)
     if _differ(state.base_T_flange.matrix, expected, SAME_ARM):
         off = np.linalg.norm(state.base_T_flange.translation - expected[:3, 3])
         raise DeviceError(
             f"{name}: its flange is {off * 1e3:.0f} mm from where a {model.model} has it at these "
-            "joint angles: is robot.model the arm that stands there?"
+            "joint angles: is robot.model the right one?"
         )
 
 

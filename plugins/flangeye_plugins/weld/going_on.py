@@ -98,9 +98,9 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
             again.take(note)
     root = None if again is None else follower_of(again.controller)
     if root is None:
-        raise StageError(f"{log}: holds no weld by touch to go on with")
+        raise StageError(f"{log}: holds no tactile weld to resume")
     if root.phase == "done":
-        raise StageError(f"{log}: this weld came to its end; there is nothing to go on with")
+        raise StageError(f"{log}: this weld is complete; there is nothing to resume")
     return root.kept()
 
 
@@ -129,8 +129,7 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
     if points.shape == before.shape and np.abs(points - before).max() < SAME_PLAN:
         return
     raise StageError(
-        f"{log}: was of another plan; go on with the seam that it had: "
-        f"--from {log} --at weld.tactile"
+        f"{log}: was planned on another seam; resume it on its own: --from {log} --at weld.tactile"
     )
 
 
@@ -147,9 +146,7 @@ def set_back(
     tip = _ahead(plan, max(kept.torch - params.overlap, params.inset - distance), distance)
     tip = min(tip, last)
     if tip < params.inset:
-        raise StageError(
-            "weld.tactile: the seam is too short to go on with from where the tip can press"
-        )
+        raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
     place = plan.at(tip)
     torch = plan.at(_behind(plan, tip, distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])

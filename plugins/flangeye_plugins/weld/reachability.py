@@ -106,8 +106,8 @@ class SeamReach:
                 return way
             reasons.append(way.reason)
         raise StageError(
-            f"weld.tactile: no free way from where the arm stands to the seam: {reasons[0]}; bring "
-            "the arm above the work by hand"
+            f"weld.tactile: no collision-free path from the arm's pose to the seam: {reasons[0]}; "
+            "bring the arm above the work by hand"
         )
 
     def _way(self, here: Floats, high: Floats, low: Floats) -> Route | Barred:

@@ -110,7 +110,7 @@ def set_tool(host, pose):
 def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
     with pytest.raises(DeviceError) as error:
         robot_aubo(load_model("robots", "ur5e"), AuboParams(host=controller.host))
-    assert "is robot.model the arm that stands there?" in str(error.value)
+    assert "is robot.model the right one?" in str(error.value)
 
 
 @pytest.mark.parametrize(

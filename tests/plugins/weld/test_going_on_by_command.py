@@ -38,7 +38,7 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
     )
     told = flangeye(tmp_path, "--resume", "again")
     assert told.returncode == 2
-    assert "again/run.mcap: this run came to its end" in told.stderr
+    assert "again/run.mcap: this run is complete" in told.stderr
 
 
 @pytest.mark.slow

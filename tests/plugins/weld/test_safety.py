@@ -78,7 +78,7 @@ def test_a_way_that_would_drag_the_finger_through_the_work_is_refused() -> None:
     arm = Arm(joints=low)
     told = refused(driver=driver_of(arm))
     assert told.startswith(
-        "weld.tactile: no free way from where the arm stands to the seam: finger or torch would "
+        "weld.tactile: no collision-free path from the arm's pose to the seam: finger or torch would "
         "come to "
     )
     assert arm.cycles <= 1
@@ -192,7 +192,7 @@ def test_an_arm_that_moves_unasked_is_stopped() -> None:
     for _ in range(5):
         drive.tick()
     robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
-    with pytest.raises(DeviceError, match="the arm moves, and was not told to"):
+    with pytest.raises(DeviceError, match="the arm moves without a command from here"):
         for _ in range(3000):
             robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
             drive.tick()
