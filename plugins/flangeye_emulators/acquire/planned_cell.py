@@ -79,7 +79,7 @@ class CellSessionParams(Params):
     )
 
 
-Sight = tuple[int, str, str]
+Sighting = tuple[int, str, str]
 """A moment, a camera, a target."""
 
 
@@ -89,28 +89,28 @@ class PlannedCell:
 
     Attributes:
         moments: What may be seen.
-        dealt: What is, unless it is chosen as it goes.
+        scheduled: What is, unless it is chosen as it goes.
         source: Where it comes from, with the truth.
         view: What the cameras see.
         chooses: Whether each sighting is chosen by what was seen so far.
     """
 
     moments: Moments
-    dealt: Sequence[Sight]
+    scheduled: Sequence[Sighting]
     source: Source
     view: View
     chooses: bool
 
-    def sights(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sight]:
+    def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
         """Yield what is seen, as it is asked for.
 
         Args:
             seen: Gives what came of the sightings so far.
         """
-        yield from Chooser(self).sights(seen) if self.chooses else self.dealt
+        yield from NextBest(self).sightings(seen) if self.chooses else self.scheduled
 
 
-class Chooser:
+class NextBest:
     """Chooses the sighting that promises to tell most, by what was seen so far.
 
     Until that tells where everything is, sightings are those a person would show: each pair in
@@ -119,15 +119,15 @@ class Chooser:
 
     def __init__(self, planned: PlannedCell) -> None:
         """Start before the first sighting."""
-        self._planned, self._left = planned, list(planned.dealt)
-        self._rng = np.random.default_rng(len(planned.dealt))
+        self._planned, self._left = planned, list(planned.scheduled)
+        self._rng = np.random.default_rng(len(planned.scheduled))
         self._taken: set[int] = set()
         self._found: Solved | None = None
 
-    def sights(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sight]:
-        """Yield what is seen, as many at most as were to be dealt."""
+    def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
+        """Yield what is seen, as many at most as were to be scheduled."""
         moments, cell = self._planned.moments, self._planned.moments.cell
-        for _ in self._planned.dealt:
+        for _ in self._planned.scheduled:
             before = seen()
             self._found = solve_so_far(before, cell, LIMITS, self._found)
             chosen = self._choose(before) or self._left.pop(0)
@@ -135,7 +135,7 @@ class Chooser:
             if self._planned.view.sees(moments.pose(*chosen)[None])[0]:
                 yield chosen
 
-    def _choose(self, seen: Sequence[Observation]) -> Sight | None:
+    def _choose(self, seen: Sequence[Observation]) -> Sighting | None:
         if self._found is None:
             return None
         cell = self._planned.moments.cell
@@ -173,11 +173,11 @@ def plan_cell(
     """
     _require_places(cell, params)
     moments = _draw(cell, params, rng)
-    chosen = _deal(cell, moments, params.sightings, view)
-    sights, unseen = chosen[: params.sightings], chosen[params.sightings :]
+    chosen = _schedule(cell, moments, params.sightings, view)
+    sightings, unseen = chosen[: params.sightings], chosen[params.sightings :]
     truth = Truth(*_true(cell, params), unseen=tuple(moments.exact(*each) for each in unseen))
     source = replace(_source(cell, seed, params), truth=truth)
-    return PlannedCell(moments, sights, source, view, params.plan == "next_best")
+    return PlannedCell(moments, sightings, source, view, params.plan == "next_best")
 
 
 def _require_places(cell: Cell, params: CellSessionParams) -> None:
@@ -240,9 +240,9 @@ class Moments:
         )
 
 
-def name_of(sight: Sight) -> str:
+def name_of(sighting: Sighting) -> str:
     """Return what a sighting is called."""
-    i, camera, target = sight
+    i, camera, target = sighting
     return f"{i:04d}-{camera}-{target}"
 
 
@@ -296,12 +296,12 @@ def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
     return regular if plan == "grid" else np.where(either, regular, anywhere)
 
 
-def _deal(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sight]:
+def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sighting]:
     """Choose who sees whom at which moment: each pair in turn, as long as it sees anything."""
     pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
     free = {p: list(np.flatnonzero(view.sees(moments.seen(*p)))) for p in pairs if _apart(cell, p)}
     taken: set[int] = set()
-    chosen: list[Sight] = []
+    chosen: list[Sighting] = []
     while len(chosen) < sightings + UNSEEN and any(free.values()):
         for (camera, target), left in free.items():
             i = next((i for i in left if i not in taken), None)
@@ -319,7 +319,7 @@ def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
     return first != second
 
 
-def _require_seen(cell: Cell, chosen: list[Sight], wanted: int) -> None:
+def _require_seen(cell: Cell, chosen: list[Sighting], wanted: int) -> None:
     count = Counter(end for _, camera, target in chosen for end in (camera, target))
     for end in (*cell.cameras, *cell.targets):
         if count[end] < FEWEST:

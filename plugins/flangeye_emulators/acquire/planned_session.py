@@ -36,17 +36,17 @@ from flangeye.types import (
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.session import (
+    ArmPoses,
     Cast,
     Places,
-    Stands,
     View,
     as_built,
     close_loop,
-    draw_stands,
+    draw_arm_poses,
     home_of,
-    really,
     seen_from,
     visible,
+    with_noise,
 )
 
 VERSION = 1
@@ -131,8 +131,8 @@ class PlannedSession:
     """A session that was planned: what the arms report, where they are, where all is."""
 
     configuration: Configuration
-    reported: Stands
-    actual: Stands
+    reported: ArmPoses
+    actual: ArmPoses
     places: Places
     unseen: tuple[Observation, ...] = ()
 
@@ -158,12 +158,12 @@ class PlannedSession:
 
     def poses(self, i: int) -> tuple[Poses, Floats | None]:
         """Return what the controllers report at a pose, and the joints."""
-        stands = self.reported
+        reported = self.reported
         second = None
         if self.configuration.other_base:
-            second = Transform(BASE2, FLANGE2, stands.target[i])
-        joints = None if stands.joints is None else stands.joints[i]
-        return by_frame(Transform(BASE, FLANGE, stands.flange[i]), second), joints
+            second = Transform(BASE2, FLANGE2, reported.target[i])
+        joints = None if reported.joints is None else reported.joints[i]
+        return by_frame(Transform(BASE, FLANGE, reported.flange[i]), second), joints
 
 
 def plan_session(
@@ -197,11 +197,11 @@ def plan_session(
     closed_by_arm = camera is not None and known is not None and other is None
     if closed_by_arm and camera is not None:
         home = home_of(cast.first, place @ invert(camera @ view.first()))
-    stands = draw_stands(cast, (home, np.asarray(params.second_home)), params.spread, rng)
-    places = close_loop(stands, view, configuration, camera, place)
+    poses = draw_arm_poses(cast, (home, np.asarray(params.second_home)), params.spread, rng)
+    places = close_loop(poses, view, configuration, camera, place)
     if closed_by_arm and camera is not None:
         places = Places(camera, np.eye(4), place)
-    found = visible(stands, places, view, params.poses)
+    found = visible(poses, places, view, params.poses)
     planned = PlannedSession(configuration, found, found, places)
     if not params.arm.is_default:
         drawn = ImperfectArm(robot, 1.0, rng.spawn(1)[0], params.arm)
@@ -209,7 +209,7 @@ def plan_session(
         other_drawn = ImperfectArm(second.model, 1.0, draw, params.arm) if second else None
         return _as_built(planned, (drawn, other_drawn), params, rng)
     session = planned.where(np.arange(params.poses))
-    return replace(session, actual=really(session.actual, configuration, _noise(params), rng))
+    return replace(session, actual=with_noise(session.actual, configuration, _noise(params), rng))
 
 
 def _noise(params: SessionParams) -> tuple[float, float]:
@@ -227,7 +227,7 @@ def _as_built(
     every = planned.where(np.arange(min(count + UNSEEN, len(planned.reported.camera))))
     built = replace(every, actual=as_built(every.reported, configuration, arms))
     session = built.where(np.arange(count))
-    shaken = really(session.actual, configuration, _noise(params), rng)
+    shaken = with_noise(session.actual, configuration, _noise(params), rng)
     return replace(session, actual=shaken, unseen=built.noise_free()[count:])
 
 

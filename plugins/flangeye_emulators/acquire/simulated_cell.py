@@ -80,18 +80,18 @@ def acquire_simulated_cell(cell: Cell, seed: Seed, params: SimulatedCellParams) 
     """
     rng = np.random.default_rng([VERSION, seed])
     planned = plan_cell(cell, seed, params, params.view, rng)
-    return Observations(_seen(planned, params, rng), planned.source, len(planned.dealt))
+    return Observations(_seen(planned, params, rng), planned.source, len(planned.scheduled))
 
 
 def _seen(
     planned: PlannedCell, params: SimulatedCellParams, rng: np.random.Generator
 ) -> Iterator[Observation]:
     """Yield the sightings with their noise; some are wrong."""
-    moments, count, seen = planned.moments, len(planned.dealt), list[Observation]()
+    moments, count, seen = planned.moments, len(planned.scheduled), list[Observation]()
     deviations = np.repeat([params.target_rotation, params.target_position], 3)
     wrong = set(rng.permutation(count)[: round(params.outliers * count)])
-    for i, sight in enumerate(planned.sights(lambda: seen)):
-        exact, pose = moments.exact(*sight), moments.pose(*sight)
+    for i, sighting in enumerate(planned.sightings(lambda: seen)):
+        exact, pose = moments.exact(*sighting), moments.pose(*sighting)
         error = deviations * rng.standard_normal(6)
         error += (i in wrong) * np.repeat([0.5, 0.1], 3) * rng.standard_normal(6)
         noisy = rigid(rotation_exp(error[:3]) @ pose[:3, :3], pose[:3, 3] + error[3:])
@@ -129,16 +129,16 @@ def acquire_simulated_cell_scans(
         return [outcome for outcome in stream.outcomes.values() if outcome is not None]
 
     def captures() -> Iterator[Capture]:
-        for sight in planned.sights(seen):
-            i, camera, target = sight
+        for sighting in planned.sightings(seen):
+            i, camera, target = sighting
             place = planned.moments.place(i, camera)
             xyz = eyes[camera].scan(before_camera(_arms(planned.moments, i, flange), place), rng)
             yield Capture(
-                name_of(sight), PointCloud(CAMERA, xyz), planned.moments.poses(i),
+                name_of(sighting), PointCloud(CAMERA, xyz), planned.moments.poses(i),
                 camera=camera, target=target,
             )  # fmt: skip
 
-    stream = Captures(captures(), planned.source, len(planned.dealt))
+    stream = Captures(captures(), planned.source, len(planned.scheduled))
     return stream
 
 

@@ -1,4 +1,4 @@
-"""A simulated session of any configuration: where the arms go, and where everything really is.
+"""A simulated session of any configuration: where the arms go, and where everything with_noise is.
 
 The loop is closed at a first pose: with camera and target where the recipe puts them, the place
 that is left over follows. Around it joints are drawn at random, and those kept at which the camera
@@ -70,7 +70,7 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
-class Stands:
+class ArmPoses:
     """N poses of the arms.
 
     Attributes:
@@ -87,12 +87,12 @@ class Stands:
     flange: Floats
     target: Floats
 
-    def where(self, chosen: NDArray[np.intp]) -> Stands:
+    def where(self, chosen: NDArray[np.intp]) -> ArmPoses:
         """Return some of the poses."""
         joints = None if self.joints is None else self.joints[chosen]
         second = None if self.second is None else self.second[chosen]
         carried = (self.camera[chosen], self.flange[chosen], self.target[chosen])
-        return Stands(joints, second, *carried)
+        return ArmPoses(joints, second, *carried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +116,9 @@ class Cast:
     draws: int = DRAWS
 
 
-def draw_stands(
+def draw_arm_poses(
     cast: Cast, home: tuple[Floats, Floats], spread: float, rng: np.random.Generator
-) -> Stands:
+) -> ArmPoses:
     """Return the first pose, and others drawn around it, in view or not.
 
     Args:
@@ -143,7 +143,7 @@ def draw_stands(
     if camera.startswith(LINK):
         carried[camera] = frames[:, int(camera.removeprefix(LINK))]
     known = None if cast.four_axes else joints
-    return Stands(known, second, carried[camera], flange, carried[cast.configuration.target])
+    return ArmPoses(known, second, carried[camera], flange, carried[cast.configuration.target])
 
 
 def _around(home: Floats, spread: float, draws: int, rng: np.random.Generator) -> Floats:
@@ -162,18 +162,18 @@ def _of_four_axes(first: Floats, spread: float, draws: int, rng: np.random.Gener
 
 
 def close_loop(
-    stands: Stands, view: View, configuration: Configuration, camera: Floats | None, place: Floats
+    poses: ArmPoses, view: View, configuration: Configuration, camera: Floats | None, place: Floats
 ) -> Places:
     """Return where everything is, such that the camera sees the target at the first pose.
 
     Args:
-        stands: The arms' poses, the first of which counts.
+        poses: The arms' poses, the first of which counts.
         view: How the camera sees the target there.
         configuration: Says what there is to close the loop with.
         camera: (4, 4) of the camera in what carries it; None for wherever it has to be.
         place: (4, 4) of the target in what carries it, unless that closes the loop.
     """
-    a, b, seen = stands.camera[0], stands.target[0], view.first()
+    a, b, seen = poses.camera[0], poses.target[0], view.first()
     identity = np.eye(4)
     if camera is None:
         return Places(invert(a) @ b @ place @ invert(seen), identity, place)
@@ -197,25 +197,25 @@ def home_of(arm: Arm, base_T_flange: Floats) -> Floats:
     return np.asarray(found[0])
 
 
-def seen_from(stands: Stands, places: Places) -> Floats:
+def seen_from(poses: ArmPoses, places: Places) -> Floats:
     """Return (N, 4, 4) camera_T_target."""
-    world = places.y @ stands.target @ places.z
-    return np.asarray(invert(stands.camera @ places.x) @ world)
+    world = places.y @ poses.target @ places.z
+    return np.asarray(invert(poses.camera @ places.x) @ world)
 
 
-def visible(stands: Stands, places: Places, view: View, count: int) -> Stands:
+def visible(poses: ArmPoses, places: Places, view: View, count: int) -> ArmPoses:
     """Return the poses at which the camera sees the target, ``count`` at least.
 
     Raises:
         StageError: There are too few.
     """
-    found = np.flatnonzero(view.sees(seen_from(stands, places)))
+    found = np.flatnonzero(view.sees(seen_from(poses, places)))
     if len(found) < count:
         raise StageError(
             f"the camera sees the target at {len(found)} of {view.draws} poses drawn, and {count} "
             "are needed; make spread smaller, or move home, camera or place"
         )
-    return stands.where(found)
+    return poses.where(found)
 
 
 def disturbed(poses: Floats, noise: tuple[float, float], rng: np.random.Generator) -> Floats:
@@ -228,41 +228,41 @@ def disturbed(poses: Floats, noise: tuple[float, float], rng: np.random.Generato
 
 
 def as_built(
-    stands: Stands, configuration: Configuration, arms: tuple[ImperfectArm, ImperfectArm | None]
-) -> Stands:
-    """Return where arms that are not what they report stand when they report ``stands``.
+    reported: ArmPoses, configuration: Configuration, arms: tuple[ImperfectArm, ImperfectArm | None]
+) -> ArmPoses:
+    """Return where imperfect arms are when they report ``reported``.
 
     Args:
-        stands: As reported, in the order of their visit.
+        reported: As reported, in the order of their visit.
         configuration: Who carries what.
         arms: The first, and the second where there is one.
 
     Raises:
         StageError: The poses are none of an arm of the catalogue.
     """
-    if stands.joints is None:
+    if reported.joints is None:
         raise StageError("an arm of four axes has no joints to be wrong; leave 'arm' out")
     first, other = arms
-    angles, carried = first.angles(stands.joints), {BASE: stands.camera * 0 + np.eye(4)}
+    angles, carried = first.angles(reported.joints), {BASE: reported.camera * 0 + np.eye(4)}
     carried[FLANGE] = first.flange(angles)
     if configuration.camera.startswith(LINK):
         link = int(configuration.camera.removeprefix(LINK))
         carried[configuration.camera] = first.frames(angles)[:, link]
-    if other is not None and stands.second is not None:
-        carried[FLANGE2] = other.flange(other.angles(stands.second))
+    if other is not None and reported.second is not None:
+        carried[FLANGE2] = other.flange(other.angles(reported.second))
     camera, target = carried[configuration.camera], carried[configuration.target]
-    return replace(stands, camera=camera, target=target, flange=carried[FLANGE])
+    return replace(reported, camera=camera, target=target, flange=carried[FLANGE])
 
 
-def really(
-    stands: Stands,
+def with_noise(
+    reported: ArmPoses,
     configuration: Configuration,
     noise: tuple[float, float],
     rng: np.random.Generator,
-) -> Stands:
-    """Return where the arms really stand when they report ``stands``; bases do not move."""
-    carried = ((configuration.camera, stands.camera), (configuration.target, stands.target))
+) -> ArmPoses:
+    """Return where the arms are when they report ``reported``; bases do not move."""
+    carried = ((configuration.camera, reported.camera), (configuration.target, reported.target))
     camera, target = (m if frame == BASE else disturbed(m, noise, rng) for frame, m in carried)
-    flange = camera if configuration.camera == FLANGE else stands.flange
+    flange = camera if configuration.camera == FLANGE else reported.flange
     flange = target if configuration.target == FLANGE else flange
-    return replace(stands, camera=camera, target=target, flange=flange)
+    return replace(reported, camera=camera, target=target, flange=flange)
