@@ -34,6 +34,10 @@ LINGER = 5.0
 ENOUGH = 5
 """Observations from which a calibration can be solved again."""
 
+SMALL = (
+    "--set", "acquire.simulated.resolution=0.5",
+    "--set", "acquire.simulated.poses={grid: {counts: [2, 2, 2]}}",
+)  # fmt: skip
 FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
 
 
@@ -60,17 +64,16 @@ def _resumed(out: Path) -> tuple[str, ...] | None:
     return ("run", "--resume", str(out), "--move", "--out", f"{out}-again")
 
 
-def _recorded(recipe: str) -> Kind:
-    return Kind(("run", recipe), _solved_again(recipe))
+def _recorded(recipe: str, *options: str) -> Kind:
+    return Kind(("run", recipe, *options), _solved_again(recipe))
 
 
-BATCH = ("batch", "ur5_phoxi-m_simulated", "--repeat", "3", "--workers", "2", "--no-report")
-FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
+BATCH = ("batch", "ur5_phoxi-m_simulated", "--repeat", "3", "--workers", "2", "--no-report", *SMALL)
 KINDS = {
     "archive": _recorded("ur5_phoxi-m_sample"),
-    "simulated": _recorded("ur5_phoxi-m_simulated"),
+    "simulated": _recorded("ur5_phoxi-m_simulated", *SMALL),
     "live": Kind(("run", "ur5e_phoxi-m_loopback", "--move", *FEWER), _resumed),
-    "weld": _recorded("ur10e_phoxi-m_weld_simulated"),
+    "weld": _recorded("ur10e_phoxi-m_weld_simulated", *SMALL),
     "batch": Kind(BATCH, lambda out: (*BATCH, "--out", str(out))),
 }
 
@@ -122,11 +125,11 @@ class Trial:
 
     def _killed(self, number: int, after: float) -> Iterator[str]:
         out = self._folder / str(number)
-        shared = set(Path("/dev/shm").iterdir())
         run = self._start((*self._kind.command, "--out", str(out)), out)
         with suppress(subprocess.TimeoutExpired):
             run.wait(after)
         before = {log: set(_finished(log)) for log in out.rglob("run.mcap")}
+        shared = _shared(str(out))
         kill = os.killpg if self._chance.random() < 0.5 else os.kill
         with suppress(ProcessLookupError):
             kill(run.pid, signal.SIGKILL)
@@ -136,7 +139,7 @@ class Trial:
             yield from self._lost(log, finished)
         yield from self._stuck(out)
 
-    def _left(self, out: Path, shared: set[Path]) -> Iterator[str]:
+    def _left(self, out: Path, shared: set[str]) -> Iterator[str]:
         """Yield what is left of a killed run besides its folder."""
         until = time.monotonic() + LINGER
         while (left := _marked(str(out))) and time.monotonic() < until:
@@ -144,8 +147,8 @@ class Trial:
         for pid, command in left.items():
             yield f"a process is left: {command}"
             os.kill(pid, signal.SIGKILL)
-        forgotten = _unused(set(Path("/dev/shm").iterdir()) - shared)
-        yield from (f"{path} is left" for path in [*_temporary(out).iterdir(), *forgotten])
+        forgotten = [*map(str, _temporary(out).iterdir()), *sorted(shared)]
+        yield from (f"{path} is left" for path in forgotten if Path(path).exists())
 
     def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
         """Yield what of a log cannot be read though it was finished before."""
@@ -200,24 +203,32 @@ def _finished(log: Path) -> list[str]:
         return []
 
 
-def _marked(out: str) -> dict[int, str]:
-    """Return the processes that a run started and that still live, with their commands."""
-    found = {}
+def _processes(out: str) -> Iterator[Path]:
+    """Yield what the system tells of each process that a run started and that still lives."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             if f"{MARK}={out}".encode() in (process / "environ").read_bytes().split(b"\0"):
-                words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-                found[int(process.name)] = words
+                yield process
+
+
+def _marked(out: str) -> dict[int, str]:
+    """Return the processes that a run started and that still live, with their commands."""
+    found = {}
+    for process in _processes(out):
+        with suppress(OSError):
+            words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            found[int(process.name)] = words
     return found
 
 
-def _unused(paths: set[Path]) -> set[Path]:
-    """Return the paths that no living process has in its memory: the others are its own."""
-    maps = ""
-    for process in Path("/proc").glob("[0-9]*"):
+def _shared(out: str) -> set[str]:
+    """Return the shared memory that the processes of a run have."""
+    found = set()
+    for process in _processes(out):
         with suppress(OSError):
-            maps += (process / "maps").read_text("utf-8", "replace")
-    return {path for path in paths if str(path) not in maps}
+            maps = (process / "maps").read_text("utf-8", "replace")
+            found |= {word for word in maps.split() if word.startswith("/dev/shm/")}
+    return found
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def test_the_samples_of_an_interval_are_those_in_it_and_one_to_each_side() -> No
     assert during(31, 99) == [30, 40]
 
 
-@pytest.mark.parametrize(("asked", "cycle"), [(0, 1), (30, 31)])
+@pytest.mark.parametrize(("asked", "cycle"), [(0, 1), (30, 30)])
 def test_samples_are_told_once_their_interval_is_over(asked: int, cycle: int) -> None:
     robot = StandIn()
     period = round(robot.period * 1e9)
@@ -134,6 +134,28 @@ def test_any_doubt_stops_the_arm_and_is_told(misbehaviour: Any, line: str) -> No
         assert "stop" in robot.commands()
         arm.go(way_to(arm, j1=0.1))
     assert robot.commands().count("move") == 1  # a safety fault is not outlived
+
+
+@pytest.mark.parametrize(
+    ("refusal", "line"),
+    [
+        ("no sample for 100 ms: the controller is gone",
+         "no sample for 100 ms: the controller is gone"),
+        ("the command was not taken",
+         "no sample for 100 ms: the controller is gone; stopping it: the command was not taken"),
+    ],
+)  # fmt: skip
+def test_an_arm_that_cannot_be_stopped_either_is_told_once(refusal: str, line: str) -> None:
+    class Gone(StandIn):
+        def stop(self):
+            raise DeviceError(refusal)
+
+    robot = Gone(under_way(lost))
+    with watched(driver_of(robot), MODEL, LIMITS) as arm:
+        arm.go(way_to(arm, j1=0.8))
+        with pytest.raises(DeviceError) as error:
+            arm.wait()
+    assert str(error.value) == line
 
 
 def test_an_arm_that_does_not_set_off_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,3 +300,11 @@ def test_a_program_that_dies_stops_the_arm() -> None:
     guard_module.guard(wire, Charge(lambda: robot, MODEL, LIMITS))
     assert robot.closed
     assert ("stop", 200) in robot.asked
+
+
+def test_the_guard_s_process_opens_the_terminal_anew_if_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "open", lambda path, flags: {"/dev/tty": 17}[path])
+    assert guard_module._terminal(None) is None
+    assert guard_module._terminal(0) == 17

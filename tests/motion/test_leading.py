@@ -11,7 +11,7 @@ from flangeye.errors import RunStopped
 from flangeye.motion.arm import WatchedArm
 from flangeye.motion.leading import LedArm, led
 from flangeye.motion.route import Leg, Route
-from flangeye.motion.watchdog import HUNG, SILENT, Charge, Report, Watchdog
+from flangeye.motion.watchdog import Charge, Report, Watchdog
 from tests.motion.stand_in import LIMITS, MODEL, StandIn, driver_of
 from tests.motion.test_guard import Wire, outside, protected
 
@@ -47,7 +47,7 @@ def test_a_program_that_leads_and_says_nothing_any_more_is_ended() -> None:
     (fault,) = [report.content for report in heard if report.what == "fault"]
     assert fault == "the program that leads the arm said nothing for 1 s"
     stopped = [cycle for name, cycle in robot.asked if name == "stop"]
-    assert stopped == pytest.approx([149 + t / robot.period for t in (SILENT, HUNG)], abs=3)
+    assert stopped == pytest.approx([149 + t / robot.period for t in (0.2, 1.0)], abs=3)  # [s]
     assert robot.arm.standing  # a safety fault is not outlived
 
 
@@ -56,13 +56,29 @@ def test_a_program_that_was_held_up_goes_on_from_rest() -> None:
     heard = guarded(robot, [*velocities(100, 150), *velocities(350, 400), (400, ("stop", None))])
     assert "fault" not in {report.what for report in heard}
     first, _ = [cycle for name, cycle in robot.asked if name == "stop"]
-    assert first == pytest.approx(149 + SILENT / robot.period, abs=3)
+    assert first == pytest.approx(149 + 0.2 / robot.period, abs=3)
 
 
 def test_a_program_that_has_stopped_the_arm_may_be_silent() -> None:
     robot = StandIn()
     heard = guarded(robot, [*velocities(100, 150), (150, ("stop", None))])
     assert "fault" not in {report.what for report in heard}
+
+
+def test_a_guard_that_waits_for_a_word_misses_no_cycle() -> None:
+    robot, waited = StandIn(), list[float]()
+    wire: Any = Wire(robot, [*velocities(100, 150), (200, ("close", None))])
+    poll = wire.poll
+
+    def polled(seconds):
+        waited.append(seconds)
+        return poll(seconds)
+
+    wire.poll = polled
+    Watchdog(robot, wire, Charge(lambda: robot, MODEL, LIMITS)).run()
+    assert waited[0] == 0  # nobody leads yet
+    assert 0 < max(waited) < robot.period
+    assert waited[-1] == 0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,182 @@
+"""Every fault of a controller on loopback: python -m tools.faults [TIMES] [--seed N] [--kind NAME …].
+
+A calibration, or a program that leads the arm as a weld does, runs against a controller on loopback
+through the maker's client. The fault comes while the arm moves, at a random moment. By the
+controller's clock the arm rests within 0.5 s; what was finished is in the log; the program ends
+within 3 s, not counting how long it and its guard waited for a core of a busy machine. Under a
+fault that hinders nothing (a network late by 20 ms) it may go on to its end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from flangeye.files.children import python_command
+from tests.live.cell import Cell
+
+FAULTS = (
+    "protective-stop", "emergency-stop", "singularity", "joint-limit", "drop", "die", "freeze",
+    "latency=20 ms", "latency=300 ms", "program-stop", "remote-control-off",
+)  # fmt: skip
+RESTS, ENDS, PATIENCE = 0.5, 3.0, 30.0
+"""After a fault: longest time until the arm rests, by its clock, and until the program ends; a
+program that has not ended after the last goes on [s]."""
+
+STARTING, WHOLE = 240.0, 600.0
+"""Longest time until a program moves the arm, and until it is through [s]; the machine is busy."""
+
+MOVES, STANDS = 0.02, 1e-4
+"""An arm that moves, and one that rests [m/s]."""
+
+
+def main() -> None:
+    """Cause each fault so many times, and print a line for each."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("times", nargs="?", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kind", nargs="+", choices=("calibration", "leading"),
+                        default=["calibration", "leading"])  # fmt: skip
+    parser.add_argument("--fault", nargs="+", default=list(FAULTS))
+    asked = parser.parse_args()
+    print(
+        "kind         fault                times  went on  rest [s]  exit [s]  no core [s]  wrong",
+        flush=True,
+    )
+    wrong = 0
+    for kind in asked.kind:
+        for fault in asked.fault:
+            trial = Trial(kind, fault, random.Random(f"{kind} {fault} {asked.seed}"))
+            for _ in range(asked.times):
+                trial.once()
+            print(trial.row(), *trial.wrong, sep="\n  ", flush=True)
+            wrong += len(trial.wrong)
+    print(f"load {os.getloadavg()[1]:.1f} on {os.cpu_count()} cores")
+    sys.exit(bool(wrong))
+
+
+class End(NamedTuple):
+    """After a fault: when the arm moved last, when the program ended, how long it had no core [s]."""
+
+    rests: float
+    exits: float | None
+    queued: float
+
+
+class Trial:
+    """One fault in one kind of program, and what came of it."""
+
+    def __init__(self, kind: str, fault: str, chance: random.Random) -> None:
+        self.wrong: list[str] = []
+        self._kind, self._fault, self._chance = kind, fault, chance
+        self._times = self._went_on = 0
+        self._ends = [End(0.0, 0.0, 0.0)]
+
+    def once(self) -> None:
+        """Start a controller and a program, cause the fault, and look."""
+        self._times += 1
+        with tempfile.TemporaryDirectory() as folder, Cell(Path(folder)) as cell:
+            program = self._start(cell)
+            try:
+                self.wrong += self._faults(cell, program)
+            except AssertionError as error:
+                self.wrong.append(str(error))
+            finally:
+                program.kill()
+                program.communicate()
+
+    def row(self) -> str:
+        """Return the line of the table, with the longest times."""
+        rests = max(end.rests for end in self._ends)
+        exits, queued = max((end.exits or 0.0, end.queued) for end in self._ends)
+        return (
+            f"{self._kind:12} {self._fault:20} {self._times:5} {self._went_on:8} {rests:9.2f} "
+            f"{exits:9.2f} {queued:12.2f} {len(self.wrong):6}"
+        )
+
+    def _start(self, cell: Cell) -> subprocess.Popen[str]:
+        if self._kind == "calibration":
+            return cell.start(cell.recipe(), "--move", "--out", "run")
+        return subprocess.Popen(
+            python_command("-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "
+                           "from tests.motion.leader import main; main(sys.argv[1])",
+                           str(Path(__file__).parents[1]), cell.controller.host),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def _faults(self, cell: Cell, program: subprocess.Popen[str]) -> Iterator[str]:
+        """Cause the fault while the arm moves, and yield what is wrong afterwards."""
+        for _ in range(self._chance.randrange(4) if self._kind == "calibration" else 0):
+            cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
+            cell.wait_until(lambda: _speed(cell) < STANDS or _over(program), STARTING)
+        cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
+        time.sleep(self._chance.uniform(0, 0.3))
+        before, began = set(cell.finished()), cell.control.truth().time
+        cell.control.fault(self._fault)
+        end = _watched(cell, program, began)
+        if end.exits is None or not program.returncode:
+            self._went_on += 1
+            yield from self._through(program, end.rests)
+        else:
+            self._ends.append(end)
+            if end.rests > RESTS or end.exits - end.queued > ENDS:
+                yield (f"the arm rests after {end.rests:.2f} s, the program ends after "
+                       f"{end.exits:.2f} s, {end.queued:.2f} s of them without a core")  # fmt: skip
+        yield from (f"{lost} is lost" for lost in before - set(cell.finished()))
+
+    def _through(self, program: subprocess.Popen[str], moved: float) -> Iterator[str]:
+        """Yield what is wrong with a program that went on under a fault."""
+        if self._kind == "calibration":
+            _, told = program.communicate(timeout=WHOLE)
+            if program.returncode not in (0, 1):
+                yield f"it went on and then ended: {told.splitlines()[-1]}"
+        elif moved < ENDS:
+            yield "the arm rests, and the program goes on"
+
+
+def _speed(cell: Cell) -> float:
+    return cell.control.truth().speed
+
+
+def _over(program: subprocess.Popen[str]) -> bool:
+    return program.poll() is not None
+
+
+def _watched(cell: Cell, program: subprocess.Popen[str], began: float) -> End:
+    """Look at an arm and its program until both have come to an end, or go on in spite of all."""
+    moved = now = 0.0
+    ended, queued = None, _queued(program.pid)
+    waited = queued
+    while now < PATIENCE and (ended is None or now < ended + RESTS):
+        truth = cell.control.truth()
+        now = truth.time - began
+        moved = now if truth.speed > STANDS else moved
+        if ended is None and _over(program):
+            ended = now
+        waited = max(waited, _queued(program.pid))
+        time.sleep(0.02)
+    return End(moved, ended, waited - queued)
+
+
+def _queued(pid: int) -> float:
+    """Return how long a program and what it started have waited for a core so far [s]."""
+    total = 0.0
+    with suppress(OSError):
+        told = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii")
+        for process in (pid, *map(int, told.split())):
+            words = Path(f"/proc/{process}/task/{process}/schedstat").read_text("ascii").split()
+            total += 1e-9 * int(words[1])
+    return total
+
+
+if __name__ == "__main__":
+    main()
