@@ -20,8 +20,10 @@ from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
 
-ROW = re.compile(r"^(\d{4})\s+(\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(\d+) deg\s+(.*)$")
-TIMES = re.compile(r"^(\d+) stops, (\d+) s under way", re.MULTILINE)
+ROW = re.compile(
+    r"^(\d{4}|-)\s+(left out|\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(?:\d+ deg\s+)?(.*)$"
+)
+TIMES = re.compile(r"^(\d+) stops, (\d+) s of motion", re.MULTILINE)
 HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """How an arm of six joints is drawn that has not said where it stands."""
 
@@ -31,10 +33,10 @@ class Stop:
     """One row of the plan that the command prints.
 
     Attributes:
-        id: Identifier of the capture.
+        id: Identifier of the capture; ``-`` where none is possible.
         role: What it is for.
         place: (3,) of the flange in the base [m].
-        way: How the arm gets there, how long it takes, or why it is barred.
+        way: How the arm gets there, how long it takes, or why it cannot.
     """
 
     id: str
@@ -44,8 +46,8 @@ class Stop:
 
     @property
     def barred(self) -> bool:
-        """Whether there is no way."""
-        return self.way.startswith("barred")
+        """Whether the arm cannot be there."""
+        return self.id == "-" or self.way.startswith("barred")
 
 
 def add(project: Project) -> None:
@@ -169,7 +171,7 @@ class Planner:
             if line.startswith("error: "):
                 mistake(line.removeprefix("error: "))
         if found := TIMES.search(text):
-            ui.label(f"{found[1]} poses, {found[2]} s under way").classes("text-subtitle1").props(
+            ui.label(f"{found[1]} poses, {found[2]} s of motion").classes("text-subtitle1").props(
                 'role="status"'
             )
         ui.code(text, language="text").classes("w-full overflow-x-auto")
@@ -184,7 +186,7 @@ class Planner:
 def stops_of(text: str) -> list[Stop]:
     """Return the stops in a plan as the command prints it."""
     rows = filter(None, map(ROW.match, text.splitlines()))
-    return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[7]) for r in rows]
+    return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[6]) for r in rows]
 
 
 def _first(data: dict[str, Any]) -> dict[str, Any] | None:

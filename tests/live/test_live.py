@@ -32,7 +32,7 @@ def test_without_move_the_plan_is_shown_and_nothing_moves(cell: Any) -> None:
     assert out.splitlines()[-2:] == [
         f"ur5e at {cell.controller.host} was read: no program was started on it, nothing was "
         "commanded",
-        "nothing moved: --move lets the arm go",
+        "dry run, nothing moved; add --move to execute",
     ]
     assert not [line for line in cell.control.log() if "program" in line]
     assert (cell.control.truth().joints == before).all()

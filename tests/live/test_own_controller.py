@@ -74,7 +74,7 @@ def test_offline_asks_no_arm(tmp_path: Path) -> None:
     assert (run.returncode, err) == (0, "")
     assert out.splitlines()[-2:] == [
         "offline: the plan begins at acquire.live's home",
-        "nothing moved: --move lets the arm go",
+        "dry run, nothing moved; add --move to execute",
     ]
     assert "not known" not in out
 

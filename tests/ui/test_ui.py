@@ -17,6 +17,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -224,6 +225,30 @@ def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
     page.get_by_label("Joint angles of three poses").fill("1 deg\n2 deg\n3 deg")
     page.get_by_role("button", name="Use these poses").click()
     page.get_by_text("view.shown: a pose has 1 joint angles, the arm 6 joints").wait_for()
+
+
+def red_pixels(page: Any) -> int:
+    """Count what is as red as a pose that cannot be reached, in the 3D scene."""
+    image = page.locator(".scene canvas").screenshot()
+    blue, green, red = cv2.split(cv2.imdecode(np.frombuffer(image, np.uint8), 1).astype(int))
+    return int(((red > 120) & (green < red / 2) & (blue < red / 2)).sum())
+
+
+@pytest.mark.slow
+def test_poses_that_cannot_be_reached_are_red(browser: Any, served: Served) -> None:
+    page = opened(browser, served)
+    recipe = yaml.safe_load(find_recipe("ur5e_phoxi-m_loopback").read_text())
+    recipe["robot"]["limits"]["box"]["size"] = ["1000 mm", "300 mm", "900 mm"]
+    recipe["steps"][0]["acquire.live"]["poses"] = {"grid": {"counts": [3, 3, 1]}}
+    write_recipe(page, yaml.safe_dump(recipe))
+    page.get_by_text("The recipe is valid.").wait_for()
+    go(page, "Plan")
+    page.wait_for_timeout(1000)
+    assert not red_pixels(page)
+    page.get_by_role("button", name="Check every pose and path").click()
+    page.get_by_text("Red poses cannot be reached; the last column says why.").wait_for()
+    page.wait_for_timeout(1000)
+    assert red_pixels(page)
 
 
 def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
@@ -471,13 +496,14 @@ def test_a_recipes_mistake_stands_at_its_field() -> None:
 
 
 def test_the_plans_rows_are_read_as_the_command_prints_them() -> None:
-    text = """2 stops, 9 s under way; 4 were wanted (2 too near a joint's limit left out)
-stop  for           flange at (mm, base)    tilt  way       time
+    text = """2 stops, 9 s of motion; 4 were requested (2 outside robot.limits.box left out)
+stop  for           flange at (mm, base)    tilt  path      time
 0000  verification    450.0    12.5   310.0   10 deg  direct     4.1 s
 0001  calibration     400.0   -12.5   290.0   20 deg  barred: outside the box
+-     left out        380.0    12.5  -90.0           outside robot.limits.box
 """
     stops = stops_of(text)
-    assert [s.barred for s in stops] == [False, True]
+    assert [s.barred for s in stops] == [False, True, True]
     np.testing.assert_allclose(stops[1].place, [0.4, -0.0125, 0.29])
 
 

@@ -45,12 +45,24 @@ class Margins(NamedTuple):
     singularity: float
 
 
+class Refusal(NamedTuple):
+    """A pose of the flange that is impossible.
+
+    Attributes:
+        place: (3,) of the flange, in ``base`` [m].
+        reason: Why.
+    """
+
+    place: Floats
+    reason: str
+
+
 class Reach:
     """What an arm can show a scanner.
 
     Attributes:
         arm: Its kinematics.
-        refused: Why poses were impossible, and how often.
+        refusals: The poses that were asked for and are impossible.
         home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
     """
 
@@ -83,7 +95,12 @@ class Reach:
         self._reach = robot.length
         self.home = np.zeros(self.arm.n)
         self._start: Floats | None = None
-        self.refused: Counter[str] = Counter()
+        self.refusals: list[Refusal] = []
+
+    def why_refused(self) -> str:
+        """Return why poses were impossible, and how often; empty where all were possible."""
+        counts = Counter(refusal.reason for refusal in self.refusals).most_common()
+        return ", ".join(f"{count} {reason}" for reason, count in counts)
 
     def facing(self, centre: Floats) -> Floats | None:
         """Return the rotation (3, 3) of a flange at ``centre`` that faces along the view.
@@ -128,16 +145,19 @@ class Reach:
         with a link between scanner and flange.
         """
         if not self.in_view(base_T_flange):
-            self.refused["out of the scanner's view"] += 1
+            self._refuse(base_T_flange, "out of the scanner's view")
             return None
         possible = self._possible(base_T_flange)
         if not possible:
             return None
         nearest = min(possible, key=lambda joints: _turn(joints, self.home))
         if self._start is not None and _turn(nearest, self.home) > FOLD:
-            self.refused["only with the arm folded over"] += 1
+            self._refuse(base_T_flange, "only with the arm folded over")
             return None
         return nearest
+
+    def _refuse(self, base_T_flange: Floats, reason: str) -> None:
+        self.refusals.append(Refusal(base_T_flange[:3, 3], reason))
 
     def in_view(self, base_T_flange: Floats) -> bool:
         """Return whether camera and projector see the whole disc, within the scanner's range."""
@@ -159,7 +179,7 @@ class Reach:
         possible = [joints for joints in clear if not self._too_near(joints)]
         if not possible:
             why = "with the arm in the way" if len(reachable) else "out of the arm's reach"
-            self.refused[str(self._too_near(clear[0])) if clear else why] += 1
+            self._refuse(base_T_flange, str(self._too_near(clear[0])) if clear else why)
         return possible
 
     def _unwound(self, joints: Floats) -> Floats:

@@ -167,10 +167,9 @@ def _refuse_too_few(
 ) -> None:
     if found >= FEWEST:
         return
-    why = ", ".join(f"{count} {reason}" for reason, count in reach.refused.most_common())
     raise StageError(
         f"acquire.simulated: {robot.model} can show its flange to {scanner.model} at "
-        f"{found} of {wanted} planned poses, {FEWEST} are needed ({why}); "
+        f"{found} of {wanted} planned poses, {FEWEST} are needed ({reach.why_refused()}); "
         "move camera.position, or the plan's centre, or make its size or tilt smaller"
     )
 

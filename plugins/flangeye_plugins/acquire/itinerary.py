@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ from flangeye.types import Floats, Observation, Role
 
 FEWEST = 3
 """Poses without which no camera pose can be found."""
+LISTED = 12
+"""Places left out of a plan that are listed, at most."""
 
 
 class Stop(NamedTuple):
@@ -103,8 +106,7 @@ class Itinerary:
 
     def why_not(self) -> str:
         """Say why poses were impossible, and how often."""
-        counts = self._reach.refused.most_common()
-        return ", ".join(f"{count} {reason}" for reason, count in counts) or "none was tried"
+        return self._reach.why_refused() or "none was tried"
 
     def shown(self, start: Floats | None) -> str:
         """Return the plan for people: every stop, the way to it, and what it takes.
@@ -125,11 +127,28 @@ class Itinerary:
                 seconds += way.seconds if way else 0.0
                 here = stop.pose.joints
         return "\n".join([
-            f"{len(stops)} stops, {seconds:.0f} s under way; {self._plan.wanted} were wanted "
+            f"{len(stops)} stops, {seconds:.0f} s of motion; {self._plan.wanted} were requested "
             f"({self.why_not()} left out)",
-            "stop  for           flange at (mm, base)    tilt  way       time",
+            "stop  for           flange at (mm, base)    tilt  path      time",
             *rows,
+            *self._left_out(stops),
         ])  # fmt: skip
+
+    def _left_out(self, stops: Sequence[Stop]) -> list[str]:
+        """Return a row for each place at which no pose is possible, a few of every reason."""
+        reasons = defaultdict[str, Counter[str]](Counter)
+        for refusal in self._reach.refusals:
+            reasons[_row_mm(refusal.place)][refusal.reason] += 1
+        for stop in stops:
+            reasons.pop(_row_mm(stop.pose.base_T_flange[:3, 3]), None)
+        rows, nth = [], Counter[str]()
+        for place, counts in reasons.items():
+            ((why, _),) = counts.most_common(1)
+            nth[why] += 1
+            rows.append((nth[why], f"{'-':4}  {'left out':12}  {place}           {why}"))
+        rows.sort(key=lambda row: row[0])
+        more = [f"and {len(rows) - LISTED} more places"] if len(rows) > LISTED else []
+        return [row for _, row in rows[:LISTED]] + more
 
     def require_enough(self, found: int) -> None:
         """Refuse a plan of fewer than three poses.
@@ -147,10 +166,8 @@ class Itinerary:
     def _row(self, stop: Stop, way: Route | Barred | None) -> str:
         pose = stop.pose.base_T_flange
         tilt = angle_between(pose[:3, 2], self._site.eye - pose[:3, 3])
-        place = " ".join(f"{1e3 * x:7.1f}" for x in pose[:3, 3])
-        return (
-            f"{stop.id}  {stop.role:12}  {place}  {np.degrees(tilt):3.0f} deg  {_route_line(way)}"
-        )
+        tilted = f"{np.degrees(tilt):3.0f} deg"
+        return f"{stop.id}  {stop.role:12}  {_row_mm(pose[:3, 3])}  {tilted}  {_route_line(way)}"
 
     def _lost(self) -> set[int]:
         """Return the places in the plan of poses that told nothing."""
@@ -182,7 +199,7 @@ def itinerary_of(
         reach.start_from(start)
     centre = middle_of_view(scanner, base_T_camera)
     if reach.facing(centre) is None:
-        reasons = ", ".join(reach.refused) or "no posture is possible"
+        reasons = reach.why_refused() or "no posture is possible"
         raise StageError(
             f"acquire.live: {robot.model} cannot show its flange to {scanner.model} at "
             f"{_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
@@ -196,6 +213,10 @@ def _route_line(way: Route | Barred | None) -> str:
     if isinstance(way, Barred):
         return f"barred: {way.reason}"
     return f"{'by home' if way.via else 'direct':8}  {way.seconds:4.1f} s"
+
+
+def _row_mm(point: Floats) -> str:
+    return " ".join(f"{1e3 * x:7.1f}" for x in point)
 
 
 def _mm(point: Floats) -> str:

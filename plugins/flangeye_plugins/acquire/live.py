@@ -55,7 +55,7 @@ from flangeye.types import (
 from flangeye.units import Angle, JointPosition, Length, param
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
-HOW_TO_MOVE = "nothing moved: --move lets the arm go"
+HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
 
 
 class LiveParams(Params):
