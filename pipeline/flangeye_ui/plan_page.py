@@ -76,7 +76,7 @@ class Planner:
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()
                 ui.button("Check every pose and path", on_click=self._plan)
-                self._told = ui.column().classes("w-full")
+        self._checked = ui.column().classes("w-full")
         command_line(project.command("run", project.recipe_path.name))
 
     def _draw(self) -> None:
@@ -153,16 +153,16 @@ class Planner:
 
     async def _plan(self) -> None:
         """Ask the command line for the plan: without --move it shows it and nothing moves."""
-        self._told.clear()
-        with self._told:
+        self._checked.clear()
+        with self._checked:
             ui.spinner()
         if self._recipe.steps[0].stage.name != "acquire.live":
             text = "this recipe drives no arm: its poses come from its recordings or its simulation"
         else:
             words = ["run", self._project.recipe_path.name]
             text = await asyncio.to_thread(self._project.run_command, words)
-        self._told.clear()
-        with self._told:
+        self._checked.clear()
+        with self._checked:
             self._show(text)
 
     def _show(self, text: str) -> None:

@@ -249,6 +249,7 @@ def test_poses_that_cannot_be_reached_are_red(browser: Any, served: Served) -> N
     page.get_by_text("Red poses cannot be reached; the last column says why.").wait_for()
     page.wait_for_timeout(1000)
     assert red_pixels(page)
+    shot(page, "plan_barred")
 
 
 def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:

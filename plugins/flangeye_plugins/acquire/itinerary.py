@@ -216,7 +216,7 @@ def _route_line(way: Route | Barred | None) -> str:
 
 
 def _row_mm(point: Floats) -> str:
-    return " ".join(f"{1e3 * x:7.1f}" for x in point)
+    return " ".join(f"{round(1e3 * x, 1) + 0.0:7.1f}" for x in point)
 
 
 def _mm(point: Floats) -> str:
