@@ -554,12 +554,12 @@ def test_a_controller_with_options_that_cannot_be(
 def test_a_deeply_nested_cache_is_made_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from flangeye.plugin import stage_list
+    from flangeye.files.memory import keep, recall
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    stage_list._place().parent.mkdir(parents=True)
-    stage_list._place().write_text("[" * 100_000)
-    assert stage_list._recall("anything") is None
+    keep("stages", "anything", "a list")
+    (tmp_path / "flangeye" / "stages.json").write_text("[" * 100_000)
+    assert recall("stages", "anything") is None
 
 
 def test_an_image_larger_than_any_camera_is_refused(tmp_path: Path) -> None:

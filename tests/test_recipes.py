@@ -14,7 +14,8 @@ from flangeye.log.read import read_run
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import Configuration
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye.recipe.find import recipe_names
+from flangeye.recipe.load import load_recipe
 from flangeye.recipe.schema import recipe_schema
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run

@@ -10,7 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye.recipe.find import recipe_names
+from flangeye.recipe.load import load_recipe
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
 

@@ -16,7 +16,8 @@ from flangeye.handeye.cell_plan import errors_at_work, work_of_frames
 from flangeye.handeye.graph import LIMITS
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye.recipe.find import recipe_names
+from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_emulators.acquire.planned_cell import CellSessionParams

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from flangeye.files.bundled import bundled
 from flangeye.plugin.stage import Stage
-from flangeye.recipe.load import find_recipe, recipe_names
+from flangeye.recipe.find import find_recipe, recipe_names
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Mistake, Project, at
 

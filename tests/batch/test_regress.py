@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from flangeye.batch.regress import read_manifests
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.files.bundled import bundled
 
 DATA = Path(__file__).parents[2] / "data"

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli import app
 from flangeye.cli.app import complete_recipe
+from flangeye.cli.commands import app
 from flangeye.models.loading import load_model, model_names
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe

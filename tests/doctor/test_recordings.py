@@ -17,7 +17,8 @@ from flangeye.doctor.diagnosis import RecordedSession
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.maths.pose_corrections import inverted, scaled, shifted, without_tool
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe, recipe_names
+from flangeye.recipe.find import recipe_names
+from flangeye.recipe.load import load_recipe
 from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import clean
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.files.elsewhere import (

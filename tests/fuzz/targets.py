@@ -81,7 +81,7 @@ def sound_log(folder: Path) -> Path:
 
 
 def _recipes(folder):
-    from flangeye.recipe.load import recipe_names
+    from flangeye.recipe.find import recipe_names
 
     names = ("ur5_phoxi-m_simulated", "ur5e_phoxi-m_loopback", "aubo-i5_phoxi-s_archive")
     return [recipe_names()[name].read_bytes() for name in names]
@@ -101,7 +101,8 @@ def _overrides(folder):
 
 
 def _check_override(path):
-    from flangeye.recipe.load import find_recipe, load_recipe
+    from flangeye.recipe.find import find_recipe
+    from flangeye.recipe.load import load_recipe
 
     text = path.read_bytes().decode("utf-8", "replace")
     load_recipe(find_recipe("ur5e_phoxi-m_loopback"), _registry(), [text])

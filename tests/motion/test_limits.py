@@ -87,7 +87,8 @@ LOOPBACK = "ur5e_phoxi-m_loopback"
 def test_limits_are_held_against_what_the_arm_can_do(override: str, said: str) -> None:
     from flangeye.errors import RecipeError
     from flangeye.plugin.registry import load_registry
-    from flangeye.recipe.load import find_recipe, load_recipe
+    from flangeye.recipe.find import find_recipe
+    from flangeye.recipe.load import load_recipe
 
     with pytest.raises(RecipeError) as error:
         load_recipe(find_recipe(LOOPBACK), load_registry(), [override])

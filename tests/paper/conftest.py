@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import find_recipe, load_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 

@@ -186,6 +186,8 @@ def test_exports_are_found_without_the_other_stages() -> None:
 
 
 def test_help_waits_for_no_arrays() -> None:
-    code = "import sys; import flangeye.cli; print({'numpy', 'pydantic'} & set(sys.modules))"
+    code = (
+        "import sys; import flangeye.cli.commands; print({'numpy', 'pydantic'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

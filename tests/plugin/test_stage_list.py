@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from platformdirs import user_cache_path
 
+from flangeye.plugin import installed as installing
 from flangeye.plugin import registry
 from flangeye.plugin import stage_list as listing
 from flangeye.plugin.registry import Registry
@@ -29,7 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, toy_registry: Reg
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "mine.py").write_text(PLUGIN.format(summary="First."))
     plugins = [EntryPoint("mine", "mine", "flangeye")]
-    monkeypatch.setattr(listing, "installed_plugins", lambda: plugins)
+    monkeypatch.setattr(installing, "installed_plugins", lambda: plugins)
     loads = []
 
     def load():

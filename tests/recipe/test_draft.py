@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 

@@ -12,7 +12,8 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.plugin.registry import Registry, load_registry
-from flangeye.recipe.load import find_recipe, load_recipe, parse_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.recipe.schema import header_line, recipe_schema
 from tests.conftest import TOY_RECIPE
 

@@ -8,7 +8,8 @@ import pytest
 
 from flangeye import types as t
 from flangeye.plugin.registry import Registry, load_registry
-from flangeye.recipe.load import find_recipe, load_recipe, parse_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run import runner
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.runner import Runner

@@ -10,7 +10,8 @@ import pytest
 from flangeye import types as t
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import Plugin
-from flangeye.recipe.load import find_recipe, load_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
 
 

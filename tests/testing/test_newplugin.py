@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.plugin.scaffold import kinds, write_plugin
 from flangeye.plugin.stage import KINDS, PARTS

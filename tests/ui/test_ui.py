@@ -29,7 +29,7 @@ from flangeye import cli
 from flangeye.errors import StageError
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
-from flangeye.recipe.load import find_recipe
+from flangeye.recipe.find import find_recipe
 from flangeye_ui import archive_page, cell_page, plan_page, run_page, server, verdict_page
 from flangeye_ui.plan_page import stops_of
 from flangeye_ui.project import Project, _mistake

@@ -14,7 +14,7 @@ from flangeye.batch.figures import drawings_of
 from flangeye.batch.tally import Tally
 from flangeye.files.bundled import VERSION
 from flangeye.files.place import Place
-from flangeye.report.page import packed_plotly
+from flangeye.report.plotly_js import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _HERE = Path(__file__).parent
 _REPORT = Path(run_report.__file__).parent
+DRAWN = frozenset({"scatter", "scattergl"})
+"""The kinds of traces in a summary."""
 
 _HEADINGS: Mapping[str, str] = {
     "session": "Session",
@@ -84,7 +86,7 @@ def render(tally: Tally) -> str:
         varied=tally.by(),
         drawings=drawings,
         seconds=duration(tally.seconds),
-        plotly_js=packed_plotly() if drawings else "",
+        plotly_js=packed_plotly(DRAWN) if drawings else "",
         version=VERSION,
     )  # fmt: skip
 

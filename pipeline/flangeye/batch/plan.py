@@ -15,7 +15,8 @@ from flangeye.batch.variants import variants
 from flangeye.errors import RecipeError
 from flangeye.files.elsewhere import is_url
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import Recipe, find_recipe, load_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import Recipe, load_recipe
 
 
 @dataclass(frozen=True)

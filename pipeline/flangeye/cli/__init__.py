@@ -1,23 +1,23 @@
 """The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
 
-Modules are imported inside the commands, so that ``--help`` answers at once. Commands are listed
-in the order in which they are declared: running first.
+Modules are imported inside the commands, so that ``--help`` answers at once, and what was said
+before, nothing having changed since, is said again before there is a parser.
 """
 
-from flangeye.cli import running, drafting, page, offering, catalogue  # noqa: I001
-from flangeye.cli import logs, watching, exporting, hardware
-from flangeye.cli.app import app, main
+import sys
 
-__all__ = [
-    "app",
-    "catalogue",
-    "drafting",
-    "exporting",
-    "hardware",
-    "logs",
-    "main",
-    "offering",
-    "page",
-    "running",
-    "watching",
-]
+from flangeye.cli.saying import end_in_words
+
+
+def main() -> None:
+    """Run the command line; every foreseen mistake is one line and an exit code."""
+    end_in_words(_command)
+
+
+def _command() -> None:
+    from flangeye.cli.remembered import said_again
+
+    if not said_again(sys.argv[1:]):
+        from flangeye.cli.commands import app
+
+        app()

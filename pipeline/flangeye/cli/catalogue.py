@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import app, say
+from flangeye.cli.app import app
+from flangeye.cli.saying import say
 
 
 @app.command()

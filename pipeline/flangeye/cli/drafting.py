@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import app, load_plugins, say
+from flangeye.cli.app import app, load_plugins
+from flangeye.cli.saying import say
 from flangeye.errors import RecipeError
 
 Answer = str | None

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import LogFile, app, load_plugins, say
+from flangeye.cli.app import LogFile, app, load_plugins
+from flangeye.cli.saying import say
 from flangeye.files.written import write_whole
 
 if TYPE_CHECKING:

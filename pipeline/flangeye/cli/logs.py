@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe, say
+from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
+from flangeye.cli.saying import say
 
 if TYPE_CHECKING:
     from flangeye.log.read import RunLog

@@ -7,26 +7,26 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
+from flangeye.cli.saying import say, say_notes
 
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: print every mistake with its line, and the unknowns."""
-    from flangeye.models.cell import Cell
-    from flangeye.models.configuration import Configuration
-    from flangeye.recipe.load import find_recipe
+    from flangeye.recipe.find import find_recipe
+    from flangeye.recipe.verdict import verdict
 
-    checked = read_recipe(recipe, load_plugins(), overrides)
-    say(f"{find_recipe(recipe)}: ok, {len(checked.steps)} steps")
-    say((checked.context.get(Cell) or checked.context[Configuration]).describe())
+    registry = load_plugins()
+    say(verdict(find_recipe(recipe), registry, overrides or ()))
+    say_notes(registry.notes())
 
 
 @app.command()
 def recipes() -> None:
     """List the bundled recipes."""
     from flangeye.files.yaml_lines import read_yaml
-    from flangeye.recipe.load import recipe_names
+    from flangeye.recipe.find import recipe_names
 
     names = recipe_names()
     width = max(map(len, names), default=0)

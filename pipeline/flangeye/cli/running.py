@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe, say
+from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
+from flangeye.cli.saying import say
 from flangeye.errors import FlangeyeError
 
 if TYPE_CHECKING:

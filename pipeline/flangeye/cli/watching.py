@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import app, load_plugins, say
+from flangeye.cli.app import app, load_plugins
+from flangeye.cli.saying import say
 
 if TYPE_CHECKING:
     from flangeye.doctor.monitor import Check, StoredCalibration

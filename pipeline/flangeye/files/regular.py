@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,6 +22,20 @@ _FLAGS = os.O_RDONLY | sum(
 """Not every system has all of them."""
 
 
+_noted: ContextVar[list[Path] | None] = ContextVar("_noted", default=None)
+
+
+@contextmanager
+def noting_opened() -> Iterator[list[Path]]:
+    """Collect which files are asked for while the context lasts, as they were named."""
+    opened: list[Path] = []
+    before = _noted.set(opened)
+    try:
+        yield opened
+    finally:
+        _noted.reset(before)
+
+
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
     """Open a regular file, or a link to one, for reading; never waits, as a FIFO would make one.
 
@@ -30,6 +47,9 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
         FlangeyeError: Of the given sort: it does not exist, cannot be read, or is a folder, a
             device, a FIFO or a socket.
     """
+    noted = _noted.get()
+    if noted is not None:
+        noted.append(path)
     try:
         number = os.open(path, _FLAGS)
     except (OSError, ValueError) as failure:

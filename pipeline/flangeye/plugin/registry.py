@@ -98,6 +98,7 @@ class Registry:
         installed: Entry point name -> version of the package it comes from.
         renamed: Former name -> present name of stages and parts.
         outdated: The former names that were asked for.
+        asked: The present names that were asked for.
     """
 
     hooks: pluggy.PluginManager
@@ -108,6 +109,7 @@ class Registry:
     installed: dict[str, str] = field(default_factory=dict)
     renamed: dict[str, str] = field(default_factory=dict)
     outdated: set[str] = field(default_factory=set)
+    asked: set[str] = field(default_factory=set)
 
     def stage(self, name: str) -> Stage:
         """Return the stage ``name``.
@@ -157,7 +159,9 @@ class Registry:
     def _present(self, name: str) -> str:
         if name in self.renamed:
             self.outdated.add(name)
-        return self.renamed.get(name, name)
+        present = self.renamed.get(name, name)
+        self.asked.add(present)
+        return present
 
     def versions(self) -> dict[str, str]:
         """Return each loaded plugin's entry point and the version of what installed it."""

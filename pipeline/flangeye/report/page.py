@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import os
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +18,7 @@ from flangeye.report.clouds import cloud_panels
 from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.images import image_view, missed_view
+from flangeye.report.plotly_js import packed_plotly, plotly_js
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
 from flangeye.report.space import workspace_drawing
@@ -32,6 +30,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 _HERE = Path(__file__).parent
+DRAWN = frozenset({"bar", "scatter", "scatter3d"})
+"""The kinds of traces in a report."""
 
 
 def write_report(
@@ -58,7 +58,7 @@ def write_report(
 def render(log: RunLog, exports: Sequence[Stage] = (), library: str | None = None) -> str:
     """Return the page as text; see :func:`write_report`."""
     content = _content(facts_of(log))
-    content |= {"library": library, "plotly_js": "" if library else packed_plotly()}
+    content |= {"library": library, "plotly_js": "" if library else packed_plotly(DRAWN)}
     content |= {"exports": exported(content["result"], exports)}
     return _environment().get_template("report.html.j2").render(content)
 
@@ -96,19 +96,6 @@ def _content(facts: Facts) -> dict[str, Any]:
         "provenance": provenance_of(facts),
         "version": VERSION,
     }
-
-
-@cache
-def packed_plotly() -> str:
-    """Return plotly.js, gzip in base64: the page unpacks it, and is a third of the size."""
-    return base64.b64encode(gzip.compress(plotly_js().encode(), mtime=0)).decode()
-
-
-def plotly_js() -> str:
-    """Return plotly.js as it is."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs())
 
 
 def _environment() -> Environment:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
 from flangeye.doctor.monitor.history import Finding
 from flangeye.doctor.monitor.opcua import write_state

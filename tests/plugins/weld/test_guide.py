@@ -9,13 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 import flangeye_plugins.weld
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.devices import MotionAllowed, RobotDriver
 from flangeye.errors import NothingMoved, StageError
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import find_recipe, load_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe
 from flangeye_emulators.finger.render import typical_compliance
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.guide.tactile import guide_tactile

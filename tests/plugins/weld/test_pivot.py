@@ -13,7 +13,8 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import find_recipe, load_recipe
+from flangeye.recipe.find import find_recipe
+from flangeye.recipe.load import load_recipe
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.guide.pivoting import ATTITUDES, Pivoted, with_body
 from flangeye_plugins.guide.tactile import guide_tool

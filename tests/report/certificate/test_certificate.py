@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flangeye.cli import app
+from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.maths.geometry import covariance_at
 from flangeye.models.loading import load_model

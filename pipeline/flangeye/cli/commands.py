@@ -1,0 +1,18 @@
+"""Every command: importing their modules declares them, in the order in which they are listed."""
+
+from flangeye.cli import running, drafting, page, offering, catalogue  # noqa: I001
+from flangeye.cli import logs, watching, exporting, hardware
+from flangeye.cli.app import app
+
+__all__ = [
+    "app",
+    "catalogue",
+    "drafting",
+    "exporting",
+    "hardware",
+    "logs",
+    "offering",
+    "page",
+    "running",
+    "watching",
+]

@@ -1,0 +1,80 @@
+"""How commands say something, and how mistakes end them; nothing here takes time to import."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from flangeye.errors import FlangeyeError, NothingMoved
+from flangeye.files.children import keep_current_folder_out
+from flangeye.files.printable import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+
+def say(text: object, err: bool = False) -> None:
+    """Write a line; what others wrote in it reaches the terminal as text, never as commands."""
+    print(printable(str(text)), file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def say_notes(notes: Sequence[str]) -> None:
+    """Say beside the output what the person should know."""
+    for note in notes:
+        say(f"note: {note}", err=True)
+
+
+def end_in_words(command: Callable[[], object]) -> None:
+    """Run the command line; every foreseen mistake is one line and an exit code."""
+    keep_current_folder_out()
+    # Ours are no plugins of pydantic; it would look for one in every installed distribution.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    _open_streams()
+    try:
+        try:
+            command()
+        finally:
+            sys.stdout.flush()
+    except NothingMoved as plan:
+        say(plan)
+    except FlangeyeError as error:
+        _fail(error)
+    except BrokenPipeError:
+        _discard_output()
+        sys.exit(0)
+    except OSError as error:
+        what = error.filename or "standard output"
+        if error.filename is None:
+            _discard_output()
+        _fail(FlangeyeError(f"{what}: cannot be read or written: {error.strerror or error}"))
+
+
+def _open_streams() -> None:
+    """Make sure that there is something to write to, in any locale, whoever closed it."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _discard_output() -> None:
+    """Forget what could not be written, or the interpreter would try again at its end."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _fail(error: FlangeyeError) -> NoReturn:
+    if os.environ.get("FLANGEYE_DEBUG"):
+        import traceback
+
+        traceback.print_exception(error)
+    with suppress(OSError):
+        for line in printable(str(error)).splitlines():
+            sys.stderr.write(f"error: {line}\n")
+    sys.exit(error.exit_code)

@@ -1,0 +1,49 @@
+"""Find a recipe by its path or its name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+from flangeye.errors import RecipeError
+from flangeye.files.bundled import bundled
+
+
+def recipe_names() -> dict[str, Path]:
+    """Return the bundled recipes: name -> path, sorted."""
+    root = bundled("recipes")
+    found = {str(p.relative_to(root).with_suffix("")): p for p in root.rglob("*.yaml")}
+    return dict(sorted(found.items()))
+
+
+def find_recipe(name: str) -> Path:
+    """Return the path of a recipe given as a path or as a bundled name.
+
+    Raises:
+        RecipeError: Neither exists; names the nearest bundled recipes.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    known = recipe_names()
+    if name in known:
+        return known[name]
+    if path.suffix in (".yaml", ".yml") or path.is_dir():
+        raise RecipeError(f"{name}: no such recipe file; {_near_file(path, known)}")
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(near)}?" if near else "'flangeye recipes' lists them"
+    raise RecipeError(f"no recipe '{name}'; {hint}")
+
+
+def _near_file(path: Path, known: Iterable[str]) -> str:
+    """Say which recipe file, beside a path that does not exist or bundled, may be meant."""
+    folder = path if path.is_dir() else path.parent
+    if not folder.is_dir():
+        return f"there is no folder {folder}"
+    files = sorted(str(file) for file in folder.glob("*.y*ml"))
+    near = difflib.get_close_matches(str(path), files, n=3)
+    near = near or difflib.get_close_matches(path.stem, known, n=1)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    return f"{folder} holds {', '.join(files[:5]) or 'no recipe'}; 'flangeye recipes' lists others"
