@@ -1,6 +1,9 @@
 """What other viewers are given: circles as points, the flanges in base, and a layout."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from flangeye import types as t
 from flangeye.log.foxglove import points_of
-from flangeye.log.layouts import CLOUDS
+from flangeye.log.layouts import CLOUDS, foxglove_layout
 from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
@@ -62,10 +65,34 @@ def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path:
     assert all(panel in named for panel in layout["configById"])
 
 
+def test_foxgloves_own_classes_write_the_same_panels() -> None:
+    """The maker's typed configurations know each setting by the name and the kind we write."""
+    fox = pytest.importorskip("foxglove.layouts", reason="foxglove-sdk is not installed")
+    clouds = {
+        t: fox.BaseRendererPointCloudTopicSettings(visible=True, point_size=2) for t in CLOUDS
+    }
+    shapes = fox.BaseRendererSceneUpdateTopicSettings(visible=True)
+    pose = fox.BaseRendererPoseTopicSettings(visible=True)
+    topics = clouds | {"/scene": shapes, "/seam": shapes, "/pose": pose}
+    camera = fox.ImageModeConfig(image_topic="/capture/image")
+    theirs = {
+        "3D!cell": fox.ThreeDeeConfig(follow_tf="base", topics=topics),
+        "Image!camera": fox.ImageConfig(image_mode=camera),
+        "RosOut!log": fox.LogConfig(min_log_level=2),
+        "RawMessages!rejected": fox.RawMessagesConfig(topic_path="/rejection"),
+    }
+    ours = json.loads(foxglove_layout())["configById"]
+    assert ours == {panel: json.loads(config.to_json()) for panel, config in theirs.items()}
+
+
 def test_a_rerun_blueprint_is_written(flangeye: Any, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     assert flangeye("layout", "rerun", "--out", tmp_path / "l.rbl")[0] == 0
     assert (tmp_path / "l.rbl").read_bytes()[:4] == b"RRF2"
+    words = [sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "l.rbl")]
+    home = os.environ | {"HOME": str(tmp_path), "RERUN_ANALYTICS": "0"}
+    read = subprocess.run(words, capture_output=True, text=True, env=home)
+    assert (read.returncode, "1 file verified without error" in read.stderr) == (0, True)
 
 
 def test_another_viewer_is_not_known(flangeye: Any) -> None:

@@ -113,18 +113,16 @@ def _without(whole: str, bodies: Mapping[str, _Body], texts: Mapping[str, str]) 
 
 
 def _bodies(text: str) -> dict[str, _Body]:
-    """Return the modules in order; none where one of them does not end as modules do."""
+    """Return the modules in order; none where they do not stand alike or end as modules do."""
     wrappers = [wrapper[1] for wrapper in _WRAPPER.finditer(text)]
     names = "|".join(map(re.escape, wrappers))
     header = re.compile(rf"(?<![\w$.])([\w$]+)=(?:{names})\((?:\([\w$,]*\)|[\w$]+)=>\{{")
     opened = {m.end(): m[1] for m in header.finditer(text)} if wrappers else {}
-    bodies = {}
-    for depth, body in _braces(text):
-        if body.start in opened:
-            if depth != 2 or text[body.end : body.end + 3] != "});":
-                return {}
-            bodies[opened[body.start]] = body
-    return bodies if len(bodies) == len(opened) else {}
+    found = [(depth, body) for depth, body in _braces(text) if body.start in opened]
+    alike = {(depth, text[body.end : body.end + 3]) for depth, body in found}
+    if len(found) != len(opened) or len(alike) != 1 or alike.pop()[1] != "});":
+        return {}
+    return {opened[body.start]: body for _, body in found}
 
 
 def _braces(text: str) -> Iterator[tuple[int, _Body]]:
