@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from flangeye.batch import page as batch_page
 from flangeye.report import page, plotly_js
 from flangeye.report.plotly_js import packed_plotly, partial_plotly
 
@@ -53,7 +54,7 @@ def test_another_structure_is_not_touched(text: str) -> None:
     assert partial_plotly(text, {"bar"}) is None
 
 
-@pytest.mark.parametrize("traces", [page.DRAWN, frozenset({"scatter", "scattergl"})], ids=str)
+@pytest.mark.parametrize("traces", [page.DRAWN, batch_page.DRAWN], ids=["report", "batch"])
 def test_the_installed_file_is_of_this_structure(traces: frozenset[str]) -> None:
     whole = plotly_js.plotly_js()
     text = partial_plotly(whole, traces)
