@@ -12,7 +12,7 @@ origin, along the base's axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, Self, runtime_checkable
 
@@ -200,6 +200,17 @@ class KnowsTorch(Protocol):
     def true_torch(self) -> tuple[Floats, Floats]:
         """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
         ...
+
+
+@runtime_checkable
+class KnowsSeams(Protocol):
+    """What a simulated scanner tells besides, for a plan to be scored; no stage that plans sees it.
+
+    Attributes:
+        true_seams: By name, (N, 3) in ``base`` [m].
+    """
+
+    true_seams: Mapping[str, Array]
 
 
 class StateSource(Protocol):

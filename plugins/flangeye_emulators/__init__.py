@@ -29,6 +29,7 @@ STAGES = {
 
 PARTS = {
     "scanner.emulator": "flangeye_emulators.scanner.loopback:scanner_loopback",
+    "scanner.mounted": "flangeye_emulators.scanner.mounted:scanner_mounted",
     "robot.emulator": "flangeye_emulators.robot.loopback:robot_loopback",
     "robot.simulated": "flangeye_emulators.robot.simulated:robot_simulated",
     "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",

@@ -68,6 +68,7 @@ STAGES = {
     "export.matrix": "flangeye_plugins.export.matrix:export_matrix",
     "scan.file": "flangeye_plugins.scan.scans:scan_file",
     "scan.live": "flangeye_plugins.scan.scans:scan_live",
+    "scan.along": "flangeye_plugins.scan.along:scan_along",
     "seam.cad": "flangeye_plugins.seam.cad:seam_cad",
     "seam.groove": "flangeye_plugins.seam.groove:seam_groove",
     "weld.tactile": "flangeye_plugins.weld.tactile:weld_tactile",

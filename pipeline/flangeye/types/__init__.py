@@ -54,7 +54,7 @@ from flangeye.types.frames import (
     by_frame,
 )
 from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed, StageLog
-from flangeye.types.scans import Capture, FlangeCloud, Image, Role, WorkpieceScan
+from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
 from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
 from flangeye.types.welding import Seam, WeldReport
 
@@ -100,6 +100,7 @@ __all__ = [
     "Rejection",
     "Resumed",
     "Role",
+    "ScanPlace",
     "ScatterNoise",
     "Seam",
     "Seed",

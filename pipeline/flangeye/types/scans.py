@@ -94,18 +94,39 @@ class FlangeCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class WorkpieceScan:
-    """What the scanner saw of the workpiece, from where it was calibrated.
+class ScanPlace:
+    """Where an arm stood while the scanner on its flange took one cloud.
 
     Attributes:
-        cloud: In ``camera``.
+        points: How many points it took there.
+        base_T_flange: (4, 4) as the controller reported it.
+        joints: (n,) as reported [rad].
+    """
+
+    points: int
+    base_T_flange: Array
+    joints: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, base_T_flange=(4, 4), joints=np.shape(self.joints))
+
+
+@dataclass(frozen=True, eq=False)
+class WorkpieceScan:
+    """What the scanner saw of the workpiece.
+
+    Attributes:
+        cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``
+            as it stood there.
         source: Where it comes from, for people.
         notes: What the person should be told.
         truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
             from the stages that plan and weld.
+        places: Where the arm stood for each cloud; empty where the scanner stands beside the arm.
     """
 
     cloud: PointCloud
     source: str
     notes: tuple[str, ...] = ()
     truth: Mapping[str, Array] = field(default_factory=dict)
+    places: tuple[ScanPlace, ...] = ()

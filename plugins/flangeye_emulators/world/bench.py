@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from pydantic import Field
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.maths.seam_geometry import distances_to_line
-from flangeye.models.workpiece import Workpiece
+from flangeye.models.workpiece import Workpiece, WorkpiecePath
+from flangeye.plugin.stage import Params
 from flangeye.types import Floats
+from flangeye.units import Angle, Length, param
 from flangeye_emulators.world import materials
 from flangeye_emulators.world.mesh import Mesh, box, capsule
 from flangeye_emulators.world.raycast import Body
@@ -18,6 +21,38 @@ THICKNESS = 0.04
 NEAREST = 0.045
 """From a seam to the middle of anything that lies about: it may touch the part, not the groove."""
 ATTEMPTS = 200
+
+
+class BenchParams(Params):
+    """A workpiece on a bench, as it really lies there."""
+
+    workpiece: WorkpiecePath = param(
+        "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
+    )
+    position: tuple[Length, Length, Length] = param(
+        ("600 mm", "0 mm", "250 mm"),
+        description="Position of the workpiece's CAD origin in the base.",
+    )
+    rpy: tuple[Angle, Angle, Angle] = param(
+        ("0 deg", "0 deg", "20 deg"), description="Roll, pitch, yaw of its CAD, in base."
+    )
+    clutter: int = Field(6, ge=0, description="Number of other objects on the bench.")
+    covered: float = Field(
+        0.0, ge=0, lt=1, description="Share of the workpiece covered by a sheet, at one end."
+    )
+
+    @property
+    def base_T_part(self) -> Floats:
+        """(4, 4), translation in [m]."""
+        return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
+
+    def true_seams(self, workpiece: Workpiece) -> dict[str, Floats]:
+        """Return the true seams by name, (N, 3) in ``base`` [m]."""
+        pose = self.base_T_part
+        return {
+            name: np.asarray(seam.points @ pose[:3, :3].T + pose[:3, 3])
+            for name, seam in workpiece.seams.items()
+        }
 
 
 def bench_with(

@@ -7,7 +7,7 @@ really is. The two meet here, as they do in a real room, and not through the con
 from __future__ import annotations
 
 from typing import Protocol
-from weakref import WeakSet
+from weakref import WeakSet, ref
 
 import numpy as np
 
@@ -28,11 +28,18 @@ class StandingArm(Protocol):
 
 
 _ARMS: WeakSet[StandingArm] = WeakSet()
+_NEWEST: list[ref[StandingArm]] = []
 
 
 def enter(arm: StandingArm) -> None:
     """Let an arm stand in the room, for as long as it lives."""
     _ARMS.add(arm)
+    _NEWEST[:] = [ref(arm)]
+
+
+def newest() -> StandingArm | None:
+    """Return the arm that came into the room last, which carries what is mounted on an arm."""
+    return _NEWEST[0]() if _NEWEST else None
 
 
 def true_flange(reported: RobotState) -> Transform:

@@ -39,6 +39,8 @@ class Plate:
         root: y of the groove's root at x, (N,) to (N,) [m]; its slope at both ends is zero.
         straight: Whether two stations are enough.
         ribbed: Whether it has the rib; without, it can be slid or turned and look the same.
+        length: Along x [m].
+        step: Between stations along a curved groove [m].
     """
 
     name: str
@@ -46,17 +48,20 @@ class Plate:
     root: Callable[[Floats], Floats]
     straight: bool = False
     ribbed: bool = True
+    length: float = LENGTH
+    step: float = STEP
 
     def stations(self) -> Floats:
         """Return (S,) x of the cross-sections [m]."""
-        ends = [-LENGTH / 2, *_rib_corners(), LENGTH / 2]
+        half = self.length / 2
+        ends = [-half, *(_rib_corners() if self.ribbed else ()), half]
         if not self.straight:
-            ends += np.arange(-LENGTH / 2, LENGTH / 2, STEP).tolist()
+            ends += np.arange(-half, half, self.step).tolist()
         return np.unique(np.round(ends, 9))
 
     def seam(self) -> Floats:
         """Return (S, 3) points along the root [m]."""
-        x = np.array([-LENGTH / 2, LENGTH / 2]) if self.straight else self.stations()
+        x = np.array([-0.5, 0.5]) * self.length if self.straight else self.stations()
         return np.column_stack([x, self.root(x), np.full(len(x), HEIGHT - DEPTH)])
 
     def mesh(self) -> Mesh:
@@ -126,7 +131,15 @@ CURVED = Plate(
     "Plate with a curved V-groove",
     lambda x: -0.02 + 0.0075 * (1 + np.cos(2 * np.pi * x / LENGTH)),
 )
-PLATES = (STRAIGHT, CURVED)
+LONG = Plate(
+    "v-long",
+    "Plate of two metres with a V-groove that swerves by 30 mm",
+    lambda x: -0.03 + 0.015 * (1 + np.cos(np.pi * x)),
+    ribbed=False,
+    length=2.0,
+    step=0.02,
+)
+PLATES = (STRAIGHT, CURVED, LONG)
 
 
 def write_files(folder: Path) -> None:

@@ -17,13 +17,13 @@ from flangeye.maths.geometry import rigid
 from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
+from flangeye.motion.executor import Executor
 from flangeye.motion.limits import limits_of
 from flangeye.plugin.stage import part
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.guide.pivoting import Hand, Pivoted, summary_lines, with_body
-from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
@@ -95,7 +95,7 @@ def _guided(
         sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
         model: RobotModel = recipe.context[RobotModel]
         limits = limits_of(recipe.context[LimitsSection], model)
-        readings = Readings(Executor(robot, latest, model, limits), sensor, finger)
+        readings = Readings(Executor(robot, model, limits, latest.tell), sensor, finger)
         ask(FREE)
         rest = readings.take(AT_REST)
         ask(HOLD)
@@ -104,7 +104,7 @@ def _guided(
 
         def look() -> list[TagReading]:
             # The person has moved the arm meanwhile: it is watched from where it stands now.
-            return Readings(Executor(robot, latest, model, limits), sensor, finger).take(EACH)
+            return Readings(Executor(robot, model, limits, latest.tell), sensor, finger).take(EACH)
 
         hand = Hand(robot, ask, look)
         pivoted = Pivoted(hand.tip(finger, found), hand.torch()) if body else None

@@ -18,12 +18,12 @@ from flangeye_plugins.seam.planned import (
     answer_for,
     cloud_around,
     for_the_controller,
-    in_base,
     refuse_outside,
     resampled,
     scanner_covariance,
 )
 from flangeye_plugins.seam.register import STAGE, Registered, RegistrationLimits, register
+from flangeye_plugins.seam.stitched import seen_in_base
 
 SEED = 11
 """Tells this use of the recipe's seed from others."""
@@ -82,17 +82,22 @@ def seam_cad(  # noqa: PLR0913  what it asks the runner for
     answer = answer_for(STAGE, calibration, params)
     workpiece = load_workpiece(params.workpiece)
     seam = _chosen(workpiece, params.seam)
-    points = scan.cloud.points().astype(np.float64)
+    if scan.places:
+        raise CalibrationRefused(
+            f"{STAGE}: the scan is put together from {len(scan.places)} places, and a CAD is "
+            "registered to what one place sees; plan the seam with seam.groove"
+        )
+    seen = seen_in_base(STAGE, scan, answer, robot)
     rng = np.random.default_rng([SEED, seed])
-    found = register(points, CadPart(workpiece), seam, _limits(params), rng)
+    found = register(seen.points, CadPart(workpiece), seam, _limits(params), rng)
     turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
     line = resampled(seam.points, params.spacing) @ turn.T + shift
     of_fit = found.fit.covariance + scanner_covariance(scanner, float(np.linalg.norm(shift)))
     covariances = covariance_at(of_fit, found.fit.about, line)
     deviation = _deviation(covariances, params.max_deviation)
-    mapped, covariance = in_base(line, covariances, answer.base_T_camera)
+    mapped, covariance = seen.in_base(line, covariances)
     refuse_outside(STAGE, mapped, workspace)
-    opening = answer.base_T_camera.transform.rotation @ turn @ seam.opening
+    opening = seen.base_T_camera.rotation @ turn @ seam.opening
     planned = Seam(
         mapped,
         np.tile(opening, (len(mapped), 1)),
@@ -101,7 +106,7 @@ def seam_cad(  # noqa: PLR0913  what it asks the runner for
         half_width=seam.half_width,
         source=f"CAD {workpiece.path.stem} on {scan.source}",
         figures={**_figures(found), "registration": deviation},
-        cloud=cloud_around(scan, line, answer.base_T_camera),
+        cloud=cloud_around(seen.points, line, seen.base_T_camera),
     )
     return for_the_controller(planned, answer, robot, params)
 

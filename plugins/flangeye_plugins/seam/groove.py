@@ -8,24 +8,22 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import CalibrationRefused, StageError, stage
-from flangeye.maths.geometry import covariance_at
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import Box, Floats, HandEye, Seam, Seed, VerifiedHandEye, WorkpieceScan
+from flangeye.types import Box, Floats, Seam, Seed, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Length, param
 from flangeye_plugins.seam.planned import (
     SeamParams,
     answer_for,
     cloud_around,
     for_the_controller,
-    in_base,
     refuse_outside,
-    scanner_covariance,
 )
 from flangeye_plugins.seam.plates import CELL, Hollow, hollows
 from flangeye_plugins.seam.points import facing_camera, thinned
 from flangeye_plugins.seam.sections import Root, trace
+from flangeye_plugins.seam.stitched import Seen, seen_in_base
 
 STAGE = "seam.groove"
 SEED = 13
@@ -56,6 +54,12 @@ class GrooveParams(SeamParams):
         "0.5 mm",
         gt=0,
         description="Largest distance of the cross-sections' roots from a smooth line, rms.",
+    )
+    max_apart: Length = param(
+        "1 mm",
+        gt=0,
+        description="Largest distance of clouds from neighbouring places where both show the same "
+        "face, median.",
     )
     distinct: float = Field(
         0.7, gt=0, lt=1, description="A groove longer than this share of the longest is its equal."
@@ -93,31 +97,30 @@ def seam_groove(  # noqa: PLR0913  what it asks the runner for
     seam, straight or curved.
 
     Figures [m]: ``residual`` of the sections from that line, rms; ``registration``, the largest
-    standard deviation of the line in the scan; ``sections``, the share that showed two walls.
+    standard deviation of the line in the scan; ``sections``, the share that showed two walls; of a
+    scan from several places ``apart``, the largest median distance of neighbouring clouds.
 
     Raises:
         StageError: The scan is empty.
         CalibrationRefused: There is no groove, or several as good, or it is rough, or outside the
-            workspace.
+            workspace; or clouds of several places do not agree.
     """
-    points = scan.cloud.points().astype(np.float64)
-    if len(points) < FEWEST:
-        raise StageError(f"{STAGE}: the scan has {len(points)} points; {FEWEST} are needed")
+    if (count := len(scan.cloud.points())) < FEWEST:
+        raise StageError(f"{STAGE}: the scan has {count} points; {FEWEST} are needed")
     answer = answer_for(STAGE, calibration, params)
-    pose = answer.base_T_camera
-    groove = _chosen(_grooves(points, answer, params, seed), params)
+    seen = seen_in_base(STAGE, scan, answer, robot)
+    _refuse_apart(seen, params)
+    groove = _chosen(_grooves(seen, params, seed), params)
     root, face = groove.root, groove.hollow.face
     order = slice(None, None, -1 if _starts_far(groove) != params.backwards else 1)
     line = face.camera(root.points)[order]
     covariances = (face.axes.T @ root.covariance @ face.axes)[order]
     covariances = covariances + (UNSHARED * root.residual) ** 2 * np.eye(3)
     deviation = float(np.sqrt(np.linalg.eigvalsh(covariances).max()))
-    distance = float(np.linalg.norm(line.mean(axis=0)))
-    of_scanner = scanner_covariance(scanner, distance)
-    covariances = covariances + covariance_at(of_scanner, line.mean(axis=0), line)
-    mapped, covariance = in_base(line, covariances, pose)
+    covariances = covariances + seen.of_scanner(line, scanner)
+    mapped, covariance = seen.in_base(line, covariances)
     refuse_outside(STAGE, mapped, workspace)
-    opening = pose.transform.rotation @ face.axes[2]
+    opening = seen.base_T_camera.rotation @ face.axes[2]
     seam = Seam(
         mapped,
         np.tile(opening, (len(mapped), 1)),
@@ -125,14 +128,30 @@ def seam_groove(  # noqa: PLR0913  what it asks the runner for
         half_angle=root.half_angle,
         half_width=root.half_width,
         source=f"V-groove in {scan.source}",
-        figures={"residual": root.residual, "registration": deviation, "sections": root.share},
-        cloud=cloud_around(scan, line, pose),
+        figures=_figures(root, deviation, seen),
+        cloud=cloud_around(seen.points, line, seen.base_T_camera),
     )
     return for_the_controller(seam, answer, robot, params)
 
 
-def _grooves(points: Floats, calibration: HandEye, params: GrooveParams, seed: int) -> list[Groove]:
+def _refuse_apart(seen: Seen, params: GrooveParams) -> None:
+    """Refuse clouds of several places that do not agree where they show the same face."""
+    if seen.apart is not None and seen.apart > params.max_apart:
+        raise CalibrationRefused(
+            f"{STAGE}: neighbouring clouds are {seen.apart * 1e3:.2f} mm apart where both show the "
+            f"same face, limit {params.max_apart * 1e3:g} mm (max_apart); calibrate the scanner on "
+            "the flange again"
+        )
+
+
+def _figures(root: Root, deviation: float, seen: Seen) -> dict[str, float]:
+    figures = {"residual": root.residual, "registration": deviation, "sections": root.share}
+    return figures if seen.apart is None else {**figures, "apart": seen.apart}
+
+
+def _grooves(seen: Seen, params: GrooveParams, seed: int) -> list[Groove]:
     """Return the V-grooves of the scan that are long enough, the longest first."""
+    points = seen.points
     rng = np.random.default_rng([SEED, seed])
     scan = facing_camera(thinned(points, CELL))
     found = []
@@ -144,7 +163,7 @@ def _grooves(points: Floats, calibration: HandEye, params: GrooveParams, seed: i
         root = trace(hollow, local[around], params.max_width, params.spacing)
         if root is not None:
             in_camera = hollow.face.camera(root.points)
-            mapped = calibration.base_T_camera.transform.apply(in_camera)
+            mapped = seen.base_T_camera.apply(in_camera)
             found.append(Groove(hollow, root, mapped))
     long = [groove for groove in found if groove.length >= params.min_length]
     return _distinct(sorted(long, key=lambda groove: -groove.length), params.max_width / 2)

@@ -10,7 +10,6 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params
 from flangeye.maths.arm_correction import reported_flange
-from flangeye.maths.geometry import covariance_at
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -21,8 +20,7 @@ from flangeye.types import (
     HandEye,
     PointCloud,
     Seam,
-    TransformEstimate,
-    WorkpieceScan,
+    Transform,
 )
 from flangeye.units import Length, param
 
@@ -59,20 +57,6 @@ def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:
     error = scanner.calibration_error if scanner else 0.0
     shift, turn = error / np.sqrt(3.0), 2 * error / distance
     return np.diag([turn**2] * 3 + [shift**2] * 3)
-
-
-def in_base(
-    points: Floats, covariances: Floats, base_T_camera: TransformEstimate
-) -> tuple[Floats, Floats]:
-    """Map (N, 3) points in ``camera`` and their covariances (N, 3, 3) to ``base``.
-
-    The covariance of the hand-eye pose is taken at each point, about the point where it holds,
-    and added: the scan of the workpiece took no part in the calibration.
-    """
-    rotation = base_T_camera.transform.rotation
-    mapped = base_T_camera.transform.apply(points)
-    of_pose = covariance_at(base_T_camera.covariance, base_T_camera.about, mapped)
-    return mapped, rotation @ covariances @ rotation.T + of_pose
 
 
 def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
@@ -160,11 +144,10 @@ def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) ->
         )
 
 
-def cloud_around(scan: WorkpieceScan, seam: Floats, base_T_camera: TransformEstimate) -> PointCloud:
-    """Return the part of a scan around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
-    points = scan.cloud.points()
+def cloud_around(points: Floats, seam: Floats, base_T_camera: Transform) -> PointCloud:
+    """Return what of points is around a seam (N, 3), both in ``camera``, thinned, in ``base``."""
     low, high = seam.min(axis=0), seam.max(axis=0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.03
     points = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
     points = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
-    return PointCloud(BASE, base_T_camera.transform.apply(points).astype(np.float32))
+    return PointCloud(BASE, base_T_camera.apply(points).astype(np.float32))

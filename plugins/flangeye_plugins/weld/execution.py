@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from flangeye.devices import DeviceError, RobotState
+from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye_plugins.weld.bounds import Bounds
-from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import FingerCameraReader
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement

@@ -11,6 +11,7 @@ from flangeye.errors import NothingMoved
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
+from flangeye.motion.executor import Executor
 from flangeye.motion.leading import led
 from flangeye.motion.limits import limits_of
 from flangeye.plugin.stage import stage
@@ -23,7 +24,6 @@ from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Cell, follow
-from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import (
     FingerCameraReader,
     LatestState,
@@ -91,7 +91,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         eyes = opened.enter_context(_tag_reader(sensor, reader, simulated))
         weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        drive = Executor(robot, latest, model, allowed)
+        drive = Executor(robot, model, allowed, latest.tell)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
         approach(cell, passage, weld_log, params.mode)
         passes = 1 + 2 * len(params.passes)  # there and back

@@ -11,10 +11,10 @@ from flangeye.errors import StageError
 from flangeye.files.bundled import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
+from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.weld.bounds import Bounds
-from flangeye_plugins.weld.executor import Executor
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
@@ -87,7 +87,7 @@ def test_a_way_that_would_drag_the_finger_through_the_work_is_refused() -> None:
 def test_an_arm_that_a_person_moves_cannot_weld() -> None:
     arm = Arm()
     vars(arm)["by_hand"] = True
-    with pytest.raises(DeviceError, match="is moved by hand; a weld needs an arm that drives"):
+    with pytest.raises(DeviceError, match="is moved by hand; an arm that drives is needed"):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm))
 
 
@@ -188,7 +188,7 @@ def test_beyond_the_bounds(displacement: list[Any], lateral: float, told: str) -
 
 def test_an_arm_that_moves_unasked_is_stopped() -> None:
     robot = StandIn()
-    drive = Executor(robot, LatestState(robot.state()), STAND_IN, LIMITS)
+    drive = Executor(robot, STAND_IN, LIMITS, LatestState(robot.state()).tell)
     for _ in range(5):
         drive.tick()
     robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -12,7 +13,6 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Route
 from flangeye.motion.supervision import STANDING, SafetyFault, Supervisor
 from flangeye.types import Transform
-from flangeye_plugins.weld.finger_camera import LatestState
 
 PATIENT = 10.0
 """Longest time for an arm to come to rest [s]."""
@@ -27,16 +27,16 @@ class Executor:
 
     Attributes:
         robot: The arm.
-        latest: Is told each of its states.
+        told: Is told each of its states.
         limits: What it must keep to.
     """
 
     def __init__(
         self,
         robot: Robot,
-        latest: LatestState,
         model: RobotModel,
         limits: MotionLimits,
+        told: Callable[[RobotState], None] = lambda state: None,
     ) -> None:
         """Begin to watch an open arm.
 
@@ -45,11 +45,11 @@ class Executor:
                 a person's hand.
         """
         if isinstance(robot, MovedByHand):
-            raise DeviceError(f"{robot.name}: is moved by hand; a weld needs an arm that drives")
-        self.robot, self.latest, self.limits = robot, latest, limits
+            raise DeviceError(f"{robot.name}: is moved by hand; an arm that drives is needed")
+        self.robot, self.told, self.limits = robot, told, limits
         self._supervisor = Supervisor(model, limits)
         state = robot.state()
-        latest.tell(state)
+        told(state)
         try:
             self._supervisor.judge(state)
             self._supervisor.check_model(state)
@@ -112,7 +112,7 @@ class Executor:
     def _judged(self) -> tuple[RobotState, bool]:
         """Return the newest state, and whether the leg under way has ended."""
         state = self.robot.state()
-        self.latest.tell(state)
+        self.told(state)
         try:
             return state, self._supervisor.judge(state)
         except SafetyFault as fault:

@@ -1,0 +1,154 @@
+"""``scan.along``: a long seam, scanned from several places by a scanner on the flange."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from flangeye import Params, StageError, stage
+from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriver
+from flangeye.errors import NothingMoved
+from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.motion.executor import Executor
+from flangeye.motion.leading import led
+from flangeye.motion.limits import MotionLimits, limits_of
+from flangeye.motion.route import Barred, Route, Router
+from flangeye.recipe.header import LimitsSection
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    Floats,
+    PointCloud,
+    ScanPlace,
+    VerifiedHandEye,
+    WorkpieceScan,
+)
+from flangeye.units import Length, param
+
+STAGE = "scan.along"
+ROLLS = 24
+"""Turns of the scanner about its view that are tried at each place."""
+
+
+class AlongParams(Params):
+    """Parameters of ``scan.along``."""
+
+    start: tuple[Length, Length, Length] = Field(
+        description="Where the seam roughly begins, in the base: to a few centimetres."
+    )
+    end: tuple[Length, Length, Length] = Field(description="Where it roughly ends.")
+    opening: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.0), description="Out of the work, in the base: the scanner looks against it."
+    )
+    distance: Length = param("650 mm", gt=0, description="From the seam to the scanner.")
+    step: Length = param(
+        "250 mm", gt=0, description="Largest way from one place to the next, along the seam."
+    )
+
+
+@stage("scan.along")
+def scan_along(  # noqa: PLR0913  what it asks the runner for
+    calibration: VerifiedHandEye,
+    robot: RobotModel,
+    arm: RobotDriver,
+    eye: ScannerDriver,
+    limits: LimitsSection,
+    motion: MotionAllowed,
+    params: AlongParams,
+) -> WorkpieceScan:
+    """Drive the scanner along a seam and scan it from evenly spaced places.
+
+    At each the scanner, as it was calibrated, looks straight at the seam. Every pose and every way
+    between two is checked before the arm sets off; the scanner's own body is not known to these
+    checks. Each cloud comes with where the controller had the arm.
+
+    Raises:
+        StageError: The scanner is not on the flange, or a place cannot be reached.
+        NothingMoved: Motion was not asked for; the message is the plan.
+        DeviceError: Arm or scanner cannot be opened, or are lost on the way.
+        RunStopped: The operator stopped the arm.
+    """
+    camera = calibration.camera.transform
+    if camera.parent == BASE:
+        raise StageError(f"{STAGE}: the scanner stands beside the arm; scan with scan.live")
+    allowed = limits_of(limits, robot)
+    if not (motion.allowed or arm.simulated):
+        raise NothingMoved(
+            f"{STAGE}: would scan from {len(_places(params))} places; nothing moved: add --move"
+        )
+    with led(arm, robot, allowed) as opened, eye.open() as scanner:
+        drive = Executor(opened, robot, allowed)
+        here = np.asarray(drive.tick().joints)
+        clouds, stood = [], []
+        for route in routes_along(robot, allowed, camera.matrix, params, here):
+            drive.follow(route)
+            state = drive.tick()
+            clouds.append(scanner.expose()().cloud.points())
+            stood.append(ScanPlace(len(clouds[-1]), state.base_T_flange.matrix, state.joints))
+        truth = scanner.true_seams if isinstance(scanner, KnowsSeams) else {}
+    points = np.concatenate(clouds)
+    note = f"workpiece scanned by {scanner.name} from {len(stood)} places, {len(points)} points"
+    cloud = PointCloud(CAMERA, points)
+    return WorkpieceScan(cloud, scanner.name, (note,), truth, tuple(stood))
+
+
+def routes_along(
+    robot: RobotModel,
+    limits: MotionLimits,
+    flange_T_camera: Floats,
+    params: AlongParams,
+    here: Floats,
+) -> list[Route]:
+    """Return the checked ways from joint angles (n,) to each place in turn.
+
+    Raises:
+        StageError: A place cannot be reached from the one before: which, and what bars it.
+    """
+    model, found = Arm(robot), []
+    for number, place in enumerate(_places(params), 1):
+        barred = Barred("out of the arm's reach")
+        for joints in _postures(model, _looking(place, params), flange_T_camera, here):
+            way = Router(robot, limits, here).route(here, joints)
+            if isinstance(way, Route):
+                found.append(way)
+                here = joints
+                break
+            barred = way
+        else:
+            raise StageError(
+                f"{STAGE}: place {number} of {len(_places(params))}, above "
+                f"{', '.join(f'{1e3 * x:.0f}' for x in place)} mm: {barred.reason}; move the work, "
+                "change 'distance', or widen robot.limits.box"
+            )
+    return found
+
+
+def _places(params: AlongParams) -> Floats:
+    """Return (P, 3) on the seam, amid equal pieces of it."""
+    start, end = np.asarray(params.start), np.asarray(params.end)
+    count = max(1, int(np.ceil(np.linalg.norm(end - start) / params.step)))
+    return np.asarray(start + (np.arange(count) + 0.5)[:, None] / count * (end - start))
+
+
+def _looking(place: Floats, params: AlongParams) -> list[Floats]:
+    """Return poses ``base_T_camera`` (4, 4) that look straight at a place, turned about that."""
+    z = -np.asarray(params.opening) / np.linalg.norm(params.opening)
+    along = np.asarray(params.end) - np.asarray(params.start)
+    x = along - (along @ z) * z
+    x /= np.linalg.norm(x)
+    axes = np.column_stack([x, np.cross(z, x), z])
+    eye = place - params.distance * z
+    turns = [rotation_from_rpy(0.0, 0.0, 2 * np.pi * k / ROLLS) for k in range(ROLLS)]
+    return [rigid(axes @ turn, eye) for turn in turns]
+
+
+def _postures(
+    arm: Arm, cameras: list[Floats], flange_T_camera: Floats, here: Floats
+) -> list[Floats]:
+    """Return joint angles (n,) for any of the poses, the nearest to ``here`` first."""
+    camera_T_flange = invert(flange_T_camera)
+    found = [joints for pose in cameras for joints in arm.inverse(pose @ camera_T_flange)]
+    turned = [joints + 2 * np.pi * np.round((here - joints) / (2 * np.pi)) for joints in found]
+    return sorted(turned, key=lambda joints: float(np.abs(joints - here).max()))

@@ -1,0 +1,206 @@
+"""A scan as it stands in the base: from one place beside the arm, or several of its flange.
+
+Clouds of a scanner on the flange are put together by the hand-eye pose and by where the controller
+had the flange. Whatever is wrong with that pose or with the zeros of the joints is wrong in every
+cloud, turned and shifted as the arm stood: a point that several clouds show is off by the mean of
+what each is off there. Where two clouds show the same face they must agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from flangeye import CalibrationRefused
+from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.geometry import covariance_at, hat
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    Floats,
+    HandEye,
+    ScanPlace,
+    Transform,
+    TransformEstimate,
+    WorkpieceScan,
+)
+from flangeye_plugins.seam.planned import scanner_covariance
+from flangeye_plugins.seam.points import facing_camera, thinned
+
+NEAR = 10e-3
+"""A cloud takes part in a point of the seam by how many of its points are so near [m]."""
+CELL = 3e-3
+"""Clouds are thinned to this before they are compared with each other [m]."""
+SAME = 10e-3
+"""Points of two clouds so near to each other may show the same face [m]."""
+FEWEST = 200
+"""Points that two clouds share, for their agreement to be known."""
+
+
+class OfPose(Protocol):
+    """What calibration and arm do to points that were mapped to the base."""
+
+    def __call__(self, points_in_base: Floats) -> Floats:
+        """Return the (K, 3, 3) covariances [m^2] of (K, 3) points."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A scan, and what is known of where it stands.
+
+    Attributes:
+        points: (N, 3) in ``camera`` [m]; of several places, as that of the middle one has them.
+        base_T_camera: Of that camera.
+        covariance: Of points mapped to the base.
+        eyes: (P, 3) where the camera was at each place, in ``camera`` [m].
+        apart: Median distance of one place's face from its neighbour's, the largest of all [m];
+            None where there is one place.
+    """
+
+    points: Floats
+    base_T_camera: Transform
+    covariance: OfPose
+    eyes: Floats
+    apart: float | None = None
+
+    def of_scanner(self, line: Floats, scanner: ScannerModel | None) -> Floats:
+        """Return the (K, 3, 3) covariances [m^2] that the scanner's own distortion gives a line.
+
+        It moves and turns what one place sees as a whole: about the line's middle, or, of several
+        places, about what the nearest has straight ahead.
+        """
+        if len(self.eyes) == 1:
+            levers, distance = line - line.mean(axis=0), np.linalg.norm(line.mean(axis=0))
+        else:
+            away = line[:, None] - self.eyes
+            nearest = np.argmin(np.linalg.norm(away, axis=2), axis=1)
+            levers = away[np.arange(len(line)), nearest]
+            distance = np.median(levers[:, 2])
+            levers[:, 2] = 0.0
+        return covariance_at(scanner_covariance(scanner, float(distance)), np.zeros(3), levers)
+
+    def in_base(self, line: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+        """Map (K, 3) points in ``camera`` and their covariances (K, 3, 3) to ``base``."""
+        rotation = self.base_T_camera.rotation
+        mapped = self.base_T_camera.apply(line)
+        return mapped, rotation @ covariances @ rotation.T + self.covariance(mapped)
+
+
+def seen_in_base(
+    stage: str, scan: WorkpieceScan, answer: HandEye, robot: RobotModel | None
+) -> Seen:
+    """Return a scan in the base, from wherever it was taken.
+
+    Args:
+        stage: Who asks, for the refusal.
+        scan: From one place beside the arm, or from several places of the flange.
+        answer: ``base_T_camera`` or ``flange_T_camera``.
+        robot: The arm, whose joints' zeros are known to ``joint_accuracy`` alone.
+
+    Raises:
+        CalibrationRefused: The scan was not taken by the scanner that was calibrated.
+    """
+    camera = answer.camera
+    of_flange = camera.transform.parent != BASE
+    if of_flange != bool(scan.places):
+        told = "rides on the flange" if of_flange else "stands beside the arm"
+        use = "scan.along" if of_flange else "scan.live or scan.file"
+        raise CalibrationRefused(f"{stage}: the scanner {told}; scan the workpiece with {use}")
+    points = scan.cloud.points().astype(np.float64)
+    if not scan.places:
+        return Seen(points, camera.transform, _AsOnePlace(camera), np.zeros((1, 3)))
+    stands = [_stand(place, answer, robot) for place in scan.places]
+    ends = np.cumsum([place.points for place in scan.places])
+    clouds = np.split(points, ends[:-1])
+    seen = [s.apply(cloud) for s, cloud in zip(stands, clouds, strict=True)]
+    middle = stands[len(stands) // 2]
+    shown = [thinned(cloud, CELL) for cloud in seen]
+    of_pose = _AsSeveral(scan.places, answer, robot, shown)
+    back = middle.inverse()
+    eyes = back.apply(np.array([stand.translation for stand in stands]))
+    return Seen(back.apply(np.concatenate(seen)), middle, of_pose, eyes, _apart(shown))
+
+
+def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Transform:
+    """Return ``base_T_camera`` at a place, by the arm as reported or, where found, corrected."""
+    arm = Arm(robot) if robot else None
+    flange = corrected_flange(place.base_T_flange, place.joints, answer.correction, arm)
+    return Transform(BASE, CAMERA, flange @ answer.camera.transform.matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class _AsOnePlace:
+    """The hand-eye pose alone: the scan of the workpiece took no part in the calibration."""
+
+    base_T_camera: TransformEstimate
+
+    def __call__(self, points_in_base: Floats) -> Floats:
+        known = self.base_T_camera
+        return covariance_at(known.covariance, known.about, points_in_base)
+
+
+@dataclass(frozen=True, eq=False)
+class _AsSeveral:
+    """The hand-eye pose and the joints' zeros, both the same at every place."""
+
+    places: Sequence[ScanPlace]
+    answer: HandEye
+    robot: RobotModel | None
+    shown: Sequence[Floats]
+
+    def __call__(self, points_in_base: Floats) -> Floats:
+        camera, count = self.answer.camera, len(points_in_base)
+        of_camera = np.zeros((count, 3, 6))
+        of_zeros = np.zeros((count, 3, 0 if self.robot is None else len(self.robot.joints)))
+        for place, share in zip(self.places, self._shares(points_in_base), strict=True):
+            flange = np.asarray(place.base_T_flange)
+            inside = (points_in_base - flange[:3, 3]) @ flange[:3, :3]
+            of_camera += share[:, None, None] * (flange[:3, :3] @ _moved(inside - camera.about))
+            if self.robot is not None:
+                moved = _moved(points_in_base - flange[:3, 3])
+                turning = Arm(self.robot).jacobian(place.joints)
+                of_zeros += share[:, None, None] * (moved @ turning)
+        zeros = 0.0 if self.robot is None else self.robot.joint_accuracy**2
+        out = of_camera @ camera.covariance @ of_camera.transpose(0, 2, 1)
+        return np.asarray(out + zeros * of_zeros @ of_zeros.transpose(0, 2, 1))
+
+    def _shares(self, points: Floats) -> Floats:
+        """Return (places, K): how much of what is seen at each point each place shows."""
+        from scipy.spatial import cKDTree
+
+        trees = [cKDTree(cloud) for cloud in self.shown]
+        counts = np.array(
+            [tree.query_ball_point(points, NEAR, return_length=True) for tree in trees], float
+        )
+        nearest = np.argmin([tree.query(points)[0] for tree in trees], axis=0)
+        counts[nearest, np.arange(len(points))] += 1e-3  # beyond what any shows: the nearest alone
+        return np.asarray(counts / counts.sum(axis=0))
+
+
+def _moved(arms: Floats) -> Floats:
+    """Return (K, 3, 6): what a small rotation and translation do at (K, 3) from where they act."""
+    return np.concatenate([-hat(arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=2)
+
+
+def _apart(clouds: Sequence[Floats]) -> float | None:
+    """Return by how much neighbouring clouds are apart, across the faces that both show."""
+    from scipy.spatial import cKDTree
+
+    found = []
+    for first, second in pairwise(clouds):
+        surface = facing_camera(first)
+        away, at = cKDTree(first).query(second, distance_upper_bound=SAME)
+        both = np.isfinite(away)
+        if both.sum() >= FEWEST:
+            at = at[both]
+            across = np.einsum("ni,ni->n", second[both] - first[at], surface.normals[at])
+            found.append(float(np.median(np.abs(across))))
+    return max(found, default=None)
