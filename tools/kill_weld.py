@@ -1,0 +1,255 @@
+"""Welds in real time, struck in their middle: python -m tools.kill_weld [--times N] [--only NAME].
+
+`flangeye run` welds through the maker's client on a controller on loopback. While the torch follows
+the seam, at a random moment, the program, its controller or its camera is struck. Printed is how
+long the arm then goes on moving, by where the controller has it: of a struck program or controller
+from the stroke on, of a camera from the last image that showed the tag; and what the run said.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from flangeye.errors import FlangeyeError
+from flangeye.files.children import python_command
+from flangeye.log.read import read_notes
+from tests.emulators.controllers.process import Process
+
+RECIPE = "recipes/paper/fig13_straight.yaml"
+FINGER = "steps.5.sensor.simulated_finger"
+HOME = "180 -90 90 -90 -90 0 deg"
+OPENING, ENDING = 240.0, 30.0
+"""Longest time until the torch follows the seam, and until a struck run has ended [s]."""
+MOVES = 1e-4
+"""Speed of the fastest joint above which an arm moves [rad/s]."""
+WITHIN = 0.3
+"""What is asked for [s]."""
+PATIENT = ("--set", "steps.5.blind=5 s", "--set", "steps.5.stale=1 s")
+"""Where the camera is not what is struck: on a busy machine its images are late."""
+AFTER = (1.0, 8.0)
+"""The stroke falls between these times after the torch has begun to follow [s]."""
+
+
+@dataclass
+class Trial:
+    """One weld on a controller."""
+
+    controller: Process
+    run: subprocess.Popen[str]
+    log: Path
+    chance: random.Random
+    reason: str = ""
+
+    def notes(self, name: str) -> Iterator[Any]:
+        """Yield what the weld has logged under a name so far."""
+        with suppress(FlangeyeError):
+            yield from (n.value for n in read_notes(self.log) if n.name == name)
+
+    def phase(self) -> str:
+        """Return what the controller was doing last."""
+        blocks = list(self.notes("cycles"))
+        return str(blocks[-1]["phase"][-1]) if blocks else ""
+
+    def follows(self) -> None:
+        """Return when the torch follows the seam."""
+        until = time.monotonic() + OPENING
+        while self.phase() != "following":
+            if self.run.poll() is not None or time.monotonic() > until:
+                raise SystemExit(f"the weld did not begin: {self.told()}")
+            time.sleep(0.5)
+
+    def lead(self) -> float:
+        """Return when the torch began to follow, after the first image [s]."""
+        first = next(self.notes("sight"))["time_ns"] * 1e-9
+        cycles = (
+            each
+            for block in self.notes("cycles")
+            for each in zip(block["time"], block["phase"], strict=True)
+        )
+        return float(next(moment for moment, phase in cycles if phase == "following") - first)
+
+    def rests(self) -> float:
+        """Return how long the arm goes on moving from now on, by the controller's clock [s]."""
+        began = self.controller.control.truth()
+        last = began.time
+        until = time.monotonic() + ENDING
+        while (now := self.controller.control.truth()).time - last < 0.5:
+            last = now.time if now.speed > MOVES else last
+            if time.monotonic() > until:
+                return float("inf")
+        return last - began.time
+
+    def told(self) -> str:
+        """Return the run's last line, once it has ended."""
+        try:
+            out, err = self.run.communicate(timeout=ENDING)
+        except subprocess.TimeoutExpired:
+            return "nothing: it has not ended"
+        lines = [line for line in (out + "\n" + err).splitlines() if line.strip()]
+        stopped = [line for line in lines if "stopped" in line or line.startswith("error")]
+        return (stopped or lines or [""])[-1]
+
+
+def killed(trial: Trial) -> float:
+    """The program is killed."""
+    os.kill(trial.run.pid, signal.SIGKILL)
+    return trial.rests()
+
+
+def hung(trial: Trial) -> float:
+    """The program is held."""
+    os.kill(trial.run.pid, signal.SIGSTOP)
+    taken = trial.rests()
+    os.kill(trial.run.pid, signal.SIGKILL)
+    return taken
+
+
+def faulted(trial: Trial) -> float:
+    """The controller reports a protective stop."""
+    trial.controller.control.fault("protective-stop")
+    taken = trial.rests()
+    trial.reason = trial.told()
+    return taken
+
+
+def frozen(trial: Trial) -> float:
+    """The controller sends nothing any more for three seconds."""
+    trial.controller.control.fault("freeze=3 s")
+    taken = trial.rests()
+    trial.reason = trial.told()
+    return taken
+
+
+def powerless(trial: Trial) -> float:
+    """The controller itself is killed; with it the arm stands. How long until the run says so."""
+    trial.controller.send(signal.SIGKILL)
+    began = time.monotonic()
+    trial.reason = trial.told()
+    return time.monotonic() - began
+
+
+def camera(trial: Trial) -> float:
+    """The camera falls silent, or is lost, as its parameters say."""
+    control, last = trial.controller.control, time.time()
+    while trial.run.poll() is None:
+        last = time.time() if control.truth().speed > MOVES else last
+    trial.reason = trial.told()
+    return last - max(s["time_ns"] for s in trial.notes("sight") if s["tag"]) * 1e-9
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """What is done to a weld, and with what parameters it is started."""
+
+    strike: Callable[[Trial], float]
+    given: Callable[[float], tuple[str, ...]] = lambda after: PATIENT
+    by_itself: bool = False
+
+
+def _silent(after: float) -> tuple[str, ...]:
+    return ("--set", f"{FINGER}.hidden=[{after:.1f} s, 1000 s]")  # stopped after 'blind'
+
+
+def _lost(after: float) -> tuple[str, ...]:
+    return (*PATIENT, "--set", f"{FINGER}.fails={after:.1f} s")
+
+
+STROKES = {
+    "program killed": Stroke(killed),
+    "program held": Stroke(hung),
+    "protective stop": Stroke(faulted),
+    "controller frozen": Stroke(frozen),
+    "controller killed": Stroke(powerless),
+    "camera silent": Stroke(camera, _silent, by_itself=True),
+    "camera lost": Stroke(camera, _lost, by_itself=True),
+}
+
+
+class Bench:
+    """A controller on loopback, and welds on it one after the other."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._folder, self._chance, self._count = folder, random.Random(seed), 0
+        self._controller = Process("--joints", HOME, model="ur10e")
+
+    def struck(self, stroke: Stroke, lead: float) -> tuple[float, str]:
+        """Return how long the arm went on moving in one weld [s], and what the run said."""
+        after = self._chance.uniform(*AFTER)
+        trial = self._begin(stroke.given(lead + after))
+        try:
+            trial.follows()
+            if not stroke.by_itself:
+                time.sleep(after)
+            return stroke.strike(trial), trial.reason
+        finally:
+            self._end(trial)
+
+    def lead(self) -> float:
+        """Return when a weld begins to follow, after the first image [s]."""
+        trial = self._begin(PATIENT)
+        try:
+            trial.follows()
+            return trial.lead()
+        finally:
+            self._end(trial)
+
+    def close(self) -> None:
+        """End the controller."""
+        self._controller.end(signal.SIGKILL)
+
+    def _begin(self, given: tuple[str, ...]) -> Trial:
+        self._count += 1
+        out = self._folder / str(self._count)
+        driver = f"robot.driver={{ur_rtde: {{host: {self._controller.host}}}}}"
+        words = ("run", RECIPE, "--move", "--out", str(out), "--set", driver, *given)
+        run = subprocess.Popen(
+            python_command("-m", "flangeye.cli", *words), text=True, start_new_session=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        return Trial(self._controller, run, out / "run.mcap", self._chance)
+
+    def _end(self, trial: Trial) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(trial.run.pid, signal.SIGKILL)
+        trial.run.wait()
+        if self._controller.process.poll() is None:
+            self._controller.end(signal.SIGKILL)
+        self._controller = Process("--joints", HOME, model="ur10e")
+
+
+def main(
+    times: Annotated[int, typer.Option(help="Welds for each stroke.")] = 20,
+    only: Annotated[str, typer.Option(help="Strokes with this in their names.")] = "",
+    seed: Annotated[int, typer.Option(help="Draws the moments.")] = 0,
+) -> None:
+    """Strike welds, and print how soon the arm rested and what was said."""
+    chosen = {name: stroke for name, stroke in STROKES.items() if only in name}
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Bench(Path(folder), seed)) as bench,
+    ):
+        lead = bench.lead()
+        print(f"{'stroke':18} welds  at rest after: median, longest  said", flush=True)
+        for name, stroke in chosen.items():
+            found = [bench.struck(stroke, lead) for _ in range(times)]
+            taken = np.array([seconds for seconds, _ in found])
+            print(f"{name:18} {times:5}  {np.median(taken):13.3f} {taken.max():9.3f} s"
+                  f"{'' if taken.max() <= WITHIN else ' *':13}  {found[-1][1]}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(typer.run(main))
