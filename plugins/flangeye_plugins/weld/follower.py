@@ -35,6 +35,9 @@ LEAD_IN = 3.0
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
 
+OPPOSITE = 3.0
+"""What is added to the variance of the arm at one end where the other has the opposite error."""
+
 PLAYED = 1.0
 """Share of the finger's play and hysteresis that stays uncertain, one standard deviation."""
 
@@ -200,7 +203,8 @@ class Follower:
         """Return the next piece of the sweep."""
         speed = self._probing.velocity(self._elapsed)
         self._probing.note(pose.time, speed, self._lateral(pose))
-        return Command(np.array([*(speed * self._place.normal), 0.0]), 0.0)
+        along = self._probing.along(self._elapsed) * self._place.tangent
+        return Command(np.array([*(speed * self._place.normal + along), 0.0]), 0.0)
 
     def _estimate(self, pose: ToolPose) -> None:
         """Estimate how far the torch may be from the seam now, and stop where that is too far."""
@@ -235,8 +239,9 @@ class Follower:
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
         arm, wander = settings.arm_sigma**2, settings.wander**2
-        # Waves that the tip felt may be the arm's, by its share in what is expected of both.
-        waves = min(self.refined.waviness(self.torch) * arm / (arm + wander), arm)
+        # Waves that the tip felt may be the arm's, by its share in what is expected of both; where
+        # tip and torch are half a wave apart both errors add up, which is four times the one.
+        waves = OPPOSITE * min(self.refined.waviness(self.torch) * arm / (arm + wander), arm)
         fixed = self._belief.fixed_variance(settings) + (self._belief.along_sigma * slant) ** 2
         play = (PLAYED * learned.width) ** 2 + learned.unexplained**2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.

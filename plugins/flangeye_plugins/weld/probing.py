@@ -19,6 +19,7 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.belief import STEEP, Belief
 from flangeye_plugins.weld.response import identify
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.sliding import Sliding
 
 MARGIN = 1.25
 """The sweep presses harder than the weld by this, so that the tip is known to stay seated."""
@@ -55,6 +56,9 @@ LARGEST_GAIN = 0.35
 
 LARGEST_PLAY = 0.1e-3
 """Within more play, to each side, nothing tells where the tip is [m]."""
+
+LOOSE = 0.5
+"""Share of the deflection down to which the tip is let go of before it is pressed for the weld."""
 
 FEWEST = 15
 """Samples of a sweep without which it says nothing."""
@@ -111,7 +115,11 @@ class Probing:
         reach = MARGIN * settings.deflection
         back = -reach if belief.two_walls else 0.4 * settings.deflection
         # It ends outwards: play and hysteresis are then where the weld keeps them.
-        self._turns = [reach, back, ENDS * settings.deflection]
+        ends = ENDS * settings.deflection
+        self._turns = [reach, back, ends]
+        # Then it slides along, pressed hard, and ends outwards again.
+        self._last = [reach, LOOSE * settings.deflection, ends] if belief.two_walls else []
+        self._sliding = Sliding(0.0)
         self._two_walls = belief.two_walls
         self._side, self._noise = side, belief.noise
         self._deflection, self._flat = settings.deflection, belief.flat(side)
@@ -119,6 +127,7 @@ class Probing:
         self._wanted: float | None = None
         self._pressed: tuple[float, int] | None = None
         self.over, self._time = False, 0.0
+        self._swept: tuple[int, int] | None = None
         self._cycles: list[tuple[float, float, float]] = []
         self._felt: list[tuple[float, float, float, float]] = []
 
@@ -136,10 +145,26 @@ class Probing:
         rate = self._rate * (SLOWEST + (1.0 - SLOWEST) * math.sin(math.pi * self._time / BEAT) ** 2)
         step = float(np.clip(goal - self._wanted, -rate * elapsed, rate * elapsed))
         self._wanted += step
-        if abs(goal - self._wanted) < 1e-9 and self._settled():
+        if abs(goal - self._wanted) < 1e-9 and self._settled() and not self.slides:
             self._turns.pop(0)
+            if not self._turns and self._swept is None:
+                self._swept = len(self._felt), len(self._cycles)
+                self._turns = self._last
+                heights = np.array([sample[2] for sample in self._felt])
+                self._sliding = Sliding((_scatter(heights) / TOLD) ** 2 if len(heights) > 2 else 0)
             self.over = not self._turns
         return self._side * step / elapsed if elapsed else 0.0
+
+    @property
+    def slides(self) -> bool:
+        """Whether the tip is at the end of the sweep where it slides along."""
+        goal = self._turns[0] if self._turns else math.nan
+        ends = self._swept is not None and len(self._turns) == len(self._last)
+        return ends and self._wanted == goal and self._sliding.state != "over"
+
+    def along(self, elapsed: float) -> float:
+        """Return the velocity of the sweep along the seam in this cycle [m/s]."""
+        return self._sliding.velocity(elapsed) if self.slides else 0.0
 
     def _rested(self) -> float | None:
         """Return by how much the tip is pressed where the sweep begins [m]; None before."""
@@ -165,12 +190,15 @@ class Probing:
     def feel(self, time: float, across: float, height: float, along: float) -> None:
         """Remember a measurement: displacements to the left and forwards, the tip's height [m]."""
         self._felt.append((time, across, height, along))
+        if self.slides:
+            self._sliding.feel(self._side * across, height)
 
     def learned(self) -> Learned | str:
         """Return what was found, or why the weld must not begin."""
         if len(self._felt) < FEWEST:
             return "the tag was seen too seldom while the finger was probed"
-        felt, cycles = np.array(self._felt), np.array(self._cycles)
+        samples, ticks = self._swept or (len(self._felt), len(self._cycles))
+        felt, cycles = np.array(self._felt[:samples]), np.array(self._cycles[:ticks])
         found = self._fit(felt, cycles)
         if abs(found.gain) > LARGEST_GAIN:
             return f"the finger's gain is off by {found.gain:.0%}; calibrate it again"
@@ -185,7 +213,32 @@ class Probing:
                 f"the finger has {2 * abs(found.width) * 1e3:.2f} mm of play or hysteresis, at "
                 f"most {2 * LARGEST_PLAY * 1e3:.2f} mm are allowed; fasten it, or its tag"
             )
-        return self._climb(felt, cycles, found) or found
+        return self._climb(felt, cycles, found) or self._slid() or found
+
+    def _slid(self) -> str | None:
+        """Say that the tip climbs where it slides along its wall, or that it may."""
+        climbed = self._sliding.climbed()
+        if climbed is None:
+            return None
+        (aside, rise), (aside_sigma, rise_sigma) = climbed[0].tolist(), climbed[1].tolist()
+        if rise > CLIMBED + 3 * rise_sigma:
+            return (
+                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it slides along it, pressed "
+                "aside; lower 'deflection' or raise 'preload'"
+            )
+        least = self._just_held()
+        if rise + 2 * rise_sigma > least and aside + 2 * aside_sigma > least * self._flat:
+            return (
+                "whether the tip climbs the wall where it slides along it is known to "
+                f"{rise_sigma * 1e3:.2f} mm only; raise 'preload' or lower 'deflection', or see to "
+                "it that the tag is read better"
+            )
+        return None
+
+    def _just_held(self) -> float:
+        """Return how far a tip rises that is just held at the deflection, pressed by MARGIN [m]."""
+        ratio = self._preload / self._deflection
+        return (MARGIN - 1.0) * self._preload / (ratio * self._flat + 1.0)
 
     def _fit(self, felt: Floats, cycles: Floats) -> Learned:
         noise = max(_scatter(felt[:, 1]), self._noise[0])
@@ -249,9 +302,7 @@ class Probing:
                 f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
                 "'deflection' or raise 'preload'"
             )
-        # What a tip does that is just held at the deflection, and pressed harder by the margin.
-        ratio = self._preload / self._deflection
-        if rise + 2 * sigma > (MARGIN - 1.0) * self._preload / (ratio * self._flat + 1.0):
+        if rise + 2 * sigma > self._just_held():
             return (
                 f"whether the tip climbs the wall is known to {sigma * 1e3:.2f} mm only; raise "
                 "'preload' or lower 'deflection', or see to it that the tag is read better"
