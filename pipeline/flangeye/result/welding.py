@@ -60,11 +60,12 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
 def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
     """Compare with the true seam that is nearest, where the torch was between its ends.
 
-    Not while the tip still feels for the groove: the torch of a weld that is gone on with is above
-    the seam then, and does not weld.
+    Not while the tip still feels for the groove, and not before the torch was near enough to the
+    seam to be lit: that of a weld that is gone on with comes back to the seam first, unlit.
     """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
-    torch = torch[~np.isin(weld.phases, ("seeking", "probing"))]
+    welds = ~np.isin(weld.phases, ("seeking", "probing"))
+    torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
     found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
     return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))
