@@ -178,3 +178,18 @@ def wandering(made, rng, turn=2e-3, shift=1e-3, wrong=0.08):
         feature = PoseFeature(Transform(CAMERA, TARGET, moved), o.feature.covariance)
         out.append(replace(o, feature=feature))
     return replace(made, observations=out)
+
+
+def walking(made, rng, turn=5e-4, shift=2e-4):
+    """Return a session in whose steps camera and target walk at random against each other."""
+    cell, motion, out = made.configuration, np.eye(4), []
+    x = next(iter(made.truth.values()))
+    for o in made.observations:
+        hand = o.base_T_flange.matrix if cell.camera == FLANGE else np.eye(4)
+        seen, camera = o.feature.camera_T_target.matrix, hand @ x
+        place = camera @ seen if cell.camera == FLANGE else camera
+        step = rigid(rotation_exp(rng.normal(0, turn, 3)), rng.normal(0, shift, 3))
+        motion = place @ step @ invert(place) @ motion
+        moved = Transform(CAMERA, TARGET, invert(camera) @ motion @ camera @ seen)
+        out.append(replace(o, feature=PoseFeature(moved, o.feature.covariance)))
+    return replace(made, observations=out)

@@ -1,5 +1,7 @@
 """Variance components: what is put in comes out, to the number, on either side of each bound."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -95,7 +97,7 @@ def test_what_the_arms_do_not_explain_is_added_evenly() -> None:
 
 @pytest.mark.parametrize("name", ["pose", "tilt", "centre_scale", "normal_scale", "arms", "depth"])
 def test_noises_are_close_to_a_thousandth(name: str) -> None:
-    base = dict(
+    base: dict[str, Any] = dict(
         pose=1e-4, tilt=1e-4, centre_scale=0.5, normal_scale=0.5, arms=0.5, size=0.5, depth=1e-4
     )
     noise = Noise(**base)

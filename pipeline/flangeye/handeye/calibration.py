@@ -39,7 +39,7 @@ from flangeye.handeye.observability import (
 )
 from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
-from flangeye.handeye.wander import with_wander
+from flangeye.handeye.wander import with_walk
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation
@@ -271,10 +271,9 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
     if flange is None or model.problem.stated:
         return model, model
     if options.smooth_error:
-        wandering = with_wander(model, options.finds_size)
-        if wandering.problem.nuisance.sized.any():
-            return wandering, wandering
-        model = wandering
+        walking = with_walk(model, options.finds_size)
+        if walking.problem.walk is not None:
+            return walking, walking
     if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
         considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
         model = with_tool_offset(model, considered)

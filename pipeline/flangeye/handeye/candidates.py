@@ -61,6 +61,11 @@ class Model:
         """
         found, sized = self.found, self.problem.nuisance.sized
         left = found.linear.residuals[:, 3:]
+        if as_reported and found.at.course is not None:
+            resting = replace(self.problem, walk=None)
+            left = weigh(
+                resting, found.at, found.noise, found.inliers.astype(float)
+            ).linear.residuals[:, 3:]
         if as_reported and sized.any():
             moves = found.linear.jacobian[:, 3:, COLUMNS:][:, :, sized]
             left = left + moves @ found.at.nuisance[sized]
@@ -124,8 +129,11 @@ def held_out(found: Solution) -> tuple[Floats, Floats]:
     """Return (N, 3) errors of the centres, each of a fit to the other folds, in ``camera`` [m].
 
     With them their (N, 3, 3) covariances, as such a fit states them; zero for those that took no
-    part. In closed form, the fit being as good as linear and its noise known.
+    part. In closed form, the fit being as good as linear and its noise known. Where the base walks
+    each is left out alone: those beside it tell where the base was.
     """
+    if found.course is not None:
+        return _each_left_out(found)
     errors, covariances = found.linear.residuals.copy(), np.zeros((len(found.squares), 3, 3))
     kept = np.flatnonzero(found.inliers)
     folds = max(FOLDS, len(kept) // LARGEST_FOLD)
@@ -136,6 +144,14 @@ def held_out(found: Solution) -> tuple[Floats, Floats]:
         errors[part], n = error, len(part)
         covariances[part] = covariance.reshape(n, 6, n, 6)[np.arange(n), 3:, np.arange(n), 3:]
     return errors[:, 3:], covariances
+
+
+def _each_left_out(found: Solution) -> tuple[Floats, Floats]:
+    kept = found.inliers[:, None, None]
+    noise = np.linalg.pinv(found.weights, rcond=1e-12, hermitian=True)
+    share = np.linalg.pinv(np.eye(6) - kept * (found.spread @ found.weights), rcond=1e-9)
+    errors = (share @ found.linear.residuals[..., None])[:, 3:, 0]
+    return errors, np.where(kept, share @ noise, 0.0)[:, 3:, 3:]
 
 
 def _without(found: Solution, part: NDArray[np.intp]) -> tuple[Floats, Floats]:

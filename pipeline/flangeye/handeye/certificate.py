@@ -76,7 +76,8 @@ class Certificate:
 
 def certificate_note(problem: Problem, found: Solution) -> str:
     """Return in words whether the poses that agree have no better answer than the one found."""
-    s, loop, kept = problem.measurements.where(found.inliers), problem.loop, found.inliers
+    s, loop, kept = problem.measurements, problem.loop, found.inliers
+    s = (s if found.at.course is None else found.at.course.applied(s)).where(kept)
     if not s.are_poses or loop.y == loop.z:
         return f"{NOT_SHOWN}: that can be done for whole poses and two unknown places alone"
     still = np.broadcast_to(np.eye(4), s.a.shape)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flangeye.handeye.walk import NO_WALK, StepSize
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
 
@@ -35,6 +36,7 @@ class Noise:
         arms: Factor on the covariances that are taken for the arms' poses.
         size: Standard deviation of the nuisances whose size is estimated.
         depth: Variance along the camera's axis beyond that of each coordinate [m^2].
+        walk: Size of the steps of what walks.
     """
 
     pose: float
@@ -44,6 +46,7 @@ class Noise:
     arms: float = 1.0
     size: float = 1.0
     depth: float = 0.0
+    walk: StepSize = NO_WALK
 
     def is_close(self, other: Noise) -> bool:
         """Whether nothing differs by more than a thousandth."""
@@ -51,7 +54,8 @@ class Noise:
         return all(abs(a - b) <= 1e-3 * max(a, b) + 1e-12 for a, b in pairs)
 
     def _variances(self) -> tuple[float, ...]:
-        scales = self.centre_scale, self.normal_scale, self.arms, self.size**2
+        walk = (each**2 for each in self.walk)
+        scales = self.centre_scale, self.normal_scale, self.arms, self.size**2, *walk
         return (self.pose + FINEST**2, self.tilt + FINEST**2, self.depth + FINEST**2, *scales)
 
 

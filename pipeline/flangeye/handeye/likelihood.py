@@ -25,6 +25,8 @@ from flangeye.handeye.loop import (
 )
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance, no_nuisance
+from flangeye.handeye.smoothing import Smoothed, size_told, smoothed
+from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats, Mask
 
@@ -55,6 +57,7 @@ class Problem:
         nuisance: Errors of the arms that are estimated along.
         pose_noise: Variance of each coordinate beyond the features' own [m^2], where it is known.
         in_depth: Whether there may be more noise along the camera's axis than across it.
+        walk: How the base walks from pose to pose; None where it rests.
     """
 
     measurements: Measurements
@@ -65,6 +68,7 @@ class Problem:
     nuisance: Nuisance = field(default_factory=lambda: no_nuisance(0))
     pose_noise: float | None = None
     in_depth: bool = False
+    walk: Walk | None = None
 
     def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
         """Return the problem of some of the measurements."""
@@ -96,6 +100,7 @@ class Solution:
         cost: What was made small: weighted squares of the shares, and of what was surprising.
         slope: (p,) of half of it.
         all_freedom: As ``freedom``, which is of rotations or translations, of both together.
+        course: What the base's course has to do with it; None where it rests.
     """
 
     at: Unknowns
@@ -110,18 +115,35 @@ class Solution:
     cost: float = np.inf
     slope: Floats = field(default_factory=lambda: np.zeros(0))
     all_freedom: float = np.inf
+    course: Smoothed | None = None
 
     @cached_property
     def covariance(self) -> Floats:
         """(20 + k, 20 + k) of all moves, the unobservable directions left out."""
+        return np.asarray(self.basis @ self.known @ self.basis.T)
+
+    @cached_property
+    def known(self) -> Floats:
+        """(p, p) covariance of the moves that were fitted."""
         root = np.sqrt(np.maximum(np.diag(self.information), TINY))
         scaled = self.information / np.outer(root, root)
         try:
             half = np.linalg.inv(np.linalg.cholesky(scaled)) / root
-            return np.asarray(self.basis @ (half.T @ half) @ self.basis.T)
+            return np.asarray(half.T @ half)
         except np.linalg.LinAlgError:
-            known = np.linalg.pinv(self.information, rcond=1e-14, hermitian=True)
-            return np.asarray(self.basis @ known @ self.basis.T)
+            return np.asarray(np.linalg.pinv(self.information, rcond=1e-14, hermitian=True))
+
+    @cached_property
+    def spread(self) -> Floats:
+        """(N, 6, 6) covariance of what is predicted, the base's motions among what is unknown."""
+        jacobian = self.linear.jacobian @ self.basis
+        left = np.zeros((6, 6))
+        if self.course is not None:
+            followed = self.course.followed
+            drift = self.linear.drift[:, :, : followed.shape[1]]
+            jacobian = jacobian - drift @ followed
+            left = drift @ self.course.told.diagonal @ np.swapaxes(drift, 1, 2)
+        return np.asarray(jacobian @ self.known @ np.swapaxes(jacobian, 1, 2) + left)
 
     @property
     def parameters(self) -> int:
@@ -146,7 +168,7 @@ def climb(
         step, gain = _step(here, damping)
         if gain < SETTLED * max(1.0, here.cost) or damping > 1e8:
             break
-        there = weigh(problem, here.at.moved(step), noise, shares)
+        there = weigh(problem, step, noise, shares)
         better = there.cost <= here.cost * (1 + 1e-12)
         here = there if better else here
         damping = max(damping / 100, LEAST_DAMPING) if better else max(1e-4, damping * 10)
@@ -157,6 +179,8 @@ def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solut
     """Return some values of the unknowns with what the measurements say of them."""
     if len(at.nuisance) != len(problem.nuisance):
         at = replace(at, nuisance=np.zeros(len(problem.nuisance)))
+    if (at.course is None) != (problem.walk is None):
+        at = replace(at, course=Course.still(len(problem.measurements)) if problem.walk else None)
     linear = linearise(problem.measurements, problem.loop, at, problem.arms, problem.nuisance)
     return _weighed(problem, at, linear, noise, shares)
 
@@ -175,19 +199,31 @@ def _weighed(
     counted = counting[:, None] * weighted
     information = jacobian.T @ counted + basis.T @ (known[:, None] * basis)
     slope = counted.T @ linear.residuals.ravel() - basis.T @ (known * surprise)
-    cost = float(shares @ squares + known @ surprise**2)
+    cost, course = float(shares @ squares + known @ surprise**2), None
+    if problem.walk is not None and at.course is not None:
+        jacobian = jacobian.reshape(len(s), 6, -1)
+        course = smoothed(
+            problem.walk, noise.walk, at.course, linear, jacobian, weights * shares[:, None, None]
+        )
+        information, slope = information - course.information, slope - course.slope
+        cost += course.cost
     return Solution(
-        at, basis, information, linear, weights, noise, shares > 0.5, np.inf, squares, cost, slope
-    )
+        at, basis, information, linear, weights, noise, shares > 0.5, np.inf, squares, cost, slope,
+        course=course,
+    )  # fmt: skip
 
 
-def _step(here: Solution, damping: float) -> tuple[Floats, float]:
-    """Return the move that makes the cost least, were all linear, and by how much it would."""
+def _step(here: Solution, damping: float) -> tuple[Unknowns, float]:
+    """Return where the cost is least, were all linear, and by how much less it would be."""
     # Scaled to unit diagonal, so that metres and radians are damped alike.
     root = np.sqrt(np.maximum(np.diag(here.information), 1e-12))
     scaled = here.information / np.outer(root, root) + damping * np.eye(len(root))
     step = np.linalg.solve(scaled, here.slope / root) / root
-    return np.asarray(here.basis @ step), float(here.slope @ step)
+    there, gain = here.at.moved(here.basis @ step), float(here.slope @ step)
+    if here.course is None or there.course is None:
+        return there, gain
+    walked = there.course.moved(here.course.moved(step))
+    return replace(there, course=walked), gain + here.course.gain
 
 
 def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
@@ -236,8 +272,7 @@ def judged(problem: Problem, found: Solution) -> tuple[Floats, Mask]:
     both would be without it, in closed form (the externally studentised residual of Cook &
     Weisberg 1982). Under normal noise either sort follows Fisher's F.
     """
-    jacobian, p = found.linear.jacobian, problem.measurements.projectors
-    share = jacobian @ found.covariance @ jacobian.transpose(0, 2, 1)
+    p, share = problem.measurements.projectors, found.spread
     signs = np.where(found.inliers, -1.0, 1.0)[:, None, None]
     noise = np.linalg.pinv(found.weights, rcond=1e-12, hermitian=True)
     # A measurement that alone says something is fitted exactly: there is nothing to compare with.
@@ -308,10 +343,8 @@ def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solutio
 
 def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]:
     """Return the noise that the residuals show, and its degrees of freedom: the fewer, and all."""
-    kept, covariance = found.inliers, found.covariance
-    turned, shifted = (
-        _residuals(problem, found, covariance, at) for at in (slice(0, 3), slice(3, 6))
-    )
+    kept = found.inliers
+    turned, shifted = (_residuals(problem, found, at) for at in (slice(0, 3), slice(3, 6)))
     if problem.pose_noise is not None:
         shifted = replace(shifted, freedom=np.inf)
     own, arms = problem.measurements.covariances[kept], found.linear.of_arms[kept]
@@ -321,23 +354,36 @@ def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]
     elif problem.measurements.are_poses:
         noises.append(without_arms(turned, shifted, own))
         if problem.in_depth:
-            noises += _in_depth(found, covariance, turned, (own, arms))
+            noises += _in_depth(found, turned, (own, arms))
     noise = max(noises, key=lambda each: _likelihood(problem, found, each))
-    size = _size(problem, found, covariance)
+    size, walk = _size(problem, found), _walked(problem, found)
     freedoms = [f for f in (turned.freedom, shifted.freedom) if np.isfinite(f)]
     fewer, both = min(freedoms, default=np.inf), sum(freedoms) if freedoms else np.inf
-    return replace(noise, size=size), max(fewer, 1.0), max(both, 1.0)
+    return replace(noise, size=size, walk=walk), max(fewer, 1.0), max(both, 1.0)
 
 
-def _in_depth(
-    found: Solution, covariance: Floats, turned: Residuals, known: tuple[Floats, Floats]
-) -> list[Noise]:
+def _in_depth(found: Solution, turned: Residuals, known: tuple[Floats, Floats]) -> list[Noise]:
     """Return what noise there is if there is more along the camera's axis: the arms', or none."""
     own, arms = known
     axis = np.broadcast_to(np.diag([0.0, 0.0, 1.0]), (len(own), 3, 3))
-    along, across = (_onto(p, found, covariance, slice(3, 6)) for p in (axis, np.eye(3) - axis))
+    along, across = (_onto(p, found, slice(3, 6)) for p in (axis, np.eye(3) - axis))
     noises = noise_of(turned, across, own, arms), without_arms(turned, across, own)
     return [with_depth(noise, along, own, arms) for noise in noises]
+
+
+def log_likelihood(problem: Problem, found: Solution) -> float:
+    """Return twice the log of the restricted likelihood of those that agree, but for a constant.
+
+    What is fitted is taken out (Patterson & Thompson 1971), and where the base walked as well: it
+    is the sum of how likely each pose is by those before it.
+    """
+    fit = weigh(problem, found.at, found.noise, found.inliers.astype(float))
+    kept, eye = found.inliers, np.eye(6)
+    weights = fit.weights[kept] + (eye - problem.measurements.projectors[kept])
+    of_course = 0.0 if fit.course is None else fit.course.logdet
+    sized = 2 * np.log(found.noise.size) * problem.nuisance.sized.sum()
+    told = np.linalg.slogdet(fit.information)[1] + sized
+    return float(np.linalg.slogdet(weights)[1].sum() - fit.cost - told - of_course)
 
 
 def _likelihood(problem: Problem, found: Solution, noise: Noise) -> float:
@@ -353,28 +399,36 @@ def _likelihood(problem: Problem, found: Solution, noise: Noise) -> float:
     return float(np.linalg.slogdet(weights)[1].sum() - squares)
 
 
-def _size(problem: Problem, found: Solution, covariance: Floats) -> float:
+def _walked(problem: Problem, found: Solution) -> StepSize:
+    """Return the size of the base's steps that makes them most likely, one iteration on."""
+    if problem.walk is None or found.course is None or found.at.course is None:
+        return found.noise.walk
+    spread = found.course.spread(problem.walk, found.known)
+    return size_told(problem.walk, found.noise.walk, found.at.course, spread)
+
+
+def _size(problem: Problem, found: Solution) -> float:
     """Return the standard deviation that makes the sized nuisances most likely, one step on."""
     sized, size = problem.nuisance.sized, found.noise.size
     if not sized.any():
         return size
     values = found.at.nuisance[sized]
-    told = sized.sum() - np.diag(covariance)[COLUMNS:][sized].sum() / size**2
+    told = sized.sum() - np.diag(found.covariance)[COLUMNS:][sized].sum() / size**2
     return max(float(np.sqrt((values @ values) / max(told, 1e-3))), FINEST)
 
 
-def _residuals(problem: Problem, found: Solution, covariance: Floats, at: slice) -> Residuals:
+def _residuals(problem: Problem, found: Solution, at: slice) -> Residuals:
     """Return the rotations', or the translations', of those that agree."""
     p = problem.measurements.projectors[found.inliers]
-    return _onto(p[:, at, at], found, covariance, at)
+    return _onto(p[:, at, at], found, at)
 
 
-def _onto(p: Floats, found: Solution, covariance: Floats, at: slice) -> Residuals:
+def _onto(p: Floats, found: Solution, at: slice) -> Residuals:
     """Return rotations or translations of those that agree, as projected."""
-    jacobian = found.linear.jacobian[found.inliers]
+    kept = found.inliers
     # Numbers less their share in the fit.
-    told = p @ found.weights[found.inliers][:, at] @ jacobian @ covariance
-    shares = (told * jacobian[:, at]).sum()
+    told = p @ found.weights[kept][:, at]
+    shares = np.einsum("nij,nji->", told, found.spread[kept][:, :, at])
     measured = np.trace(p, axis1=1, axis2=2).sum()
     freedom = float(measured - shares) if measured else np.inf
     errors = (p @ found.linear.residuals[found.inliers][:, at, None])[..., 0]

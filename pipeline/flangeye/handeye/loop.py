@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flangeye.handeye.components import FINEST, Noise
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance
+from flangeye.handeye.walk import Course
 from flangeye.maths.geometry import hat, rotation_between, rotation_exp, rotation_log
 from flangeye.types import Floats
 
@@ -32,6 +33,7 @@ class Unknowns:
         z: (4, 4) target in its carrier.
         tilt: (2,) of all normals, about the target's x and y [rad].
         nuisance: (k,) of the arms.
+        course: Where the base walked; None where it rests.
     """
 
     x: Floats
@@ -39,6 +41,7 @@ class Unknowns:
     z: Floats
     tilt: Floats
     nuisance: Floats = field(default_factory=lambda: np.zeros(0))
+    course: Course | None = None
 
     def moved(self, step: Floats) -> Unknowns:
         """Return the unknowns moved by (20 + k,)."""
@@ -46,7 +49,7 @@ class Unknowns:
             _moved(m, step[6 * k : 6 * k + 6]) for k, m in enumerate((self.x, self.y, self.z))
         )
         tilt, nuisance = self.tilt + step[18:COLUMNS], self.nuisance + step[COLUMNS:]
-        return Unknowns(x, y, z, tilt, nuisance)
+        return Unknowns(x, y, z, tilt, nuisance, self.course)
 
 
 def _moved(transform: Floats, step: Floats) -> Floats:
@@ -77,15 +80,19 @@ class Linear:
         residuals: (N, 6).
         jacobian: (N, 6, 20 + k) of what is predicted.
         of_arms: (N, 6, 6) covariance that the arms' noise has in the camera; None if not stated.
+        drift: (N, 6, s) of what is predicted by a motion of the base, and of the camera's scale;
+            none where it rests.
     """
 
     residuals: Floats
     jacobian: Floats
     of_arms: Floats
+    drift: Floats
 
     def where(self, chosen: NDArray[np.bool_]) -> Linear:
         """Return some of the measurements."""
-        return Linear(self.residuals[chosen], self.jacobian[chosen], self.of_arms[chosen])
+        each = self.residuals, self.jacobian, self.of_arms, self.drift
+        return Linear(*(of_all[chosen] for of_all in each))
 
 
 def linearise(
@@ -96,6 +103,8 @@ def linearise(
     nuisance: Nuisance | None = None,
 ) -> Linear:
     """Predict every measurement, and how the prediction moves with each unknown."""
+    if at.course is not None:
+        measurements = at.course.applied(measurements)
     chain = _Chain(measurements, at)
     jacobian = np.zeros((len(measurements), 6, COLUMNS + len(at.nuisance)))
     jacobian[:, :, :6] = chain.of_camera()
@@ -115,7 +124,10 @@ def linearise(
         for moved, effect in (loop.camera_moves, of_camera), (loop.target_moves, of_target):
             if moved:
                 covariance += effect @ arms.covariance @ effect.transpose(0, 2, 1)
-    return Linear(residuals, jacobian, covariance)
+    drift = (
+        measurements.projectors @ chain.of_walk() if at.course else np.zeros((len(jacobian), 6, 0))
+    )
+    return Linear(residuals, jacobian, covariance, drift)
 
 
 class _Chain:
@@ -128,7 +140,7 @@ class _Chain:
         self._seen = measurements.offsets @ at.z[:3, :3].T + at.z[:3, 3]
         carried = _apply(measurements.b, self._seen)
         self._from_base2 = carried @ at.y[:3, :3].T
-        in_base = self._from_base2 + at.y[:3, 3]
+        self._in_base = in_base = self._from_base2 + at.y[:3, 3]
         in_carrier = (self._to_carrier @ (in_base - measurements.a[:, :3, 3])[..., None])[..., 0]
         self._in_carrier, self._from_camera = in_carrier, in_carrier - at.x[:3, 3]
         self._to_target_carrier = self._to_carrier @ at.y[:3, :3] @ measurements.b[:, :3, :3]
@@ -151,6 +163,12 @@ class _Chain:
     def of_second_base(self) -> Floats:
         turn = self._eye @ self._to_carrier
         return self._blocks(turn, -turn @ hat(self._from_base2), turn)
+
+    def of_walk(self) -> Floats:
+        turn = self._eye @ self._to_carrier
+        moved = self._blocks(turn, -turn @ hat(self._in_base), turn)
+        longer = np.concatenate([np.zeros_like(self._s.centres), -self._s.centres], axis=1)
+        return np.concatenate([moved, longer[..., None]], axis=2)
 
     def of_place(self) -> Floats:
         from_origin = self._seen - self._at.z[:3, 3]

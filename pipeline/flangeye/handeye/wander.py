@@ -1,86 +1,103 @@
-"""What wanders during a session: a drifting camera or target, a scale that creeps. Arrays only.
-
-Residuals that are alike in poses near in time are no independent noise: many of them know no more
-than few. A wander is one more smooth error, over time in place of the workspace: cosines that are
-the modes of a random walk, the k-th of size 1/k, their common size estimated along.
-"""
+"""Whether something wandered during a session that should have rested. Arrays only."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
-from flangeye.handeye.candidates import Model, better, held_out, rms, with_nuisance
-from flangeye.handeye.loop import COLUMNS
-from flangeye.handeye.nuisance import Nuisance, nuisance_of
-from flangeye.handeye.target_size import longer_distances
+from flangeye.handeye.candidates import Model, rms
+from flangeye.handeye.likelihood import log_likelihood, with_noise
+from flangeye.handeye.walk import StepSize, Walk
+from flangeye.maths.geometry import invert, nearest_rotation
+from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
 
-MODES, POSES_A_MODE = 16, 4
-"""Modes at most, and how many poses there are to each at least."""
 FEWEST = 24
-"""Poses below which no wander is looked for: its folds would hold too few to compare."""
+"""Poses below which no walk is looked for."""
+SIGNIFICANT = 0.9999
+"""Probability with which poses that rest are not taken for a walk."""
 
 
-def with_wander(model: Model, scale_too: bool = False) -> Model:
-    """Estimate how camera and target wander against each other in time, if that helps.
+def with_walk(model: Model, grows: bool = False) -> Model:
+    """Estimate how camera and target walk against each other in time, if the poses speak for it.
 
-    Only where one of them rests and the target's place is unknown, so that nothing but the mean of
-    that place is taken for still. Poses are in order of time.
+    Only where one of them rests and the target's place is unknown. Poses are in order of time. What
+    speaks for it is the likelihood of every pose by those before it, all that is fitted taken out.
 
     Args:
         model: What was found without.
-        scale_too: Whether the camera's distances may creep as well, for a target of unknown size.
+        grows: Whether the camera's scale may walk as well, for a target of unknown size.
     """
     loop, kept = model.problem.loop, model.found.inliers
     if loop.y or not loop.z or kept.sum() < FEWEST or loop.camera_moves == loop.target_moves:
         return model
-    found = [(frame, with_nuisance(model, n)) for frame, n in _wanders(model, scale_too).items()]
-    candidates = [(frame, candidate) for frame, candidate in found if candidate is not None]
-    if not candidates:
+    walks = {name: Walk(about, grows) for name, about in _places(model).items()}
+    name, found = "target", _walking(model, walks["target"])
+    if found is not None and (likelier := _likeliest(found, walks)) != name:
+        name, found = likelier, _walking(model, walks[likelier])
+    if found is None or _gain(model, found) < chi2_quantile(SIGNIFICANT, 3 if grows else 2):
         return model
-    frame, best = min(candidates, key=lambda each: rms(held_out(each[1].found)[0][kept]))
-    size = rms(shifts(best)[kept]) * 1e3
-    chosen = better(model, best, f"the {frame} wandered during the session, by {size:.3f} mm rms")
-    return model if chosen.found is model.found else chosen
+    found = _about_the_mean(found)
+    size = rms((found.residuals(as_reported=True) - found.residuals())[kept]) * 1e3
+    return found.noted(f"the {name} wandered during the session, by {size:.3f} mm rms")
 
 
-def shifts(model: Model) -> Floats:
-    """Return (N, 3) by how much the sized errors move what is predicted, in ``camera`` [m]."""
-    sized, found = model.problem.nuisance.sized, model.found
-    moves = found.linear.jacobian[:, 3:, COLUMNS:][:, :, sized]
-    return np.asarray(moves @ found.at.nuisance[sized])
+def _places(model: Model) -> dict[str, Floats]:
+    """Return what may wander, and (N, 3) where it is in ``base``: the steps turn about that."""
+    s, at = model.problem.measurements, model.found.at
+    camera, target = (s.a @ at.x)[:, :3, 3], (s.b @ at.z)[:, :3, 3]
+    return {"camera": camera, "target": target, "base": np.zeros_like(camera)}
 
 
-def _wanders(model: Model, scale_too: bool) -> dict[str, Nuisance]:
-    """Return what may wander: the camera where it is fixed, or what rests in the base."""
-    s = model.problem.measurements
-    modes = _modes(len(s), min(MODES, int(model.found.inliers.sum()) // POSES_A_MODE))
-    twists = _each(modes, np.broadcast_to(np.eye(6), (len(s), 6, 6)))
-    still = np.zeros_like(twists)
-    of_camera = nuisance_of(still, still, 1.0, sized=True, seen=twists)
+def _walking(model: Model, walk: Walk) -> Model | None:
+    """Return the model with a walk; it begins as large as to leave the residuals there are."""
+    found = model.found
+    turn, shift = (
+        rms(found.linear.residuals[found.inliers][:, at]) for at in (slice(0, 3), slice(3, 6))
+    )
+    step = np.sqrt(2.0 / len(found.inliers))
+    size = StepSize(step * turn, step * shift, step * turn)
+    started = replace(found, noise=replace(found.noise, walk=size))
+    consensus = replace(model.consensus, found=started)
+    return replace(model, consensus=consensus).with_problem(replace(model.problem, walk=walk))
+
+
+def _likeliest(model: Model, walks: Mapping[str, Walk]) -> str:
+    """Return about what the steps most likely turn that led where the model has it."""
+    found, course, before = model.found, model.found.at.course, model.problem.walk
+    if course is None or before is None:
+        return ""
+
+    def likelihood(walk: Walk) -> float:
+        now, then = (rms(course.steps(each)[1:, 3:6]) for each in (walk, before))
+        size = found.noise.walk._replace(shift=found.noise.walk.shift * now / then)
+        noise = replace(found.noise, walk=size)
+        return log_likelihood(replace(model.problem, walk=walk), replace(found, noise=noise))
+
+    return max(walks, key=lambda name: likelihood(walks[name]))
+
+
+def _about_the_mean(model: Model) -> Model:
+    """Return the model with what wandered where it was in the mean, not where it began."""
+    found, course = model.found, model.found.at.course
+    if course is None:
+        return model
+    mean = course.motions[found.inliers].mean(axis=0)
+    mean[:3, :3] = nearest_rotation(mean[:3, :3])
     if model.problem.loop.camera_moves:
-        resting, of_resting = "target", nuisance_of(still, twists, 1.0, sized=True)
+        place, motions = {"z": mean @ found.at.z}, course.motions @ invert(mean)
     else:
-        resting, of_resting = "base", nuisance_of(twists, still, 1.0, sized=True)
-    wanders = {"camera": of_camera, resting: of_resting}
-    if not scale_too:
-        return wanders
-    creep = _each(modes, longer_distances(s))
-    still = np.zeros_like(creep)
-    scale = nuisance_of(still, still, 1.0, sized=True, seen=creep)
-    return {frame: wander.and_also(scale) for frame, wander in wanders.items()}
+        place, motions = {"x": invert(mean) @ found.at.x}, invert(mean) @ course.motions
+    at = replace(found.at, course=replace(course, motions=motions), **place)
+    return replace(model, consensus=replace(model.consensus, found=replace(found, at=at)))
 
 
-def _modes(count: int, modes: int) -> Floats:
-    """Return (N, 1 + K) modes of a random walk over N poses: its mean, and cosines.
-
-    The mean cannot be told from the place of what wanders, which so is known no better than that.
-    """
-    time, k = (np.arange(count) + 0.5) / count, np.arange(1, modes + 1)
-    cosines = np.cos(np.pi * time[:, None] * k) / k
-    return np.hstack([np.full((count, 1), np.pi / np.sqrt(6)), cosines])
-
-
-def _each(modes: Floats, effects: Floats) -> Floats:
-    """Return (N, 6, m K): (N, 6, m) effects, each of them in every mode."""
-    return np.asarray(np.einsum("nk,nij->nijk", modes, effects).reshape(len(modes), 6, -1))
+def _gain(model: Model, candidate: Model) -> float:
+    """Return twice by how much the log likelihood of the same poses is larger with a walk."""
+    same = replace(model.found, inliers=candidate.found.inliers)
+    rested = with_noise(model.problem, same)
+    return log_likelihood(candidate.problem, candidate.found) - log_likelihood(
+        model.problem, rested
+    )
