@@ -1,13 +1,14 @@
 """Every mistake, planted in sessions with known truth, is named; clean sessions give nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye.doctor import examine
-from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.doctor.diagnosis import Finding, RecordedSession
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_corrections import (
     delayed,
@@ -351,6 +352,44 @@ def test_two_mistakes_are_both_named_and_one_line_mends_both() -> None:
     assert findings[-1].fix == (
         "- acquire.archive: {reader: {corrected: {reader: auto, scale: 0.001}}, leave_out: ['004']}"
     )
+
+
+def hard(seed):
+    """Half of the poses in another unit, what was seen tens of millimetres off, some of another."""
+    rng = np.random.default_rng(seed)
+    kind, carried = SOME[seed % len(SOME)]
+    session = session_of(kind, carried, seed, n=15)
+    poses = np.array(session.poses)
+    poses[::2] = scaled(poses[::2], float(rng.choice([1e3, 1e-3, 25.4])))
+    poses[3:6] = arbitrary(rng)[3:6]
+    off = rng.normal(0, 0.03, session.centres.shape)
+    return replace(session, poses=poses, centres=session.centres + off)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_finding_of_a_hopeless_session_is_told_once_and_on_its_own(seed: int) -> None:
+    findings = examine(hard(seed), CHECKS).findings
+    shared = [finding.name for finding in findings if not finding.samples]
+    assert len(shared) == len(set(shared))
+    assert all(finding.fix.count("corrected") <= len(shared) for finding in findings)
+
+
+class Insisting:
+    """A check that finds the same of all samples however often it was mended."""
+
+    part = SimpleNamespace(name="check.insisting")
+
+    def bind(self):
+        return self
+
+    def __call__(self, session):
+        mended = session.read_with(scale=0.001)
+        yield Finding("unit", "all in mm", mended.step(), corrected_session=mended)
+
+
+def test_a_mistake_of_all_samples_is_found_once() -> None:
+    (finding,) = examine(session_of("point"), [Insisting()]).findings  # type: ignore[list-item]
+    assert finding.fix.count("corrected") == 1
 
 
 EVERY = [

@@ -57,6 +57,9 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
         if len(found) == MOST_MISTAKES or current.seen.sum() < FEWEST:
             break
         offered, _ = _offered(current, bound)
+        # What all samples share is read once: the same mistake again would be of the first mending.
+        named = {f.name for f in found if not f.samples}
+        offered = [f for f in offered if f.samples or f.name not in named]
     found += [f for f in offered if f.corrected_session is None and not f.note]
     notes = tuple(f for f in offered if f.note)
     return Diagnosis(session, tuple(found), notes, _names(bound), idle)
