@@ -180,7 +180,7 @@ def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solut
     if len(at.nuisance) != len(problem.nuisance):
         at = replace(at, nuisance=np.zeros(len(problem.nuisance)))
     if (at.course is None) != (problem.walk is None):
-        at = replace(at, course=Course.still(len(problem.measurements)) if problem.walk else None)
+        at = replace(at, course=Course.still(problem.walk) if problem.walk else None)
     linear = linearise(problem.measurements, problem.loop, at, problem.arms, problem.nuisance)
     return _weighed(problem, at, linear, noise, shares)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flangeye.handeye.components import FINEST, Noise
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance
-from flangeye.handeye.walk import Course
+from flangeye.handeye.walk import Course, Of
 from flangeye.maths.geometry import hat, rotation_between, rotation_exp, rotation_log
 from flangeye.types import Floats
 
@@ -125,7 +125,9 @@ def linearise(
             if moved:
                 covariance += effect @ arms.covariance @ effect.transpose(0, 2, 1)
     drift = (
-        measurements.projectors @ chain.of_walk() if at.course else np.zeros((len(jacobian), 6, 0))
+        measurements.projectors @ chain.of_walk(at.course.of)
+        if at.course
+        else np.zeros((len(jacobian), 6, 0))
     )
     return Linear(residuals, jacobian, covariance, drift)
 
@@ -164,9 +166,12 @@ class _Chain:
         turn = self._eye @ self._to_carrier
         return self._blocks(turn, -turn @ hat(self._from_base2), turn)
 
-    def of_walk(self) -> Floats:
-        turn = self._eye @ self._to_carrier
-        moved = self._blocks(turn, -turn @ hat(self._in_base), turn)
+    def of_walk(self, of: Of) -> Floats:
+        if of == "base":
+            turn = self._eye @ self._to_carrier
+            moved = self._blocks(turn, -turn @ hat(self._in_base), turn)
+        else:
+            moved = -(self.of_camera_arm() if of == "camera" else self.of_arm())
         longer = np.concatenate([np.zeros_like(self._s.centres), -self._s.centres], axis=1)
         return np.concatenate([moved, longer[..., None]], axis=2)
 

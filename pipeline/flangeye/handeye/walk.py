@@ -1,15 +1,16 @@
-"""A random walk of what should rest in the base: camera, target, or an odometry's world. Arrays.
+"""A random walk of what should rest: camera, target, or an odometry's world. Arrays only.
 
 Residuals that are alike in poses near in time are no independent noise: many of them know no
-more than few. What wanders is a motion ``W_k`` of the base at every pose, from one to the next by a
-small step that turns about a point, ``W_k = Exp(step) W_{k-1}``. Steps are independent, so that the
-precision of all motions is block tridiagonal: marginalised exactly, the cost linear in the poses.
+more than few. What wanders is a motion ``W_k`` of the base, or of the hand, at every pose, from one
+to the next by a small step that turns about a point, ``W_k = Exp(step) W_{k-1}``. Steps are
+independent, so that the precision of all motions is block tridiagonal: they are marginalised
+exactly, at a cost linear in the poses.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from flangeye.handeye.measurements import Measurements
 from flangeye.maths.geometry import hat, invert, rotation_exp, rotation_log
 from flangeye.types import Floats
 
+Of = Literal["base", "camera", "target"]
+"""What walks: the base under what rests in it, or what the hand carries, in the hand."""
 FINEST_STEP = 1e-9
 """Of a walk [m, rad]: what does not walk keeps a finite precision."""
 
@@ -38,12 +41,14 @@ class Walk:
     """How it walks.
 
     Attributes:
-        about: (N, 3) what the steps turn about, in ``base`` [m].
+        about: (N, 3) what the steps turn about, in ``base``, or in the hand [m].
         grows: Whether the camera's scale walks as well.
+        of: What walks.
     """
 
     about: Floats
     grows: bool = False
+    of: Of = "base"
 
     @property
     def states(self) -> int:
@@ -73,17 +78,20 @@ class Course:
     """Where it walked.
 
     Attributes:
-        motions: (N, 4, 4) of the base.
+        motions: (N, 4, 4) of the base; of the hand under what it carries, where that walks.
         growth: (N,) logarithm of the camera's scale.
+        of: What walks.
     """
 
     motions: Floats
     growth: Floats
+    of: Of = "base"
 
     @classmethod
-    def still(cls, count: int) -> Course:
-        """Return the course of what rests."""
-        return cls(np.tile(np.eye(4), (count, 1, 1)), np.zeros(count))
+    def still(cls, walk: Walk) -> Course:
+        """Return the course of what may walk, and rests."""
+        count = len(walk.about)
+        return cls(np.tile(np.eye(4), (count, 1, 1)), np.zeros(count), walk.of)
 
     def moved(self, by: Floats) -> Course:
         """Return the course moved by (N, s): turn and shift about the base's origin, growth."""
@@ -91,12 +99,15 @@ class Course:
         turn = rotation_exp(by[:, :3])
         motions[:, :3] = turn @ motions[:, :3]
         motions[:, :3, 3] += by[:, 3:6]
-        return Course(motions, self.growth + by[:, 6:].sum(axis=1))
+        return replace(self, motions=motions, growth=self.growth + by[:, 6:].sum(axis=1))
 
     def applied(self, measurements: Measurements) -> Measurements:
         """Return what would have been measured, had it walked and nobody said so."""
-        centres = measurements.centres * np.exp(self.growth)[:, None]
-        return replace(measurements, b=self.motions @ measurements.b, centres=centres)
+        s = replace(measurements, centres=measurements.centres * np.exp(self.growth)[:, None])
+        if self.of == "base":
+            return replace(s, b=self.motions @ s.b)
+        back = invert(self.motions)
+        return replace(s, a=s.a @ back) if self.of == "camera" else replace(s, b=s.b @ back)
 
     def steps(self, walk: Walk) -> Floats:
         """Return the (N, s) steps that led here, each about its point."""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from flangeye.handeye.candidates import Model, rms
 from flangeye.handeye.likelihood import log_likelihood, with_noise
-from flangeye.handeye.walk import StepSize, Walk
+from flangeye.handeye.walk import Of, StepSize, Walk
 from flangeye.maths.geometry import invert, nearest_rotation
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.types import Floats
 
 FEWEST = 24
 """Poses below which no walk is looked for."""
@@ -33,25 +32,39 @@ def with_walk(model: Model, grows: bool = False) -> Model:
     loop, kept = model.problem.loop, model.found.inliers
     if loop.y or not loop.z or kept.sum() < FEWEST or loop.camera_moves == loop.target_moves:
         return model
-    walks = {name: Walk(about, grows) for name, about in _places(model).items()}
-    name, found = "target", _walking(model, walks["target"])
-    if found is not None and (likelier := _likeliest(found, walks)) != name:
-        name, found = likelier, _walking(model, walks[likelier])
-    if found is None or _gain(model, found) < chi2_quantile(SIGNIFICANT, 3 if grows else 2):
+    found = [(name, model_of) for name, model_of in _walking(model, grows) if model_of is not None]
+    if not found:
         return model
-    found = _about_the_mean(found)
-    size = rms((found.residuals(as_reported=True) - found.residuals())[kept]) * 1e3
-    return found.noted(f"the {name} wandered during the session, by {size:.3f} mm rms")
+    gains = [_gain(model, each) for _, each in found]
+    (name, best), gain = found[int(np.argmax(gains))], max(gains)
+    if gain < chi2_quantile(SIGNIFICANT, 3 if grows else 2):
+        return model
+    best = _about_the_mean(best)
+    size = rms((best.residuals(as_reported=True) - best.residuals())[kept]) * 1e3
+    return best.noted(f"the {name} wandered during the session, by {size:.3f} mm rms")
 
 
-def _places(model: Model) -> dict[str, Floats]:
-    """Return what may wander, and (N, 3) where it is in ``base``: the steps turn about that."""
-    s, at = model.problem.measurements, model.found.at
+def _walking(model: Model, grows: bool) -> Iterator[tuple[str, Model | None]]:
+    """Give what may wander and the model with it: in the base, and in the hand what it carries.
+
+    Steps in the base turn about what rests there, about what moves there, as an odometry's, or
+    about its origin: the likeliest of these by the steps of the first is tried.
+    """
+    loop, s, at = model.problem.loop, model.problem.measurements, model.found.at
     camera, target = (s.a @ at.x)[:, :3, 3], (s.b @ at.z)[:, :3, 3]
-    return {"camera": camera, "target": target, "base": np.zeros_like(camera)}
+    resting, moving = ("target", camera) if loop.camera_moves else ("camera", target)
+    held: Of = "camera" if loop.camera_moves else "target"
+    places = {resting: target if loop.camera_moves else camera, "view": moving}
+    walks = {name: Walk(p, grows) for name, p in (places | {"base": np.zeros_like(camera)}).items()}
+    name, found = resting, _with(model, walks[resting])
+    if found is not None and (likelier := _likeliest(found, walks)) != name:
+        name, found = likelier, _with(model, walks[likelier])
+    yield name, found
+    in_hand = (at.x if loop.camera_moves else at.z)[:3, 3]
+    yield held, _with(model, Walk(np.tile(in_hand, (len(s), 1)), grows, held))
 
 
-def _walking(model: Model, walk: Walk) -> Model | None:
+def _with(model: Model, walk: Walk) -> Model | None:
     """Return the model with a walk; it begins as large as to leave the residuals there are."""
     found = model.found
     turn, shift = (
@@ -86,10 +99,12 @@ def _about_the_mean(model: Model) -> Model:
         return model
     mean = course.motions[found.inliers].mean(axis=0)
     mean[:3, :3] = nearest_rotation(mean[:3, :3])
-    if model.problem.loop.camera_moves:
+    if model.problem.loop.camera_moves and course.of == "base":
         place, motions = {"z": mean @ found.at.z}, course.motions @ invert(mean)
     else:
-        place, motions = {"x": invert(mean) @ found.at.x}, invert(mean) @ course.motions
+        name = "z" if course.of == "target" else "x"
+        place = {name: invert(mean) @ getattr(found.at, name)}
+        motions = invert(mean) @ course.motions
     at = replace(found.at, course=replace(course, motions=motions), **place)
     return replace(model, consensus=replace(model.consensus, found=replace(found, at=at)))
 
