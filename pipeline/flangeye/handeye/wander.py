@@ -54,7 +54,7 @@ def _walking(model: Model, grows: bool) -> Iterator[tuple[str, Model | None]]:
     camera, target = (s.a @ at.x)[:, :3, 3], (s.b @ at.z)[:, :3, 3]
     resting, moving = ("target", camera) if loop.camera_moves else ("camera", target)
     held: Of = "camera" if loop.camera_moves else "target"
-    places = {resting: target if loop.camera_moves else camera, "view": moving}
+    places = {resting: target if loop.camera_moves else camera, "world": moving}
     walks = {name: Walk(p, grows) for name, p in (places | {"base": np.zeros_like(camera)}).items()}
     name, found = resting, _with(model, walks[resting])
     if found is not None and (likelier := _likeliest(found, walks)) != name:
