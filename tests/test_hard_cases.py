@@ -526,6 +526,18 @@ def test_a_reader_that_leaves_is_no_mistake_and_an_ascii_terminal_none_either(
     assert r"no stage '\xfcmlaut'" in told.stderr
 
 
+def test_a_current_folder_that_was_deleted_is_said(tmp_path: Path) -> None:
+    program = " ".join(python_command("-m", "flangeye.cli"))
+    told = subprocess.run(
+        ["sh", "-c", f"mkdir gone; cd gone; rmdir ../gone; {program} check ur5_phoxi-m_simulated"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert told.returncode == 2
+    assert told.stderr.splitlines() == [
+        "error: the current folder: cannot be read or written: No such file or directory"
+    ]
+
+
 def test_a_file_that_cannot_be_written_is_said(
     flangeye: Callable[..., Any], tmp_path: Path
 ) -> None:

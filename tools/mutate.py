@@ -141,8 +141,15 @@ class Tests:
         of_file = self._lines.get(file, {})
         run = {test for line in lines for test in of_file.get(line, ())}
         run = run or {test for tests in of_file.values() for test in tests} or set(self._seconds)
+        return self._within(run, budget)
+
+    def but(self, tried: list[str], budget: float) -> tuple[list[str], float]:
+        """Return the other tests in the same way: what is worked out at import is none's line."""
+        return self._within(set(self._seconds) - set(tried), budget)
+
+    def _within(self, tests: set[str], budget: float) -> tuple[list[str], float]:
         chosen, total = list[str](), 0.0
-        for test in sorted(run, key=self._seconds.__getitem__):
+        for test in sorted(tests, key=self._seconds.__getitem__):
             total += self._seconds[test]
             if chosen and total > budget:
                 break
@@ -243,7 +250,10 @@ def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) 
     for number, mutation in enumerate(chosen):
         print(f"\r{number} of {len(chosen)} ", end="", file=sys.stderr, flush=True)
         named, seconds = tests.of(mutation.file, mutation.lines, budget)
-        if not copy.killed(mutation, named, seconds):
+        if copy.killed(mutation, named, seconds):
+            continue
+        others, more = tests.but(named, budget)
+        if not others or not copy.killed(mutation, others, more):
             alive += 1
             print(f"  alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
     return alive

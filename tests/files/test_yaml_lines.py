@@ -37,6 +37,9 @@ def test_scalars_mean_what_they_look_like(text: str, value: Any) -> None:
         ("a: 1\n b: 2", "x:2: not valid YAML: mapping values are not allowed here"),
         ("a: 1\n---\nb: 2", "x:2: not valid YAML: but found another document"),
         ("a: \x00", "x: not valid YAML: unacceptable character #x0000: special characters are not allowed"),
+        ('a: 1\nb: "\\uD800"', "x:2: is not UTF-8 text"),
+        ('a: 1\n"\\uDFFF": 1', "x:2: is not UTF-8 text"),
+        ("a: \udcff", "x: is not UTF-8 text"),
     ],
 )  # fmt: skip
 def test_what_is_refused_names_the_line(text: Any, message: str) -> None:
@@ -62,7 +65,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_yaml(tmp_path / "big.yaml")
 
 
-@given(st.text(max_size=200))
+@given(st.text(st.characters(), max_size=200))
 def test_any_text_is_read_or_refused(text: str) -> None:
     try:
         parse_yaml(text, "x")

@@ -31,6 +31,7 @@ def test_a_place_outside_the_box_is_named() -> None:
     assert LIMITS.outside(np.array([0.0, -1.002, 1.102]), slack=0.002) is None
     assert LIMITS.outside(np.array([0.0, 0.0, 1.103]), slack=0.002) is not None
     assert LIMITS.outside(np.array([-1.003, 0.0, 0.0]), slack=0.002) is not None
+    assert LIMITS.outside(np.array([-1.0005, 0.0, 0.0])) is not None  # not a half millimetre
 
 
 def test_the_joint_nearest_to_its_limit_is_named() -> None:
@@ -47,6 +48,7 @@ def test_the_joint_nearest_to_its_limit_is_named() -> None:
     on_it = np.r_[limits.upper[:1], np.zeros(5)]
     assert limits.beyond(on_it, 0.0) is None
     assert limits.beyond(on_it, 1e-9) is not None
+    assert limits.beyond(on_it) is None
 
 
 def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:

@@ -47,7 +47,8 @@ def end_in_words(command: Callable[[], object]) -> None:
         _discard_output()
         sys.exit(0)
     except OSError as error:
-        what = error.filename or "standard output"
+        deleted = isinstance(error, FileNotFoundError)
+        what = error.filename or ("the current folder" if deleted else "standard output")
         if error.filename is None:
             _discard_output()
         _fail(FlangeyeError(f"{what}: cannot be read or written: {error.strerror or error}"))

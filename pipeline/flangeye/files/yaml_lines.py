@@ -27,6 +27,7 @@ MAX_DIGITS = 18
 """Of an integer: it fits into 64 bits, and into a float."""
 
 _INTEGER = re.compile(r"[-+]?\d+")
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _WORDS: Mapping[str, Any] = {
     "null": None,
@@ -82,6 +83,8 @@ def parse_yaml(text: str, name: str) -> Document:
 
 @lru_cache(maxsize=64)  # a batch reads its recipe and its robot's file once a session
 def _parse(text: str, name: str) -> Document:
+    if _SURROGATE.search(text):  # a byte of the command line that is no UTF-8
+        raise RecipeError(f"{name}: is not UTF-8 text")
     try:
         root = _composed(text, name)
     except yaml.MarkedYAMLError as error:
@@ -137,13 +140,21 @@ def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> An
         return _build_mapping(node, path, lines, name)
     if isinstance(node, yaml.SequenceNode):
         return [_build(child, (*path, i), lines, name) for i, child in enumerate(node.value)]
-    text, plain = str(node.value), not getattr(node, "style", None)
+    text, plain = _text(node, name), not getattr(node, "style", None)
     if plain and len(text) > MAX_DIGITS and _INTEGER.fullmatch(text):
         raise RecipeError(
             f"{name}:{lines[path]}: an integer of {len(text)} digits; at most {MAX_DIGITS} are "
             "read, and a name of digits is written in quotes"
         )
     return _scalar(text, plain)
+
+
+def _text(node: yaml.Node, name: str) -> str:
+    """Return the text of a scalar; an escape can write what is no character and has no UTF-8."""
+    text = str(node.value)
+    if _SURROGATE.search(text):
+        raise RecipeError(f"{name}:{node.start_mark.line + 1}: is not UTF-8 text")
+    return text
 
 
 def _build_mapping(
@@ -154,7 +165,7 @@ def _build_mapping(
         line = key_node.start_mark.line + 1
         if not isinstance(key_node, yaml.ScalarNode):
             raise RecipeError(f"{name}:{line}: a key must be plain text")
-        key = str(key_node.value)
+        key = _text(key_node, name)
         if key in built:
             first = lines[(*path, key)]
             raise RecipeError(f"{name}:{line}: duplicate key '{key}', first given on line {first}")

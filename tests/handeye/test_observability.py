@@ -1,0 +1,21 @@
+"""What poses can tell: centres in a mirror are told from centres with noise."""
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.handeye.observability import require_right_handed
+from flangeye.maths.geometry import rotation_exp
+
+
+def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    tcps = rng.uniform(-0.2, 0.2, (8, 3))
+    centres = (tcps - [0.6, 0.0, 1.0]) @ rotation_exp(np.array([2.0, 0.3, -0.4]))
+    noise = 1e-4 * rng.standard_normal((8, 3))
+    require_right_handed(centres + noise, tcps)
+    require_right_handed(centres + 100 * noise, tcps)  # noise alone is no mirror
+    for axis in range(3):
+        mirrored = (centres + noise) * np.where(np.arange(3) == axis, -1.0, 1.0)
+        with pytest.raises(StageError, match=r"only when mirrored \(0.1 mm rms instead of"):
+            require_right_handed(mirrored, tcps)
