@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.handeye.observability import require_right_handed
-from flangeye.maths.geometry import rotation_exp
+from flangeye.handeye.observability import require_right_handed, robust_sigma
+from flangeye.maths.geometry import kabsch, rotation_exp
 
 
 def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
@@ -19,3 +19,14 @@ def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
         mirrored = (centres + noise) * np.where(np.arange(3) == axis, -1.0, 1.0)
         with pytest.raises(StageError, match=r"only when mirrored \(0.1 mm rms instead of"):
             require_right_handed(mirrored, tcps)
+
+
+def test_the_noise_that_residuals_show_is_the_noise_of_one_coordinate() -> None:
+    rng, sigma, count = np.random.default_rng(1), 1e-3, 6
+    found = []
+    for _ in range(600):
+        centres = rng.uniform(-0.2, 0.2, (count, 3))
+        tcps = centres + sigma * rng.standard_normal((count, 3))
+        rotation, shift = kabsch(centres, tcps)
+        found.append(robust_sigma(tcps - centres @ rotation.T - shift))
+    assert np.mean(found) == pytest.approx(sigma, rel=0.06)

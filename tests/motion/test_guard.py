@@ -12,7 +12,7 @@ import pytest
 from flangeye.devices import DeviceError, RobotState
 from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
-from flangeye.motion.arm import watched
+from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.route import Router
 from flangeye.motion.supervision import Sample
 from flangeye.motion.watchdog import Charge, Watchdog
@@ -217,6 +217,32 @@ def test_a_driver_that_cannot_open_says_so() -> None:
         watched(opened_nowhere(), MODEL, LIMITS),
     ):
         pass
+
+
+class Mute:
+    """A wire on which a guard says so much and then nothing any more."""
+
+    def __init__(self, *reports):
+        self.reports, self.waited = list(reports), 0.0
+
+    def poll(self, seconds):
+        self.waited = seconds
+        return bool(self.reports)
+
+    def recv(self):
+        return self.reports.pop(0)
+
+
+def test_a_guard_is_waited_for_as_long_as_is_said() -> None:
+    wire: Any = Mute()
+    with pytest.raises(DeviceError, match=r"^the arm does not answer \(30 s\)"):
+        WatchedArm(wire, lambda state: None)
+    assert wire.waited == 30.0
+    wire = Mute(guard_module.Report("opened", ("ur5e", 2e-3, StandIn().state())))
+    arm = WatchedArm(wire, lambda state: None)
+    with pytest.raises(DeviceError, match=r"^the arm has fallen silent \(6 s\)"):
+        arm.wait()
+    assert wire.waited == 6.0
 
 
 def test_a_driver_that_breaks_is_one_line_and_the_arm_is_let_go() -> None:

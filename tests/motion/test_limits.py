@@ -64,6 +64,8 @@ def test_the_recipe_narrows_the_arm_and_never_widens_it() -> None:
          "robot.limits.joints: 5 ranges, but a ur5e has 6 joints; give one [lower, upper] for each"),
         ([["-90 deg", "90 deg"]] * 5 + [["10 deg", "-10 deg"]],
          "robot.limits.joints: no angle is left for joint 6 of a ur5e; the lower limit comes first"),
+        ([["-90 deg", "90 deg"]] * 5 + [["10 deg", "10 deg"]],
+         "robot.limits.joints: no angle is left for joint 6 of a ur5e; the lower limit comes first"),
     ],
 )  # fmt: skip
 def test_limits_for_another_arm_are_refused(joints: Any, line: str) -> None:
