@@ -1,11 +1,13 @@
 """A cell's covariance holds for arms whose joints are not where their controllers say."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from flangeye.files.bundled import bundled
-from flangeye.handeye.cell import calibrate_cell, solve_cell
+from flangeye.handeye.calibration import TYPICAL_ARM
+from flangeye.handeye.cell import _notes, calibrate_cell, solve_cell
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.cell import Cell
@@ -42,3 +44,10 @@ def test_what_joint_zeros_may_be_off_by_is_in_the_covariance() -> None:
     assert bare.mean() > 12
     assert 3 < considered.mean() < 10
     assert (considered < 12.6).mean() >= 0.8  # the 95 % region
+
+
+def test_the_noise_of_what_moves_is_told_in_millimetres_and_degrees() -> None:
+    found: Any = SimpleNamespace(movers=4.0)  # twice what is typical
+    _, note = _notes([], found)
+    shift, turn = 2e3 * TYPICAL_ARM.translation, 2.0 * np.degrees(TYPICAL_ARM.rotation)
+    assert f"{shift:.3f} mm and {turn:.3f} deg per axis" in note

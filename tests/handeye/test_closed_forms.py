@@ -1,5 +1,7 @@
 """Closed forms: exact on exact data, within their known errors on noise, no worse than OpenCV 4's."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from flangeye.handeye.closed.comanipulation import (
     random_rotations,
     two_steps,
 )
+from flangeye.handeye.closed.daniilidis import _ratios
 from flangeye.handeye.closed.motions import motions_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye_plugins.solve.closed_forms import ClosedFormParams
@@ -215,3 +218,16 @@ def test_kronecker_alone_is_a_start() -> None:
     x, _, _ = kronecker(*given)
     turn = rotation_log(x[:3, :3] @ made.truth["flange_T_camera"][:3, :3].T)
     assert np.linalg.norm(turn) < np.radians(1.0)
+
+
+@pytest.mark.parametrize(
+    ("parabola", "expected"),
+    [
+        ((1.0, -3.0, 2.0), [1.0, 2.0]),
+        ((1.0, 2.0, 1.0 + 1e-9), [-1.0]),  # noise has left it short of zero: its vertex
+        ((0.5, 2.0, 2.0 + 1e-9), [-2.0]),
+    ],
+)
+def test_where_a_parabola_is_zero_or_nearest_to_it(parabola: Any, expected: list[float]) -> None:
+    found = [s / t for s, t in _ratios(*parabola)]
+    assert sorted(found) == pytest.approx(expected, rel=1e-6)

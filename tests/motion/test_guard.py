@@ -1,5 +1,6 @@
 """An arm under guard: it arrives, or it stops and says why; nothing is waited for in vain."""
 
+import multiprocessing
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 from flangeye.devices import DeviceError, RobotState
 from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
-from flangeye.motion.arm import WatchedArm, watched
+from flangeye.motion.arm import GUARD, WatchedArm, run_number, watched
 from flangeye.motion.route import Router
 from flangeye.motion.supervision import Sample
 from flangeye.motion.watchdog import Charge, Watchdog
@@ -334,3 +335,9 @@ def test_the_guard_s_process_opens_the_terminal_anew_if_there_is_one(
     monkeypatch.setattr(os, "open", lambda path, flags: {"/dev/tty": 17}[path])
     assert guard_module._terminal(None) is None
     assert guard_module._terminal(0) == 17
+
+
+def test_the_run_s_number_is_the_same_in_its_guard(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run_number() == os.getpid()
+    monkeypatch.setattr(multiprocessing.current_process(), "_name", GUARD)
+    assert run_number() == os.getppid()
