@@ -60,3 +60,9 @@ def test_a_quantity_that_is_none_says_what_is_allowed(value: Any, message: str) 
 @given(st.floats(-1e6, 1e6), st.sampled_from(["length", "angle", "duration", "speed", "force"]))
 def test_formatting_reads_back_to_the_same_float(si: float, kind: Any) -> None:
     assert parse_quantity(format_quantity(si, kind), kind) == si
+
+
+@pytest.mark.parametrize("text", ["1" * 400_000 + "..", "1" + " " * 400_000 + "2", "1." * 200_000])
+def test_a_text_of_very_many_digits_is_refused_in_one_pass(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a length"):
+        parse_quantity(text, "length")

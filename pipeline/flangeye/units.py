@@ -35,7 +35,9 @@ _EXAMPLES = {
     "force": "3 N",
     "stiffness": "2 N/mm",
 }
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.]\S*)?\s*")
+# Each part can be matched in one way only: otherwise ten thousand digits take for ever.
+_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*(?:([^\d\s.]\S*)\s*)?")
 
 
 def parse_quantity(value: object, kind: str) -> float:

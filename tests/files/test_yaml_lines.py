@@ -71,3 +71,8 @@ def test_any_text_is_read_or_refused(text: str) -> None:
         parse_yaml(text, "x")
     except RecipeError as error:
         assert str(error).startswith("x")
+
+
+def test_a_text_of_very_many_digits_is_read_in_one_pass() -> None:
+    text = "1" * 400_000 + "x"  # steps that grow with the square would take a day
+    assert parse_yaml(f"a: {text}", "x").data == {"a": text}

@@ -143,6 +143,17 @@ def test_it_hears_the_state_of_the_cycle_it_waits_for() -> None:
     assert guard.recv() == ("cycle", None)
 
 
+def test_a_velocity_asks_for_its_next_cycle_and_nothing_else_does() -> None:
+    state = StandIn().state()
+    arm, guard, _ = led_arm(Report("cycle", state), Report("cycle", state))
+    arm.move_velocity(SIDEWAYS, 0.5)
+    arm.wait_cycle()
+    arm.move_linear(state.base_T_flange, 0.1, 0.5)
+    arm.wait_cycle()
+    assert [guard.recv()[0] for _ in range(3)] == ["velocity", "linear", "cycle"]
+    assert not guard.poll(0)
+
+
 def test_a_fault_and_the_operator_s_stop_end_the_wait() -> None:
     arm, _, _ = led_arm(Report("fault", "the arm is outside the box"))
     with pytest.raises(DeviceError, match="^the arm is outside the box$"):

@@ -23,7 +23,7 @@ COLOURS = (
 MARKER = {"size": 6, "opacity": 0.6}
 LINE = {"width": 2, "dash": "dot"}
 
-_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)")
+_QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)")
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ MAX_DIGITS = 18
 
 _INTEGER = re.compile(r"[-+]?\d+")
 _SURROGATE = re.compile("[\ud800-\udfff]")
-_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")  # linear, whatever follows
 _WORDS: Mapping[str, Any] = {
     "null": None,
     "~": None,

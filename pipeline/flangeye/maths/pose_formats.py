@@ -46,7 +46,7 @@ _LENGTHS = {"m": 1.0, "mm": 1e-3}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180}
 _TOKEN = re.compile(
     r"(?:(?P<label>[A-Za-z][A-Za-z0-9]*)\s*[:=]?\s*)?"
-    r"(?<![\d.])(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+    r"(?<![\d.])(?P<number>[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
     r"(?:\s*(?P<unit>mm|m|deg|rad|°)(?![A-Za-z]))?"
 )
 _NESTED = re.compile(r"\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]")

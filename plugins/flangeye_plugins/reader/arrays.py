@@ -17,7 +17,7 @@ from flangeye.types import Floats
 MAX_MATLAB = 1_000_000
 """Longest .mat file [bytes]: its compression makes a thousand times as much of it at most."""
 _DIGITS = re.compile(r"(\d+)")
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def arrays_at(folder: Path, place: str) -> tuple[list[Path], list[tuple[str, Floats]]]:
