@@ -18,6 +18,7 @@ from flangeye.batch.variants import split_values
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
+from tests.conftest import Call
 
 SOFTWARE = Software("1", ("toy 1.0",))
 
@@ -107,6 +108,11 @@ def test_an_archive_for_a_recipe_that_simulates(
     assert str(caught.value) == (
         f"acquire.toy takes no archive, and {archives[0]} is given; leave it out"
     )
+
+
+def test_more_seeds_than_anybody_runs(flangeye: Call) -> None:
+    code, _, err = flangeye("batch", "ur5_phoxi-m_simulated", "--repeat", "9" * 20)
+    assert (code, "less than or equal to 10000000" in err) == (2, True)
 
 
 def test_the_same_archive_twice(

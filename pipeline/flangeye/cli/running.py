@@ -242,7 +242,9 @@ def batch(  # noqa: PLR0913  one argument an option
     archives: Sessions = None,
     overrides: Overrides = None,
     grid: Grid = None,
-    repeat: Annotated[int | None, typer.Option(min=1, help="Number of seeds to run.")] = None,
+    repeat: Annotated[
+        int | None, typer.Option(min=1, max=10_000_000, help="Number of seeds to run.")
+    ] = None,
     vary: Annotated[str, typer.Option(help="Value that --repeat increments.")] = "seed",
     workers: Annotated[
         int | None,
