@@ -24,13 +24,13 @@ def test_where_a_wander_is_looked_for(
 ) -> None:
     asked: list[Any] = []
 
-    def none(*given: Any) -> dict[str, Any]:
+    def none(*given: Any) -> list[Any]:
         asked.append(given)
-        return {}
+        return []
 
-    monkeypatch.setattr(wander, "_wanders", none)
+    monkeypatch.setattr(wander, "_walking", none)
     loop = SimpleNamespace(y=None, z="flange", camera_moves=camera_moves, target_moves=target_moves)
     found = SimpleNamespace(inliers=np.ones(poses, dtype=bool))
     model: Any = SimpleNamespace(problem=SimpleNamespace(loop=loop), found=found)
-    assert wander.with_wander(model) is model
+    assert wander.with_walk(model) is model
     assert len(asked) == looked
