@@ -141,9 +141,13 @@ class Belief:
         return settings.preload / ratio, settings.deflection * ratio
 
     def fixed_variance(self, settings: Following) -> float:
-        """Return the variance of the torch that nothing measured along the seam lessens [m^2]."""
+        """Return the variance of the torch that nothing measured along the seam lessens [m^2].
+
+        The arm is off when the tip passes a place and when the torch does: oppositely at worst, as
+        one that waves along its way is with both half a wave apart.
+        """
         creep = CREEP * settings.deflection
-        parts = (self.torch_sigma, settings.arm_sigma, settings.distortion, creep)
+        parts = (self.torch_sigma, 2.0 * settings.arm_sigma, settings.distortion, creep)
         return sum(part**2 for part in parts) + self._seat_variance(settings)
 
     def _seat_variance(self, settings: Following) -> float:

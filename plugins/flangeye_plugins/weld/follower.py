@@ -35,9 +35,6 @@ LEAD_IN = 3.0
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
 
-OPPOSITE = 3.0
-"""What is added to the variance of the arm at one end where the other has the opposite error."""
-
 PLAYED = 1.0
 """Share of the finger's play and hysteresis that stays uncertain, one standard deviation."""
 
@@ -238,17 +235,13 @@ class Follower:
         settings, learned = self._settings, self.learned
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
-        arm, wander = settings.arm_sigma**2, settings.wander**2
-        # Waves that the tip felt may be the arm's, by its share in what is expected of both; where
-        # tip and torch are half a wave apart both errors add up, which is four times the one.
-        waves = OPPOSITE * min(self.refined.waviness(self.torch) * arm / (arm + wander), arm)
         fixed = self._belief.fixed_variance(settings) + (self._belief.along_sigma * slant) ** 2
         play = (PLAYED * learned.width) ** 2 + learned.unexplained**2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
         turned_by = 2.0 * math.sin((angle - self.refined.angle(self.torch, angle)) / 2.0)
         tip = (self._belief.tip_sigma * turned_by) ** 2
         felt = self.refined.variance(self.torch) + self._weave.variance
-        return fixed + gain**2 + play + waves + tip + felt
+        return fixed + gain**2 + play + tip + felt
 
     # --- what the finger says -------------------------------------------------------------------
 

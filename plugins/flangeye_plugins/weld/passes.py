@@ -200,7 +200,7 @@ class Passes:
     def _estimate(self, error: float) -> None:
         """State how far the torch may be from where it is to be, and stop where that is too far."""
         settings = self._settings
-        again = settings.arm_sigma**2 + settings.distortion**2 + self._weave.variance
+        again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
         seam = self._traced.sigma(self.torch + self._pass.along)
         self.sigma = math.sqrt(seam**2 + again)
         self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))

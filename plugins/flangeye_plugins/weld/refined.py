@@ -73,13 +73,11 @@ class _Fit(NamedTuple):
     Attributes:
         offsets: (2 SPAN + 1,) of the seam from the plan at the bins around it [m].
         variance: Of the one in the middle [m^2].
-        waviness: Variance of what the plan's motion leaves around [m^2].
         angle: Of the tool when the nearest bin was felt [rad].
     """
 
     offsets: list[float]
     variance: float
-    waviness: float
     angle: float
 
 
@@ -217,11 +215,6 @@ class RefinedPath:
         fit = self._fit(s)
         return float(PRIOR[0] ** 2) if fit is None else fit.variance
 
-    def waviness(self, s: float) -> float:
-        """Return the variance of what the plan's motion leaves around a place [m^2]."""
-        fit = self._fit(s)
-        return 0.0 if fit is None else fit.waviness
-
     def doubt(self, s: float) -> float:
         """Return how far off the seam the tip may have been around a place [m]."""
         index, near = self._index(s), round(DOUBTED / BIN)
@@ -288,7 +281,7 @@ class RefinedPath:
         left = motion.excess * max(field.variance + field.wander - held, 0.0)
         variance = left + float(free @ motion.covariance @ free)
         nearest = int(near[np.abs(near - index).argmin()])
-        return _Fit(offsets.tolist(), variance, field.variance, float(self._angle[nearest]))
+        return _Fit(offsets.tolist(), variance, float(self._angle[nearest]))
 
     def _motion(self, index: int) -> _Motion | None:
         """Return how the plan is moved in the zone of a bin; the same for all its bins."""

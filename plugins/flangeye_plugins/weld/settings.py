@@ -90,8 +90,8 @@ class Following(Params):
         "(4 sigma and its control error) exceeds this.",
     )  # fmt: skip
     arm_sigma: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of what the arm is off by between the "
-        "tip's and the torch's passing one place.",
+        "0.03 mm", ge=0, description="Standard deviation of what the arm is off by, across the "
+        "seam, when the tip passes a place; the torch's passing has the same.",
     )  # fmt: skip
     distortion: Length = param(
         "0.05 mm", ge=0, description="Standard deviation of how far heat moves the seam between "

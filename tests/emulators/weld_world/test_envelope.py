@@ -58,7 +58,7 @@ def test_what_cannot_be_welded_is_stopped_with_its_reason(name: str, reason: str
     ("name", "message"),
     [
         ("groove half angle 60 deg, known", "climb the wall.*lower 'deflection' to 1.24 mm"),
-        ("torch 0.5 mm aside", "torch is known to 1.24 mm at best"),
+        ("torch 0.5 mm aside", "torch is known to 1.25 mm at best"),
         ("arm wavy 0.3 mm", "of arm_sigma and of distortion"),
     ],
 )
@@ -87,8 +87,10 @@ def test_a_tip_that_only_friction_holds_is_found_out_before_it_welds() -> None:
     assert "climbs the wall" in verdict.outcome
 
 
-def test_waves_of_the_arm_at_tip_and_torch_are_in_the_stated_bound() -> None:
-    assert not judged(910211).silent
+@pytest.mark.parametrize("world", [910211, 910313])
+def test_waves_of_the_arm_at_tip_and_torch_are_in_the_stated_bound(world: int) -> None:
+    verdict = judged(world)
+    assert verdict.welded and not verdict.silent
 
 
 def test_a_wavy_seam_is_followed_as_far_as_it_is_felt() -> None:
