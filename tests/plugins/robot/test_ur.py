@@ -142,8 +142,7 @@ def test_another_arm_than_the_recipes_is_refused(controller: Any) -> None:
         robot_ur_rtde(load_model("robots", "ur10e"), UrRtdeParams(host=controller.host))
     assert str(error.value).startswith(f"ur10e at {controller.host}: its flange is ")
     assert str(error.value).endswith(
-        "mm from where a ur10e has it at these joint angles: is robot.model the arm that stands "
-        "there?"
+        "mm from where a ur10e has it at these joint angles: is robot.model the right one?"
     )
 
 
