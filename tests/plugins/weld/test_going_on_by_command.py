@@ -33,9 +33,8 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
     assert weld["truth"]["rms"] < 0.15e-3
     assert weld["figures"]["lit_from"] > 0.03  # m: it did not begin at the seam's start
     start = next(n for n in read_notes(tmp_path / "again" / "run.mcap") if n.name == "start")
-    assert start.value["kept"]["torch"] - weld["figures"]["lit_from"] == pytest.approx(
-        0.03, abs=2e-3
-    )
+    # What is asked for, less the way on which the torch is not yet known well enough.
+    assert 0.02 < start.value["kept"]["torch"] - weld["figures"]["lit_from"] < 0.032
     told = flangeye(tmp_path, "--resume", "again")
     assert told.returncode == 2
     assert "again/run.mcap: this run is complete" in told.stderr
@@ -43,7 +42,7 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_weld_that_stopped_by_itself_is_gone_on_with_too(tmp_path: Path) -> None:
-    hidden = "steps.7.sensor.simulated_finger.hidden=[40 s, 42 s]"
+    hidden = "steps.7.sensor.simulated_finger.hidden=[46 s, 48 s]"
     small = "steps.0.resolution=0.3"
     stopped = flangeye(tmp_path, SEAM, "--set", small, "--set", hidden, "--out", "stopped")
     assert stopped.returncode == 1
