@@ -2,26 +2,30 @@
 
 python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE]: a sample over the
 rooms below, each in a copy of the repository, under those fast tests of its room that run the changed
-line (coverage.py says which, once for each file of tests: build/mutation), the fastest first. A
-change that fails no test is a survivor: its place and what was changed are printed, and the share
-that was killed.
+line (coverage.py says which, once for each file of tests: build/mutation), the file's own first, then
+the fastest: in a fork of a process that has them collected (tools/trying.py), and if it lives there,
+in a new process. A change that fails no test is a survivor: its place and what was changed are
+printed, and the share that was killed.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import base64
 import hashlib
 import json
+import marshal
 import os
 import random
+import re
 import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,9 +49,9 @@ KEPT = ROOT / "build" / "mutation"
 COMPARED = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
             ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is}  # fmt: skip
 COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
-SLOWER, STARTS = 4.0, 12.0
+SLOWER, STARTS = 4.0, 8.0
 """A change is noticed, too, by tests that take so many times as long, and so much more [CPU s]."""
-IDLE = 4.0
+IDLE = 3.0
 """Or by tests that wait so many times longer than that [wall s a CPU s]."""
 MEMORY = 16 << 30
 """Or by tests that take so much of it [bytes]."""
@@ -66,9 +70,17 @@ class Mutation(NamedTuple):
 
     def text(self) -> str:
         """Return the changed source."""
+        return ast.unparse(self._tree())
+
+    def code(self, root: Path) -> str:
+        """Return the changed source compiled, as if it were under ``root``."""
+        code = compile(self._tree(), root / self.file, "exec", dont_inherit=True)
+        return base64.b64encode(marshal.dumps(code)).decode()
+
+    def _tree(self) -> ast.Module:
         tree = ast.parse((ROOT / self.file).read_text("utf-8"))
         self.change(list(ast.walk(tree))[self.node])
-        return ast.unparse(tree)
+        return tree
 
 
 def mutations(room: str) -> Iterator[Mutation]:
@@ -132,8 +144,8 @@ class Tests:
             for line, tests in by_line.items():
                 known.setdefault(int(line) if same else 0, set()).update(tests)
 
-    def of(self, file: str, lines: range, budget: float) -> tuple[list[str], float]:
-        """Return the tests that run one of the lines, the fastest first, and what they take.
+    def of(self, file: str, lines: range, budget: float) -> dict[str, float]:
+        """Return the tests that run one of the lines and what each takes, the file's own first.
 
         What runs at import only, or in another process, is given to all tests of its file, or to
         all. No more are taken than a budget allows [CPU s].
@@ -141,20 +153,20 @@ class Tests:
         of_file = self._lines.get(file, {})
         run = {test for line in lines for test in of_file.get(line, ())}
         run = run or {test for tests in of_file.values() for test in tests} or set(self._seconds)
-        return self._within(run, budget)
+        return self._within(run, budget, f"test_{Path(file).stem}.py")
 
-    def but(self, tried: list[str], budget: float) -> tuple[list[str], float]:
+    def but(self, tried: Collection[str], budget: float) -> dict[str, float]:
         """Return the other tests in the same way: what is worked out at import is none's line."""
         return self._within(set(self._seconds) - set(tried), budget)
 
-    def _within(self, tests: set[str], budget: float) -> tuple[list[str], float]:
-        chosen, total = list[str](), 0.0
-        for test in sorted(tests, key=self._seconds.__getitem__):
-            total += self._seconds[test]
-            if chosen and total > budget:
+    def _within(self, tests: set[str], budget: float, own: str = "") -> dict[str, float]:
+        """Return tests within a budget: those of their own file, then the fastest."""
+        chosen = dict[str, float]()
+        for test in sorted(tests, key=lambda test: (own not in test, self._seconds[test])):
+            if chosen and sum(chosen.values()) + self._seconds[test] > budget:
                 break
-            chosen.append(test)
-        return chosen, min(total, budget)
+            chosen[test] = self._seconds[test]
+        return chosen
 
 
 class Copy:
@@ -166,6 +178,7 @@ class Copy:
             ".git", ".venv", ".hypothesis", "runs", "site", "build", "__pycache__"
         )
         shutil.copytree(ROOT, self._root, symlinks=True, ignore=left_out)
+        self._trying: subprocess.Popen[str] | None = None
 
     def tests(self, room: str) -> Tests:
         """Return a room's fast tests; what was found of a file before is taken as it is."""
@@ -183,32 +196,42 @@ class Copy:
             found.add(json.loads(kept.read_text("utf-8")))
         return found
 
-    def killed(self, mutation: Mutation, tests: list[str], seconds: float) -> bool:
+    def collect(self, room: str) -> None:
+        """Let the tests of a room be collected, for :meth:`killed_in_fork`."""
+        self.close()
+        words = ["-m", "tools.trying", ROOMS[room][1]]
+        self._trying = self._start(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def close(self) -> None:
+        """Let go of the process that has tests collected."""
+        if self._trying:
+            self._trying.communicate()
+            self._trying = None
+
+    def killed_in_fork(self, mutation: Mutation, tests: dict[str, float]) -> bool:
+        """Return whether a changed function fails tests in a fork of where they are collected."""
+        assert self._trying is not None and self._trying.stdin and self._trying.stdout
+        bounds = {test: SLOWER * seconds + STARTS for test, seconds in tests.items()}
+        asked = {"code": mutation.code(self._root), "tests": bounds, "idle": IDLE}
+        print(json.dumps(asked), file=self._trying.stdin, flush=True)
+        if not (answer := self._trying.stdout.readline()):
+            raise SystemExit("the process that has the tests collected has ended")
+        return answer != "0\n"
+
+    def killed(self, mutation: Mutation, tests: dict[str, float]) -> bool:
         """Return whether tests that take so long fail on a change, or do not come to an end."""
         file = self._root / mutation.file
         sound = file.read_text("utf-8")
         file.write_text(mutation.text(), "utf-8")
+        patience = SLOWER * sum(tests.values()) + STARTS
         try:
-            return bool(self._run(["-m", "pytest", "-x", *FAST, *tests], SLOWER * seconds + STARTS))
+            return bool(self._run(["-m", "pytest", "-x", *FAST, *tests], patience))
         finally:
             file.write_text(sound, "utf-8")
 
     def _run(self, words: list[str], patience: float | None = None) -> int:
         """Run Python on the copy; a run that takes more than ``patience`` [CPU s] has failed."""
-        paths = [".", "pipeline", "plugins", "plugins/flangeye_paper"]
-        paths = [str(self._root / path) for path in paths]
-        path = os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")])
-
-        def bounded() -> None:
-            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-            if patience:
-                resource.setrlimit(resource.RLIMIT_CPU, (int(patience), int(patience) + 5))
-
-        child = subprocess.Popen(
-            [sys.executable, "-B", *words], cwd=self._root, env={**os.environ, "PYTHONPATH": path},
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=bounded,
-            start_new_session=True,
-        )  # fmt: skip
+        child = self._start(words, patience, stdout=subprocess.DEVNULL)
         try:
             return child.wait(patience and IDLE * patience)
         except subprocess.TimeoutExpired:
@@ -218,6 +241,23 @@ class Copy:
                 os.killpg(child.pid, signal.SIGKILL)
             child.wait()
 
+    def _start(
+        self, words: list[str], patience: float | None = None, **more: Any
+    ) -> subprocess.Popen[Any]:
+        paths = [".", "pipeline", "plugins", "plugins/flangeye_paper"]
+        paths = [str(self._root / path) for path in paths]
+        path = os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")])
+
+        def bounded() -> None:
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+            if patience:
+                resource.setrlimit(resource.RLIMIT_CPU, (int(patience), int(patience) + 5))
+
+        return subprocess.Popen(
+            [sys.executable, "-B", *words], cwd=self._root, env={**os.environ, "PYTHONPATH": path},
+            stderr=subprocess.DEVNULL, preexec_fn=bounded, start_new_session=True, **more,
+        )  # fmt: skip
+
 
 def main() -> None:
     """Try a sample of each room, and print who survived."""
@@ -225,7 +265,9 @@ def main() -> None:
     parser.add_argument("sample", nargs="?", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--room", nargs="+", choices=ROOMS, default=list(ROOMS))
-    parser.add_argument("--only", default="", help="a part of FILE:LINE: those changes alone, all")
+    parser.add_argument(
+        "--only", default="", help="a pattern of FILE:LINE: those changes alone, all"
+    )
     parser.add_argument("--budget", type=float, default=60, help="of tests for a change [CPU s]")
     asked = parser.parse_args()
     killed = tried = 0
@@ -235,7 +277,10 @@ def main() -> None:
             chosen = _chosen(room, asked.sample // len(asked.room), asked.seed, asked.only)
             if not chosen:
                 continue
-            alive = _survivors(copy, chosen, copy.tests(room), asked.budget)
+            tests = copy.tests(room)
+            copy.collect(room)
+            alive = _survivors(copy, chosen, tests, asked.budget)
+            copy.close()
             print(f"{room:10} {len(chosen) - alive:3} of {len(chosen):3} killed", flush=True)
             killed, tried = killed + len(chosen) - alive, tried + len(chosen)
     print(f"{killed} of {tried} killed by fast tests ({killed / max(tried, 1):.0%})")
@@ -244,23 +289,24 @@ def main() -> None:
 def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) -> int:
     """Print the changes that no test notices and return how many they are."""
     alive = 0
-    named, seconds = tests.of(chosen[0].file, chosen[0].lines, budget)
-    if copy.killed(chosen[0]._replace(change=lambda node: None), named, seconds):
-        raise SystemExit(f"{chosen[0].room}: its tests fail without any change: {named}")
+    unchanged = chosen[0]._replace(change=lambda node: None)
+    named = tests.of(unchanged.file, unchanged.lines, budget)
+    if copy.killed_in_fork(unchanged, named) or copy.killed(unchanged, named):
+        raise SystemExit(f"{chosen[0].room}: its tests fail without any change: {list(named)}")
     for number, mutation in enumerate(chosen):
         print(f"\r{number} of {len(chosen)} ", end="", file=sys.stderr, flush=True)
-        named, seconds = tests.of(mutation.file, mutation.lines, budget)
-        if copy.killed(mutation, named, seconds):
+        named = tests.of(mutation.file, mutation.lines, budget)
+        if copy.killed_in_fork(mutation, named) or copy.killed(mutation, named):
             continue
-        others, more = tests.but(named, budget)
-        if not others or not copy.killed(mutation, others, more):
+        others = tests.but(named, budget)
+        if not others or not copy.killed(mutation, others):
             alive += 1
             print(f"  alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
     return alive
 
 
 def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:
-    every = [m for m in mutations(room) if only in f"{m.file}:{m.line}:"]
+    every = [m for m in mutations(room) if re.search(only, f"{m.file}:{m.line}:")]
     return every if only else random.Random(f"{room} {seed}").sample(every, min(count, len(every)))
 
 

@@ -2,6 +2,8 @@
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -13,7 +15,7 @@ import pytest
 from flangeye.devices import DeviceError, RobotState
 from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
-from flangeye.motion.arm import GUARD, WatchedArm, run_number, watched
+from flangeye.motion.arm import GUARD, WatchedArm, _alarmed, run_number, watched
 from flangeye.motion.route import Router
 from flangeye.motion.supervision import Sample
 from flangeye.motion.watchdog import Charge, Watchdog
@@ -341,3 +343,30 @@ def test_the_run_s_number_is_the_same_in_its_guard(monkeypatch: pytest.MonkeyPat
     assert run_number() == os.getpid()
     monkeypatch.setattr(multiprocessing.current_process(), "_name", GUARD)
     assert run_number() == os.getppid()
+
+
+def test_a_signal_writes_to_the_alarm_and_what_was_there_before_comes_back() -> None:
+    hears, alarm = multiprocessing.Pipe(duplex=False)
+    before = signal.set_wakeup_fd(-1)
+    signal.set_wakeup_fd(before)
+    number, handler = signal.SIGUSR1, signal.signal(signal.SIGUSR1, lambda *_: None)
+    try:
+        with _alarmed(alarm):
+            os.kill(os.getpid(), number)
+            assert os.read(hears.fileno(), 1) == bytes([number])
+    finally:
+        signal.signal(number, handler)
+    assert signal.set_wakeup_fd(before) == before
+
+
+def test_an_arm_may_be_opened_from_any_thread() -> None:
+    # Signals are the main thread's: another one cannot hear of them, and need not.
+    def opens() -> None:
+        with _alarmed(multiprocessing.Pipe(duplex=False)[1]):
+            opened.append(True)
+
+    opened: list[bool] = []
+    thread = threading.Thread(target=opens)
+    thread.start()
+    thread.join()
+    assert opened

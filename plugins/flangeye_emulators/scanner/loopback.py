@@ -83,6 +83,7 @@ def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scan
     scanner = LoopbackScanner(model, params, control)
     try:
         scanner.require_same_arm()
+        scanner.prepare()
     except DeviceError:
         scanner.close()
         raise
@@ -127,6 +128,10 @@ class LoopbackScanner(OpenScanner):
                 f"scanner.emulator: the controller at {self._params.host} does not move the "
                 f"model {self._params.robot}: set robot to what it moves"
             )
+
+    def prepare(self) -> None:
+        """Do what takes long before the arm moves: who renders does not hear of its faults."""
+        self._studio.prepare(self._stance())
 
     def expose(self) -> Callable[[], Scan]:
         """Look at the arm for as long as the exposure lasts."""

@@ -13,7 +13,7 @@ from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import plate_of
 from flangeye.types import Floats
 from flangeye_emulators.world.cell import Cell
-from flangeye_emulators.world.raycast import Image
+from flangeye_emulators.world.raycast import Image, Scene
 from flangeye_emulators.world.scanner import before_camera
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
@@ -69,10 +69,16 @@ class CellScene:
         looks = [self._look(stance, seed) for stance in _distinct(stances)]
         return looks[0] if len(looks) == 1 else np.mean(looks, axis=0, dtype=np.float32)
 
+    def prepare(self, stance: Stance) -> None:
+        """Load and compute now, with the arm as it stands, what the first scan would wait for."""
+        self._scene(stance)
+
     def _look(self, stance: Stance, seed: Sequence[int]) -> Image:
+        return self._eye.scan(self._scene(stance), np.random.default_rng(seed))
+
+    def _scene(self, stance: Stance) -> Scene:
         bodies = self._cell.arm(self._arm.frames(stance.joints), stance.base_T_flange)
-        scene = before_camera([*self._around, *bodies], self._base_T_camera)
-        return self._eye.scan(scene, np.random.default_rng(seed))
+        return before_camera([*self._around, *bodies], self._base_T_camera)
 
 
 def _distinct(stances: Sequence[Stance]) -> list[Stance]:

@@ -1,0 +1,241 @@
+"""Which poses of the flange are asked of an arm: seen, lit, clear, and near to where it stands."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.maths.geometry import rigid, rotation_from_rpy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.motion.clearance import ArmVolume
+from flangeye.motion.reach import Margins, Reach
+from tests.motion.stand_in import LIMITS, MODEL, turned
+
+ARM = Arm(MODEL)
+AHEAD = np.array([0.6, 0.0, 0.3])
+OVERHEAD = np.array([[0, -1, 0, 0.6], [-1, 0, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=float)
+SHOWN = np.radians([10.0, -125.0, -105.0, -40.0, -90.0, 170.0])
+"""A posture with the flange below the scanner, facing it."""
+
+
+def scanner(**more: Any) -> Any:
+    """Return a scanner that sees 90 x 60 deg, without a projector."""
+    plain = {"field_of_view": np.radians([90.0, 60.0]), "near": 0.5, "far": 1.0, "baseline": 0.0,
+             "convergence": 0.0, "projection": None}  # fmt: skip
+    return load_model("scanners", "phoxi-m").model_copy(update=plain | more)
+
+
+def reach(margins: Margins | None = None, **more: Any) -> Reach:
+    return Reach(MODEL, scanner(**more), OVERHEAD, 0.05, margins)
+
+
+def seen_from_above(**far_away: Any) -> Reach:
+    """Return a reach whose scanner sees and lights all that the arm can show."""
+    return reach(near=0.01, far=9.0, field_of_view=np.radians([170.0, 170.0]), **far_away)
+
+
+@pytest.mark.parametrize(
+    ("place", "seen"),
+    [
+        ((0.0, 0.0, 0.7), True),
+        ((0.614, 0.0, 0.7), True), ((0.616, 0.0, 0.7), False),  # 0.95 x 0.7 tan 45 - 0.05
+        ((-0.614, 0.0, 0.7), True), ((-0.616, 0.0, 0.7), False),
+        ((0.0, 0.333, 0.7), True), ((0.0, 0.335, 0.7), False),  # 0.95 x 0.7 tan 30 - 0.05
+        ((0.0, -0.333, 0.7), True), ((0.0, -0.335, 0.7), False),
+        ((0.0, 0.0, 0.5), True), ((0.0, 0.0, 0.499), False),
+        ((0.0, 0.0, 1.0), True), ((0.0, 0.0, 1.001), False),
+    ],
+)  # fmt: skip
+def test_the_whole_disc_lies_in_the_field_of_view_and_in_range(place: Any, seen: bool) -> None:
+    of_camera = Reach(MODEL, scanner(), np.eye(4), 0.05)
+    assert of_camera.in_view(rigid(np.eye(3), np.array(place))) is seen
+
+
+def test_the_rim_of_a_disc_on_edge_counts_not_its_centre_alone() -> None:
+    of_camera = Reach(MODEL, scanner(), np.eye(4), 0.05)
+    for axis in ("roll", "pitch"):
+        on_edge = rotation_from_rpy(*(np.pi / 2 * (axis == name) for name in ("roll", "pitch", "")))
+        for depth, seen in ((0.549, False), (0.551, True), (0.949, True), (0.951, False)):
+            assert of_camera.in_view(rigid(on_edge, np.array([0.0, 0.0, depth]))) is seen
+
+
+@pytest.mark.parametrize(
+    ("depth", "lit"), [(0.455, False), (0.475, True), (0.7, True), (1.04, True), (1.06, False)]
+)
+def test_camera_and_projector_lean_towards_each_other_and_both_must_see(
+    depth: float, lit: bool
+) -> None:
+    # Each leans by 30 deg, 0.7 m apart: their axes meet at 0.7 m. From the projector, a point on
+    # the camera's axis is at 19.07 deg (0.95 tan 20) from its axis at depths of 0.467 and 1.049 m.
+    lean = {"baseline": 0.7, "convergence": np.radians(30.0)}
+    both = scanner(near=0.1, far=2.0, projection=np.radians([40.0, 40.0]), **lean)
+    pose = rigid(np.eye(3), np.array([0.0, 0.0, depth]))
+    assert Reach(MODEL, both, np.eye(4), 1e-4).in_view(pose) is lit
+    alone = scanner(near=0.1, far=2.0, **lean)  # lights all of space
+    assert Reach(MODEL, alone, np.eye(4), 1e-4).in_view(pose)
+
+
+def test_what_lies_behind_the_projector_is_not_lit() -> None:
+    lean = {"baseline": 0.7, "convergence": np.radians(60.0)}
+    wide = np.radians([120.0, 120.0])
+    both = scanner(near=0.01, field_of_view=wide, projection=wide, **lean)
+    # 0.15 m before the camera, 0.25 m beyond the projector on the line through both.
+    beyond = np.array([0.95 * np.cos(lean["convergence"]), 0.0, 0.95 * np.sin(lean["convergence"])])
+    assert not Reach(MODEL, both, np.eye(4), 1e-4).in_view(rigid(np.eye(3), beyond))
+
+
+def rolls(arm: Reach, place: Any) -> list[tuple[float, Any, Any]]:
+    """Return manipulability, rotation and joints of every clear posture that faces the scanner."""
+    found = []
+    for turn in np.radians(45.0 * np.arange(8)):
+        facing = OVERHEAD[:3, :3] @ rotation_from_rpy(np.pi, 0.0, 0.0)
+        rotation = facing @ rotation_from_rpy(0.0, 0.0, turn)
+        for joints in ARM.inverse(rigid(rotation, place)):
+            if arm._clear(joints):
+                found.append((float(ARM.manipulability(joints)), rotation, joints))
+    return found
+
+
+def test_a_flange_faces_the_scanner_in_the_posture_that_moves_best() -> None:
+    arm = seen_from_above()
+    rotation = arm.facing(AHEAD)
+    assert rotation is not None
+    assert rotation[:, 2] == pytest.approx(-OVERHEAD[:3, 2], abs=1e-12)
+    assert ARM.flange(arm.home) == pytest.approx(rigid(rotation, AHEAD), abs=1e-8)
+    best = max(score for score, *_ in rolls(arm, AHEAD))
+    assert float(ARM.manipulability(arm.home)) == pytest.approx(best, rel=1e-6)
+
+
+def test_from_where_the_arm_stands_it_takes_the_nearest_posture_that_moves_half_as_well() -> None:
+    arm, place = seen_from_above(), np.array([0.2, 0.2, 0.3])
+    every = rolls(arm, place)
+    best = max(score for score, *_ in every)
+    assert min(score for score, *_ in every) < 0.5 * best  # some do not move well
+    for _, _, start in every:
+        arm.start_from(start)
+        arm.facing(place)
+        turns = [(np.abs(joints - start).max(), score) for score, _, joints in every]
+        nearest = min(turn for turn, score in turns if score >= 0.5 * best)
+        # Whole turns of a joint may bring a posture nearer yet.
+        assert np.abs(arm.home - start).max() <= nearest + 1e-6
+        assert float(ARM.manipulability(arm.home)) >= 0.5 * best * (1 - 1e-9)
+
+
+def test_a_place_out_of_reach_has_no_facing_and_is_said_once_for_each_roll() -> None:
+    arm = seen_from_above()
+    assert arm.facing(np.array([3.0, 0.0, 0.3])) is None
+    assert arm.why_refused() == "8 out of the arm's reach"
+    assert all(refusal.place == pytest.approx([3.0, 0.0, 0.3]) for refusal in arm.refusals)
+
+
+@pytest.mark.parametrize("last", [20.0, 200.0, 350.0, -200.0, -350.0])
+def test_joints_stay_in_the_turn_in_which_the_arm_stands(last: float) -> None:
+    arm, start = seen_from_above(), np.r_[SHOWN[:5], np.radians(last)]
+    arm.start_from(start)
+    assert arm.joints(ARM.flange(start)) == pytest.approx(start, abs=1e-6)
+
+
+@pytest.mark.parametrize(("by", "there"), [(9.0, 359.0), (11.0, 1.0)])
+def test_a_turn_that_would_pass_a_limit_is_not_gone_on_with(by: float, there: float) -> None:
+    arm, start = seen_from_above(), np.r_[SHOWN[:5], np.radians(350.0)]
+    arm.start_from(start)
+    pose = ARM.flange(turned(start, j6=np.radians(by)))
+    found = [q for q in arm._possible(pose) if np.abs(q[:5] - SHOWN[:5]).max() < 1e-6]
+    assert [np.degrees(joints[5]) for joints in found] == [pytest.approx(there, abs=1e-4)]
+
+
+def test_of_several_postures_the_one_nearest_to_home_is_taken() -> None:
+    arm, pose = seen_from_above(), ARM.flange(SHOWN)
+    clear = [joints for joints in ARM.inverse(pose) if arm._clear(joints)]
+    assert len(clear) > 1
+    for joints in clear:
+        arm.home = joints
+        assert arm.joints(pose) == pytest.approx(joints, abs=1e-6)
+
+
+def only(joints: Any, room: float = 0.02) -> Margins:
+    """Return margins that leave the arm no posture but those near one."""
+    limits = replace(LIMITS, lower=joints - room, upper=joints + room)
+    return Margins(limits, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("turn", "folds"), [(119.9, False), (120.1, True), (-120.1, True)])
+def test_an_arm_under_way_does_not_fold_over(turn: float, folds: bool) -> None:
+    arm = seen_from_above(margins=only(SHOWN))
+    start = turned(SHOWN, j4=np.radians(turn))
+    arm.home = start
+    assert arm.joints(ARM.flange(SHOWN)) is not None  # nothing is known of where it stands
+    arm.start_from(start)
+    assert (arm.joints(ARM.flange(SHOWN)) is None) is folds
+    assert arm.why_refused() == ("1 only with the arm folded over" if folds else "")
+
+
+def scaled(joints: Any) -> float:
+    """Return the smallest singular value of the Jacobian, lengths in units of the reach."""
+    units = np.r_[np.ones(3), np.full(3, 1 / MODEL.length)]
+    return float(np.linalg.svd(units[:, None] * ARM.jacobian(joints), compute_uv=False).min())
+
+
+@pytest.mark.parametrize(
+    ("margins", "reason"),
+    [
+        (only(SHOWN), ""),
+        (only(SHOWN)._replace(joints=0.019), ""),
+        (only(SHOWN)._replace(joints=0.021), "near the limits of the joints"),
+        (Margins(replace(LIMITS, high=np.array([1.0, 1.0, 0.3])), 0.0, 0.0),
+         "outside robot.limits.box"),
+    ],
+)  # fmt: skip
+def test_a_pose_that_is_too_near_to_a_margin_is_refused_and_says_to_which(
+    margins: Margins, reason: str
+) -> None:
+    arm = seen_from_above(margins=margins)
+    assert (arm.joints(ARM.flange(SHOWN)) is None) is bool(reason)
+    assert arm.why_refused() == (f"1 {reason}" if reason else "")
+
+
+def test_a_posture_counts_as_singular_by_its_worst_direction_in_units_of_the_reach() -> None:
+    clear = [
+        joints for joints in ARM.inverse(ARM.flange(SHOWN)) if seen_from_above()._clear(joints)
+    ]
+    best = max(scaled(joints) for joints in clear)
+    for share, refused in ((0.999, ""), (1.001, "1 near a singularity")):
+        arm = seen_from_above(margins=Margins(LIMITS, 0.0, share * best))
+        arm.joints(ARM.flange(SHOWN))
+        assert arm.why_refused() == refused
+
+
+def test_the_arm_comes_down_to_the_table_and_not_below_it() -> None:
+    volume = ArmVolume(MODEL)
+    axes = volume.axes(ARM.frames(SHOWN))
+    arm = seen_from_above(margins=only(SHOWN, 1.5))
+    low = ARM.flange(SHOWN)
+    for _ in range(3):  # the wrist is lowest: it goes down with the flange
+        joints = ARM.inverse_near(low, SHOWN[None])[0]
+        axes, moving = volume.axes(ARM.frames(joints)), volume.links >= 2
+        low[2, 3] -= (axes[moving, :, 2].min(axis=1) - volume.radii[moving]).min()
+    for above, clear in ((0.0005, True), (-0.0005, False)):
+        pose = rigid(low[:3, :3], low[:3, 3] + [0.0, 0.0, above])
+        joints = ARM.inverse_near(pose, SHOWN[None])[0]
+        assert arm._clear(joints) is clear
+
+
+def test_an_arm_in_the_line_of_sight_of_camera_or_projector_is_in_the_way() -> None:
+    # Seen from the side, the flange turned away from it: the arm itself stands between.
+    place = ARM.flange(SHOWN)[:3, 3]
+    for baseline, convergence in ((0.0, 0.0), (0.8, 0.0)):
+        for way, clear in ((1.0, True), (-1.0, False)):
+            camera = OVERHEAD.copy()
+            camera[2, 3] = place[2] + way * 0.7
+            lean = {"baseline": baseline, "convergence": convergence}
+            arm = Reach(MODEL, scanner(**lean), camera, 0.05)
+            assert arm._clear(SHOWN) is clear
+
+
+def test_an_arm_that_touches_itself_is_in_its_own_way() -> None:
+    folded = np.radians([0.0, -90.0, 157.0, 0.0, 86.0, 0.0])
+    arm = seen_from_above()
+    assert not arm._volume.apart(arm._volume.axes(ARM.frames(folded)))
+    assert not arm._clear(folded)
