@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Commands are started some hundred times: their bytecode is kept, whatever the shell says of it.
+export PYTHONDONTWRITEBYTECODE :=
 # Tests in real time share the machine with whatever runs beside them: what fails is tried once more.
 REALTIME := $(BIN)/python -m pytest -q
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check

@@ -1,7 +1,7 @@
 """The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
 
-Modules are imported inside the commands, so that ``--help`` answers at once, and what was said
-before, nothing having changed since, is said again before there is a parser.
+Modules are imported inside the commands, so that ``--help`` answers at once; ``check RECIPE`` and
+``stages`` need no parser.
 """
 
 import sys
@@ -15,9 +15,9 @@ def main() -> None:
 
 
 def _command() -> None:
-    from flangeye.cli.remembered import said_again
+    from flangeye.cli.unparsed import answered
 
-    if not said_again(sys.argv[1:]):
+    if not answered(sys.argv[1:]):
         from flangeye.cli.commands import app
 
         app()

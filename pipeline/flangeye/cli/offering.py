@@ -8,18 +8,15 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
-from flangeye.cli.saying import say, say_notes
+from flangeye.cli.saying import say
 
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: print every mistake with its line, and the unknowns."""
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.verdict import verdict
+    from flangeye.cli.unparsed import say_verdict
 
-    registry = load_plugins()
-    say(verdict(find_recipe(recipe), registry, overrides or ()))
-    say_notes(registry.notes())
+    say_verdict(recipe, overrides or ())
 
 
 @app.command()
