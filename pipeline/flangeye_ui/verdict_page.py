@@ -162,7 +162,7 @@ class Doctor:
 
     def _show(self, found: Finding) -> None:
         warning(f"{found.name}: {found.what}")
-        ui.code(found.fix, language="yaml").classes("w-full overflow-x-auto")
+        ui.code("\n# or:\n".join(found.choices), language="yaml").classes("w-full overflow-x-auto")
         with ui.row().classes("gap-2"):
             for line in found.lines:
                 label = f"Write {next(iter(line))} into the recipe"

@@ -100,8 +100,10 @@ def test_the_base_in_the_flange(kind: Any, carried: Any) -> None:
     assert "the poses are flange_T_base" in finding.what
     step = "- acquire.archive: {reader: {corrected: {reader: auto, inverted: true}}}"
     mounted = {"target": "eye-in-hand", "camera": "eye-on-base"}[carried]
-    other = f"configuration: {{name: {mounted}, place: unknown}}  # or, if it is not: "
-    assert finding.fix == (other if kind in ("marker", "point") else "") + step
+    marker = "- acquire.archive: {reader: {corrected: {reader: auto, target_inverted: true}}}"
+    other = f"configuration: {{name: {mounted}, place: unknown}}"
+    exchanged = {"marker": [other, step, marker], "point": [other, step]}
+    assert finding.choices == exchanged.get(kind, [step])
 
 
 @pytest.mark.parametrize("carried", ["target", "camera"])

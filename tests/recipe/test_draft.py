@@ -1,5 +1,6 @@
 """``flangeye init``: from folders as newcomers have them to a recipe that passes check, or a line."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,11 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
 from flangeye.plugin.registry import load_registry
+from flangeye.recipe.draft.arrays import PoseArrays
 from flangeye.recipe.load import load_recipe
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
@@ -186,6 +189,117 @@ def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder: Path) ->
     np.testing.assert_allclose(read_poses(folder), poses, atol=1e-9)
 
 
+ARM = np.array([np.block([[t.as_matrix(), p[:, None]], [np.zeros(3), 1]]) for p, t in POSES])
+SEEN = ARM[::-1] @ ARM[1]
+
+
+def opencv_names(folder):
+    np.savez(folder / "handeye.npz", R_gripper2base=ARM[:, :3, :3], t_gripper2base=ARM[:, :3, 3:],
+             R_target2cam=SEEN[:, :3, :3], t_target2cam=SEEN[:, :3, 3:])  # fmt: skip
+
+
+def opencv_vectors(folder):
+    vectors = Rotation.from_matrix(SEEN[:, :3, :3]).as_rotvec()
+    np.savez(folder / "detections.npz", rvecs=vectors, tvecs=SEEN[:, :3, 3])
+    np.save(folder / "gripper2base.npy", ARM)
+
+
+def matlab_names(folder):
+    world_t_camera = np.moveaxis(np.linalg.inv(SEEN), 0, 2)
+    savemat(folder / "data.mat", {"bHg": np.moveaxis(ARM, 0, 2), "wHc": world_t_camera})
+
+
+def frames_in_names(folder):
+    np.savez(folder / "poses.npz", T_flange_base=np.linalg.inv(ARM), T_cam_board=SEEN)
+
+
+def opencv_file(folder):
+    storage = cv2.FileStorage(str(folder / "pairs.yml"), cv2.FILE_STORAGE_WRITE)
+    for name, poses in (("cam", SEEN), ("robot", ARM)):
+        for k, pose in enumerate(poses):
+            storage.write(f"{name}_{k}", pose)
+    storage.release()
+
+
+def folders_of_texts(folder):
+    for name, poses in (("camera", SEEN), ("robot", ARM)):
+        (folder / name).mkdir()
+        for k, pose in enumerate(poses):
+            np.savetxt(folder / name / f"{k}.txt", pose)
+
+
+def files_side_by_side(folder):
+    for name, poses in (("board_in_cam", SEEN), ("flange", ARM)):
+        for k, pose in enumerate(poses):
+            np.savetxt(folder / f"{name}_{k}.txt", pose)
+
+
+def json_objects(folder):
+    rows = [{"robot": a.tolist(), "marker": s.tolist(), "ids": [1] * k}
+            for k, (a, s) in enumerate(zip(ARM, SEEN, strict=True))]  # fmt: skip
+    (folder / "samples.json").write_text(json.dumps(rows))
+
+
+def rows_in_millimetres(folder):
+    def rows(poses):
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        return np.hstack([1e3 * poses[:, :3, 3], turns])
+
+    np.savez(folder / "rows.npz", robot=rows(ARM), target=rows(SEEN))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        opencv_names, opencv_vectors, matlab_names, frames_in_names, opencv_file, folders_of_texts,
+        files_side_by_side, json_objects, rows_in_millimetres,
+    ],
+)  # fmt: skip
+def test_arrays_are_read_as_their_names_say(folder: Path, made: Callable[[Path], None]) -> None:
+    made(folder)
+    init("--camera", "flange")
+    first = recipe(folder).steps[0].params
+    recorded = first.reader(first.path).recordings
+    assert np.allclose([r.base_T_flange for r in recorded], ARM, atol=1e-9)
+    assert np.allclose([r.camera_T_target for r in recorded], SEEN, atol=1e-9)
+
+
+def test_arrays_without_names_are_asked_for(folder: Path) -> None:
+    arrays_of_nobody(folder)
+    init(typed="none\nposes.npz:B\nbase_T_flange\ncamera_T_target\nnone\nflange\n")
+    assert np.allclose(read_poses(folder), SEEN, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames"),
+    [
+        ("gripper2base", ("base", "flange")), ("R_base2gripper", ("flange", "base")),
+        ("target_to_camera", ("camera", "target")), ("base_T_flange", ("base", "flange")),
+        ("wTc", ("world", "camera")), ("T_b_e", ("base", "flange")), ("bTo", None),
+        ("samples", None), ("T1_*", None),
+    ],
+)  # fmt: skip
+def test_two_frames_in_a_name(name: str, frames: tuple[str, str] | None) -> None:
+    assert PoseArrays(f"robot/poses.npz:{name}", (4, 4), 5).frames == frames
+
+
+@pytest.mark.parametrize("names", [("arm.tum", "board.tum"), ("robot.csv", "camera.csv")])
+def test_trajectories_are_told_apart_by_their_names(folder: Path, names: tuple[str, str]) -> None:
+    stops = np.repeat(np.arange(5), 20)
+    for name, poses, times in (
+        (names[0], ARM[stops], 0.1 * np.arange(100)),
+        (names[1], SEEN, 1.0 + 2 * np.arange(5)),
+    ):
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        heading = "" if name.endswith("tum") else "t x y z qx qy qz qw"
+        rows = np.column_stack([times, poses[:, :3, 3], turns])
+        np.savetxt(folder / name, rows, header=heading, comments="")
+        text = (folder / name).read_text().lstrip("\n")
+        (folder / name).write_text(text)
+    init("--camera", "flange")
+    assert np.allclose(read_poses(folder), ARM, atol=1e-6)
+
+
 def odd_heading(folder):
     clouds(folder)
     table(folder, "u,v,w,alpha,beta,gamma", kuka)
@@ -206,9 +320,12 @@ def sample(folder):
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
 
 
-def arrays(folder):
-    piles: dict[str, Any] = {name: np.tile(np.eye(4), (5, 1, 1)) for name in ("robot", "seen")}
-    np.savez(folder / "poses.npz", **piles)
+def arrays_of_nobody(folder):
+    np.savez(folder / "poses.npz", A=ARM, B=SEEN)
+
+
+def arrays_of_the_arm(folder):
+    np.save(folder / "robot.npy", ARM)
 
 
 @pytest.mark.parametrize(
@@ -227,8 +344,12 @@ def arrays(folder):
          "quaternion_wxyz, vector, xyz, ZYX, …): nothing tells; add --rotation vector"),
         (images, [], "which printed target is seen: nothing tells; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
-        (arrays, [], "rec: holds arrays; say which are the arm's poses: --reader 'matrices: "
-         "{robot: \"poses.npz:robot\", length: m, target: {at: \"poses.npz:seen\", length: m}}'"),
+        (arrays_of_nobody, [], "which arrays are the arm's poses (poses.npz:A, poses.npz:B): "
+         "nothing tells; add --table poses.npz:A"),
+        (arrays_of_nobody, ["--table", "A"],
+         "--table A: are no poses; known: poses.npz:A, poses.npz:B"),
+        (arrays_of_the_arm, [], "rec: robot.npy are 5 poses of the arm, but there are neither "
+         "scans nor as many measurements of the target beside them; put them there"),
         (lambda folder: table(folder, "x,y,z,qx,qy,qz,qw", quaternion), [],
          "rec/log.csv: has poses of the arm, but there are no scans beside it, and no "
          "columns of what the camera saw; add --target-columns NAMES, or put the scans there"),

@@ -26,7 +26,7 @@ Target = Annotated[
         "and so on, with the parameters of that fit."
     ),
 ]
-Table = Annotated[Answer, typer.Option(help="Table with the arm's poses.")]
+Table = Annotated[Answer, typer.Option(help="Table or array with the arm's poses.")]
 Columns = Annotated[
     Answer,
     typer.Option(help="Columns of the arm's pose, position first: X,Y,Z,A,B,C or 1,2,3,4,5,6."),
@@ -50,6 +50,9 @@ TargetRotation = Annotated[
 ]
 TargetLength = Annotated[Answer, typer.Option(help="Unit of the target's positions: m or mm.")]
 TargetAngle = Annotated[Answer, typer.Option(help="Unit of the target's angles: deg or rad.")]
+TargetPose = Annotated[
+    Answer, typer.Option(help="Direction of the target: camera_T_target or target_T_camera.")
+]
 Reader = Annotated[
     Answer, typer.Option(help="Reader as written in a recipe; replaces the options above.")
 ]
@@ -75,6 +78,7 @@ def init(  # noqa: PLR0913  one for each option
     target_rotation: TargetRotation = None,
     target_length: TargetLength = None,
     target_angle: TargetAngle = None,
+    target_pose: TargetPose = None,
     reader: Reader = None,
     yes: Yes = False,
     out: Out = Path("recipe.yaml"),
@@ -94,7 +98,7 @@ def init(  # noqa: PLR0913  one for each option
         "table": table, "columns": columns, "rotation": rotation, "length": length,
         "angle": angle, "pose": pose, "target-columns": target_columns,
         "target-rotation": target_rotation, "target-length": target_length,
-        "target-angle": target_angle, "reader": reader,
+        "target-angle": target_angle, "target-pose": target_pose, "reader": reader,
     }  # fmt: skip
     questions = Questions(given, None if yes else _prompt)
     draft = draft_recipe(survey, out, questions, registry)

@@ -11,9 +11,11 @@ import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.saying import say
+from flangeye.errors import RecipeError
 
 if TYPE_CHECKING:
     from flangeye.log.read import RunLog
+    from flangeye.recipe.load import Recipe
 
 
 @app.command()
@@ -199,7 +201,8 @@ def watch(
 @app.command()
 def doctor(
     archive: Annotated[
-        Path, typer.Argument(help="A run.mcap, or recordings in a format that a reader supports.")
+        Path,
+        typer.Argument(help="A run.mcap, recordings that a reader supports, or a recipe of these."),
     ],
     recipe: Annotated[
         str | None,
@@ -217,7 +220,11 @@ def doctor(
     from flangeye.doctor import as_json, as_text, examine, open_session
 
     registry = load_plugins()
+    if recipe is None and archive.suffix in (".yaml", ".yml") and archive.is_file():
+        recipe = str(archive)
     checked = read_recipe(recipe, registry, overrides) if recipe else None
+    if checked is not None and recipe == str(archive):
+        archive = _archive_of(checked)
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     with of_foreign(archive, "it cannot be examined"):
         session = open_session(archive, registry, checked)
@@ -225,3 +232,18 @@ def doctor(
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
     if diagnosis.findings:
         raise typer.Exit(1)
+
+
+def _archive_of(recipe: Recipe) -> Path:
+    """Return what a recipe reads.
+
+    Raises:
+        RecipeError: Its first step reads no archive.
+    """
+    path = getattr(recipe.steps[0].params, "path", None)
+    if not isinstance(path, Path):
+        raise RecipeError(
+            f"{recipe.steps[0].stage.name}: reads no archive to examine; name a run's log, or "
+            "recordings"
+        )
+    return path

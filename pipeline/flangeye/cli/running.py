@@ -138,7 +138,7 @@ def _refuse(options: object, why: str) -> None:
 def _advise(log: Path, registry: Registry) -> None:
     """Say what to do about a refusal: the doctor's command, and what it finds first."""
     from flangeye.cli.logs import of_foreign
-    from flangeye.doctor import examine, open_session
+    from flangeye.doctor import examine, fix_lines, open_session
     from flangeye.files.elsewhere import with_urls
 
     say(with_urls(f"\nwhat to do: flangeye doctor {log}"))
@@ -149,7 +149,8 @@ def _advise(log: Path, registry: Registry) -> None:
     except FlangeyeError:
         return  # the doctor needs more than this log has, and says so when it is asked
     if findings:
-        say(f"  likely: {findings[0].name}: {findings[0].what}\n  fix: {findings[0].fix}")
+        say(f"  likely: {findings[0].name}: {findings[0].what}")
+        say("\n".join(fix_lines(findings[0], "  ")))
     else:
         say(
             "  it finds no mistake in poses or scans: more poses, turned further, are the next step"

@@ -2,6 +2,6 @@
 
 from flangeye.doctor.examine import Diagnosis, examine
 from flangeye.doctor.opening import open_session
-from flangeye.doctor.text import as_json, as_text
+from flangeye.doctor.text import as_json, as_text, fix_lines
 
-__all__ = ["Diagnosis", "as_json", "as_text", "examine", "open_session"]
+__all__ = ["Diagnosis", "as_json", "as_text", "examine", "fix_lines", "open_session"]

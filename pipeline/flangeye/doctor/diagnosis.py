@@ -223,13 +223,17 @@ class Finding:
         return certain and self.corrected_session is None and not self.note
 
     @property
+    def choices(self) -> list[str]:
+        """What to do, the likeliest first."""
+        return self.fix.split(OR_ELSE)
+
+    @property
     def lines(self) -> list[dict[str, Any]]:
         """The lines of a recipe to choose from, a step or section each, by its name.
 
         Empty where a person has something to do that is no line.
         """
-        choices = self.fix.split(OR_ELSE)
-        lines = [choice.removeprefix("- ") for choice in choices if _LINE.fullmatch(choice)]
+        lines = [choice.removeprefix("- ") for choice in self.choices if _LINE.fullmatch(choice)]
         return [dict(parse_value(line, "the doctor's line")) for line in lines]
 
 

@@ -212,4 +212,4 @@ def _written(reader: Any) -> Reader:
 def _given(params: Params, apart_from: Set[str] = frozenset()) -> dict[str, Any]:
     """Return the parameters that the recipe states, as it may write them."""
     stated = set(params.model_fields_set - apart_from)
-    return params.model_dump(mode="json", include=stated)
+    return params.model_dump(mode="json", include=stated, exclude_unset=True, exclude_none=True)

@@ -21,7 +21,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
     for note in diagnosis.notes:
-        lines += ["", f"note: {note.name}: {note.what}", f"   fix: {note.fix}"]
+        lines += ["", f"note: {note.name}: {note.what}", *fix_lines(note, "   ")]
     if not diagnosis.findings:
         lines += ["", "nothing found"]
     return "\n".join(lines)
@@ -44,7 +44,13 @@ def _details(finding: Finding) -> list[str]:
     if finding.before is not None and finding.after is not None:
         error = f"error {_error(finding.before)} before, {_error(finding.after)} after"
         lines.append(f"   evidence: {error}; by chance {_chance(finding.probability)}")
-    return [*lines, f"   fix: {finding.fix}"]
+    return [*lines, *fix_lines(finding, "   ")]
+
+
+def fix_lines(finding: Finding, indent: str) -> list[str]:
+    """Return what to do, a line for each choice."""
+    first, *others = finding.choices
+    return [f"{indent}fix: {first}", *(f"{indent}or:  {other}" for other in others)]
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Arms, Change, Finding, Findings, RecordedSession
+from flangeye.doctor.diagnosis import OR_ELSE, Arms, Change, Finding, Findings, RecordedSession
 from flangeye.maths.pose_corrections import inverted, reread, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS
 from flangeye.types import Floats
@@ -99,9 +99,7 @@ def direction(session: RecordedSession) -> Findings:
     whose = "the" if session.seconds is None else named(arms, session)
     what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
-        held, name = _MOUNTED_OTHERWISE[session.carried]
-        what = f"the camera is {held}, or the poses are flange_T_base: the samples fit either way"
-        fix = f"configuration: {{name: {name}, place: unknown}}  # or, if it is not: {fix}"
+        what, fix = _of_exchanged(session, fix)
     yield Finding("pose direction", what, fix, (), *evidence[1:], corrected_session)
 
 
@@ -118,6 +116,17 @@ def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
     """Whether camera and target, exchanged, come to the same as poses the other way round."""
     unknown = not np.isfinite(session.places).any()
     return session.links is None and session.seconds is None and unknown
+
+
+def _of_exchanged(session: RecordedSession, inverted: str) -> tuple[str, str]:
+    """Return what may be wrong, and the lines to choose from: the samples fit each of them."""
+    held, name = _MOUNTED_OTHERWISE[session.carried]
+    what = f"the camera is {held}, or the poses are flange_T_base"
+    lines = [f"configuration: {{name: {name}, place: unknown}}", inverted]
+    if np.isfinite(session.rotations).any():
+        what += ", or the target's are target_T_camera"
+        lines.append(_marker_inverted(session).step())
+    return f"{what}: the samples fit each", OR_ELSE.join(lines)
 
 
 def _marker_rather(session: RecordedSession) -> bool:

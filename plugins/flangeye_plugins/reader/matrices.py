@@ -1,7 +1,9 @@
-"""Poses of arm and target as arrays: NumPy, MATLAB, OpenCV's YAML and XML, folders of text files.
+"""Poses of arm and target as arrays: NumPy, MATLAB, JSON, OpenCV's YAML and XML, text files.
 
 ``robot: poses.npz:robot`` names a file and the array in it; ``robot: data.yml:T1_*`` the arrays of
 an OpenCV file that are called T1_0, T1_1, …; ``robot: robot/*.txt`` a folder of 4x4 text files.
+Rotations alone, 3x3 or vectors, have their positions elsewhere: ``robot: cal.npz:R_gripper2base``,
+``translation: cal.npz:t_gripper2base``.
 """
 
 from __future__ import annotations
@@ -10,15 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
+from flangeye.files.named_arrays import arrays_at
 from flangeye.files.recording import Archive, Recording
 from flangeye.files.scans import recording_of, scans_in
 from flangeye.maths.pose_corrections import inverted
 from flangeye.types import FLANGE, FLANGE2, Floats
-from flangeye_plugins.reader.arrays import arrays_at
 from flangeye_plugins.reader.written import POINT, WrittenParams
 
 Named = list[tuple[str, Floats]]
@@ -28,6 +31,7 @@ class TargetArrays(WrittenParams):
     """The target as the camera measured it."""
 
     at: str = Field(description="Where they are: FILE, FILE:ARRAY, or a pattern of either.")
+    translation: str | None = Field(None, description="As for the arm.")
     rotation: str = Field("matrix", description="As for the arm; point: position only.")
     pose: Literal["camera_T_target", "target_T_camera"] = Field(
         "camera_T_target", description="Direction of the pose."
@@ -43,6 +47,9 @@ class MatricesParams(WrittenParams):
     """Where the arrays are, and how poses are written in them."""
 
     robot: str = Field(description="Where the arm's poses are: FILE, FILE:ARRAY, or a pattern.")
+    translation: str | None = Field(
+        None, description="Where the positions are, if the arrays above hold rotations only."
+    )
     rotation: str = Field("matrix", description="matrix, or of rows of numbers as in reader.table.")
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
         "base_T_flange", description="Direction of the pose."
@@ -60,13 +67,13 @@ class MatricesParams(WrittenParams):
 
 @part("reader.matrices")
 def matrices(path: Path, params: MatricesParams) -> Archive:
-    """Read poses saved as arrays: .npy, .npz, .mat, OpenCV YAML or XML, folders of text files."""
+    """Read poses saved as arrays: .npy, .npz, .mat, .json, OpenCV YAML, folders of text files."""
     folder = path.parent if path.is_file() else path
-    files, arm = arrays_at(folder, params.robot)
+    files, arm = _joined(folder, params.robot, params.translation)
     poses = _values(folder, arm, params, params.pose == "flange_T_base")
     recordings = _with_scans(folder, poses) if params.target is None else []
     if params.target is not None:
-        more, seen = arrays_at(folder, params.target.at)
+        more, seen = _joined(folder, params.target.at, params.target.translation)
         turned = params.target.pose == "target_T_camera"
         recordings = _with_target(folder, poses, _values(folder, seen, params.target, turned))
         files += more
@@ -77,6 +84,29 @@ def matrices(path: Path, params: MatricesParams) -> Archive:
     files = list(dict.fromkeys(files))
     layout = f"arrays, {files[0].name}" + (f" and {len(files) - 1} more" if files[1:] else "")
     return Archive(layout, folder, recordings, files, params.cloud_unit)
+
+
+def _joined(folder: Path, place: str, translation: str | None) -> tuple[list[Path], Named]:
+    """Return the files, and each pose's numbers, rotations joined to positions that lie apart."""
+    files, named = arrays_at(folder, place)
+    if translation is None:
+        return files, named
+    more, positions = arrays_at(folder, translation)
+    _require_as_many(folder, len(positions), "positions", len(named))
+    joined = [
+        (name, _pose_numbers(f"{folder}: {name}", rotation, position))
+        for (name, rotation), (_, position) in zip(named, positions, strict=True)
+    ]
+    return [*files, *more], joined
+
+
+def _pose_numbers(where: str, rotation: Floats, position: Floats) -> Floats:
+    """Return a matrix (3, 4), or a row that begins with the position."""
+    if position.size != 3:
+        raise StageError(f"{where}: a position has 3 numbers, not {position.size}")
+    if rotation.shape == (3, 3):
+        return np.column_stack([rotation, position.ravel()])
+    return np.concatenate([position.ravel(), rotation.ravel()])
 
 
 def _values(folder: Path, named: Named, written: WrittenParams, turned: bool) -> Named:

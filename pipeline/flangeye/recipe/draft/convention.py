@@ -12,7 +12,14 @@ import numpy as np
 from flangeye.errors import RecipeError
 from flangeye.files.tables import Column, TextTable, number_of
 from flangeye.maths.pose_formats import CONVENTIONS
-from flangeye.recipe.draft.headings import ROTATIONS, Group, Headings, headings_of, holds_matrix
+from flangeye.recipe.draft.headings import (
+    ROTATIONS,
+    SEEN,
+    Group,
+    Headings,
+    headings_of,
+    holds_matrix,
+)
 from flangeye.recipe.draft.questions import Questions
 from flangeye.types import Floats
 
@@ -88,8 +95,13 @@ def _sorted(
         if named is not None:
             known = ", ".join(t.file.name for t in tables)
             raise RecipeError(f"--table {named}: is no table of poses; known: {known}")
-        tables = sorted(tables, key=lambda t: headings_of(t).arm is None)
+        tables = sorted(tables, key=_is_seen)
     return tables[0], tables[1] if len(tables) > 1 else None
+
+
+def _is_seen(table: TextTable) -> tuple[bool, bool]:
+    """Return a key that sorts what a camera saw behind the arm's poses."""
+    return headings_of(table).arm is None, SEEN.search(table.file.stem.lower()) is not None
 
 
 def _of_row(heads: Headings) -> dict[str, Any]:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from flangeye.files.tables import Column, TextTable, number_of
 
 POSITION = ("x", "y", "z")
@@ -25,7 +27,10 @@ _PLACES = ("position", "pos", "translation", "trans", "t", "p")
 _TURNS = ("orientation", "ori", "quaternion", "quat", "rotation", "rot", "q", "r")
 _SCANS = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
 _CLOCKS = ("time", "timestamp", "stamp", "secs", "sec", "t")
-_SEEN = re.compile(r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object")
+_TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_ROUNDED = 1e-3
+"""By how much the length of a written quaternion may differ from 1."""
+SEEN = re.compile(r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object")
 _MATRIX = re.compile(r"[a-z_]*\d[_ ]?\d|[a-z]*\d{1,2}")
 
 
@@ -74,6 +79,8 @@ class Headings:
 
 def headings_of(table: TextTable) -> Headings:
     """Return what a table's columns hold, as far as their names tell."""
+    if not table.heading:
+        return _of_trajectory(table)
     found = Headings()
     groups: dict[str, Group] = {}
     for index, name in enumerate(table.heading):
@@ -85,12 +92,24 @@ def headings_of(table: TextTable) -> Headings:
         elif words and not _is_time(found, name, words):
             _group(groups, name, words)
     whole = {prefix: g for prefix, g in groups.items() if set(POSITION) <= set(g.columns)}
-    seen = [prefix for prefix in whole if _SEEN.search(prefix)]
+    seen = [prefix for prefix in whole if SEEN.search(prefix)]
     arms = [prefix for prefix in whole if prefix not in seen and whole[prefix].rotation]
     others = seen or [prefix for prefix in whole if prefix not in arms[:1]]
     found.arm = whole[arms[0]] if arms else None
     found.target = whole[others[0]] if others else None
     return found
+
+
+def _of_trajectory(table: TextTable) -> Headings:
+    """Return what a file of TUM's format holds: time, position, quaternion, without a heading."""
+    if {len(cells) for _, cells in table.rows} != {len(_TUM)}:
+        return Headings()
+    numbers = table.numbers(range(len(_TUM)))
+    rising = bool((np.diff(numbers[:, 0]) > 0).all())
+    if not rising or np.abs(np.linalg.norm(numbers[:, 4:], axis=1) - 1).max() > _ROUNDED:
+        return Headings()
+    columns: dict[str, Column] = {name: i for i, name in enumerate(_TUM, 1)}
+    return Headings(arm=Group({k: v for k, v in columns.items() if k != "t"}), time=columns["t"])
 
 
 def holds_matrix(names: Sequence[str]) -> bool:

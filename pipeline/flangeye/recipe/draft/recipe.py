@@ -22,6 +22,7 @@ from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
+from flangeye.recipe.draft.matrices import array_params
 from flangeye.recipe.draft.questions import Questions
 from flangeye.recipe.draft.survey import FolderSurvey
 from flangeye.recipe.load import parse_recipe
@@ -96,8 +97,10 @@ def _reader(
         return "auto"
     if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
+    scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
+    if survey.arrays:
+        return {"matrices": array_params(survey.folder, survey.arrays, questions, scans)}
     if survey.tables:
-        scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
         return {"table": table_params(survey.tables, questions, _maker(robot), scans)}
     raise StageError(_missing(survey, reason))
 
@@ -122,13 +125,6 @@ def _maker(robot: Mapping[str, Any]) -> str | None:
 def _missing(survey: FolderSurvey, reason: str) -> str:
     """Say what is missing, and the line that would bring it."""
     scans = survey.of(CLOUDS) or survey.of(IMAGES)
-    if survey.arrays:
-        first, *others = (array.partition(" ")[0] for array in survey.arrays)
-        target = f', target: {{at: "{others[0]}", length: m}}' if others else ""
-        return (
-            f"{survey.folder}: holds arrays; say which are the arm's poses: --reader 'matrices: "
-            f'{{robot: "{first}", length: m{target}}}\''
-        )
     if scans:
         return (
             f"{survey.folder}: holds {len(scans)} scans, but nothing that says where the flange "

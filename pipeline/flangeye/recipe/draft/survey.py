@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.files.arrays import read_arrays
 from flangeye.files.scans import CLOUDS, IMAGES, VENDOR
 from flangeye.files.tables import TextTable, number_of, read_text_table
+from flangeye.recipe.draft.arrays import PoseArrays, pose_arrays
 
-TABLES = (".csv", ".txt", ".dat", ".tsv")
-ARRAYS = (".npz", ".npy", ".mat", ".xml")
-LARGEST = 10_000_000
-"""A file of arrays that is larger [bytes] holds scans, and is not looked into."""
+TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum")
 FEWEST_ROWS, FEWEST_COLUMNS = 3, 6
 
 
@@ -27,17 +24,17 @@ class FolderSurvey:
         folder: Where.
         files: All files of the folder, by name.
         tables: Those that are tables of numbers.
-        arrays: What ``reader.matrices`` may read, as a recipe names it, with its shape.
+        arrays: What ``reader.matrices`` may read.
     """
 
     folder: Path
     files: Sequence[Path]
     tables: Sequence[TextTable]
-    arrays: Sequence[str]
+    arrays: Sequence[PoseArrays]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
         """Return the files that end so; arrays of poses are no clouds."""
-        named = {array.partition(":")[0].partition(" ")[0] for array in self.arrays}
+        named = {array.at.partition(":")[0] for array in self.arrays}
         return [p for p in self.files if p.suffix.lower() in suffixes and p.name not in named]
 
     def lines(self) -> list[str]:
@@ -67,7 +64,7 @@ def look(folder: Path) -> FolderSurvey:
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
     tables = [table for p in files if (table := _table(p)) is not None]
-    return FolderSurvey(folder, files, tables, [name for p in files for name in _arrays(p)])
+    return FolderSurvey(folder, files, tables, pose_arrays(folder))
 
 
 def _table(file: Path) -> TextTable | None:
@@ -87,20 +84,3 @@ def _table(file: Path) -> TextTable | None:
 def _of_table(table: TextTable) -> str:
     heading = ", ".join(table.heading) or f"no heading, {len(table.rows[0][1])} columns"
     return f"{table.file.name}, {len(table.rows)} rows: {heading}"
-
-
-def _arrays(file: Path) -> list[str]:
-    """Return the arrays of a file that may be poses; of MATLAB and XML the file alone."""
-    if file.suffix.lower() not in ARRAYS or file.stat().st_size > LARGEST:
-        return []
-    if file.suffix.lower() in (".mat", ".xml"):
-        return [file.name]
-    try:
-        arrays = read_arrays(file)
-    except FlangeyeError:
-        return []
-    return [
-        f"{file.name}{':' if name else ''}{name} ({' x '.join(map(str, array.shape))})"
-        for name, array in arrays.items()
-        if array.shape[-2:] in ((4, 4), (3, 4)) or array.shape[:2] in ((4, 4), (3, 4))
-    ]

@@ -1,14 +1,16 @@
-"""Arrays of poses as numerical programs save them: NumPy, MATLAB, OpenCV, ViSP, and text."""
+"""Arrays of poses as numerical programs save them: NumPy, MATLAB, OpenCV, ViSP, JSON, and text."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from flangeye import StageError
+from flangeye.errors import StageError
 from flangeye.files.arrays import read_arrays
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import MAX_TEXT, read_regular, read_text
@@ -16,6 +18,8 @@ from flangeye.types import Floats
 
 MAX_MATLAB = 1_000_000
 """Longest .mat file [bytes]: its compression makes a thousand times as much of it at most."""
+MATRICES = ((4, 4), (3, 3), (3, 4))
+"""Shapes of a pose, of its rotation, and of a pose without its last row."""
 _DIGITS = re.compile(r"(\d+)")
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
@@ -38,7 +42,7 @@ def arrays_at(folder: Path, place: str) -> tuple[list[Path], list[tuple[str, Flo
         raise NotThisLayout(f"{folder}: holds no {name}")
     found: list[tuple[str, Floats]] = []
     for file in files:
-        arrays = _chosen(file, _read(file), key)
+        arrays = _chosen(file, arrays_of(file), key)
         for array_name, array in arrays:
             alone = file.stem if len(arrays) == 1 else array_name
             found += _split(f"{file}: {array_name}".rstrip(": "), alone, array)
@@ -64,23 +68,25 @@ def _chosen(file: Path, arrays: dict[str, Floats], key: str) -> list[tuple[str, 
 
 
 def _split(where: str, name: str, array: Floats) -> list[tuple[str, Floats]]:
-    """Return the poses of an array: one matrix, a pile of them, or a row each."""
-    if array.shape in ((4, 4), (3, 4)) or array.ndim == 1 or min(array.shape) == 1:
-        return [(name, array if array.ndim == 2 and min(array.shape) > 1 else array.ravel())]
-    if array.ndim == 3 and array.shape[:2] in ((4, 4), (3, 4)) and array.shape[1:] != (4, 4):
+    """Return the poses of an array: one matrix, a stack of them, or a row each."""
+    if array.shape in MATRICES or array.ndim == 1 or (min(array.shape) == 1 and array.ndim == 2):
+        return [(name, array if array.shape in MATRICES else array.ravel())]
+    if array.ndim == 3 and array.shape[:2] in MATRICES and array.shape[1:] not in MATRICES:
         array = np.moveaxis(array, 2, 0)  # MATLAB counts poses last
-    if array.ndim == 2 or (array.ndim == 3 and array.shape[1:] in ((4, 4), (3, 4))):
+    if array.ndim == 3 and 1 in array.shape[1:]:
+        array = array.reshape(len(array), -1)  # OpenCV's vectors are columns
+    if array.ndim == 2 or (array.ndim == 3 and array.shape[1:] in MATRICES):
         return [(f"{i:04}", pose) for i, pose in enumerate(array)]
     raise StageError(f"{where}: is {'x'.join(map(str, array.shape))}, expected N x 4 x 4 or rows")
 
 
-def _read(file: Path) -> dict[str, Floats]:
+def arrays_of(file: Path) -> dict[str, Floats]:
     """Return the arrays of a file by name; the name is empty where there is none.
 
     Raises:
         StageError: It cannot be read.
     """
-    readers = {".npy": _numpy, ".npz": _numpy, ".mat": _matlab, ".xml": _opencv}
+    readers = {".npy": _numpy, ".npz": _numpy, ".mat": _matlab, ".xml": _opencv, ".json": _json}
     try:
         head = read_regular(file, MAX_MATLAB if file.suffix.lower() == ".mat" else MAX_TEXT)[:10]
         reader = _opencv if head.startswith(b"%YAML") else readers.get(file.suffix.lower(), _text)
@@ -93,8 +99,16 @@ def _read(file: Path) -> dict[str, Floats]:
 
 def _numbers(arrays: Iterable[tuple[str, object]]) -> dict[str, Floats]:
     """Return those of a file's values that are arrays of numbers."""
-    found = {name: np.asarray(value) for name, value in arrays}
-    return {name: a.astype(np.float64) for name, a in found.items() if a.dtype.kind in "iuf"}
+    found = {name: _array(value) for name, value in arrays}
+    return {name: array for name, array in found.items() if array is not None}
+
+
+def _array(value: object) -> Floats | None:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
 
 
 def _numpy(file: Path) -> dict[str, Floats]:
@@ -114,6 +128,15 @@ def _opencv(file: Path) -> dict[str, Floats]:
     root = storage.root()
     nodes = [(name, storage.getNode(name)) for name in root.keys()]  # noqa: SIM118  not a dict
     return _numbers((name, node.mat()) for name, node in nodes if node.isMap())
+
+
+def _json(file: Path) -> dict[str, Floats]:
+    """Return what each key of an object holds; of a list of objects, each key of them all."""
+    data: Any = json.loads(read_text(file))
+    if isinstance(data, list) and data and all(isinstance(item, dict) for item in data):
+        keys = [key for key in data[0] if all(key in item for item in data)]
+        data = {key: [item[key] for item in data] for key in keys}
+    return _numbers(data.items() if isinstance(data, dict) else [("", data)])
 
 
 def _text(file: Path) -> dict[str, Floats]:

@@ -1,0 +1,61 @@
+"""``flangeye doctor`` as people call it: of a recipe, and with lines that can be copied."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.maths.geometry import rigid, rotation_exp
+
+RECIPE = """\
+title: Poses of a camera in the hand
+configuration: {name: eye-in-hand, place: unknown}
+steps:
+  - acquire.samples: {path: poses.npz, reader: {matrices: {robot: "poses.npz:robot", length: m, target: {at: "poses.npz:target", length: m}}}}
+  - solve.robust
+"""
+
+
+def save_with_inverted_targets(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    turns = rotation_exp(rng.normal(0, 0.6, (20, 3)))
+    arm = np.array(
+        [rigid(r, p) for r, p in zip(turns, rng.uniform(0.2, 0.6, (20, 3)), strict=True)]
+    )
+    flange_t_camera = rigid(rotation_exp([0.1, 0.2, 1.5]), [0.05, 0.02, 0.1])
+    base_t_target = rigid(rotation_exp([2.8, 0.0, 0.3]), [0.4, 0.4, -0.6])
+    seen = np.linalg.inv(arm @ flange_t_camera) @ base_t_target
+    np.savez(folder / "poses.npz", robot=arm, target=np.linalg.inv(seen))
+
+
+def test_each_line_that_would_mend_a_recipe_can_be_copied(
+    command: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_with_inverted_targets(tmp_path)
+    (tmp_path / "cell.yaml").write_text(RECIPE)
+    code, out, _ = command("doctor", "cell.yaml")
+    assert code == 1
+    lines = [line.strip() for line in out.splitlines()]
+    choices = [line[5:] for line in lines if line.startswith(("fix: ", "or:  "))]
+    assert len(choices) == 3
+    for line in choices:
+        old = "- acquire.samples" if line.startswith("- ") else "configuration"
+        mended = [line if old in row else row for row in RECIPE.splitlines()]
+        mended = [f"  {row}" if row.startswith("- ") else row for row in mended]
+        (tmp_path / "mended.yaml").write_text(
+            "\n".join(mended).replace("{reader:", "{path: poses.npz, reader:", 1)
+        )
+        code, out, err = command("doctor", "mended.yaml")
+        assert (code, err) == (0, "")
+        assert out.endswith("nothing found\n")
+
+
+def test_a_recipe_that_reads_no_archive(flangeye: Callable[..., Any], toy_recipe: Path) -> None:
+    assert flangeye("doctor", toy_recipe) == (
+        2,
+        "",
+        "error: acquire.toy: reads no archive to examine; name a run's log, or recordings\n",
+    )
