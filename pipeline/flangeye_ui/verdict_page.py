@@ -164,8 +164,9 @@ class Doctor:
         warning(f"{found.name}: {found.what}")
         ui.code("\n# or:\n".join(found.choices), language="yaml").classes("w-full overflow-x-auto")
         with ui.row().classes("gap-2"):
-            for line in found.lines:
-                label = f"Write {next(iter(line))} into the recipe"
+            for number, line in enumerate(found.lines, 1):
+                which = f" (choice {number})" if len(found.lines) > 1 else ""
+                label = f"Write {next(iter(line))} into the recipe{which}"
                 ui.button(label, on_click=partial(self._apply, line)).props("no-caps")
 
     def _apply(self, line: dict[str, Any]) -> None:
