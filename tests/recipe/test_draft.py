@@ -264,6 +264,20 @@ def test_arrays_are_read_as_their_names_say(folder: Path, made: Callable[[Path],
     assert np.allclose([r.camera_T_target for r in recorded], SEEN, atol=1e-9)
 
 
+def test_each_capture_may_have_a_folder_of_its_own(folder: Path) -> None:
+    clouds(folder)
+    for k, pose in enumerate(ARM):
+        (folder / f"capture_{k}").mkdir()
+        (folder / f"scan_{k}.xyz").rename(folder / f"capture_{k}" / "points.xyz")
+        np.savetxt(folder / f"capture_{k}" / "pose.txt", pose)
+    told = init()
+    assert "clouds: 5 .xyz" in told
+    recorded = recipe(folder).steps[0].params.reader(folder).recordings
+    assert [r.id for r in recorded] == [f"capture_{k}" for k in range(5)]
+    assert [r.cloud.parent.name for r in recorded] == [r.id for r in recorded]
+    assert np.allclose([r.base_T_flange for r in recorded], ARM, atol=1e-9)
+
+
 def test_arrays_without_names_are_asked_for(folder: Path) -> None:
     arrays_of_nobody(folder)
     init(typed="none\nposes.npz:B\nbase_T_flange\ncamera_T_target\nnone\nflange\n")

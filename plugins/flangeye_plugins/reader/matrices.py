@@ -71,7 +71,7 @@ def matrices(path: Path, params: MatricesParams) -> Archive:
     folder = path.parent if path.is_file() else path
     files, arm = _joined(folder, params.robot, params.translation)
     poses = _values(folder, arm, params, params.pose == "flange_T_base")
-    recordings = _with_scans(folder, poses) if params.target is None else []
+    recordings = _with_scans(folder, files, poses) if params.target is None else []
     if params.target is not None:
         more, seen = _joined(folder, params.target.at, params.target.translation)
         turned = params.target.pose == "target_T_camera"
@@ -115,7 +115,13 @@ def _values(folder: Path, named: Named, written: WrittenParams, turned: bool) ->
     return [(n, inverted(v) if turned and v.shape == (4, 4) else v) for n, v in found]
 
 
-def _with_scans(folder: Path, poses: Named) -> list[Recording]:
+def _with_scans(folder: Path, files: list[Path], poses: Named) -> list[Recording]:
+    homes = [file.parent for file in files]
+    if len(poses) == len(set(homes)) > 1:  # a folder for each capture
+        return [
+            recording_of(home.name, pose, scans_in(home))
+            for home, (_, pose) in zip(homes, poses, strict=True)
+        ]
     scans: dict[str, list[Path]] = {}
     for scan in scans_in(folder):
         scans.setdefault(scan.stem, []).append(scan)

@@ -7,7 +7,7 @@ the arm, ``camera_T_target``, ``T_cam_board`` and ``cHt`` are the target's as th
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,11 +123,14 @@ def _places(folder: Path) -> Iterator[tuple[str, list[Path]]]:
         if file.suffix.lower() in (*FILES, *TEXTS) and file.is_file():
             alike = re.sub(r"\d+$", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
-    for place, files in groups.items():
-        if len(files) >= FEWEST:
-            yield place, files
-        else:
-            yield from ((str(file.relative_to(folder)), [file]) for file in files)
+    single = [file for files in groups.values() if len(files) < FEWEST for file in files]
+    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST]
+    yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST)
+    for file in single:
+        if file.name not in one_each:
+            yield str(file.relative_to(folder)), [file]
+    for name in one_each:  # a folder for each capture
+        yield f"*/{name}", [file for file in single if file.name == name]
 
 
 def _arrays(file: Path) -> dict[str, Floats]:

@@ -22,7 +22,7 @@ class FolderSurvey:
 
     Attributes:
         folder: Where.
-        files: All files of the folder, by name.
+        files: All files of the folder, and of the folders in it.
         tables: Those that are tables of numbers.
         arrays: What ``reader.matrices`` may read.
     """
@@ -60,10 +60,10 @@ def look(folder: Path) -> FolderSurvey:
     """
     if not folder.is_dir():
         raise RecipeError(f"{folder}: is no folder; name the one that holds the recordings")
-    files = sorted(p for p in folder.iterdir() if p.is_file())
+    files = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
-    tables = [table for p in files if (table := _table(p)) is not None]
+    tables = [table for p in files if p.parent == folder and (table := _table(p)) is not None]
     return FolderSurvey(folder, files, tables, pose_arrays(folder))
 
 
