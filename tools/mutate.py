@@ -153,16 +153,19 @@ class Tests:
         of_file = self._lines.get(file, {})
         run = {test for line in lines for test in of_file.get(line, ())}
         run = run or {test for tests in of_file.values() for test in tests} or set(self._seconds)
-        return self._within(run, budget, f"test_{Path(file).stem}.py")
+        own = {test for test in self._seconds if f"/test_{Path(file).stem}.py" in test}
+        return self._within(run | own, budget, own)
 
     def but(self, tried: Collection[str], budget: float) -> dict[str, float]:
         """Return the other tests in the same way: what is worked out at import is none's line."""
         return self._within(set(self._seconds) - set(tried), budget)
 
-    def _within(self, tests: set[str], budget: float, own: str = "") -> dict[str, float]:
+    def _within(
+        self, tests: set[str], budget: float, own: Collection[str] = ()
+    ) -> dict[str, float]:
         """Return tests within a budget: those of their own file, then the fastest."""
         chosen = dict[str, float]()
-        for test in sorted(tests, key=lambda test: (own not in test, self._seconds[test])):
+        for test in sorted(tests, key=lambda test: (test not in own, self._seconds[test])):
             if chosen and sum(chosen.values()) + self._seconds[test] > budget:
                 break
             chosen[test] = self._seconds[test]

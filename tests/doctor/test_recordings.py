@@ -150,9 +150,18 @@ def test_a_log_of_ours_needs_no_recipe(
     with pytest.raises(SystemExit):
         cli.main()
     capsys.readouterr()
-    code, out, _ = run(monkeypatch, capsys, tmp_path / "o" / "run.mcap")
-    assert code == 0
+    log = tmp_path / "o" / "run.mcap"
+    code, out, err = run(monkeypatch, capsys, log)
+    assert (code, err) == (0, "")
     assert out.startswith("8 of 8 samples have a target in them")
+    # A result that was changed afterwards is no mistake of the samples, and is named beside them.
+    raw = bytearray(log.read_bytes())
+    raw[bytes(raw).rindex(b'"verified"') + 1] = ord("V")
+    log.write_bytes(raw)
+    code, changed, err = run(monkeypatch, capsys, log)
+    assert (code, changed) == (1, out)
+    assert err.startswith(f"note: {log}: damaged: ")
+    assert "the attached result.json does not match" in err
 
 
 def run(monkeypatch, capsys, *words):

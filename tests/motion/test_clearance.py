@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.models.robots import Volume
 from flangeye.motion.clearance import ArmVolume, segment_distance
 
 A_POINT = 2e-6
@@ -59,6 +60,54 @@ def test_an_arm_that_stands_upright_touches_nothing(robot: str) -> None:
 def test_a_folded_arm_touches_itself() -> None:
     volume, axes = volume_at("ur5", [0, -np.pi / 2, 2.75, 0, 1.5, 0])
     assert not volume.apart(axes)
+
+
+def of_capsules(*links: tuple[int, float, float]) -> tuple[ArmVolume, Any]:
+    """Return upright capsules 0.2 m long with a radius of 0.05: each a link, its x and its foot."""
+    volumes = [
+        Volume.model_construct(link=link, start=(x, 0, z), end=(x, 0, z + 0.2), radius=0.05)
+        for link, x, z in links
+    ]
+    volume = ArmVolume(load_model("robots", "ur5").model_copy(update={"volumes": tuple(volumes)}))
+    return volume, volume.axes(np.broadcast_to(np.eye(4), (7, 4, 4)))
+
+
+@pytest.mark.parametrize(
+    ("links", "apart"),
+    [
+        ([(1, 0.0, 0.0), (3, 0.09, 0.0)], True),  # joined by the link between them
+        ([(1, 0.0, 0.0), (4, 0.09, 0.0)], False),
+        ([(4, 0.0, 0.0), (1, 0.09, 0.0)], False),
+        ([(1, 0.0, 0.0), (4, 0.11, 0.0)], True),
+        ([(1, 0.0, 0.0), (2, 0.5, 0.0), (6, 0.09, 0.23)], False),  # the ends count, and all pairs
+    ],
+)
+def test_links_that_are_three_joints_apart_must_not_touch(links: Any, apart: bool) -> None:
+    volume, axes = of_capsules(*links)
+    assert volume.apart(axes) is apart
+
+
+@pytest.mark.parametrize(
+    ("links", "above"),
+    [
+        ([(0, 0.0, -0.1), (1, 0.0, 0.0), (2, 0.0, 0.351)], True),  # base and shoulder stand on it
+        ([(2, 0.0, 0.349)], False),
+        ([(2, 0.0, 1.0), (6, 0.0, 0.349)], False),
+    ],
+)
+def test_all_that_moves_stays_above_the_table(links: Any, above: bool) -> None:
+    volume, axes = of_capsules(*links)
+    assert volume.above(axes, 0.3) is above
+
+
+def test_segments_on_one_line_and_points_have_their_distance_too() -> None:
+    first = np.array(
+        [[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [1, 0, 0]], [[2, 0, 0], [2, 0, 0]]], float
+    )
+    second = np.array(
+        [[[3, 0, 0], [5, 0, 0]], [[0, 2, 0], [1, 2, 0]], [[2, 0, 0], [2, 0, 0]]], float
+    )
+    assert segment_distance(first, second) == pytest.approx([2.0, 2.0, 0.0], abs=1e-15)
 
 
 def test_a_line_of_sight_through_the_arm_is_not_free() -> None:

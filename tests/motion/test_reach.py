@@ -40,10 +40,10 @@ def seen_from_above(**far_away: Any) -> Reach:
     ("place", "seen"),
     [
         ((0.0, 0.0, 0.7), True),
-        ((0.614, 0.0, 0.7), True), ((0.616, 0.0, 0.7), False),  # 0.95 x 0.7 tan 45 - 0.05
-        ((-0.614, 0.0, 0.7), True), ((-0.616, 0.0, 0.7), False),
-        ((0.0, 0.333, 0.7), True), ((0.0, 0.335, 0.7), False),  # 0.95 x 0.7 tan 30 - 0.05
-        ((0.0, -0.333, 0.7), True), ((0.0, -0.335, 0.7), False),
+        ((0.6149, 0.0, 0.7), True), ((0.6151, 0.0, 0.7), False),  # 0.95 x 0.7 tan 45 - 0.05
+        ((-0.6149, 0.0, 0.7), True), ((-0.6151, 0.0, 0.7), False),
+        ((0.0, 0.3338, 0.7), True), ((0.0, 0.3341, 0.7), False),  # 0.95 x 0.7 tan 30 - 0.05
+        ((0.0, -0.3338, 0.7), True), ((0.0, -0.3341, 0.7), False),
         ((0.0, 0.0, 0.5), True), ((0.0, 0.0, 0.499), False),
         ((0.0, 0.0, 1.0), True), ((0.0, 0.0, 1.001), False),
     ],
@@ -75,6 +75,20 @@ def test_camera_and_projector_lean_towards_each_other_and_both_must_see(
     assert Reach(MODEL, both, np.eye(4), 1e-4).in_view(pose) is lit
     alone = scanner(near=0.1, far=2.0, **lean)  # lights all of space
     assert Reach(MODEL, alone, np.eye(4), 1e-4).in_view(pose)
+
+
+def test_the_projector_s_field_lies_about_its_own_axis() -> None:
+    lean = np.radians(30.0)
+    wide = {"near": 0.01, "far": 9.0, "field_of_view": np.radians([170.0, 170.0])}
+    both = scanner(projection=np.radians([40.0, 30.0]), baseline=0.7, convergence=lean, **wide)
+    right, up = (0.95 * 0.7 * np.tan(np.radians(half)) for half in (20.0, 15.0))
+    turn = rotation_from_rpy(0.0, -2 * lean, 0.0)
+    place = 0.7 * np.array([np.cos(lean), 0.0, np.sin(lean)])
+    for x, y in ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.9, 1.0), (-0.9, 1.0)):
+        for edge, lit in ((-1e-4, True), (1e-4, False)):
+            point = np.array([x * (right + edge * abs(x // 1)), y * (up + edge * abs(y)), 0.7])
+            pose = rigid(np.eye(3), place + turn @ point)
+            assert Reach(MODEL, both, np.eye(4), 1e-6).in_view(pose) is lit
 
 
 def test_what_lies_behind_the_projector_is_not_lit() -> None:
@@ -137,9 +151,12 @@ def test_joints_stay_in_the_turn_in_which_the_arm_stands(last: float) -> None:
     assert arm.joints(ARM.flange(start)) == pytest.approx(start, abs=1e-6)
 
 
-@pytest.mark.parametrize(("by", "there"), [(9.0, 359.0), (11.0, 1.0)])
-def test_a_turn_that_would_pass_a_limit_is_not_gone_on_with(by: float, there: float) -> None:
-    arm, start = seen_from_above(), np.r_[SHOWN[:5], np.radians(350.0)]
+@pytest.mark.parametrize(
+    ("last", "by", "there"),
+    [(350.0, 9.0, 359.0), (350.0, 11.0, 1.0), (-350.0, -11.0, -1.0), (200.0, 140.0, 340.0)],
+)
+def test_a_turn_is_gone_on_with_up_to_the_limit(last: float, by: float, there: float) -> None:
+    arm, start = seen_from_above(), np.r_[SHOWN[:5], np.radians(last)]
     arm.start_from(start)
     pose = ARM.flange(turned(start, j6=np.radians(by)))
     found = [q for q in arm._possible(pose) if np.abs(q[:5] - SHOWN[:5]).max() < 1e-6]
@@ -194,6 +211,14 @@ def test_a_pose_that_is_too_near_to_a_margin_is_refused_and_says_to_which(
     arm = seen_from_above(margins=margins)
     assert (arm.joints(ARM.flange(SHOWN)) is None) is bool(reason)
     assert arm.why_refused() == (f"1 {reason}" if reason else "")
+
+
+def test_a_single_posture_that_is_too_near_says_so_too() -> None:
+    pose = ARM.flange(np.radians([19.7, -141.7, -116.2, 0.2, -118.1, 182.7]))
+    assert sum(seen_from_above()._clear(joints) for joints in ARM.inverse(pose)) == 1
+    arm = seen_from_above(margins=Margins(replace(LIMITS, high=np.zeros(3)), 0.0, 0.0))
+    assert arm.joints(pose) is None
+    assert arm.why_refused() == "1 outside robot.limits.box"
 
 
 def test_a_posture_counts_as_singular_by_its_worst_direction_in_units_of_the_reach() -> None:

@@ -40,6 +40,27 @@ def test_the_time_is_that_of_a_ramp_up_a_ride_and_a_ramp_down() -> None:
     assert way.seconds == pytest.approx(1.0 / leg.speed + leg.speed / leg.acceleration)
 
 
+@pytest.mark.parametrize("turn", [0.001, 0.05, 1.0])
+def test_the_arm_is_as_fast_as_the_flange_s_limit_allows_and_no_faster(turn: float) -> None:
+    way = ROUTER.route(HOME, turned(HOME, j1=turn))
+    assert isinstance(way, Route)
+    place = Arm(MODEL).flange(HOME)[:3, 3]
+    radius = np.hypot(place[0], place[1])
+    assert radius * LIMITS.joint_speed > LIMITS.speed  # the flange's is the one that counts
+    (leg,) = way.legs
+    assert radius * leg.speed == pytest.approx(LIMITS.speed, rel=1e-3)
+
+
+def test_a_short_way_takes_its_ramps_alone() -> None:
+    gentle = replace(LIMITS, acceleration=0.02)
+    way = Router(MODEL, gentle, HOME).route(HOME, turned(HOME, j1=0.01))
+    assert isinstance(way, Route)
+    (leg,) = way.legs
+    assert leg.speed**2 / leg.acceleration > 0.01  # it never comes to its speed
+    shortest = 2 * np.sqrt(0.01 / leg.acceleration)
+    assert 0.5 * shortest <= way.seconds <= shortest
+
+
 def test_a_way_that_leads_through_the_table_is_barred() -> None:
     low = np.radians([0.0, 0.0, 30.0, -90.0, -90.0, 0.0])
     way = ROUTER.route(HOME, low)

@@ -15,7 +15,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.touching import SHORT, Toucher
+from flangeye.motion.touching import Toucher
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 
 UR5E = load_model("robots", "ur5e")
@@ -77,8 +77,10 @@ def test_what_was_touched_is_where_the_tip_really_was() -> None:
     for each, point, stood in zip(touched, truth, cell.stood, strict=True):
         np.testing.assert_allclose(each.actual, point, atol=2e-5)
         np.testing.assert_allclose(each.error, wrong, atol=2e-5)
-        # It stopped before where the calibration has the point, and no nearer.
-        assert np.linalg.norm(stood - each.predicted) == pytest.approx(SHORT, abs=1e-4)
+        # It stopped 5 mm before where the calibration has the point, along the tip: not behind it.
+        along = each.base_T_flange[:3, :3] @ TIP / np.linalg.norm(TIP)
+        np.testing.assert_allclose(each.predicted - stood, 0.005 * along, atol=1e-4)
+    assert "point 1: the arm will go to 5 mm before it; keep clear" in cell.asked
     assert [text.partition(":")[0] for text in cell.asked] == ["point 1"] * 2 + ["point 2"] * 2
 
 

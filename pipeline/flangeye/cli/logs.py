@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
-from flangeye.cli.saying import say
+from flangeye.cli.saying import say, say_notes
 from flangeye.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -228,9 +228,10 @@ def doctor(
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     with of_foreign(archive, "it cannot be examined"):
         session = open_session(archive, registry, checked)
+        say_notes(session.damage)
         diagnosis = examine(session, checks)
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
-    if diagnosis.findings:
+    if diagnosis.findings or session.damage:
         raise typer.Exit(1)
 
 

@@ -59,6 +59,7 @@ class RecordedSession:
         changes: Parameters of that step that differ from the recipe's, by what was mended.
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
+        damage: What of the log could not be read or was changed, a line each.
     """
 
     ids: tuple[str, ...]
@@ -78,6 +79,7 @@ class RecordedSession:
     changes: Mapping[str, Any] = field(default_factory=dict)
     marks_open: bool = False
     remarks: tuple[Finding, ...] = ()
+    damage: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ids)

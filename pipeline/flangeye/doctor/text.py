@@ -56,6 +56,7 @@ def fix_lines(finding: Finding, indent: str) -> list[str]:
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return what was found as plain data, SI units."""
     return {
+        "damage": list(diagnosis.session.damage),
         "samples": len(diagnosis.session),
         "seen": int(diagnosis.session.seen.sum()),
         "checks": list(diagnosis.checks),

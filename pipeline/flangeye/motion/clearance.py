@@ -28,8 +28,8 @@ class ArmVolume:
         volumes = robot.volumes
         self.links = np.array([volume.link for volume in volumes], dtype=np.intp)
         self.radii = np.array([volume.radius for volume in volumes])
-        self._ends = np.array([[v.start, v.end] for v in volumes]).reshape(-1, 2, 3)
-        first, second = np.triu_indices(len(volumes), k=1)
+        self._ends = np.array([[v.start, v.end] for v in volumes]).reshape(len(volumes), 2, 3)
+        first, second = np.triu_indices(len(volumes))
         far = np.abs(self.links[first] - self.links[second]) >= APART
         self._pairs = first[far], second[far]
 
@@ -80,4 +80,4 @@ def _dot(first: Floats, second: Floats) -> Floats:
 
 def _ratio(over: Floats, under: Floats) -> Floats:
     """Divide; zero where parallel lines or points leave the quotient open."""
-    return np.asarray(np.where(under > 1e-12, over / np.where(under > 1e-12, under, 1.0), 0.0))
+    return np.divide(over, under, out=np.zeros_like(over), where=under > 1e-12)

@@ -224,4 +224,4 @@ def _turn(first: Floats, second: Floats) -> float:
 def _within(points: Floats, field: tuple[float, float]) -> bool:
     """Return whether (N, 3) points before a pinhole lie in its field of view, with a margin."""
     half = np.tan(np.asarray(field) / 2) * MARGIN
-    return bool((points[:, 2] > 0).all() and (np.abs(points[:, :2] / points[:, 2:]) <= half).all())
+    return bool((np.abs(points[:, :2]) <= half * points[:, 2:]).all())

@@ -211,7 +211,7 @@ class Watchdog:
                 self._command(request, content)
             if request in ("cycle", "velocity"):
                 # A program that leads waits for each cycle and answers it within: one word does.
-                self._asked, self._listens = True, 0.0
+                self._asked = True
                 return True
         self._listens = 0.0
         return True
