@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
+from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.route import Barred, Route, Router
 from tests.motion.stand_in import LIMITS, MODEL, turned
 
@@ -59,6 +60,45 @@ def test_a_short_way_takes_its_ramps_alone() -> None:
     assert leg.speed**2 / leg.acceleration > 0.01  # it never comes to its speed
     shortest = 2 * np.sqrt(0.01 / leg.acceleration)
     assert 0.5 * shortest <= way.seconds <= shortest
+
+
+def test_a_way_is_checked_from_its_start_to_its_end_every_two_degrees() -> None:
+    seen: list[Any] = []
+
+    class Watching(Router):
+        def _bars(self, joints: Any, frames: Any, place: Any) -> str | None:
+            seen.append(joints)
+            return super()._bars(joints, frames, place)
+
+    start = np.zeros(6)
+    start[0] = -0.6
+    assert isinstance(Watching(MODEL, LIMITS, HOME).route(start, -start), Route)
+    assert seen[0] == pytest.approx(start, abs=1e-12)
+    assert seen[-1] == pytest.approx(-start, abs=1e-12)
+    assert np.degrees(np.abs(np.diff(seen, axis=0)).max()) <= 2.0
+
+
+def test_no_joint_accelerates_by_more_than_60_degrees_a_second_squared() -> None:
+    way = ROUTER.route(HOME, turned(HOME, j6=1.0))
+    assert isinstance(way, Route)
+    assert np.degrees(way.legs[0].acceleration) == pytest.approx(60.0)
+
+
+def test_an_arm_passes_a_millimetre_above_the_table_and_says_where_it_would_touch() -> None:
+    joints = np.radians([0.0, -30.0, 60.0, -30.0, -90.0, 0.0])
+    volume = ArmVolume(MODEL)
+    axes, moving = volume.axes(Arm(MODEL).frames(joints)), volume.links >= 2
+    lowest = (axes[moving, :, 2].min(axis=1) - volume.radii[moving]).min()
+    pose = Arm(MODEL).flange(joints)
+    for gap, clear in ((0.0005, True), (-0.0005, False)):
+        pose[2, 3] += gap - lowest
+        lowest = gap
+        (near, *_) = Arm(MODEL).inverse_near(pose, joints[None])
+        way = ROUTER.route(near, near)
+        assert isinstance(way, Route) is clear
+    assert isinstance(way, Barred)
+    place = ", ".join(f"{1e3 * x:.0f}" for x in pose[:3, 3])
+    assert way.reason == f"touches the table with the flange at {place} mm"
 
 
 def test_a_way_that_leads_through_the_table_is_barred() -> None:

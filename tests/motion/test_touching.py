@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,6 @@ class Cell:
         self.asked: list[str] = []
         self.stood: list[np.ndarray] = []
         self._jogs_to = iter(jogs_to)
-        self.fastest = 0.0
 
     @contextmanager
     def _open(self) -> Iterator[SimulatedRobot]:
@@ -104,3 +104,10 @@ def test_a_point_that_cannot_be_reached_is_one_line_and_nothing_moves() -> None:
         list(cell.toucher().touch(low, move=True))
     assert cell.asked == []
     assert np.array_equal(cell.tip(), before)
+
+
+def test_the_arm_is_slow_beside_the_work_whatever_the_recipe_allows() -> None:
+    fast, slow = Cell([]).toucher()._slowly(), replace(LIMITS, speed=0.01, joint_speed=0.1)
+    assert (fast.speed, fast.joint_speed) == (0.02, 0.2)
+    kept = Cell([]).toucher(slow)._slowly()
+    assert (kept.speed, kept.joint_speed) == (0.01, 0.1)

@@ -14,7 +14,7 @@ from flangeye.models.coverage import coverage_of
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import RunFolder
-from flangeye.run.outlook import outlook, outlook_of_log
+from flangeye.run.outlook import Outlook, outlook, outlook_of_log
 from flangeye.run.session import Start, record_run
 
 RECIPE = """title: ready-made centres
@@ -80,3 +80,15 @@ def test_coverage_counts_cells_and_turns() -> None:
         "go to the high end of the work along z",
     ]
     assert coverage_of(box, []).places.sum() == 0
+
+
+def test_an_outlook_is_told_in_millimetres() -> None:
+    told = Outlook({"01": 0.0012}, {"02": "too far"}, 0.0005).lines()
+    assert told == [
+        "01  1.200 mm",
+        "02  set aside: too far",
+        "error to expect: 95 % below 0.500 mm anywhere at the work",
+    ]
+    assert Outlook(missing="move the arm").lines() == [
+        "error to expect: not known yet", "missing: move the arm",
+    ]  # fmt: skip

@@ -17,7 +17,7 @@ from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
-from flangeye.run.restart import FromNothing, restart_at
+from flangeye.run.restart import FromNothing, restart_at, restart_hint
 from flangeye.run.runner import Runner
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
@@ -251,3 +251,18 @@ def test_what_is_solved_again_is_refined_again(execute: Callable[..., Any]) -> N
         execute(TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy"))
     assert told[0].notes == ("refined",)
     assert len(told[0].pairs) == 5
+
+
+@pytest.mark.parametrize(
+    ("clouds", "hint"),
+    [
+        ("full", "flangeye run toy --from old.mcap --at segment.toy --set PATH=VALUE"),
+        ("reduced", "flangeye run toy --from old.mcap --at fit.toy --set PATH=VALUE "
+         "(to do segment.toy again, record with --set log.clouds=full)"),
+    ],
+)  # fmt: skip
+def test_a_log_is_gone_on_with_at_the_first_step_whose_input_it_holds(
+    toy_registry: Registry, clouds: str, hint: str
+) -> None:
+    text = f"log: {{clouds: {clouds}}}\n{TOY_RECIPE}"
+    assert restart_hint(parse_recipe(text, "toy", toy_registry), Path("old.mcap")) == hint

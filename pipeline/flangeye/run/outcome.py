@@ -105,8 +105,7 @@ def result_of(
         provenance=_provenance(outcome, recipe, registry),
     )
     given = recipe.context.get(t.Box)
-    box = work_of(calibration, outcome.source, given) if calibration else None
-    if calibration and box:
+    if calibration and (box := work_of(calibration, outcome.source, given)):
         result.method = calibration.method
         result.workspace = r.workspace_result(calibration.camera, box)
         if truth := truths.cell:

@@ -27,6 +27,7 @@ from flangeye_plugins.verify.holdout import (
     HeldOut,
     HoldoutParams,
     _beyond_gate,
+    _corrected_figures,
     deal,
     verify_holdout,
 )
@@ -240,3 +241,30 @@ def test_a_pose_is_an_outlier_beyond_the_quantile_of_three_degrees_of_freedom(
     errors[:2, 0] = gate * 0.999, gate * 1.001  # the others lie where they should: nothing is added
     held = HeldOut(errors, np.tile(np.eye(3) * MM**2, (9, 1, 1)), np.full(9, np.nan))
     assert _beyond_gate(held, probability).tolist() == [False, True] + [False] * 7
+
+
+def test_errors_larger_than_stated_are_scatter_not_outliers_but_for_the_one_far_off() -> None:
+    errors = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
+    errors[7] = [0.0, 0.03, 0.0]
+    held = HeldOut(errors, np.tile(1e-12 * np.eye(3), (40, 1, 1)), np.full(40, np.nan))
+    assert np.flatnonzero(_beyond_gate(held, 0.999)).tolist() == [7]
+
+
+def test_two_folds_are_enough_and_one_is_not() -> None:
+    assert HoldoutParams(folds=2).folds == 2
+    with pytest.raises(ValueError, match="greater than or equal to 2"):
+        HoldoutParams(folds=1)
+
+
+def test_figures_of_a_corrected_arm_are_those_of_the_errors_lengths() -> None:
+    errors = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 12.0, 0.0]])
+    held = HeldOut(errors, np.zeros((3, 3, 3)), np.zeros(3))
+    figures = _corrected_figures(held, np.array([False, False, True]))
+    assert figures == pytest.approx(
+        {
+            "corrected_rms": np.sqrt((25 + 1 + 144) / 3),
+            "corrected_median": 5.0,
+            "corrected_p95": 11.3,
+            "corrected_rms_inliers": np.sqrt(13.0),
+        }
+    )
