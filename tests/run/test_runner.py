@@ -257,7 +257,7 @@ def test_what_is_solved_again_is_refined_again(execute: Callable[..., Any]) -> N
     ("clouds", "hint"),
     [
         ("full", "flangeye run toy --from old.mcap --at segment.toy --set PATH=VALUE"),
-        ("reduced", "flangeye run toy --from old.mcap --at fit.toy --set PATH=VALUE "
+        ("preview", "flangeye run toy --from old.mcap --at fit.toy --set PATH=VALUE "
          "(to do segment.toy again, record with --set log.clouds=full)"),
     ],
 )  # fmt: skip
