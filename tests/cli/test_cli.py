@@ -334,6 +334,8 @@ def test_a_runs_folder_is_as_good_as_its_log(
     assert (tmp_path / "here" / "report.html").exists()
     assert flangeye("replay", "here") == flangeye("replay", "here/run.mcap")
     assert flangeye("doctor", "here") == flangeye("doctor", "here/run.mcap")
+    assert flangeye("show", "here/calibration.yaml") == flangeye("show", "here")
+    assert flangeye("doctor", "here/result.json") == flangeye("doctor", "here")
 
 
 def test_a_refused_run_writes_no_calibration(

@@ -220,7 +220,7 @@ def doctor(
     from flangeye.doctor import as_json, as_text, examine, open_session
 
     registry = load_plugins()
-    if recipe is None and archive.suffix in (".yaml", ".yml") and archive.is_file():
+    if recipe is None and _is_recipe(archive):
         recipe = str(archive)
     checked = read_recipe(recipe, registry, overrides) if recipe else None
     if checked is not None and recipe == str(archive):
@@ -233,6 +233,13 @@ def doctor(
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
     if diagnosis.findings or session.damage:
         raise typer.Exit(1)
+
+
+def _is_recipe(path: Path) -> bool:
+    """Whether a path is a YAML file that stands for no run."""
+    from flangeye.log.read import log_of
+
+    return path.suffix in (".yaml", ".yml") and path.is_file() and log_of(path) == path
 
 
 def _archive_of(recipe: Recipe) -> Path:

@@ -33,7 +33,10 @@ HistoryFile = Annotated[
 
 @app.command()
 def monitor(  # noqa: PLR0913  one argument an option
-    calibration: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
+    calibration: Annotated[
+        Path,
+        typer.Argument(help="The calibration: its run's folder, run.mcap or calibration.yaml."),
+    ],
     archive: Later = None,
     more: More = None,
     live: Annotated[

@@ -41,6 +41,7 @@ _GIVEN: dict[str, tuple[type, ...]] = {
 }
 """What the steps of a kind give, where others rely on it."""
 
+_OF_A_RUN = ("calibration.yaml", "result.json", "report.html")
 MAX_JSON = 1 << 24
 """Longest JSON message that is read [bytes]; decoded, it takes forty times as much."""
 MAX_TOLD = 10
@@ -293,8 +294,11 @@ class RunLog:
 
 
 def log_of(path: Path) -> Path:
-    """Return the log of a run that is given as its folder or as the log itself."""
-    return path / "run.mcap" if path.is_dir() else path
+    """Return the log of a run that is given as its folder, or as any of the files in it."""
+    if path.is_dir():
+        return path / "run.mcap"
+    beside = path.parent / "run.mcap"
+    return beside if path.name in _OF_A_RUN and beside.is_file() else path
 
 
 def is_log(path: Path) -> bool:
