@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import app, load_plugins
+from flangeye.cli.app import Overrides, app, load_plugins
 from flangeye.cli.saying import say
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         bool,
         typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
     ] = False,
+    overrides: Overrides = None,
     history: HistoryFile = None,
     false_alarms: Annotated[
         float, typer.Option(min=1e-9, max=0.05, help="Probability of a false alarm per check.")
@@ -84,7 +85,7 @@ def monitor(  # noqa: PLR0913  one argument an option
     stored = stored_calibration(calibration)
     kept = History.read(history or stored.path.parent / "monitor.parquet", stored.key)
     registry = load_plugins()
-    for check in _checks(stored, registry, archive, (scans, move)):
+    for check in _checks(stored, registry, archive, (scans, move), overrides or ()):
         kept.add(check)
         kept.findings.append(judge(stored, kept, test))
         kept.write()
@@ -100,11 +101,12 @@ def _checks(
     registry: Registry,
     archives: list[Path],
     live: tuple[int, bool],
+    overrides: Sequence[str],
 ) -> Iterator[Check]:
     from flangeye.doctor.monitor import from_archive, from_arm
 
     for path in archives:
-        yield from_archive(path, stored, registry)
+        yield from_archive(path, stored, registry, overrides)
     if not archives:
         yield from_arm(stored, registry, *live)
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -17,6 +19,7 @@ from flangeye.doctor.monitor.history import Finding
 from flangeye.doctor.monitor.opcua import write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.handeye.drift import DriftTest
+from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.doctor.monitor.cell import calibrate, check
 
 
@@ -174,3 +177,19 @@ def test_live_needs_a_calibration_that_was_live(cell: Path) -> None:
 
     with pytest.raises(StageError, match=r"was not calibrated live"):
         from_arm(stored_calibration(cell / "calibration"), load_registry(), 3, move=False)
+
+
+def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Path) -> None:
+    sample = Path(__file__).parents[3] / "data" / "samples" / "ur5_phoxi-m"
+    done = CliRunner().invoke(app, ["run", "ur5_phoxi-m_sample", "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.output
+    later = tmp_path / "later"
+    shutil.copytree(sample, later)
+    poses = [r.base_T_flange for r in folder(sample, FolderParams()).recordings]
+    (later / "poses.csv").unlink()
+    np.save(later / "arm.npy", poses)
+    words = ["monitor", str(tmp_path / "run" / "calibration.yaml"), "--archive", str(later)]
+    reader = "acquire.archive.reader={matrices: {robot: arm.npy, length: m}}"
+    found = CliRunner().invoke(app, [*words, "--set", reader])
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout)["state"] == "OK"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ from flangeye.doctor.monitor.history import Check
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.log.read import read_run
+from flangeye.log.read import log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner
 
 
-def from_archive(path: Path, stored: StoredCalibration, registry: Registry) -> Check:
+def from_archive(
+    path: Path, stored: StoredCalibration, registry: Registry, overrides: Sequence[str] = ()
+) -> Check:
     """Return what an archive shows of the flange: one check.
 
     Args:
@@ -27,16 +30,17 @@ def from_archive(path: Path, stored: StoredCalibration, registry: Registry) -> C
             segmented and fitted as the calibration's own recipe did.
         stored: The calibration.
         registry: The plugins on offer.
+        overrides: Where the recordings are read in another way than the calibration's were.
 
     Raises:
         StageError: It cannot be read, or the flange is in none of its scans.
     """
-    log = path / "run.mcap" if path.is_dir() else path
+    log = log_of(path)
     if log.suffix == ".mcap" and log.is_file():
         return _checked(path, *_of_log(log))
     if not path.exists():
         raise StageError(f"{path}: does not exist")
-    recipe = parse_recipe(_from_archive(stored), stored.path.name, registry)
+    recipe = parse_recipe(_from_archive(stored), stored.path.name, registry, overrides)
     seen = Runner(recipe, registry, t.ArchivePath(path)).take(None)
     return _checked(path, seen, path.stat().st_mtime_ns)
 
