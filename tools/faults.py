@@ -3,8 +3,8 @@
 A calibration, or a program that leads the arm as a weld does, runs against a controller on loopback
 through the maker's client. The fault comes while the arm moves, at a random moment. By the
 controller's clock the arm rests within 0.5 s; what was finished is in the log; the program ends
-within 3 s, not counting how long it and its guard waited for a core of a busy machine. Under a
-fault that hinders nothing (a network late by 20 ms) it may go on to its end.
+within 3 s, not counting how long it or its guard, the longer of both, waited for a core of a busy
+machine. Under a fault that hinders nothing (a network late by 20 ms) it may go on to its end.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def main() -> None:
 
 
 class End(NamedTuple):
-    """After a fault: when the arm moved last, when the program ended, how long it had no core [s]."""
+    """After a fault, when the arm moved last and when the program ended, and how long the process
+    of it that had to wait most had no core [s]."""
 
     rests: float
     exits: float | None
@@ -154,28 +155,28 @@ def _over(program: subprocess.Popen[str]) -> bool:
 def _watched(cell: Cell, program: subprocess.Popen[str], began: float) -> End:
     """Look at an arm and its program until both have come to an end, or go on in spite of all."""
     moved = now = 0.0
-    ended, queued = None, _queued(program.pid)
-    waited = queued
+    ended, waited, before = None, 0.0, _queued(program.pid)
     while now < PATIENCE and (ended is None or now < ended + RESTS):
         truth = cell.control.truth()
         now = truth.time - began
         moved = now if truth.speed > STANDS else moved
         if ended is None and _over(program):
             ended = now
-        waited = max(waited, _queued(program.pid))
+        for process, seconds in _queued(program.pid).items():
+            waited = max(waited, seconds - before.get(process, 0.0))
         time.sleep(0.02)
-    return End(moved, ended, waited - queued)
+    return End(moved, ended, waited)
 
 
-def _queued(pid: int) -> float:
-    """Return how long a program and what it started have waited for a core so far [s]."""
-    total = 0.0
+def _queued(pid: int) -> dict[int, float]:
+    """Return how long a program, and each that it started, has waited for a core so far [s]."""
+    waited: dict[int, float] = {}
     with suppress(OSError):
         told = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii")
         for process in (pid, *map(int, told.split())):
             words = Path(f"/proc/{process}/task/{process}/schedstat").read_text("ascii").split()
-            total += 1e-9 * int(words[1])
-    return total
+            waited[process] = 1e-9 * int(words[1])
+    return waited
 
 
 if __name__ == "__main__":

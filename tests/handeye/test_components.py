@@ -81,10 +81,20 @@ def test_the_arms_explain_translations_as_far_as_rotations_allow() -> None:
     least = turned.factor(OWN, OWN, chi2_quantile(0.05, 3 * N))
     wanted = shifted.factor(OWN, OWN, 3.0 * N)
     assert 0 < least < wanted == pytest.approx(4.0, rel=1e-5)
-    assert noise_of(turned, shifted, own, arms).arms == least
+    found = noise_of(turned, shifted, own, arms)
+    assert found.arms == least
+    assert found.pose == pytest.approx(5e-8 - 1e-8 * (1 + least) - FINEST**2, rel=1e-5)
     free = residuals(1e-8, np.inf)
     assert noise_of(free, shifted, own, arms).arms == wanted
     assert noise_of(turned, shifted, own, 0 * arms).arms == 1.0
+
+
+def test_one_free_rotation_may_be_explained_down_to_the_5_percent_quantile_of_one() -> None:
+    own, arms = six(1e-8, 1e-8)[:1], six(1e-8, 1e-8)[:1]
+    turned = Residuals(np.array([[1e-4, 0.0, 0.0]]), EYE[:1], 0.6)
+    shifted = Residuals(np.array([[1.0, 0.0, 0.0]]), EYE[:1], 3.0)
+    allowed = turned.factor(OWN[:1], OWN[:1], chi2_quantile(0.05, 1))
+    assert noise_of(turned, shifted, own, arms).arms == pytest.approx(allowed)
 
 
 def test_what_the_arms_do_not_explain_is_added_evenly() -> None:
@@ -106,8 +116,14 @@ def test_noises_are_close_to_a_thousandth(name: str) -> None:
     assert not Noise(**{**base, name: base[name] * 1.0012}).is_close(noise)
 
 
+def test_a_size_is_compared_by_its_variance() -> None:
+    one = Noise(0.0, 0.0, size=0.5)
+    assert one.is_close(Noise(0.0, 0.0, size=0.5 * 1.0004))
+    assert not one.is_close(Noise(0.0, 0.0, size=0.5 * 1.0006))
+
+
 def test_without_more_said_nothing_is_scaled() -> None:
-    assert Noise(0.0, 0.0) == Noise(0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
+    assert Noise(0.0, 0.0) == Noise(0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0)
 
 
 def test_a_nuisances_size_is_compared_by_its_variance() -> None:
@@ -129,3 +145,10 @@ def test_noise_that_is_none_of_the_arms_has_no_share_of_theirs() -> None:
     found = without_arms(residuals(4e-8), residuals(9e-8), own)
     assert found.arms == 0.0
     assert found.pose == pytest.approx(8e-8 - FINEST**2, rel=1e-5)
+
+
+def test_depth_is_what_neither_features_nor_arms_nor_the_other_noise_explain() -> None:
+    known = six(shifted=1e-8)
+    noise = with_depth(Noise(1e-8, 0.0, arms=2.0), residuals(9e-8), known, known)
+    assert noise.depth == pytest.approx(5e-8 - FINEST**2, rel=1e-5)
+    assert (noise.pose, noise.arms) == (1e-8, 2.0)

@@ -56,7 +56,7 @@ class Noise:
     def _variances(self) -> tuple[float, ...]:
         walk = (each**2 for each in self.walk)
         scales = self.centre_scale, self.normal_scale, self.arms, self.size**2, *walk
-        return (self.pose + FINEST**2, self.tilt + FINEST**2, self.depth + FINEST**2, *scales)
+        return (self.pose, self.tilt, self.depth, *scales)
 
 
 def noise_of(turned: Residuals, shifted: Residuals, own: Floats, arms: Floats) -> Noise:
@@ -127,8 +127,6 @@ class Residuals:
     def factor(self, own: Floats, further: Floats, wanted: float) -> float:
         """Return how often covariances have to be added to own ones for a sum of squares."""
         squares, shares = self._along(own, further)
-        if np.isinf(wanted) or squares.sum() <= wanted:
-            return 0.0
         # Newton on the reciprocal of the sum, which is concave: it climbs to the answer from below.
         factor = 0.0
         for _ in range(STEPS):
