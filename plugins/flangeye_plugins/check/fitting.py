@@ -157,8 +157,10 @@ def _normal_block(equations: Equations, unknowns: VariantUnknowns) -> Block:
 
 def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: float) -> Block:
     """Return errors with what each group of parameters does to them."""
-    alike = [np.broadcast_to(part, (*residuals.shape, 3)) for part in parts]
-    return Block(residuals, np.concatenate(alike, axis=-1), dimension, finest)
+    jacobian = np.empty((*residuals.shape, 3 * len(parts)))
+    for i, part in enumerate(parts):
+        jacobian[..., 3 * i : 3 * i + 3] = part
+    return Block(residuals, jacobian, dimension, finest)
 
 
 def _squares(block: Block) -> Floats:
@@ -190,9 +192,10 @@ def _normal_equations(
     gradient: Floats = np.zeros((1, p))
     for block, weight, scale in zip(blocks, weights, scales, strict=True):
         w = np.sqrt(weight)[..., None] / scale[:, None, None]
-        rows = np.nan_to_num(block.jacobian) * w[..., None]
+        seen = weight[..., None] > 0
+        rows = np.where(seen[..., None], block.jacobian, 0.0) * w[..., None]
         flat = rows.reshape(len(rows), -1, p)
-        errors = (np.nan_to_num(block.residuals) * w).reshape(len(rows), -1, 1)
+        errors = (np.where(seen, block.residuals, 0.0) * w).reshape(len(rows), -1, 1)
         information = information + flat.swapaxes(-1, -2) @ flat
         gradient = gradient + (flat.swapaxes(-1, -2) @ errors)[..., 0]
     return information, gradient

@@ -143,5 +143,7 @@ def _evidence(
     # Those with too few samples are put in as the session is, which is no better than itself.
     known[~enough] = True
     tried = [o.session if kept else session for o, kept in zip(others, enough, strict=True)]
-    given = equations_of(session).without(~known)
-    return best_of(fit(given), fit(equations_of(*tried).without(~known)), further)
+    chosen, against = np.unique(known, axis=0, return_inverse=True)
+    given = fit(equations_of(session).without(~chosen))
+    others_fit = fit(equations_of(*tried).without(~known))
+    return best_of(given, others_fit, further, against=against.reshape(-1))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.doctor.diagnosis import Misfit
-from flangeye.types import Floats
+from flangeye.types import Floats, Indices
 from flangeye_plugins.check.fitting import VariantFits
 
 NEGLIGIBLE = 0.5e-3
@@ -45,22 +45,29 @@ class Significance(NamedTuple):
 
 
 def best_of(
-    null: VariantFits, alternatives: VariantFits, further: int = 0, tried: int | None = None
+    null: VariantFits,
+    alternatives: VariantFits,
+    further: int = 0,
+    tried: int | None = None,
+    against: Indices | None = None,
 ) -> Significance:
     """Return the alternative with the largest likelihood, held against the session as it is.
 
     Args:
-        null: One variant, or one for each alternative.
+        null: The session as it is: once, or on several choices of its samples.
         alternatives: K variants of the same samples.
         further: Parameters an alternative has more than the session; 0 for another reading of
             the same numbers, which is tested as if it had twice as many (the model that holds
             both).
         tried: How many alternatives there were, where they were not all fitted.
+        against: (K,) which of ``null`` has the samples of each alternative; the first if not given.
     """
-    ratios = alternatives.likelihood - null.likelihood
+    if against is None:
+        against = np.zeros(len(alternatives.likelihood), dtype=int)
+    ratios = alternatives.likelihood - null.likelihood[against]
     # Of readings that come to the same, the first: they are listed by how common they are.
     index = int(np.flatnonzero(ratios >= ratios.max() - SAME)[0])
-    at = index if len(null.likelihood) > 1 else 0
+    at = int(against[index])
     before, after = null.misfit(at), alternatives.misfit(index)
     freedom = float(null.count[at]) - alternatives.parameters - further
     counted = tried or len(ratios)

@@ -25,18 +25,35 @@ def rotations_of_poses(equations: Equations) -> Rotations:
 
     Each in turn is the one that fits best given the other two (Procrustes), from random ones.
     """
-    left, seen, right = _rotations(equations)
-    k = len(left)
+    by_x, by_y, by_z = _by_unknown(*_rotations(equations))
+    k = len(by_x)
     rng = np.random.default_rng(0)
     x, y, z = nearest_rotation(rng.standard_normal((3, STARTS, 1, 3, 3)).repeat(k, axis=2))
     for _ in range(ROUNDS):
-        x = nearest_rotation((left @ _all(y) @ right @ _all(z) @ _turned(seen)).sum(axis=2))
-        carried = _turned(left) @ _all(x) @ seen
-        y = nearest_rotation((carried @ _turned(_all(z)) @ _turned(right)).sum(axis=2))
-        moved = (_turned(right) @ _turned(_all(y)) @ carried).sum(axis=2)
+        x = nearest_rotation(_contracted(by_x, y, z))
+        y = nearest_rotation(_contracted(by_y, x, z))
+        moved = _contracted(by_z, x, y)
         z = nearest_rotation(moved)
     best = np.argmax((moved * z).sum(axis=(-1, -2)), axis=0), np.arange(k)
     return x[best], y[best], z[best]
+
+
+def _by_unknown(left: Floats, seen: Floats, right: Floats) -> list[Floats]:
+    """Return what is to be largest, ``sum_n tr(X seen_n (left_n Y right_n Z)^T)``, as matrices.
+
+    It is linear in X, in Y and in Z: summed over the samples once, a round costs the same however
+    many there are. Each (K, 9, 81) has the entries of one of them in its rows and the products of
+    the other two's in its columns.
+    """
+    form = np.einsum("knac,knde,knbf->kabcdef", left, right, seen).reshape(-1, 9, 9, 9)
+    return [np.moveaxis(form, axis, 1).reshape(-1, 9, 81) for axis in (1, 2, 3)]
+
+
+def _contracted(form: Floats, one: Floats, other: Floats) -> Floats:
+    """Return what the rotation in the rows is to be nearest to, given two (S, K, 3, 3)."""
+    s, k = one.shape[:2]
+    products = (one.reshape(s, k, 9, 1) * other.reshape(s, k, 1, 9)).reshape(s, k, 81, 1)
+    return np.asarray((form @ products).reshape(s, k, 3, 3))
 
 
 def _rotations(equations: Equations) -> Rotations:
@@ -49,15 +66,6 @@ def _rotations(equations: Equations) -> Rotations:
         np.broadcast_to(m, (k, n, 3, 3)) for m in (bases[..., :3, :3], seen, mounts)
     )
     return left, middle, right
-
-
-def _all(rotation: Floats) -> Floats:
-    """Return rotations (S, K, 3, 3) as those of every sample."""
-    return rotation[:, :, None]
-
-
-def _turned(rotations: Floats) -> Floats:
-    return rotations.swapaxes(-1, -2)
 
 
 def rotations_of_circles(equations: Equations) -> Rotations:
@@ -131,7 +139,7 @@ def positions(equations: Equations, rotations: Rotations) -> tuple[Floats, Float
     known = equations.places if equations.knows_place else np.zeros((1, 1, 3))
     carried = (mounts[..., :3, :3] @ known[..., None])[..., 0] + mounts[..., :3, 3]
     right = (to_base2 @ carried[..., None])[..., 0] + bases[..., :3, 3]
-    right = right - np.broadcast_to(equations.centres, (k, n, 3)) @ _turned(x)
+    right = right - np.broadcast_to(equations.centres, (k, n, 3)) @ x.swapaxes(-1, -2)
     eye = np.broadcast_to(np.eye(3), to_base2.shape)
     parts = [eye, -bases[..., :3, :3]]
     parts += [] if equations.knows_place else [-to_base2 @ mounts[..., :3, :3]]
