@@ -30,7 +30,7 @@ SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""
 
 LEAD_IN = 3.0
-"""After so many tool lengths the torch has to be on the seam."""
+"""So many tool lengths after it may weld first the torch has to be on the seam."""
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
@@ -220,7 +220,7 @@ class Follower:
             return
         if self.bound <= self._settings.max_error:
             self.lit = self.torch if self.lit is None else self.lit
-        elif self.lit is not None or self.torch > LEAD_IN * self._belief.distance:
+        elif self.lit is not None or self.torch > welds_from + LEAD_IN * self._belief.distance:
             self._stop(self._too_uncertain())
         if self._before is not None and self.lit is None and self.torch > self._before.torch:
             self._stop("the torch was not on the seam again where it had stopped; raise 'overlap'")

@@ -19,7 +19,7 @@ from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.follower import SETTLING, Follower, ResumePoint
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
@@ -29,6 +29,9 @@ SAME_PLAN = 1e-6
 
 PRESSING = 5e-3
 """So far before the tip lets go of the wall it is set down at the latest [m]."""
+
+RUN_IN = 2 * SETTLING
+"""Way in which the torch takes back what the sweep has led it aside by, before it is lit [m]."""
 
 
 def controller_of(
@@ -138,20 +141,23 @@ def set_back(
 ) -> WeldTactileParams:
     """Return the parameters with which the tip is set down so that the torch overlaps.
 
+    It is lit where the overlap begins, and set down a run-in before that.
+
     Raises:
         StageError: The tip would be beyond where it can press.
     """
     release = params.speed * params.deflection / params.release
     last = plan.length - params.ending - release - PRESSING
-    tip = _ahead(plan, max(kept.torch - params.overlap, params.inset - distance), distance)
-    tip = min(tip, last)
+    lit = kept.torch - params.overlap
+    tip = min(_ahead(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
     if tip < params.inset:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
     place = plan.at(tip)
     torch = plan.at(_behind(plan, tip, distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return params.model_copy(update={"inset": tip, "start_angle": angle})
+    lit = max(lit, params.offset_along)
+    return params.model_copy(update={"inset": tip, "start_angle": angle, "offset_along": lit})
 
 
 def _ahead(plan: Path, torch: float, distance: float) -> float:

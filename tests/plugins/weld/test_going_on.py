@@ -11,12 +11,13 @@ from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
-from flangeye_plugins.weld.follower import ResumePoint
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.frame import WorkPlane
-from flangeye_plugins.weld.going_on import resume_point_of, set_back
+from flangeye_plugins.weld.going_on import RUN_IN, resume_point_of, set_back
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import WeldTactileParams
-from tests.plugins.weld.bench import curved
+from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged
 
@@ -37,7 +38,7 @@ def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped: Any, tmp_pat
     before, log = stopped
     report, journal = run(SEAM, seed=4, speed="10 mm/s", resume=log)
     assert report.completed
-    assert report.along[0] == pytest.approx(before.along[-1] - 30e-3, abs=2e-3)
+    assert report.along[0] == pytest.approx(before.along[-1] - 30e-3 - RUN_IN, abs=2e-3)
     welding = report.along > before.along[-1]
     assert torch_deviation(
         report.torch[welding], true_line("v-straight", END), report.opening
@@ -75,9 +76,24 @@ def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any
     assert resume_point_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 
 
+PARAMS = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
+
+
 def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it() -> None:
     plan = Path(curved(0.15))
-    params = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
-    params = set_back(params, plan, 0.04, ResumePoint(np.zeros((0, 4)), 0.06))
-    tip, torch = plan.at(params.inset).point, plan.at(0.03).point
+    params = set_back(PARAMS, plan, 0.04, ResumePoint(np.zeros((0, 4)), 0.06))
+    tip, torch = plan.at(params.inset).point, plan.at(0.03 - RUN_IN).point
     assert np.linalg.norm(tip - torch) == pytest.approx(0.04, abs=0.6e-3)
+    assert params.offset_along == pytest.approx(0.03)
+
+
+def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
+    line = straight(0.25)
+    plan, felt = Path(line), np.zeros((200, 5))
+    felt[:, 0], felt[:, 3] = np.linspace(0.11, 0.21, 200), 1.0
+    kept = ResumePoint(felt, 0.17)
+    params = set_back(PARAMS, plan, DISTANCE, kept)
+    follower = Follower(plan, Belief(DISTANCE), params, before=kept)
+    World(line, line, follower, params).run()
+    assert (follower.phase, follower.reason) == ("done", "")
+    assert follower.lit == pytest.approx(0.14, abs=0.2e-3)

@@ -34,7 +34,7 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
     assert weld["figures"]["lit_from"] > 0.03  # m: it did not begin at the seam's start
     start = next(n for n in read_notes(tmp_path / "again" / "run.mcap") if n.name == "start")
     assert start.value["kept"]["torch"] - weld["figures"]["lit_from"] == pytest.approx(
-        0.03, abs=2e-3
+        0.03, abs=0.5e-3
     )
     told = flangeye(tmp_path, "--resume", "again")
     assert told.returncode == 2
@@ -43,11 +43,14 @@ def test_a_run_killed_in_its_weld_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_weld_that_stopped_by_itself_is_gone_on_with_too(tmp_path: Path) -> None:
-    hidden = "steps.7.sensor.simulated_finger.hidden=[46 s, 48 s]"
+    # The recipe hides the tag of the second run too; the tip then lets go of the wall already.
+    hidden = "steps.7.sensor.simulated_finger.hidden=[50 s, 52 s]"
     small = "steps.0.resolution=0.3"
     stopped = flangeye(tmp_path, SEAM, "--set", small, "--set", hidden, "--out", "stopped")
     assert stopped.returncode == 1
     assert "the weld was stopped: no tag was seen for 500 ms" in stopped.stdout
     again = flangeye(tmp_path, "--resume", "stopped", "--out", "again")
     assert again.returncode == 0, again.stderr + again.stdout
-    assert json.loads((tmp_path / "again" / "result.json").read_text())["weld"]["completed"]
+    weld = json.loads((tmp_path / "again" / "result.json").read_text())["weld"]
+    assert weld["completed"]
+    assert weld["truth"]["rms"] < 0.15e-3
