@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from flangeye.devices import MotionAllowed, RobotDriver, TactileSensor
+from flangeye.devices import MotionAllowed, Robot, RobotDriver, TactileSensor
 from flangeye.errors import NothingMoved, StageError
 from flangeye.files.written import write_whole
 from flangeye.maths.geometry import rigid
@@ -18,7 +18,8 @@ from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor
-from flangeye.motion.limits import limits_of
+from flangeye.motion.leading import led
+from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.plugin.stage import part
 from flangeye.recipe.header import LimitsSection
 from flangeye.recipe.load import Recipe
@@ -89,25 +90,29 @@ def _guided(
             f"tactile calibrate: would move the arm by {STROKE * 1e3:.0f} mm to both sides and "
             "down, with the tip held; nothing moved: add --move"
         )
+    model: RobotModel = recipe.context[RobotModel]
+    limits = limits_of(recipe.context[LimitsSection], model)
     with ExitStack() as opened:
-        robot = opened.enter_context(driver.open())
-        latest = LatestState(robot.state())
-        sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
-        model: RobotModel = recipe.context[RobotModel]
-        limits = limits_of(recipe.context[LimitsSection], model)
-        readings = Readings(Executor(robot, model, limits, latest.tell), sensor, finger)
-        ask(FREE)
-        rest = readings.take(AT_REST)
-        ask(HOLD)
-        held = list(readings.held())
-        found = calibrate(rest, held, f"flangeye tactile calibrate, on {robot.name}")
+        arm = _Arm(driver, model, limits, opened)
+        with arm.standing() as robot:
+            latest = LatestState(robot.state())
+            sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
 
-        def look() -> list[TagReading]:
-            # The person has moved the arm meanwhile: it is watched from where it stands now.
-            return Readings(Executor(robot, model, limits, latest.tell), sensor, finger).take(EACH)
+            def readings(robot: Robot) -> Readings:
+                # The person has moved the arm meanwhile: it is watched from where it stands now.
+                return Readings(Executor(robot, model, limits, latest.tell), sensor, finger)
 
-        hand = Hand(robot, ask, look)
-        pivoted = Pivoted(hand.tip(finger, found), hand.torch()) if body else None
+            ask(FREE)
+            rest = readings(robot).take(AT_REST)
+            ask(HOLD)
+        with arm.moving() as robot:
+            held = list(readings(robot).held())
+            found = calibrate(rest, held, f"flangeye tactile calibrate, on {robot.name}")
+        pivoted = None
+        if body:
+            with arm.standing() as robot:
+                hand = Hand(robot, ask, lambda: readings(robot).take(EACH))
+                pivoted = Pivoted(hand.tip(finger, found), hand.torch())
     measured = found.lateral is not None
     if not measured and finger.calibration is not None:
         known = finger.calibration
@@ -121,6 +126,30 @@ def _guided(
     points = [] if pivoted is None else summary_lines(pivoted)
     use = f"{out}: weld with it: finger: {out.name}"
     return "\n".join([counts, *_summary_lines(found, measured), *points, use])
+
+
+class _Arm:
+    """An arm that a person moves and that is only read then; the guard has it while it is driven.
+
+    A guard stops an arm that moves without being told to. A simulated arm is open all the time, and
+    its time goes on.
+    """
+
+    def __init__(
+        self, driver: RobotDriver, model: RobotModel, limits: MotionLimits, opened: ExitStack
+    ) -> None:
+        self._driver, self._model, self._limits = driver, model, limits
+        self._simulated = opened.enter_context(driver.open()) if driver.simulated else None
+
+    def standing(self) -> AbstractContextManager[Robot]:
+        """Open the arm to read it."""
+        return nullcontext(self._simulated) if self._simulated else self._driver.open()
+
+    def moving(self) -> AbstractContextManager[Robot]:
+        """Open the arm to drive it, under guard."""
+        if self._simulated:
+            return nullcontext(self._simulated)
+        return led(self._driver, self._model, self._limits)
 
 
 def _summary_lines(found: Calibration, measured: bool) -> list[str]:

@@ -1,6 +1,7 @@
 """flangeye tactile calibrate, from end to end: a simulated arm, rendered images, a finger's file."""
 
 import re
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
 from flangeye_emulators.finger.render import typical_compliance
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
+from flangeye_plugins.guide import tactile
 from flangeye_plugins.guide.tactile import guide_tactile
 from tests.plugins.weld.cell import HOME, MODEL
 from tools.readme import same
@@ -113,6 +115,30 @@ def test_an_arm_that_feels_finds_the_stiffness(tmp_path: Path) -> None:
     assert "stiffness  0.80 N/mm across, 1.50 N/mm along\n" in guided(recipe, tmp_path)
     found = read_model(tmp_path / "finger.yaml", Finger).calibration
     assert (found.lateral, found.axial) == pytest.approx((800.0, 1500.0), rel=1e-3)
+
+
+def test_the_guard_has_a_real_arm_while_it_is_driven_and_only_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    happened = []
+    arm = FeelingArm()
+
+    @contextmanager
+    def guarding(driver, model, limits):
+        happened.append("guard")
+        yield arm
+        happened.append("guard ends")
+
+    drive = arm.move_linear
+    arm.move_linear = lambda *motion: (happened.append("moves"), drive(*motion))
+    monkeypatch.setattr(tactile, "led", guarding)
+    recipe = loaded(HELD)
+    recipe.context[RobotDriver] = RobotDriver("robot.ur_rtde", lambda: arm)
+    guide_tactile.function(
+        recipe, MotionAllowed(True), lambda text: happened.append("ask"), tmp_path / "finger.yaml"
+    )
+    assert list(dict.fromkeys(happened)) == ["ask", "guard", "moves", "guard ends"]
+    assert happened.count("guard") == 1
 
 
 def test_a_real_arm_does_not_move_unasked(tmp_path: Path) -> None:
