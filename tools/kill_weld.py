@@ -37,7 +37,11 @@ MOVES = 1e-4
 """Speed of the fastest joint above which an arm moves [rad/s]."""
 RESTS, ENDS = 0.3, 3.0
 """What is asked for: an arm at rest; a program that has ended, where no arm is left to look at [s]."""
-PATIENT = ("--set", "steps.5.blind=5 s", "--set", "steps.5.stale=1 s")
+PATIENT = tuple(
+    word
+    for given in ("blind=5 s", "stale=1 s", "still=2 s")
+    for word in ("--set", f"steps.5.{given}")
+)
 """Where the camera is not what is struck: on a busy machine its images are late."""
 AFTER = (1.0, 8.0)
 """The stroke falls between these times after the torch has begun to follow [s]."""
@@ -161,7 +165,7 @@ class Stroke:
 
 
 def _silent(after: float) -> tuple[str, ...]:
-    return ("--set", f"{FINGER}.hidden=[{after:.1f} s, 1000 s]")  # stopped after 'blind'
+    return ("--set", f"{FINGER}.hidden=[{after:.1f} s, 1000 s]")  # at rest after 'still'
 
 
 def _lost(after: float) -> tuple[str, ...]:

@@ -135,7 +135,7 @@ class Follower:
         self._track = Track()
         self._felt: SeamReading | None = None if touch else SeamReading(0.0, 0.0)
         self._time: float | None = None
-        self._seen = self._bridge = 0.0
+        self._seen = self._heard = self._bridge = 0.0
         self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
         self._latency = 0.0
         self._place = plan.at(self.tip)
@@ -154,7 +154,7 @@ class Follower:
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""
         if self._time is None:
-            self._time = self._seen = pose.time
+            self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
         self._track.add(pose)
         for touch in touches:
@@ -165,7 +165,11 @@ class Follower:
         waiting = self.phase == "seeking" and self._search.resting
         if self.phase in ("done", "stopped") or self._felt is None or waiting:
             return STILL
+        silent = self._silence(pose.time) > self._settings.still
+        if silent:  # sweep and ramp wait too
+            self._elapsed = 0.0
         command = self._probe(pose) if self.phase == "probing" else self._lead(pose, coming)
+        command = STILL if silent else command
         self._response.record(pose.time, command)
         return command
 
@@ -250,7 +254,7 @@ class Follower:
         pose = self._track.at(touch.time - self.learned.stamp)
         if pose is None:
             return
-        self._seen = touch.time
+        self._seen, self._heard = touch.time, self._time or 0.0
         late = (self._time or 0.0) - touch.time + self.learned.stamp
         self._latency += LATE_SHARE * (late - self._latency)
         s, felt, deflection = self._located(pose, touch)
@@ -471,12 +475,17 @@ class Follower:
         """Return the tip's speed along the seam: less where blind or crooked."""
         if self.phase == "seeking":
             return 0.0
-        settings = self._settings
-        age = pose.time - self._seen if self._touching and self.phase != "ending" else 0.0
-        sight = min(max((settings.blind - age) / (settings.blind - settings.stale), 0.0), 1.0)
+        settings, silence = self._settings, self._silence(pose.time)
+        sight = 1.0
+        if settings.stale < silence <= settings.still:
+            sight = (settings.still - silence) / (settings.still - settings.stale)
         speed = min(settings.speed, self._agility())
         steered = self._steering.pace(speed, pose.direction, normal, self._place.tangent)
         return steered * sight * self._firmness()
+
+    def _silence(self, now: float) -> float:
+        """Return for how long no image of the tag has come, where one is needed [s]."""
+        return now - self._heard if self._touching and self.phase != "ending" else 0.0
 
     def _agility(self) -> float:
         """Return the speed at which the arm swerves little in the time in which it is blind.

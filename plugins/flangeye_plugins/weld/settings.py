@@ -80,8 +80,12 @@ class Following(Params):
     )
     force: Force = param("10 N", gt=0, description="Largest force of the tip, by its stiffness.")
     stale: Duration = param(
-        "150 ms", gt=0, description="Older images slow the weld down until a new one comes."
+        "100 ms", gt=0, description="Without a new image of the tag for longer the weld slows down."
     )
+    still: Duration = param(
+        "150 ms", gt=0, description="Without one for longer the arm stands until one comes: at "
+        "rest, since the last image was taken, after this, the images' latency and its braking.",
+    )  # fmt: skip
     friction: float = Field(
         0.3, ge=0, le=1, description="Largest coefficient of the tip on the work to reckon with."
     )

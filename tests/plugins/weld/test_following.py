@@ -106,6 +106,17 @@ def test_a_short_blindness_slows_down_and_a_long_one_stops() -> None:
     assert long.time[-1] == pytest.approx(8.5, abs=0.1)
 
 
+@pytest.mark.parametrize("began", [8.0, 15.0])  # in the sweep; following
+@pytest.mark.parametrize("latency", [0.03, 0.1])
+def test_an_arm_that_sees_no_tag_stands_still(began: float, latency: float) -> None:
+    true = straight(0.06)
+    done = weld(true, true, hidden=(began, 60.0), latency=latency)
+    assert done.phase[-2] == ("probing" if began == 8.0 else "following")
+    moved = np.abs(np.diff([done.torch_s, done.torch, done.robot])).max(axis=0) > 1e-7
+    assert done.time[1:][moved][-1] - began < 0.3
+    assert done.time[-1] == pytest.approx(began + 0.5, abs=0.1)
+
+
 def test_another_side_of_the_groove_does_as_well() -> None:
     true = curved(0.08)
     done = weld(true, planning_error(true, seed=1), settings=Following(side="right"))
