@@ -25,6 +25,12 @@ LIFTED = 3e-3
 PLANNED = (0.02, 0.01)
 """A plan is wrong by these slopes, aside and up; what leaves it faster may be a tip that climbs."""
 
+LASTING = 20e-3
+"""Over so much of the seam a tip is higher that climbs; one that a tack weld lifts is not [m]."""
+
+UNEVEN, TILTED = 0.5e-3, 0.02
+"""Joints are wider or narrower, and so heights differ, by this [m]; plans are tilted by this."""
+
 LIKELY, SURE = 2.0, 5.0
 """Standard deviations of what is judged, to reckon with it and to stop for it."""
 
@@ -33,19 +39,22 @@ class Seating:
     """Holds the newest samples against a line through those before.
 
     A seated tip may wander aside with the seam, or be lifted by a tack weld; both at once, towards
-    the wall that it presses, is climbing.
+    the wall that it presses, is climbing. Where the plan is far off, what the seam wanders aside by
+    hides that: a tip that stays higher than in the sweep at the start may climb all the same.
 
     Attributes:
         doubt: How far aside the tip may have climbed, too little to be sure of it [m].
+        risen: The same of one that has been higher for long, all along :data:`LASTING` [m].
     """
 
     def __init__(self, side: float, flat: float) -> None:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
-        self._side, self.doubt = side, 0.0
+        self._side, self.doubt, self.risen = side, 0.0, 0.0
         self._flat = flat
         self._samples: deque[tuple[float, float, float]] = deque()
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=NEWEST)
         self._seated: deque[tuple[float, float, float]] = deque()
+        self._swept: list[tuple[float, float]] = []
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
@@ -56,6 +65,7 @@ class Seating:
     def seated(self, s: float, offset: float, height: float) -> None:
         """Take a sample of a tip that is known to be seated; see :meth:`judge`."""
         self._seated.append((s, offset, height))
+        self._swept.append((s, height))
 
     def judge(self, s: float, offset: float, height: float) -> str | None:
         """Take a sample; return what is wrong.
@@ -74,6 +84,7 @@ class Seating:
         known = self._before(self._seated, s)
         if len(known) >= 2 * NEWEST:
             self._doubt_newest(*_newest_from(known, newest, PLANNED))
+        self.risen = self._risen(s) * self._flat / STEEP
         if len(before) < 2 * NEWEST:
             return None
         aside, lifted = _newest_from(before, newest)
@@ -86,6 +97,17 @@ class Seating:
                 f"{lifted[0] * 1e3:.1f} mm up; lower 'deflection' or raise 'preload'"
             )
         return None
+
+    def _risen(self, s: float) -> float:
+        """Return how much higher than in the sweep the tip is for long; 0 if it may be [m]."""
+        if len(self._swept) < NEWEST or s - self._samples[0][0] < LASTING:
+            return 0.0
+        heights = np.array([height for at, _, height in self._samples if s - at < LASTING])
+        at, swept = np.array(self._swept).T
+        tilted = TILTED * abs(s - LASTING / 2 - float(at.mean()))
+        rise = float(np.median(heights) - swept.mean()) - tilted
+        sigma = float(np.hypot(*(each.std() / np.sqrt(len(each)) for each in (heights, swept))))
+        return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
     def _before(self, samples: Iterable[tuple[float, float, float]], s: float) -> Floats:
         """Return the samples (K, 3) that lie behind the tip."""

@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
-from flangeye_plugins.weld.consistency import Seating
+from flangeye_plugins.weld.consistency import LASTING, Seating
 from flangeye_plugins.weld.contact import Contact, Release
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
@@ -352,6 +352,7 @@ class Follower:
     def _watch(self, s: float, felt: SeamReading) -> None:
         """Stop where the tip does not sit in the groove any more."""
         wrong = self._seating.judge(s, felt.offset, felt.height)
+        self.refined.suspect(s - LASTING, s, self._seating.risen)
         if wrong is not None and self.phase == "following":
             self.refined.forget_pending()
             self._stop(wrong)

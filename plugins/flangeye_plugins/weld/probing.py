@@ -255,6 +255,8 @@ class Probing:
         askew = float(middle @ slid) / moved / across
         gain = across * (1.0 + askew**2) - 1.0
         sigma = max(float(rms[best]), noise) / math.sqrt(moved)
+        # Walls that stand askew may be curved too: the correction is as uncertain as it is large.
+        sigma = math.hypot(sigma, askew**2)
         dead, lag = identify(cycles)
         return Learned(
             gain=gain,

@@ -201,6 +201,11 @@ class RefinedPath:
                 self.add(-math.inf, s, offset, angle, doubt)
         self.confirm(0.0)
 
+    def suspect(self, begin: float, end: float, doubt: float) -> None:
+        """Note that the tip may be off the seam by ``doubt`` between two arc lengths [m]."""
+        between = slice(self._index(begin), self._index(end) + 1)
+        self._doubt[between] = np.maximum(self._doubt[between], doubt)
+
     def offset(self, s: float) -> float:
         """Return the seam's offset from the plan at one arc length."""
         return self._offsets(s, (0.0,))[0]

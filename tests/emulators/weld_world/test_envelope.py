@@ -165,6 +165,8 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
         pytest.param(100076, id="hardly felt before the wall ends, plan bowed by 4 mm"),
         pytest.param(300162, id="wall at 64 deg, heights too noisy to see the tip climb it"),
         pytest.param(100178, id="waves at speed: the torch is not yet where it was sent"),
+        pytest.param(910577, id="tip climbs steadily, plan 11 mm off"),
+        pytest.param(910752, id="curved walls askew in the sweep taken for a finger's gain"),
     ],
 )
 def test_what_once_was_a_silent_failure_is_in_its_stated_bound(seed: int) -> None:

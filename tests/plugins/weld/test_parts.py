@@ -366,6 +366,31 @@ def test_a_tip_that_may_have_climbed_a_little_is_doubted_by_so_much() -> None:
     assert climbing(0.3e-3, 0.0) < 0.05e-3  # the seam turns aside
 
 
+def test_a_piece_of_the_seam_is_suspected_after_it_was_felt() -> None:
+    refined = RefinedPath(Path(straight(0.1)), 0.05)
+    refined.suspect(0.02, 0.04, 1e-3)
+    refined.suspect(0.03, 0.04, 0.5e-3)
+    assert [refined.doubt(s) for s in (0.01, 0.02, 0.035, 0.05)] == [0.0, 1e-3, 1e-3, 0.0]
+
+
+def risen(rise, first=0.03, last=1.0):
+    """Judge a seam that leaves its plan to the other side; the tip rises from first on [m]."""
+    seating, rng, most = Seating(1.0, 1.0), np.random.default_rng(0), 0.0
+    for _ in range(100):
+        seating.seated(5e-3, 0.0, 0.6e-3 * rng.standard_normal())
+    for s in np.arange(5e-3, 80e-3, 0.3e-3).tolist():
+        height = rise * max(s - first, 0.0) * (s < last) + 0.6e-3 * rng.standard_normal()
+        seating.judge(s, -0.2 * s, height)
+        most = max(most, seating.risen)
+    return most
+
+
+def test_a_tip_that_stays_higher_is_doubted_whatever_it_does_aside() -> None:
+    assert risen(0.06) > 0.5e-3
+    assert risen(0.015) == 0.0  # the plan is tilted by 1 deg
+    assert risen(0.2, last=38e-3) == 0.0  # a tack weld of 8 mm
+
+
 def test_a_noisy_tip_on_a_short_line_is_not_taken_for_one_that_is_lifted() -> None:
     for seed in range(20):
         seating, rng = Seating(1.0, 1.0), np.random.default_rng(seed)
