@@ -1,9 +1,12 @@
-"""Sharp corners of a plan: each leg between them is a weld of its own.
+"""Sharp corners of a plan: each leg between them is a weld of its own, or the corners are rounded.
 
 At a corner the torch stops: the weld of one leg ends, the tool is lifted, turned, and set down for
 the next. The finger goes ahead of the torch, straight beyond the end of its leg, and the torch
 comes from behind the start of the next: for both there is room only where the upright plate of a
 fillet or lap joint ends at the corner.
+
+In a groove, which holds the tip between two walls, tip and torch may go round instead: the plan's
+corner becomes an arc, and what the tip feels says how far the seam is from that.
 """
 
 from __future__ import annotations
@@ -23,6 +26,9 @@ SHARP = np.radians(35.0)
 
 CHORD = 5e-3
 """Length of the chords to both sides of a corner [m]."""
+
+ARC = 40
+"""Points on the arc that rounds a corner."""
 
 
 class Corner(NamedTuple):
@@ -66,20 +72,22 @@ def _turn(planar: Floats, along: Floats, s: float) -> float:
 
 
 def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
-    """Return the leg of a plan that is to be welded: all of it where it has no corner.
+    """Return the leg of a plan that is to be welded: all of it where it has no corner to stop at.
 
     Raises:
         StageError: It has corners and no leg is chosen, or the other way round, or the tool has no
-            room beyond one of the leg's ends.
+            room beyond one of the leg's ends, or for an arc.
     """
     plane = WorkPlane(seam.points_in_base, seam.openings_in_base)
     corners = corners_of(plane.points(seam.points_in_base))
+    if params.corners == "round":
+        return _rounded(seam, corners, params)
     if params.leg is None:
         if corners:
             raise StageError(
                 f"weld.tactile: the seam has sharp corners ({_listed(corners)}), at which the "
                 f"torch has to stop: write a step weld.tactile for each leg, leg: 1 to "
-                f"{len(corners) + 1}"
+                f"{len(corners) + 1}; in a groove, corners: round leads it round them"
             )
         return seam
     if params.leg > len(corners) + 1:
@@ -98,6 +106,63 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
         openings_in_base=seam.openings_in_base[kept],
         covariance=seam.covariance[kept],
     )
+
+
+def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams) -> Seam:
+    """Return a plan with an arc in the place of each corner."""
+    if params.leg is not None:
+        raise StageError(
+            "weld.tactile: corners: round leaves no legs; drop 'leg', or corners: stop"
+        )
+    if params.joint in ("fillet", "lap") and corners:
+        raise StageError(
+            f"weld.tactile: round the corner {_listed(corners[:1])} only a joint with two walls "
+            f"leads the tip, a {params.joint} joint has one: weld each leg, corners: stop"
+        )
+    points = seam.points_in_base
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    ends = [0.0, *(along[each.point] for each in corners), along[-1]]
+    pieces, kept = [], np.full(len(along), True)
+    for corner, before, here, after in zip(corners, ends, ends[1:], ends[2:], strict=False):
+        cut = params.corner_radius * np.tan(abs(corner.turn) / 2.0)
+        room = min(here - before, after - here) / 2.0
+        if cut > room:
+            allowed = params.corner_radius * room / cut
+            raise StageError(
+                f"weld.tactile: the corner {_listed([corner])} has no room for a corner_radius of "
+                f"{params.corner_radius * 1e3:.3g} mm, at most {allowed * 1e3:.3g} mm"
+            )
+        kept &= np.abs(along - here) >= cut
+        pieces.append(_arc(points, along, here, cut, corner.turn))
+    at = np.concatenate([along[kept], *(ticks for ticks, _ in pieces)])
+    order = np.argsort(at)
+    return replace(
+        seam,
+        points_in_base=np.concatenate([points[kept], *(arc for _, arc in pieces)])[order],
+        openings_in_base=_at(at[order], along, seam.openings_in_base),
+        covariance=_at(at[order], along, seam.covariance),
+    )
+
+
+def _arc(
+    points: Floats, along: Floats, here: float, cut: float, turn: float
+) -> tuple[Floats, Floats]:
+    """Return the arc (K, 3) between the legs of a corner, and its arc lengths (K,) on the plan.
+
+    A rational quadratic curve of this weight is a circle's (Piegl and Tiller 1997, 7.3).
+    """
+    first, corner, last = _at(here + cut * np.array([-1.0, 0.0, 1.0]), along, points)
+    t = np.linspace(0.0, 1.0, ARC)[:, None]
+    weights = np.hstack([(1 - t) ** 2, 2 * t * (1 - t) * np.cos(turn / 2.0), t**2])
+    arc = weights @ np.stack([first, corner, last]) / weights.sum(axis=1, keepdims=True)
+    return here + cut * np.linspace(-1.0, 1.0, ARC), arc
+
+
+def _at(at: Floats, along: Floats, rows: Floats) -> Floats:
+    """Return rows (N, ...) by arc length (N,), at others (K,)."""
+    columns = rows.reshape(len(rows), -1).T
+    there = np.stack([np.interp(at, along, column) for column in columns], axis=1)
+    return np.asarray(there.reshape(len(at), *rows.shape[1:]))
 
 
 def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None:

@@ -185,6 +185,14 @@ class WeldTactileParams(Following):
         description="Of a plan with sharp corners, which leg between them this step welds; at a "
         "corner the torch stops.",
     )  # fmt: skip
+    corners: Literal["stop", "round"] = Field(
+        "stop",
+        description="stop: the torch stops at a sharp corner, each leg is a step. round: in a "
+        "groove, tip and torch go round it without a stop.",
+    )
+    corner_radius: Length = param(
+        "5 mm", gt=0, description="Of the arc that a rounded corner of the plan becomes."
+    )
     clearance: Length = param(
         "15 mm", gt=0, description="Height of the tip above the planned start, before it descends."
     )

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.types import Seam
-from flangeye_plugins.weld.corners import corners_of, leg_of
-from flangeye_plugins.weld.settings import WeldTactileParams
-from tests.plugins.weld import cell
+from flangeye_plugins.weld.corners import ARC, corners_of, leg_of
+from flangeye_plugins.weld.settings import Following, WeldTactileParams
+from tests.plugins.weld import bench, cell
 
 Points = NDArray[np.float64]
 
@@ -35,7 +35,8 @@ def seam_of(points: Points) -> Seam:
 
 
 def told(**given):
-    return WeldTactileParams.model_construct(**{"side": "left", "joint": "lap", **given})
+    defaults = {"side": "left", "joint": "lap", "corners": "stop", "corner_radius": 5e-3}
+    return WeldTactileParams.model_construct(**{**defaults, **given})
 
 
 @pytest.mark.parametrize("turns", [(90.0,), (60.0, -60.0), (120.0, -120.0, 120.0), (-45.0,)])
@@ -77,6 +78,59 @@ def test_a_leg_is_what_lies_between_its_corners() -> None:
 def test_what_has_no_room_or_is_not_chosen_is_refused(turns, given, message: str) -> None:
     with pytest.raises(StageError, match=message):
         leg_of(seam_of(polyline(*turns)), told(**{"leg": None, **given}))
+
+
+ROUND = {"leg": None, "corners": "round", "joint": "groove"}
+
+
+@pytest.mark.parametrize("sampled", [polyline, lambda *t: dense(polyline(*t))])
+def test_a_rounded_corner_is_an_arc_that_touches_both_legs(sampled) -> None:
+    points = sampled(60.0)
+    plan = leg_of(seam_of(points), told(**ROUND))
+    cut = 5e-3 * np.tan(np.radians(30.0))
+    middle = np.array([0.06 - cut, 5e-3, 0.0])
+    away = np.linalg.norm(plan.points_in_base - middle, axis=1)
+    assert away.min() == pytest.approx(5e-3, abs=1e-9)
+    assert np.count_nonzero(np.abs(away - 5e-3) < 1e-9) >= ARC
+    for ends in (0, -1):
+        np.testing.assert_allclose(plan.points_in_base[ends], points[ends])
+    assert plan.covariance.shape == (len(plan.points_in_base), 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("turns", "given", "message"),
+    [
+        ((90.0,), {"leg": 1}, "corners: round leaves no legs; drop 'leg'"),
+        ((90.0,), {"joint": "lap"}, r"\+90 deg at 60 mm only a joint .* a lap joint has one"),
+        ((90.0, 90.0), {"corner_radius": 0.04}, "no room .* of 40 mm, at most 30 mm"),
+    ],
+)
+def test_a_corner_that_cannot_be_rounded_is_refused(turns, given, message: str) -> None:
+    with pytest.raises(StageError, match=message):
+        leg_of(seam_of(polyline(*turns)), told(**{**ROUND, **given}))
+
+
+@pytest.mark.parametrize("turn", [45.0, -45.0])
+def test_tip_and_torch_go_round_a_corner_of_a_groove(turn: float) -> None:
+    true = dense(polyline(turn, leg=0.07))
+    plan = leg_of(seam_of(bench.misplaced(true, (1e-3, 1e-3, 0.0), 0.01)), told(**ROUND))
+    settings = Following(max_error="1.5 mm")
+    controller = bench.make("tactile", plan.points_in_base, settings)
+    step, bounds = controller.step, list[float]()
+
+    def noted(pose, touches):
+        command = step(pose, touches)
+        bounds.append(controller.bound if controller.lit is not None else np.inf)
+        return command
+
+    controller.step = noted
+    done = bench.World(true, plan.points_in_base, controller, settings, period=16e-3).run()
+    assert controller.phase == "done", controller.reason
+    beside = (done.torch_s > 0.0) & (done.torch_s < done.length)
+    off = np.abs(done.torch[beside])
+    assert (off <= np.array(bounds)[beside]).all()
+    assert off.max() < 0.6e-3
+    assert np.sqrt(np.mean(off**2)) < 0.1e-3
 
 
 BENT = [[-40.0, -15.0, 14.0], [20.0, -15.0, 14.0], [20.0, 40.0, 14.0]]
