@@ -121,7 +121,13 @@ def test_the_guard_has_a_real_arm_while_it_is_driven_and_only_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     happened = []
-    arm = FeelingArm()
+
+    class Noting(FeelingArm):
+        def move_linear(self, *motion):
+            happened.append("moves")
+            super().move_linear(*motion)
+
+    arm = Noting()
 
     @contextmanager
     def guarding(driver, model, limits):
@@ -129,8 +135,6 @@ def test_the_guard_has_a_real_arm_while_it_is_driven_and_only_then(
         yield arm
         happened.append("guard ends")
 
-    drive = arm.move_linear
-    arm.move_linear = lambda *motion: (happened.append("moves"), drive(*motion))
     monkeypatch.setattr(tactile, "led", guarding)
     recipe = loaded(HELD)
     recipe.context[RobotDriver] = RobotDriver("robot.ur_rtde", lambda: arm)
