@@ -15,6 +15,7 @@ CYCLE = 0.01
 def test_a_late_arm_comes_to_where_its_commands_lead(dead: float, lag: float) -> None:
     response = Response()
     response.dead_time, response.lag = dead, lag
+    assert response.delay == pytest.approx(dead + lag)
     motion = np.array([0.01, -0.02, 0.005, 0.5])
     told = np.repeat([motion, np.zeros(4), -motion], [100, 60, 40], axis=0)
     place, speed, late = np.zeros(4), np.zeros(4), round(dead / CYCLE)
@@ -46,4 +47,4 @@ def test_what_an_arm_does_to_a_stroke_tells_how_late_it_is(dead: float, lag: flo
         speed += share * (late[now - 1] - speed)
         place[now] = place[now - 1] + 5e-3 * speed
     found = identify(np.column_stack([clock, command, place + 0.3]))
-    assert found == pytest.approx((dead, lag), abs=0.011)
+    assert found == pytest.approx((dead, lag), abs=1e-9)
