@@ -19,6 +19,7 @@ from flangeye.maths.pose_corrections import (
     transposed,
     without_tool,
 )
+from flangeye.maths.streams import later, passed, pose_at
 from flangeye_plugins.check import CHECKS
 from tests.doctor.sessions import CARRIED, KINDS, bent, clean, in_motion
 
@@ -218,6 +219,19 @@ def test_a_time_offset_between_the_streams(delay: float) -> None:
     if finding.name == "time offset":
         told = float(finding.fix.split("delay: ")[1].partition(" ms")[0])
         assert told == pytest.approx(-delay * 1e3, abs=2)
+
+
+def test_a_time_offset_where_the_arms_stream_was_recorded() -> None:
+    """Once a second is too seldom to tell where the arm was between: its own stream tells."""
+    session = in_motion(np.random.default_rng(2), 400)
+    seldom = session.where(np.arange(400) % 10 == 5)
+    motions = [passed(session.times, session.poses, at) for at in seldom.times]
+    late = seldom.with_poses(np.array([pose_at(motion, -0.08) for motion in motions]))
+    motions = tuple(later(motion, -0.08) or motion for motion in motions)
+    finding = only(replace(late, motions=motions))
+    assert finding.name == "time offset"
+    told = float(finding.fix.split("delay: ")[1].partition(" ms")[0])
+    assert told == pytest.approx(80, abs=2)
 
 
 @pytest.mark.parametrize(("kind", "carried"), CONFIGURATIONS)

@@ -14,6 +14,7 @@ from flangeye.maths.geometry import (
     rotation_log,
 )
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.streams import passed, pose_at
 from flangeye.models.configuration import Configuration, carriers_of
 from flangeye.models.loading import load_model
 from flangeye.types import (
@@ -177,6 +178,29 @@ def wandering(made, rng, turn=2e-3, shift=1e-3, wrong=0.08):
         moved = rigid(rotation_exp(off[:3]) @ pose[:3, :3], pose[:3, 3] + off[3:])
         feature = PoseFeature(Transform(CAMERA, TARGET, moved), o.feature.covariance)
         out.append(replace(o, feature=feature))
+    return replace(made, observations=out)
+
+
+def moving(times):
+    """Return (n, 4, 4) the motion of an arm that never stands still, some 0.2 m/s and 0.5 rad/s."""
+    turn = np.stack([0.4 * np.sin(times), 0.3 * np.cos(1.3 * times), 0.4 * np.sin(0.7 * times)], 1)
+    place = np.stack([0.15 * np.sin(1.1 * times), 0.15 * np.cos(0.9 * times),
+                      0.1 * np.sin(1.7 * times)], 1)  # fmt: skip
+    return np.array([rigid(rotation_exp(w), p) for w, p in zip(turn, place, strict=True)])
+
+
+def passing(configuration, rng, delay, n=40, **more):
+    """Draw a session of a moving arm, seen by ``delay`` [s] later than the poses' times."""
+    at = np.sort(rng.uniform(1.0, 25.0, n))
+    made = session(configuration, rng, n=n, poses=moving(at + delay), **more)
+    home = made.observations[0].base_T_flange.matrix @ invert(moving(at[:1] + delay)[0])
+    stream = np.arange(0.0, 26.0, 0.01)
+    poses = home @ moving(stream)
+    out = []
+    for o, when in zip(made.observations, at, strict=True):
+        motion = passed(stream, poses, when)
+        pose = Transform(BASE, FLANGE, pose_at(motion, 0.0))
+        out.append(replace(o, poses={FLANGE: pose}, motion=motion))
     return replace(made, observations=out)
 
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from flangeye.files.yaml_lines import parse_value
-from flangeye.types import Floats, Mask
+from flangeye.types import Floats, Mask, Motion
 
 Reader = str | Mapping[str, Any]
 """A reader as a recipe writes it: its name, or its name and parameters."""
@@ -53,6 +54,7 @@ class RecordedSession:
         links: (N, 4, 4) base_T_link of the link that carries the camera [m]; None where none does.
         seconds: (N, 4, 4) base2_T_flange2 [m], where a second arm carries the target, else None.
         place: (4, 4) of the target in the flange or base that has it, where that is known [m].
+        motions: N of them, how the flange passed each; None where not recorded for all of them.
         reach: Nearest and farthest distance that the scanner sees [m].
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
@@ -73,6 +75,7 @@ class RecordedSession:
     links: Floats | None = None
     seconds: Floats | None = None
     place: Floats = field(default_factory=lambda: np.eye(4))
+    motions: tuple[Motion, ...] | None = None
     reach: tuple[float, float] = (0.05, 5.0)
     reader: Reader = "auto"
     acquire: str = "acquire.archive"
@@ -131,6 +134,7 @@ class RecordedSession:
             times=self.times[mask],
             links=None if self.links is None else self.links[mask],
             seconds=None if self.seconds is None else self.seconds[mask],
+            motions=None if self.motions is None else tuple(compress(self.motions, mask)),
         )
 
     def without(self, mask: Mask) -> RecordedSession:
@@ -160,11 +164,11 @@ class RecordedSession:
         given = self.seconds
         seconds = given if given is None or arms == "first" else change(given)
         read = self.read_with(arms=arms, **correction)
-        return replace(read, poses=poses, seconds=seconds)
+        return replace(read, poses=poses, seconds=seconds, motions=None)
 
     def with_poses(self, poses: Floats) -> RecordedSession:
         """Return the session with other poses (N, 4, 4)."""
-        return replace(self, poses=poses)
+        return replace(self, poses=poses, motions=None)
 
     def step(self) -> str:
         """Return the acquire step that gives this session, as a line of the recipe."""

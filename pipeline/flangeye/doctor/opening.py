@@ -142,6 +142,9 @@ def _of_archive(archive: Archive, found: Mapping[str, t.Feature]) -> RecordedSes
     poses = {r.id: r.base_T_flange for r in calibration}
     times = {r.id: r.time_ns for r in calibration}
     session = _session(poses, found, times)
+    motions = tuple(r.motion for r in calibration if r.motion and r.passes_alone)
+    if len(motions) == len(calibration):
+        session = replace(session, motions=motions)
     if not np.isfinite(session.rotations).any():
         return replace(session, acquire="acquire.centres")
     # A marker's place on what carries it is not known unless a recipe says so.

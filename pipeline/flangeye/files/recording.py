@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.elsewhere import digest_elsewhere
-from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Role
+from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Motion, Role
 
 MIN_CAPTURES = 3
 MIN_SPREAD = 1e-3
@@ -60,6 +60,7 @@ class Recording:
         axes: Of a cell, where each rail and positioner was [m or rad].
         seen_by: Which camera of a cell looked.
         saw: Which target of a cell it saw.
+        motion: How the (first) arm's flange passed, where that was recorded and it moved.
     """
 
     id: str
@@ -75,11 +76,17 @@ class Recording:
     axes: Mapping[str, float] = field(default_factory=dict)
     seen_by: str = CAMERA
     saw: str = TARGET
+    motion: Motion | None = None
 
     @property
     def base_T_flange(self) -> Floats:
         """(4, 4) pose of the (first) arm's flange [m]."""
         return self.poses[FLANGE]
+
+    @property
+    def passes_alone(self) -> bool:
+        """Whether where the flange was at other times is all there is to know of the arms."""
+        return self.motion is not None and self.joints is None and set(self.poses) == {FLANGE}
 
 
 @dataclass(frozen=True, eq=False)

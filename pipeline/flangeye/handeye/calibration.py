@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.arm import (
-    MovedFlange,
+    SIGNIFICANT,
     unknown_zeros,
     with_field,
     with_joint_offsets,
     with_tool_offset,
 )
-from flangeye.handeye.candidates import Model, considered, understated, with_nuisance
+from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
 from flangeye.handeye.certificate import certificate_note
 from flangeye.handeye.consensus import find_consensus
 from flangeye.handeye.distortion import distortion_of, edges_of
@@ -28,7 +26,7 @@ from flangeye.handeye.estimates import (
 )
 from flangeye.handeye.flange_roll import roll_note
 from flangeye.handeye.likelihood import Problem, Solution
-from flangeye.handeye.loop import ArmNoise, meaningless_turns
+from flangeye.handeye.loop import COLUMNS, ArmNoise, meaningless_turns
 from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.handeye.observability import (
@@ -37,15 +35,11 @@ from flangeye.handeye.observability import (
     require_turns,
     unobservable,
 )
+from flangeye.handeye.observed import Cell
 from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
 from flangeye.handeye.wander import with_walk
-from flangeye.maths.geometry import rigid
-from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import covariance_inflation
-from flangeye.models.configuration import Configuration
-from flangeye.models.robots import RobotModel
-from flangeye.models.scanners import ScannerModel
+from flangeye.maths.statistics import covariance_inflation, f_quantile
 from flangeye.types import (
     FLANGE,
     CorrectedArm,
@@ -53,11 +47,12 @@ from flangeye.types import (
     HandEye,
     Observation,
     Pair,
-    PoseFeature,
     ScatterNoise,
     TransformEstimate,
 )
 
+CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
+"""Steps to find the time between two clocks, and how small the last one is [s]."""
 SIZES, EXACT_SIZE, LOOSEST_SIZE = 10, 1e-6, 0.1
 """Steps to find a target's size, the share by which the last one changes it, and the largest
 standard deviation of what is taken for found."""
@@ -102,60 +97,6 @@ class Options:
     certify: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
-    """What was observed, and where.
-
-    Attributes:
-        observations: N of them.
-        configuration: Who carries what.
-        robot: The arm's model, where it is known.
-        scanner: The scanner's, where it is known.
-    """
-
-    observations: Sequence[Observation]
-    configuration: Configuration
-    robot: RobotModel | None
-    scanner: ScannerModel | None = None
-
-    @cached_property
-    def arm(self) -> Arm | None:
-        """The arm's kinematics."""
-        return Arm(self.robot) if self.robot else None
-
-    @cached_property
-    def flange(self) -> MovedFlange | None:
-        """The arm whose flange carries camera or target; None where a link does, or nothing."""
-        carried = self.configuration.camera, self.configuration.target
-        if FLANGE not in carried:
-            return None
-        arm = self.arm
-        known = [o.joints for o in self.observations if o.joints is not None]
-        usable = arm is not None and all(len(q) == arm.n for q in known)
-        return MovedFlange(
-            np.array([o.base_T_flange.matrix for o in self.observations]),
-            np.array(known) if usable and len(known) == len(self.observations) else None,
-            self.configuration.camera == FLANGE,
-            arm,
-            self.robot.joint_accuracy if self.robot else 0.0,
-        )
-
-    def resized(self, factor: float) -> Cell:
-        """Return the cell with all poses of the target so many times as far from the camera."""
-        scale = np.repeat([1.0, factor], 3)
-        observations = []
-        for o in self.observations:
-            if isinstance(o.feature, PoseFeature):
-                seen = o.feature.camera_T_target
-                pose = rigid(seen.rotation, factor * seen.translation)
-                covariance = o.feature.covariance * np.outer(scale, scale)
-                moved = replace(o.feature, camera_T_target=replace(seen, matrix=pose),
-                                covariance=covariance)  # fmt: skip
-                o = replace(o, feature=moved)
-            observations.append(o)
-        return replace(self, observations=observations)
-
-
 def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     """Return every unknown of a cell with its covariance, and what is wrong with the arm.
 
@@ -173,7 +114,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         size = size_of(problem.measurements, problem.loop, np.random.default_rng(0))
         cell = cell.resized(size)
         problem = _problem(cell, options)
-    model = Model(find_consensus(problem, options.limits.rotation))
+    cell, model = _with_clock(cell, _agreed(cell, options), options)
     weak = unobservable(model.problem, model.found, options.limits)
     model, weak = _with_shared(model, cell, weak)
     if options.finds_size and model.problem.measurements.are_poses:
@@ -220,7 +161,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
                 "poses, or say target_size: known"
             )
         size, cell = size * (1 + told.share), cell.resized(1 + told.share)
-        model = Model(find_consensus(_problem(cell, options), options.limits.rotation))
+        model = _agreed(cell, options)
         if abs(told.share) < EXACT_SIZE:
             break
     longer = longer_distances(model.problem.measurements)
@@ -231,6 +172,56 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     return cell, known.noted(
         f"by the arm's own motion the target is {size:.{digits}f} +- {sigma:.{digits}f} times as "
         "large as was said where it was fitted, and is taken to be"
+    )
+
+
+def _agreed(cell: Cell, options: Options) -> Model:
+    """Return what the measurements agree on, with the time between two clocks if it was found."""
+    model = Model(find_consensus(_problem(cell, options), options.limits.rotation))
+    unknown = None if cell.delay is None else cell.unknown_delay()
+    return model if unknown is None else with_nuisance(model, unknown) or model
+
+
+def _with_clock(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]:
+    """Return the cell with the flange where it was when it was seen, if that helps, and its model.
+
+    Where the arm moved and a stream of its poses was recorded by a clock of its own. What is left
+    of the time between the clocks is part of the model; where it does not help, of the covariance.
+    """
+    unknown = cell.unknown_delay()
+    told = None if unknown is None else with_nuisance(model, unknown)
+    if told is None:
+        return cell, model
+    delay, sigma = _delay_of(told)
+    kept = replace(cell, clock_deviation=float(np.hypot(delay, sigma)))
+    if (delay / sigma) ** 2 < f_quantile(SIGNIFICANT, 1, told.found.freedom):
+        return kept, model
+    moved, candidate = cell, told
+    for _ in range(CLOCK_STEPS):
+        later = moved.delayed(delay)
+        if later is None:
+            return kept, model.noted("left out: " + _clock_told(moved, delay, sigma))
+        moved = later
+        candidate = _agreed(moved, options)
+        delay, sigma = _delay_of(candidate)
+        if abs(delay) < EXACT_DELAY:
+            break
+    chosen = better(model, candidate, _clock_told(moved, 0.0, sigma))
+    return (moved if chosen.found is candidate.found else kept), chosen
+
+
+def _delay_of(model: Model) -> tuple[float, float]:
+    """Return the first of the nuisances, and its standard deviation."""
+    found = model.found
+    return float(found.at.nuisance[0]), float(np.sqrt(found.covariance[COLUMNS, COLUMNS]))
+
+
+def _clock_told(cell: Cell, further: float, sigma: float) -> str:
+    delay = (cell.delay or 0.0) + further
+    which = "after" if delay > 0 else "before"
+    return (
+        f"the flange was at the poses {abs(delay) * 1e3:.1f} +- {sigma * 1e3:.1f} ms {which} the "
+        "times they are paired by"
     )
 
 
@@ -310,6 +301,10 @@ def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list
     distortion = None if weak.shape[1] else _distortion(model, cell, options)
     if distortion is not None:
         covariance = covariance + considered(model, distortion)
+    clock = cell.unknown_delay() if cell.clock_deviation else None
+    if clock is not None:
+        known = replace(clock, prior=np.array([cell.clock_deviation]))
+        covariance = covariance + considered(model, known)
     turns = meaningless_turns(model.problem.measurements, model.problem.loop, at)
     arbitrary = np.hstack([weak[:18], turns[:18]])
     columns = {name: columns_of(name, configuration) for name in transforms}

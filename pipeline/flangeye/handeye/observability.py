@@ -295,9 +295,9 @@ def unobservable(problem: Problem, found: Solution, limits: ObservabilityLimits)
     information += found.basis.T @ (known[:, None] * found.basis)
     found_weak = weak_moves(information, _scale(found.basis, limits))
     if not found_weak:
-        return np.zeros((20, 0))
+        return np.zeros((len(found.basis), 0))
     weak = np.asarray(np.linalg.qr(found.basis @ found_weak.moves)[0])
-    turns = np.abs(weak.reshape(20, -1)[_rotations()]).max()
+    turns = np.abs(weak[_rotations()]).max()
     if limits.mark and turns < 0.05:
         return np.asarray(weak)
     raise CalibrationRefused(f"{_of_what(weak)}: {missing_motion(problem)}")
@@ -309,7 +309,7 @@ def _rotations() -> NDArray[np.intp]:
 
 def _scale(basis: Floats, limits: ObservabilityLimits) -> Floats:
     """Return the (p,) limit of each fitted move."""
-    is_turn = np.isin(np.arange(20), [*_rotations(), 18, 19])
+    is_turn = np.isin(np.arange(len(basis)), [*_rotations(), 18, 19])
     turning = (np.abs(basis) * is_turn[:, None]).sum(axis=0) > 0
     return np.where(turning, limits.rotation, limits.translation)
 

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypeVar
+from typing import Annotated, Any, NotRequired, TypeVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -68,6 +68,7 @@ class _CaptureFacts(TypedDict):
     image: NotRequired[dict[str, Any] | None]
     camera: NotRequired[str]
     target: NotRequired[str]
+    motion: NotRequired[t.Motion | None]
 
 
 class _StepFacts(TypedDict):
@@ -196,7 +197,11 @@ class RunLog:
         given = [e.value for e in self.of_kind("acquire") if isinstance(e.value, t.Observation)]
         fitted = [
             t.Observation(
-                str(e.capture), e.value, *self._pose(str(e.capture)), *self._ends(str(e.capture))
+                str(e.capture),
+                e.value,
+                *self._pose(str(e.capture)),
+                *self._ends(str(e.capture)),
+                self._motion(str(e.capture)),
             )
             for e in self.of_kind("fit")
             if e.capture in self.poses
@@ -285,7 +290,15 @@ class RunLog:
         poses, joints = self._pose(capture)
         image = None if pixels is None else t.Image(pixels, **meta["image"])
         ends = self._ends(capture)
-        return t.Capture(capture, cloud, poses, joints, meta["time_ns"], meta["role"], image, *ends)
+        when = meta["time_ns"], meta["role"]
+        return t.Capture(
+            capture, cloud, poses, joints, *when, image, *ends, self._motion(capture)
+        )  # fmt: skip
+
+    def _motion(self, capture: str) -> t.Motion | None:
+        """Return how the flange passed; logs of arms that stood still do not say."""
+        motion = adapter(t.Motion | None).validate_python(self.poses[capture].get("motion"))
+        return cast("t.Motion | None", motion)
 
     def _ends(self, capture: str) -> tuple[str, str]:
         """Return which camera looked at which target; logs of one camera may not say."""

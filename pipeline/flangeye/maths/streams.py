@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.maths.geometry import nearest_rotation, rigid, rotation_log
-from flangeye.types import Floats
+from flangeye.types import Floats, Motion
 
 STILL_DISTANCE = 0.5e-3
 STILL_ANGLE = np.radians(0.1)
@@ -18,6 +18,8 @@ STILL_TIME = 0.3
 """An arm stands still while it stays so near to one pose [m, rad], for so long at least [s]."""
 LARGEST_OFFSET = 2.0
 """Of two clocks [s]: further apart than this, nothing is looked for."""
+PASSED, PASSED_STEP = 10, 0.02
+"""How many poses before and after a moment are kept of a stream, and how far apart [s]."""
 CLEAR_CORRELATION = 0.7
 """Of two signals of motion, below which their best shift means nothing."""
 
@@ -71,6 +73,25 @@ def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
     turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
     moved = np.stack([np.interp(inside, times, poses[:, k, 3]) for k in range(3)], axis=1)
     return np.array([rigid(r, p) for r, p in zip(turned, moved, strict=True)])
+
+
+def passed(times: Floats, poses: Floats, at: float) -> Motion:
+    """Return how the stream's flange passed a moment ``at`` that lies in the stream."""
+    steps = PASSED_STEP * np.arange(-PASSED, PASSED + 1)
+    steps = steps[(steps == 0) | ((at + steps >= times[0]) & (at + steps <= times[-1]))]
+    return Motion(steps, interpolated(times, poses, at + steps))
+
+
+def later(motion: Motion, delay: float) -> Motion | None:
+    """Return how the flange passed the moment ``delay`` later [s]; None beyond what was kept."""
+    if not motion.times[0] <= delay <= motion.times[-1]:
+        return None
+    return Motion(motion.times - delay, motion.poses)
+
+
+def pose_at(motion: Motion, time: float) -> Floats:
+    """Return the pose (4, 4) at a time of a motion [s]."""
+    return np.asarray(interpolated(motion.times, motion.poses, np.array([time]))[0])
 
 
 def mean_pose(poses: Floats) -> Floats:

@@ -224,8 +224,9 @@ class Runner:
         if feature is None:
             return None
         return t.Observation(
-            capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target
-        )
+            capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target,
+            capture.motion,
+        )  # fmt: skip
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
         if flange := self._start.segmented(capture.id):

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.types.arrays import Array, freeze
-from flangeye.types.frames import CAMERA, TARGET, FrameMismatchError, Placed, Poses, Transform
+from flangeye.types.frames import (
+    CAMERA,
+    TARGET,
+    FrameMismatchError,
+    Motion,
+    Placed,
+    Poses,
+    Transform,
+)
 from flangeye.types.scans import FlangeCloud
 
 
@@ -124,6 +132,7 @@ class Observation(Placed):
         joints: (n,) joint angles [rad], when known.
         camera: Frame of the camera that saw it; a cell has several.
         target: Frame of what it saw.
+        motion: How the flange passed it, where that was recorded and it moved.
     """
 
     id: str
@@ -132,6 +141,7 @@ class Observation(Placed):
     joints: Array | None = None
     camera: str = CAMERA
     target: str = TARGET
+    motion: Motion | None = None
 
     @property
     def circle(self) -> CircleFeature:

@@ -111,6 +111,23 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """Where a flange was shortly before and after a capture, from a stream of its poses.
+
+    Attributes:
+        times: (K,) from the time of the capture's own pose, rising [s].
+        poses: (K, 4, 4) base_T_flange [m].
+    """
+
+    times: Array
+    poses: Array
+
+    def __post_init__(self) -> None:
+        count = len(self.times)
+        freeze(self, times=(count,), poses=(count, 4, 4))
+
+
+@dataclass(frozen=True, eq=False)
 class TransformEstimate:
     """A transform that was estimated, with what is known of its error.
 

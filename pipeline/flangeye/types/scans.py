@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye.types.arrays import Array, Pixels, freeze
 from flangeye.types.clouds import PointCloud
-from flangeye.types.frames import CAMERA, TARGET, Placed, Poses
+from flangeye.types.frames import CAMERA, TARGET, Motion, Placed, Poses
 
 Role = Literal["calibration", "verification"]
 
@@ -62,6 +62,7 @@ class Capture(Placed):
         image: What a camera in the scanner saw, in the same frame, if one looked.
         camera: Frame of the scanner that took it; a cell has several.
         target: Frame of what it looked at.
+        motion: How the flange passed, where that was recorded and it moved.
     """
 
     id: str
@@ -73,6 +74,7 @@ class Capture(Placed):
     image: Image | None = None
     camera: str = CAMERA
     target: str = TARGET
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, eq=False)

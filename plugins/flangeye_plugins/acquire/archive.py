@@ -199,6 +199,7 @@ def _captures(
             _image(recording, cloud, camera),
             recording.seen_by,
             recording.saw,
+            recording.motion,
         )
 
 

@@ -116,5 +116,5 @@ def _captures(
             cloud = read_cloud(recording.cloud, unit) if recording.cloud else nothing
             yield Capture(
                 recording.id, cloud, poses_of(recording), recording.joints,
-                recording.time_ns, recording.role, image,
+                recording.time_ns, recording.role, image, motion=recording.motion,
             )  # fmt: skip

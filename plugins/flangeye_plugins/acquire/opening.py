@@ -130,6 +130,7 @@ def observation_of(recording: Recording, feature: Feature, cell: Cell | None = N
         recording.joints,
         recording.seen_by,
         recording.saw,
+        recording.motion,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from flangeye import part
 from flangeye.doctor.diagnosis import Arms, Finding, Findings, NotApplicable, RecordedSession
 from flangeye.maths.pose_corrections import delayed, shifted
+from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Mask
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
@@ -127,7 +128,10 @@ def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> l
 
 def _delayed(session: RecordedSession, arms: Arms, delay: float) -> Alternative:
     def change(poses: Floats) -> tuple[Floats, Mask]:
-        return delayed(poses, session.times, delay)
+        if session.motions is None or poses is not session.poses:
+            return delayed(poses, session.times, delay)
+        known = np.array([later(each, delay) is not None for each in session.motions])
+        return np.array([pose_at(each, delay) for each in session.motions]), known
 
     return _at_other_times(session, change, arms, delay=f"{delay * 1e3:.1f} ms")
 

@@ -28,6 +28,7 @@ from flangeye.maths.pose_corrections import (
     without_tool,
 )
 from flangeye.maths.pose_formats import EULER_ORDERS
+from flangeye.maths.streams import later, pose_at
 from flangeye.types import FLANGE, FLANGE2, Floats, Mask
 from flangeye.units import Duration, Length, param
 
@@ -99,23 +100,26 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     """Undo what concerns each pose by itself."""
     spared = {"first": FLANGE2, "second": FLANGE}.get(params.arms)
     poses = {
-        frame: pose if frame == spared else _corrected(pose, params)
+        frame: pose if frame == spared else _corrected(pose[None], params)[0]
         for frame, pose in recording.poses.items()
     }
     centre, target = recording.centre_in_camera, recording.camera_T_target
     if target is not None and params.target_inverted:
         target = inverted(target[None])[0]
+    motion = recording.motion
+    if motion is not None and params.arms != "second":
+        motion = replace(motion, poses=_corrected(motion.poses, params))
     return replace(
         recording,
+        motion=motion,
         poses=poses,
         centre_in_camera=None if centre is None else centre * params.target_scale,
         camera_T_target=None if target is None else scaled(target, params.target_scale),
     )
 
 
-def _corrected(pose: Floats, params: CorrectedParams) -> Floats:
-    """Return one arm's pose (4, 4) as it should be."""
-    poses = pose[None]
+def _corrected(poses: Floats, params: CorrectedParams) -> Floats:
+    """Return one arm's poses (N, 4, 4) as they should be."""
     if params.read_as and params.written_as:
         poses = reread(poses, params.read_as, params.written_as)
     if params.transposed:
@@ -123,7 +127,7 @@ def _corrected(pose: Floats, params: CorrectedParams) -> Floats:
     poses = scaled(poses, params.scale)
     if params.inverted:
         poses = inverted(poses)
-    return np.asarray(without_tool(poses, -np.array(params.target_offset))[0])
+    return without_tool(poses, -np.array(params.target_offset))
 
 
 def _shift(
@@ -144,18 +148,29 @@ def _shift(
 def _delay(
     archive: Archive, recordings: Sequence[Recording], params: CorrectedParams
 ) -> list[Recording]:
+    if params.arms == "both" and all(r.passes_alone for r in recordings):
+        return [found for r in recordings if (found := _passing_later(r, params.delay))]
     times = np.array([r.time_ns for r in recordings if r.role == "calibration"]) * 1e-9
     if (np.diff(times) <= 0).any():
         raise StageError(f"{archive.root}: delay: the poses' times do not rise")
     wanted = times + params.delay
     kept = (wanted >= times[0]) & (wanted <= times[-1])
 
-    def later(rows: Floats) -> Floats:
+    def moved(rows: Floats) -> Floats:
         if rows.ndim == 3:
             return delayed(rows, times, params.delay)[0]
         return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
 
-    return _replaced(recordings, later, kept, params.arms)
+    return _replaced(recordings, moved, kept, params.arms)
+
+
+def _passing_later(recording: Recording, delay: float) -> Recording | None:
+    """Return a recording with the flange where it was later; None beyond what was recorded."""
+    motion = recording.motion and later(recording.motion, delay)
+    if motion is None:
+        return None
+    poses = {**recording.poses, FLANGE: pose_at(motion, 0.0)}
+    return replace(recording, poses=poses, motion=motion)
 
 
 def _replaced(
@@ -180,6 +195,7 @@ def _replaced(
     if arms != "second" and all(recording.joints is not None for recording in calibration):
         turned = change(np.array([recording.joints for recording in calibration]))
         changed = [replace(r, joints=m) for r, m in zip(changed, turned, strict=True)]
+    changed = [replace(r, motion=None) for r in changed]  # of its own moment, not of this
     return [r for r in recordings if r.role != "calibration"] + [
         recording for recording, has in zip(changed, kept, strict=True) if has
     ]

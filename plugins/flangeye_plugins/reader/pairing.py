@@ -17,9 +17,10 @@ from flangeye.maths.streams import (
     interpolated,
     mean_pose,
     offset_into,
+    passed,
     standstills,
 )
-from flangeye.types import Floats
+from flangeye.types import Floats, Motion
 from flangeye.units import Angle, Duration, Length, param
 
 Signal = tuple[Floats, Floats]
@@ -54,11 +55,13 @@ class Pair:
         time: When [s], by the arm's clock.
         pose: (4, 4) [m].
         events: Which measurements, by their index; at least one.
+        motion: How the arm passed; None where it stood still.
     """
 
     time: float
     pose: Floats
     events: tuple[int, ...]
+    motion: Motion | None = None
 
 
 def pair(
@@ -139,7 +142,13 @@ def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -
     at = np.where(sparse, times[_nearest(times, moved[usable])], moved[usable])
     between = interpolated(times, poses, at) if len(times) > 1 else poses[[0] * len(at)]
     kept = apart(between, params.distance, params.angle)
-    return [Pair(float(at[i]), between[i], (int(usable[i]),)) for i in kept]
+    return [
+        Pair(
+            float(at[i]), between[i], (int(usable[i]),),
+            None if sparse[i] else passed(times, poses, float(at[i])),
+        )
+        for i in kept
+    ]  # fmt: skip
 
 
 def _nearest(times: Floats, at: Floats) -> Floats:

@@ -268,6 +268,7 @@ class Target:
                 {FLANGE: found.pose},
                 joints=_angles(joints, found),
                 time_ns=round(found.time * 1e9),
+                motion=found.motion,
                 camera_T_target=mean_pose(self.poses[list(found.events)]),
             )
             for i, found in enumerate(pairs)
@@ -315,6 +316,7 @@ class Scans:
                 cloud=files[event] if self.clouds else None,
                 joints=_angles(joints, found),
                 time_ns=round(found.time * 1e9),
+                motion=found.motion,
                 image=images.get(event),
                 camera=self.camera,
             )

@@ -239,7 +239,10 @@ def _joined(
     except StageError as error:
         raise StageError(f"{target.file}: {error}") from None
     recordings = [
-        _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time)
+        replace(
+            _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time),
+            motion=p.motion,
+        )
         for i, p in enumerate(pairs)
     ]
     return recordings, notes

@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import FlangeyeError, Params, stage
-from flangeye.handeye.calibration import Cell, Options, calibrate
+from flangeye.handeye.calibration import Options, calibrate
 from flangeye.handeye.loop import ArmNoise
 from flangeye.handeye.observability import ObservabilityLimits
+from flangeye.handeye.observed import Cell
 from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from flangeye import StageError
 from flangeye.maths.geometry import rigid
 from flangeye.maths.streams import clock_offset, standstills, turning
+from flangeye.plugin.registry import load_registry
+from flangeye_plugins.reader.corrected import CorrectedParams, corrected
 from flangeye_plugins.reader.matrices import MatricesParams, matrices
 from flangeye_plugins.reader.table import TableParams, table
 from flangeye_plugins.reader.visp import visp
@@ -141,6 +143,27 @@ def test_two_streams_are_paired_and_their_clocks_compared(
     ]
     assert len(found) == 7 if still else len(found) > 20
     assert max(wrong) < (1e-4 if still else 4e-3)
+
+
+def test_a_delay_is_undone_by_the_stream_of_an_arm_that_moved(tmp_path: Path) -> None:
+    """Between the poses taken, 5 mm and more apart, nothing but the stream tells where it was."""
+    times = np.arange(0, 8, 0.008)
+    arm = moving(times, np.full(times.shape, False))
+    which = np.arange(100, 900, 50)
+    written(tmp_path / "arm.csv", ["t", *"xyzabcd"], np.hstack([times[:, None], quaternions(arm)]))
+    written(tmp_path / "seen.csv", ["t", *"xyzabcd"],
+            np.hstack([times[which][:, None] - 0.08, quaternions(np.linalg.inv(arm[which]))]))  # fmt: skip
+    target = {"file": "seen.csv", "time": "t", "rotation": "xyzw", "length": "m"}
+    read = {"rotation": "xyzw", "length": "m", "pose": "base_T_flange", "file": "arm.csv",
+            "time": "t", "target": target, "join": {"clock_offset": "0 s"}}  # fmt: skip
+    late = table(tmp_path, params(**read)).recordings
+    assert all(recording.motion is not None for recording in late)
+    reader = load_registry().part("reader.table").bind(params(**read))
+    mended = corrected(tmp_path, CorrectedParams(reader=reader, delay=0.08)).recordings
+    assert len(mended) == len(late) == len(which)
+    wrong = [np.linalg.norm((r.base_T_flange @ r.camera_T_target)[:3, 3]) for r in (*late, *mended)]
+    assert min(wrong[: len(late)]) > 5e-3
+    assert max(wrong[len(late) :]) < 1e-4
 
 
 def test_standstills_are_found_and_noise_does_not_break_them() -> None:
