@@ -227,8 +227,8 @@ def test_a_time_offset_where_the_arms_stream_was_recorded() -> None:
     seldom = session.where(np.arange(400) % 10 == 5)
     motions = [passed(session.times, session.poses, at) for at in seldom.times]
     late = seldom.with_poses(np.array([pose_at(motion, -0.08) for motion in motions]))
-    motions = tuple(later(motion, -0.08) or motion for motion in motions)
-    finding = only(replace(late, motions=motions))
+    known = tuple(later(motion, -0.08) or motion for motion in motions)
+    finding = only(replace(late, motions=known))
     assert finding.name == "time offset"
     told = float(finding.fix.split("delay: ")[1].partition(" ms")[0])
     assert told == pytest.approx(80, abs=2)

@@ -62,5 +62,6 @@ def test_a_motion_tells_other_moments_as_far_as_it_was_recorded() -> None:
     motion = made.observations[0].motion
     assert later(motion, 0.21) is None
     moved = later(motion, 0.1)
+    assert moved is not None
     np.testing.assert_array_equal(pose_at(moved, 0.0), pose_at(motion, 0.1))
     assert moved.times[-1] == pytest.approx(0.1)

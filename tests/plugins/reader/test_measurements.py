@@ -159,7 +159,9 @@ def test_a_delay_is_undone_by_the_stream_of_an_arm_that_moved(tmp_path: Path) ->
     late = table(tmp_path, params(**read)).recordings
     assert all(recording.motion is not None for recording in late)
     reader = load_registry().part("reader.table").bind(params(**read))
-    mended = corrected(tmp_path, CorrectedParams(reader=reader, delay=0.08)).recordings
+    mended = corrected(
+        tmp_path, CorrectedParams.model_validate({"reader": reader, "delay": "80 ms"})
+    ).recordings
     assert len(mended) == len(late) == len(which)
     wrong = [np.linalg.norm((r.base_T_flange @ r.camera_T_target)[:3, 3]) for r in (*late, *mended)]
     assert min(wrong[: len(late)]) > 5e-3
