@@ -114,7 +114,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         size = size_of(problem.measurements, problem.loop, np.random.default_rng(0))
         cell = cell.resized(size)
         problem = _problem(cell, options)
-    cell, model = _with_clock(cell, _agreed(cell, options), options)
+    cell, model = _with_clock(cell, _agreed(cell, options, problem), options)
     weak = unobservable(model.problem, model.found, options.limits)
     model, weak = _with_shared(model, cell, weak)
     if options.finds_size and model.problem.measurements.are_poses:
@@ -175,9 +175,10 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     )
 
 
-def _agreed(cell: Cell, options: Options) -> Model:
+def _agreed(cell: Cell, options: Options, problem: Problem | None = None) -> Model:
     """Return what the measurements agree on, with the time between two clocks if it was found."""
-    model = Model(find_consensus(_problem(cell, options), options.limits.rotation))
+    problem = problem or _problem(cell, options)
+    model = Model(find_consensus(problem, options.limits.rotation))
     unknown = None if cell.delay is None else cell.unknown_delay()
     return model if unknown is None else with_nuisance(model, unknown) or model
 

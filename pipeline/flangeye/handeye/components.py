@@ -126,26 +126,18 @@ class Residuals:
 
     def factor(self, own: Floats, further: Floats, wanted: float) -> float:
         """Return how often covariances have to be added to own ones for a sum of squares."""
-        squares, shares = self._along(own, further)
-        # Newton on the reciprocal of the sum, which is concave: it climbs to the answer from below.
-        factor = 0.0
-        for _ in range(STEPS):
-            terms = squares / (1 + factor * shares)
-            total, slope = terms.sum(), (terms * shares / (1 + factor * shares)).sum()
-            if total <= wanted * (1 + 1e-9) or factor > LARGEST:
-                break
-            factor += total * (total - wanted) / (wanted * max(slope, 1e-300))
-        return float(min(factor, LARGEST))
+        return _factor(*self._along(own, further), wanted)
 
     def extra(self, own: Floats) -> tuple[float, float]:
         """Return the variance to add, and the scale of the covariances, at most one."""
         if np.isinf(self.freedom):
             return 0.0, 1.0
         freedom, unit = max(self.freedom, 1.0), max(float((self.errors**2).mean()), FINEST**2)
-        explained = float(self._along(own, unit * np.eye(3))[0].sum())
+        squares, shares = self._along(own, unit * np.eye(3))
+        explained = float(squares.sum())
         if explained <= freedom:
             return 0.0, max(explained / freedom, 1e-6)
-        return unit * self.factor(own, unit * np.eye(3), freedom), 1.0
+        return unit * _factor(squares, shares, freedom), 1.0
 
     def _along(self, own: Floats, further: Floats) -> tuple[Floats, Floats]:
         """Return squared errors (3 N,) in units of their noise, and what is to be added there.
@@ -161,3 +153,16 @@ class Residuals:
         shares, axes = np.linalg.eigh(0.5 * (added + np.swapaxes(added, 1, 2)))
         errors = np.einsum("nij,ni->nj", axes, whitened[..., 0])
         return (errors**2).ravel(), np.maximum(shares, 0.0).ravel()
+
+
+def _factor(squares: Floats, shares: Floats, wanted: float) -> float:
+    """Return the factor on shares of a noise to be added at which squares come to a sum."""
+    # Newton on the reciprocal of the sum, which is concave: it climbs to the answer from below.
+    factor = 0.0
+    for _ in range(STEPS):
+        terms = squares / (1 + factor * shares)
+        total, slope = terms.sum(), (terms * shares / (1 + factor * shares)).sum()
+        if total <= wanted * (1 + 1e-9) or factor > LARGEST:
+            break
+        factor += total * (total - wanted) / (wanted * max(slope, 1e-300))
+    return float(min(factor, LARGEST))

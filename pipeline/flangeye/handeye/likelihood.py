@@ -163,7 +163,13 @@ def climb(
         shares: (N,) from 0 to 1.
         iterations: Steps at most.
     """
-    here, damping = _weighed(problem, found.at, found.linear, noise, shares), LEAST_DAMPING
+    here = _weighed(problem, found.at, found.linear, noise, shares)
+    return _climb_on(problem, here, shares, iterations)
+
+
+def _climb_on(problem: Problem, here: Solution, shares: Floats, iterations: int) -> Solution:
+    """Return the most likely unknowns near what is weighed with these shares already."""
+    noise, damping = here.noise, LEAST_DAMPING
     for _ in range(iterations):
         step, gain = _step(here, damping)
         if gain < SETTLED * max(1.0, here.cost) or damping > 1e8:
@@ -337,7 +343,7 @@ def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solutio
         found = climb(problem, found, noise, shares, few)
         if before.is_close(noise):
             break
-    found = climb(problem, found, found.noise, shares, many)
+    found = _climb_on(problem, found, shares, many)
     return replace(found, freedom=freedom, all_freedom=both)
 
 

@@ -237,5 +237,7 @@ def weights_of(measurements: Measurements, linear: Linear, noise: Noise) -> Floa
     own = measurements.covariances + noise.arms * linear.of_arms
     extra[5, 5] += noise.depth
     covariance = own * np.outer(scale, scale) + extra
+    if measurements.are_poses:
+        return np.asarray(np.linalg.inv(covariance))
     p = measurements.projectors
     return np.asarray(p @ np.linalg.inv(p @ covariance @ p + (np.eye(6) - p)) @ p)
