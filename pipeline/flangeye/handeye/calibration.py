@@ -25,7 +25,7 @@ from flangeye.handeye.estimates import (
     transforms_of,
 )
 from flangeye.handeye.flange_roll import roll_note
-from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.likelihood import Problem, Solution, freedom_of_sizes
 from flangeye.handeye.loop import COLUMNS, ArmNoise, meaningless_turns
 from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
@@ -294,7 +294,8 @@ def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list
     at, alone = found.at, not (model.problem.loop.y or model.problem.loop.z)
     transforms = transforms_of(configuration, at.x, at.y, at.z)
     points = points_of_interest(configuration, transforms, _agreeing(model, cell), cell.arm)
-    wider = covariance_inflation(found.freedom, 6 if alone else found.parameters)
+    freedom = freedom_of_sizes(model.problem, found)
+    wider = covariance_inflation(freedom, 6 if alone else found.parameters)
     covariance = found.covariance[:18, :18] * wider
     if _considers_zeros(cell, options):
         added = unknown_zeros(model, cell.flange) if cell.flange else None

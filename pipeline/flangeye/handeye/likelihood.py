@@ -25,7 +25,7 @@ from flangeye.handeye.loop import (
 )
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance, no_nuisance
-from flangeye.handeye.smoothing import Smoothed, size_told, smoothed
+from flangeye.handeye.smoothing import Smoothed, size_told, smoothed, steps_told
 from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats, Mask
@@ -361,7 +361,9 @@ def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]
         noises.append(without_arms(turned, shifted, own))
         if problem.in_depth:
             noises += _in_depth(found, turned, (own, arms))
-    noise = max(noises, key=lambda each: _likelihood(problem, found, each))
+    noise = noises[0]
+    if len(noises) > 1:
+        noise = max(noises, key=lambda each: _likelihood(problem, found, each))
     size, walk = _size(problem, found), _walked(problem, found)
     freedoms = [f for f in (turned.freedom, shifted.freedom) if np.isfinite(f)]
     fewer, both = min(freedoms, default=np.inf), sum(freedoms) if freedoms else np.inf
@@ -411,6 +413,21 @@ def _walked(problem: Problem, found: Solution) -> StepSize:
         return found.noise.walk
     spread = found.course.spread(problem.walk, found.known)
     return size_told(problem.walk, found.noise.walk, found.at.course, spread)
+
+
+def freedom_of_sizes(problem: Problem, found: Solution) -> float:
+    """Return the degrees of freedom that the covariance's scale was estimated from.
+
+    Where the base walked its steps take up most of what residuals show, and few are left to tell
+    the noise; but then the covariance is the steps' more than the noise's, and many tell those.
+    """
+    if problem.walk is None or found.course is None or not np.isfinite(found.freedom):
+        return found.freedom
+    left = [_residuals(problem, found, at).freedom for at in (slice(0, 3), slice(3, 6))]
+    steps = steps_told(
+        problem.walk, found.noise.walk, found.course.spread(problem.walk, found.known)
+    )
+    return max(1.0, min(own + told for own, told in zip(left, steps, strict=False)))
 
 
 def _size(problem: Problem, found: Solution) -> float:

@@ -154,6 +154,8 @@ def shared_errors(observations: Sequence[Observation]) -> Floats:
     each = [o.feature.shared if isinstance(o.feature, PoseFeature) else np.zeros((6, 0))
             for o in observations]  # fmt: skip
     most = max(moved.shape[1] for moved in each)
+    if not most:
+        return np.zeros((len(each), 6, 0))
     return np.array([np.pad(moved, ((0, 0), (0, most - moved.shape[1]))) for moved in each])
 
 

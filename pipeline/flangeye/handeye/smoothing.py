@@ -11,6 +11,9 @@ from flangeye.handeye.walk import FINEST_STEP, Course, StepSize, Walk
 from flangeye.maths.tridiagonal import Tridiagonal, solve_tridiagonal
 from flangeye.types import Floats
 
+GROUPS = slice(0, 3), slice(3, 6), slice(6, 7)
+"""Where turns, shifts and a change of scale stand in a step."""
+
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
@@ -96,10 +99,23 @@ def size_told(walk: Walk, size: StepSize, course: Course, spread: Floats) -> Ste
         course: Where it walked, by that.
         spread: (N - 1, s) variances of its steps.
     """
-    steps, groups = course.steps(walk)[1:], (slice(0, 3), slice(3, 6), slice(6, 7))
-    sizes = list(size)
-    for i, at in enumerate(groups[: 3 if walk.grows else 2]):
-        variance = max(size[i], FINEST_STEP) ** 2
-        told = steps[:, at].size - spread[:, at].sum() / variance
-        sizes[i] = max(float(np.sqrt((steps[:, at] ** 2).sum() / max(told, 1e-3))), FINEST_STEP)
+    steps, sizes = course.steps(walk)[1:], list(size)
+    for i, told in enumerate(steps_told(walk, size, spread)):
+        squares = (steps[:, GROUPS[i]] ** 2).sum()
+        sizes[i] = max(float(np.sqrt(squares / max(told, 1e-3))), FINEST_STEP)
     return StepSize(*sizes)
+
+
+def steps_told(walk: Walk, size: StepSize, spread: Floats) -> list[float]:
+    """Return of how many numbers the steps' turns, shifts and, if it grows, scales are known.
+
+    Args:
+        walk: How it walks.
+        size: Of its steps.
+        spread: (N - 1, s) variances of the steps.
+    """
+    variances = [max(each, FINEST_STEP) ** 2 for each in size]
+    return [
+        spread[:, at].size - float(spread[:, at].sum()) / variance
+        for at, variance in zip(GROUPS[: 3 if walk.grows else 2], variances, strict=False)
+    ]
