@@ -270,6 +270,47 @@ def _read_poses(path):
     _registry().part("reader.folder").bind()(folder)
 
 
+def _matrices(suffix):
+    def written(folder):
+        import cv2
+
+        file = folder / f"sound{suffix}"
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+        for i in range(3):
+            storage.write(f"T1_{i}", np.eye(4))
+        storage.release()
+        return [file.read_bytes()]
+
+    return written
+
+
+def _bags(suffix):
+    def recorded(folder):
+        from tests.plugins.reader import bags
+
+        poses = np.tile(np.eye(4), (3, 1, 1))
+        poses[:, 0, 3] = 0.3, 0.4, 0.5
+        times, held, middles = bags.stops(poses, rate=10)
+        told = [
+            ("/pose", t, bags.pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)
+        ]
+        told += [("/points", t, bags.point_cloud(t, np.ones((4, 3)))) for t in middles]
+        bag = bags.write_bag(folder / f"bag{suffix}", suffix.removeprefix("."), told)
+        return [next(bag.glob(f"*{suffix}")).read_bytes()]
+
+    return recorded
+
+
+def _read_bag(path):
+    _registry().part("reader.ros2_bag").bind()(path)
+
+
+def _read_arrays(path):
+    from flangeye.files.named_arrays import arrays_of
+
+    arrays_of(path)
+
+
 def _read_json(path):
     from flangeye.errors import StageError
     from flangeye.log.read import decode_json
@@ -291,6 +332,10 @@ TARGETS = {
     "xyz": Target(".xyz", lambda folder: [b"0 0 1\n1 0 1\n", b"x,y,z\n1,2,3\n"], _read_cloud),
     "mesh-ply": Target(".ply", _ply, _read_mesh),
     "mesh-stl": Target(".stl", _stl, _read_mesh),
+    "opencv-yaml": Target(".yml", _matrices(".yml"), _read_arrays),
+    "opencv-xml": Target(".xml", _matrices(".xml"), _read_arrays),
+    "bag-mcap": Target(".mcap", _bags(".mcap"), _read_bag),
+    "bag-db3": Target(".db3", _bags(".db3"), _read_bag),
     "image": Target(".png", _images, _read_image),
     "poses": Target(".csv", _poses, _read_poses),
     "log": Target(".mcap", _logs, _read_log),

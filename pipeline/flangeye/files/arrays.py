@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import array_of, holds_numbers, load_npy
+from flangeye.files.printable import reason_of
 from flangeye.files.regular import open_regular, read_text
 from flangeye.types import Floats
 
@@ -70,8 +71,7 @@ def _expanded(path: Path, only: str | None = None) -> dict[str, NDArray[Any]]:
         except StageError:
             raise
         except Exception as error:  # damaged bytes can break the decoders in any way
-            reason = str(error).partition("\n")[0] or type(error).__name__
-            raise StageError(f"{path}: is not a NumPy .npz file: {reason}") from None
+            raise StageError(f"{path}: is not a NumPy .npz file: {reason_of(error)}") from None
 
 
 def _of_numbers(archive: ZipFile, info: ZipInfo) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,27 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files import matlab_parser
 from flangeye.files.arrays import read_arrays
+from flangeye.files.children import python_command
+from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import MAX_TEXT, read_regular, read_text
 from flangeye.types import Floats
 
 MAX_MATLAB = 1_000_000
-"""Longest .mat file [bytes]: its compression makes a thousand times as much of it at most."""
+"""Longest .mat file [bytes]."""
 MATRICES = ((4, 4), (3, 3), (3, 4))
 """Shapes of a pose, of its rotation, and of a pose without its last row."""
+_IN_YAML = re.compile(
+    r"^ *(?P<name>[\w-]+): !!opencv-matrix\s+rows: (?P<rows>\d{1,9})\s+cols: (?P<cols>\d{1,9})\s+"
+    r"dt: [a-z]\s+data: \[(?P<data>[^\]]*)\]",
+    re.MULTILINE,
+)
+_IN_XML = re.compile(
+    r"<(?P<name>[\w-]+) type_id=\"opencv-matrix\">\s*<rows>(?P<rows>\d{1,9})</rows>\s*"
+    r"<cols>(?P<cols>\d{1,9})</cols>\s*<dt>[a-z]</dt>\s*<data>(?P<data>[^<]*)</data>"
+)
 _DIGITS = re.compile(r"(\d+)")
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
@@ -94,7 +108,7 @@ def arrays_of(file: Path) -> dict[str, Floats]:
     except StageError:
         raise
     except Exception as error:  # damaged bytes can break these parsers in any way
-        raise StageError(f"{file}: cannot be read: {error}") from None
+        raise StageError(f"{file}: cannot be read: {reason_of(error)}") from None
 
 
 def _numbers(arrays: Iterable[tuple[str, object]]) -> dict[str, Floats]:
@@ -116,18 +130,35 @@ def _numpy(file: Path) -> dict[str, Floats]:
 
 
 def _matlab(file: Path) -> dict[str, Floats]:
-    from scipy.io import loadmat
-
-    return _numbers((n, value) for n, value in loadmat(file).items() if not n.startswith("__"))
+    """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
+    command = python_command(matlab_parser.__file__)
+    content = read_regular(file, MAX_MATLAB)
+    try:
+        done = subprocess.run(
+            command, input=content, capture_output=True, timeout=matlab_parser.SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise StageError(
+            f"{file}: cannot be read: its parser took more than {matlab_parser.SECONDS} s"
+        ) from None
+    if done.returncode < 0:
+        raise StageError(f"{file}: cannot be read: it is damaged, its parser crashed")
+    if done.returncode:
+        raise ValueError(done.stderr.decode("utf-8", "replace"))
+    found = np.load(io.BytesIO(done.stdout), allow_pickle=False)
+    return {n.removeprefix(matlab_parser.PREFIX): a.astype(np.float64) for n, a in found.items()}
 
 
 def _opencv(file: Path) -> dict[str, Floats]:
-    import cv2
-
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-    root = storage.root()
-    nodes = [(name, storage.getNode(name)) for name in root.keys()]  # noqa: SIM118  not a dict
-    return _numbers((name, node.mat()) for name, node in nodes if node.isMap())
+    """Return the matrices of a file that cv2.FileStorage wrote; damage would crash that class."""
+    text = read_text(file)
+    matrices = _IN_XML if file.suffix.lower() == ".xml" else _IN_YAML
+    return {
+        found["name"]: np.array(found["data"].replace(",", " ").split(), float).reshape(
+            int(found["rows"]), int(found["cols"])
+        )
+        for found in matrices.finditer(text)
+    }
 
 
 def _json(file: Path) -> dict[str, Floats]:

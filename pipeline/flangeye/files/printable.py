@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+LONGEST = 160
+"""What is quoted of a parser's message [characters]: some quote the file."""
 _CONTROLS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
@@ -13,3 +15,9 @@ _CONTROLS = re.compile(
 def printable(text: str) -> str:
     """Return a text with its control characters written out as escapes."""
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def reason_of(error: BaseException) -> str:
+    """Return what a library says of damaged input, as one short line."""
+    line = printable(str(error)).strip().partition("\n")[0].strip()
+    return line[:LONGEST] or type(error).__name__

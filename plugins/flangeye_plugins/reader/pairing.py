@@ -126,6 +126,8 @@ def _standing(arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats) 
             # Its ends hold the last of one motion and the first of the next.
             trim = 0.2 * (span.end - span.start)
             held = poses[(times >= span.start + trim) & (times <= span.end - trim)]
+            if not len(held):  # a stream so slow that a standstill is its two ends
+                held = poses[(times >= span.start) & (times <= span.end)]
             found.append(Pair(span.middle, mean_pose(held), tuple(within.tolist())))
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 
 from flangeye import StageError
+from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
 from flangeye.log.records import Channel, LogFile
 from flangeye.types import Singles
 
+SHORTEST = 12
+"""A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
 MISSING = "{}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """``sensor_msgs/PointField``: datatype -> NumPy's."""
@@ -46,6 +49,8 @@ class Raw:
     @property
     def stamp(self) -> float:
         """``header.stamp`` [s] of a message that begins with a header; else when received."""
+        if len(self.data) < SHORTEST:
+            return self.received
         order = "<" if self.data[1] & 1 else ">"
         seconds, nanoseconds = struct.unpack_from(f"{order}iI", self.data, 4)
         return seconds + nanoseconds * 1e-9 if seconds or nanoseconds else self.received
@@ -86,7 +91,11 @@ def messages(files: list[Path], topics: Collection[str]) -> Iterator[Raw]:
         read = _mcap_messages if file.suffix == ".mcap" else _db3_messages
         found = read(file, topics)
         while (raw := _guarded(file, lambda _: next(found, None))) is not None:  # noqa: B023
-            yield raw
+            yield replace(raw, decode=partial(_guarded, file, _decoder(raw)))
+
+
+def _decoder(raw: Raw) -> Callable[[Path], Any]:
+    return lambda _: raw.decode()
 
 
 def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
@@ -97,7 +106,7 @@ def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
     except ModuleNotFoundError:
         raise StageError(MISSING.format(file)) from None
     except Exception as error:  # damaged bytes can break the libraries in any way
-        raise StageError(f"{file}: cannot be read as a ROS 2 bag: {error}") from None
+        raise StageError(f"{file}: cannot be read as a ROS 2 bag: {reason_of(error)}") from None
 
 
 def _mcap_topics(file: Path) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """A ROS 2 bag, read without ROS, gives what was recorded."""
 
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -223,3 +224,24 @@ def test_a_bag_that_expands_too_far_is_refused_before_it_does(
         StageError, match=r"bag.mcap: damaged: .* a chunk says that it expands to 10"
     ):
         list(messages([file], ["/pose"]))
+
+
+def test_a_message_that_is_damaged_is_one_line(tmp_path: Path) -> None:
+    times, held, _ = stops(np.tile(np.eye(4), (3, 1, 1)))
+    told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
+    file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute("UPDATE messages SET data = x'00010000ffff' WHERE id = 2")
+    with pytest.raises(StageError) as refused:
+        ros2_bag(file, BagParams())
+    assert str(refused.value).startswith(f"{file}: cannot be read as a ROS 2 bag: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_standstills_of_two_samples_each(bag: Callable[..., Any]) -> None:
+    times, held, middles = stops(POSES, hold=0.5, way=0.5, rate=2.0)
+    told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+    found = read(bag(told)).recordings
+    assert np.allclose([r.base_T_flange for r in found], POSES[: len(found)], atol=1e-6)
+    assert len(found) >= 4  # whether the last one is a standstill, its one sample does not tell

@@ -1,0 +1,45 @@
+"""Turns a .mat file into .npz, from standard input to output: a program of its own.
+
+A damaged file can crash scipy's parser, or let it ask for any memory. Nothing of flangeye is
+imported here.
+"""
+
+from __future__ import annotations
+
+import io
+import resource
+import sys
+from typing import Any
+
+PREFIX = "of_"
+"""In front of each array's name: savez has arguments of its own."""
+SECONDS = 20
+"""Longest time for one file."""
+MEMORY = 4 << 30
+"""What the process may ask for [bytes]; libraries reserve much that they never use."""
+LARGEST = 1 << 28
+"""What the arrays of a file may come to [bytes]."""
+
+
+def main() -> None:
+    """Parse, and write the arrays of numbers."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    import numpy as np
+    from scipy.io import loadmat
+
+    values = loadmat(io.BytesIO(sys.stdin.buffer.read())).items()
+    numbers = ((n, v) for n, v in values if isinstance(v, np.ndarray) and v.dtype.kind in "iuf")
+    arrays: dict[str, Any] = {PREFIX + name: array for name, array in numbers}
+    if sum(array.nbytes for array in arrays.values()) > LARGEST:
+        raise ValueError(f"its arrays come to more than {LARGEST} bytes")
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    sys.stdout.buffer.write(out.getvalue())
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except Exception as error:  # damaged bytes can break the parser in any way
+        sys.exit(str(error) or type(error).__name__)

@@ -1,0 +1,70 @@
+"""Arrays of poses in other programs' files: what damages their parsers does not damage us."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from flangeye.errors import StageError
+from flangeye.files.named_arrays import arrays_of
+
+POSES = np.tile(np.eye(4), (5, 1, 1))
+
+
+def refusal(file: Path) -> str:
+    with pytest.raises(StageError) as refused:
+        arrays_of(file)
+    assert "\n" not in str(refused.value)
+    return str(refused.value).removeprefix(f"{file}: ")
+
+
+def test_a_mat_file_that_crashes_its_parser(tmp_path: Path) -> None:
+    file = tmp_path / "poses.mat"
+    savemat(file, {"robot": POSES})
+    content = bytearray(file.read_bytes())
+    content[180] = 127  # what kind of numbers the matrix has: scipy ends by a signal
+    file.write_bytes(content)
+    assert refusal(file) == "cannot be read: it is damaged, its parser crashed"
+
+
+def test_what_a_parser_quotes_of_a_file_is_short_and_plain(tmp_path: Path) -> None:
+    file = tmp_path / "poses.mat"
+    savemat(file, {"robot": POSES[0]}, format="4")
+    content = bytearray(file.read_bytes())
+    content[16:20] = (30).to_bytes(4, "little")  # the name is longer, and what follows too short
+    content[20:30] = b"\x1b[31m\nred\x07"
+    file.write_bytes(content)
+    text = refusal(file)
+    assert text.startswith("cannot be read: Not enough bytes to read matrix")
+    assert len(text) < 200 and "\x1b" not in text
+
+
+def test_names_and_numbers_of_a_mat_file(tmp_path: Path) -> None:
+    file = tmp_path / "poses.mat"
+    savemat(file, {"file": POSES, "count": np.uint8(5), "text": "no numbers"})
+    found = arrays_of(file)
+    assert set(found) == {"file", "count"}
+    assert np.array_equal(found["file"], POSES)
+
+
+def test_json_of_objects_and_of_lists(tmp_path: Path) -> None:
+    file = tmp_path / "poses.json"
+    file.write_text('[{"robot": [1, 2], "name": "a"}, {"robot": [3, 4], "name": "b", "more": 1}]')
+    assert np.array_equal(arrays_of(file)["robot"], [[1, 2], [3, 4]])
+    assert list(arrays_of(file)) == ["robot"]
+    file.write_text('{"robot": [[1, 2], [3, 4]], "ragged": [[1], [2, 3]]}')
+    assert list(arrays_of(file)) == ["robot"]
+    file.write_text("[[1, 2], [3, 4]]")
+    assert np.array_equal(arrays_of(file)[""], [[1, 2], [3, 4]])
+
+
+YAML = "%YAML:1.0\n---\nT_0: !!opencv-matrix\n   rows: 2\n   cols: 2\n   dt: d\n   data: [ 1., 2., {} ]\n"
+
+
+def test_opencvs_yaml(tmp_path: Path) -> None:
+    file = tmp_path / "pairs.yml"
+    file.write_text(YAML.format("3.,\n       4.e+00") + "count: 1\n")
+    assert np.array_equal(arrays_of(file)["T_0"], [[1, 2], [3, 4]])
+    file.write_text(YAML.format("3."))
+    assert refusal(file) == "cannot be read: cannot reshape array of size 3 into shape (2,2)"
