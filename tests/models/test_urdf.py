@@ -1,5 +1,6 @@
 """An arm from its URDF: the chain, the frames, the volumes, and what is said when one is wrong."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -160,7 +161,18 @@ def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
          '<link name="c"/><joint name="c" type="fixed"><parent link="link_6"/><child link="c"/>'
          "</joint></robot>"), "which link is the flange, .* write flange: a or c"),
         (lambda t: t.replace("revolute", "fixed"), "no joint moves between base and flange"),
-        (lambda t: t.replace("0 0 0.400", "0 0 x"), "is not three numbers"),
+        (lambda t: t.replace("0 0 0.400", "0 0 x"), 'xyz="0 0 x" is not three finite numbers'),
+        (lambda t: t.replace("0 0 0.400", "0 0"), 'xyz="0 0" is not three finite numbers'),
+        (lambda t: t.replace('velocity="1"', 'velocity=""'),
+         'velocity="" is not one finite number'),
+        (lambda t: t.replace('velocity="1"', 'velocity="nan"', 1),
+         'velocity="nan" is not one finite number'),
+        (lambda t: re.sub('lower="[^"]*"', 'lower="nan"', t), 'lower="nan" is not one finite'),
+        (lambda t: t.replace('axis xyz="0 0 -1"', 'axis xyz="0 0 0"'),
+         r"kr6.urdf: joint axis: an axis needs a direction, for example \[0, 0, 1\]"),
+        (lambda t: t.replace('scale="0.001 0.001 0.001"', 'scale="1e400 1 1"', 1),
+         'scale="1e400 1 1" is not three finite numbers'),
+        (lambda t: re.sub("<mesh [^>]*>", '<sphere radius="-1"/>', t), "volume radius: "),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_urdf_is_one_line(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import RecipeError
+from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_text
 from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
 from flangeye.maths.geometry import rotation_from_rpy
@@ -51,8 +52,8 @@ def _from_controller(robot: RobotModel, path: Path) -> RobotModel:
         rows = [_numbers(parser["mounting"][name]) for name in DELTAS]
     except (configparser.Error, KeyError, ValueError, OSError) as error:
         raise RecipeError(
-            f"{path}: not a controller's calibration.conf: {error}; it has a section [mounting] "
-            f"with {', '.join(DELTAS)}, each [six numbers]"
+            f"{path}: not a controller's calibration.conf: {reason_of(error)}; it has a section "
+            f"[mounting] with {', '.join(DELTAS)}, each [six numbers]"
         ) from None
     if {len(row) for row in rows} != {len(robot.joints)}:
         raise RecipeError(f"{path}: {len(robot.joints)} numbers are needed in each row")

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy, rpy_from_rotation
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
 from flangeye.models.urdf_meshes import MissingMesh, capsule_of
+from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats
 from flangeye.units import SI
 
@@ -77,8 +79,14 @@ def robot_from_urdf(
     shared = _shared(to_base, to_flange)
     if any(joint.get("type") in MOVES for joint in to_base[shared:]):
         raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
-    base_T_root = invert(_fixed(to_base[shared:]))
-    return _assemble(urdf, base_T_root, to_flange[shared:], standard, packages or {})
+    base_T_root = invert(_fixed(path, to_base[shared:]))
+    try:
+        return _assemble(urdf, base_T_root, to_flange[shared:], standard, packages or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        what = first["msg"].removeprefix("Value error, ")
+        raise RecipeError(f"{path}: {error.title.lower()} {field}: {what}") from None
 
 
 def read_urdf(path: Path) -> Urdf:
@@ -121,7 +129,7 @@ def _assemble(
             missing = str(error)
         if joint is None:
             break
-        before = before @ _origin(joint)
+        before = before @ _origin(urdf.path, joint)
         reached = _end(joint, "child")
         if joint.get("type") in MOVES:
             joints.append(_joint(urdf, joint, before))
@@ -138,15 +146,16 @@ def _assemble(
         volumes=() if missing else tuple(volumes),
         volumes_missing=missing,
         source=f"URDF {urdf.path.name}",
-        **_joint_speed(chain),
+        **_joint_speed(urdf.path, chain),
     )
 
 
-def _joint_speed(chain: Iterable[ET.Element]) -> dict[str, SI]:
+def _joint_speed(path: Path, chain: Iterable[ET.Element]) -> dict[str, SI]:
     """Return the speed of the slowest joint that turns [rad/s], where the file has any."""
     limits = [joint.find("limit") for joint in chain if joint.get("type") in TURNS]
-    told = [float(limit.get("velocity", "0")) for limit in limits if limit is not None]
-    speeds = [speed for speed in told if 0 < speed < np.inf]
+    bounded = [limit for limit in limits if limit is not None and limit.get("velocity") != "inf"]
+    told = [numbers_of(path, limit, "velocity", "0", 1)[0] for limit in bounded]
+    speeds = [speed for speed in told if speed > 0]
     return {"joint_speed": SI(min(speeds))} if speeds else {}
 
 
@@ -159,9 +168,9 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
     axis, limit = joint.find("axis"), joint.find("limit")
     lower, upper = -2 * np.pi, 2 * np.pi
     if joint.get("type") != "continuous" and limit is not None:
-        lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+        lower, upper = (numbers_of(urdf.path, limit, end, "0", 1)[0] for end in ("lower", "upper"))
     return Joint(
-        axis=tuple(_numbers(axis, "xyz", "1 0 0")),
+        axis=tuple(numbers_of(urdf.path, axis, "xyz", "1 0 0")),
         slides=joint.get("type") == "prismatic",
         lower=SI(lower),
         upper=SI(upper),
@@ -176,7 +185,7 @@ def _volumes(
         geometry = collision.find("geometry")
         if geometry is None or not len(geometry):
             continue
-        placed = pose @ _origin(collision)
+        placed = pose @ _origin(urdf.path, collision)
         capsule = capsule_of(geometry[0], urdf.path, packages)
         ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
         start, end = (tuple(map(SI, point)) for point in ends)
@@ -236,25 +245,18 @@ def _shared(first: list[ET.Element], second: list[ET.Element]) -> int:
     return count
 
 
-def _fixed(joints: list[ET.Element]) -> Floats:
+def _fixed(path: Path, joints: list[ET.Element]) -> Floats:
     pose = np.eye(4)
     for joint in joints:
-        pose = pose @ _origin(joint)
+        pose = pose @ _origin(path, joint)
     return pose
 
 
-def _origin(element: ET.Element) -> Floats:
+def _origin(path: Path, element: ET.Element) -> Floats:
     origin = element.find("origin")
-    rpy, xyz = _numbers(origin, "rpy", "0 0 0"), _numbers(origin, "xyz", "0 0 0")
+    rpy = numbers_of(path, origin, "rpy", "0 0 0")
+    xyz = numbers_of(path, origin, "xyz", "0 0 0")
     return rigid(rotation_from_rpy(*rpy), np.array(xyz))
-
-
-def _numbers(element: ET.Element | None, name: str, default: str) -> list[float]:
-    text = default if element is None else element.get(name, default)
-    try:
-        return [float(word) for word in text.split()]
-    except ValueError:
-        raise RecipeError(f'URDF: {name}="{text}" is not three numbers') from None
 
 
 def _pose(pose: Floats) -> dict[str, Any]:

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.errors import RecipeError
+from flangeye.files.printable import reason_of
 from flangeye.maths.capsules import Capsule, fit_capsule
+from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats
 
 MAX_BYTES = 200_000_000
@@ -33,7 +35,7 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
         RecipeError: It cannot be read.
     """
     if body.tag == "sphere":
-        return Capsule(np.zeros(3), np.zeros(3), float(body.get("radius", "0")))
+        return Capsule(np.zeros(3), np.zeros(3), _number(body, "radius", urdf))
     points = _points(body, urdf, packages)
     capsule = fit_capsule(points)
     outside = float(capsule.distance(points).max())
@@ -44,14 +46,18 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
 
 def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Floats:
     if body.tag == "box":
-        half = np.array([float(word) for word in body.get("size", "").split()]) / 2
+        half = np.array(numbers_of(urdf, body, "size", "")) / 2
         return np.asarray(half * np.array(list(itertools.product((-1, 1), repeat=3))))
     if body.tag == "cylinder":
-        return _cylinder(float(body.get("radius", "0")), float(body.get("length", "0")))
+        return _cylinder(_number(body, "radius", urdf), _number(body, "length", urdf))
     if body.tag == "mesh":
-        scale = np.array([float(word) for word in body.get("scale", "1 1 1").split()])
+        scale = np.array(numbers_of(urdf, body, "scale", "1 1 1"))
         return np.asarray(_vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
     raise RecipeError(f"{urdf}: <{body.tag}> is no body that URDF knows")
+
+
+def _number(body: ET.Element, name: str, urdf: Path) -> float:
+    return numbers_of(urdf, body, name, "0", 1)[0]
 
 
 def _cylinder(radius: float, length: float) -> Floats:
@@ -97,7 +103,7 @@ def _vertices(path: Path) -> Floats:
     try:
         mesh = trimesh.load_mesh(path)
     except Exception as error:  # trimesh raises whatever its readers do
-        raise RecipeError(f"{path}: is no mesh that can be read: {error}") from None
+        raise RecipeError(f"{path}: is no mesh that can be read: {reason_of(error)}") from None
     points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError(f"{path}: has no vertices, or some that are not finite")
