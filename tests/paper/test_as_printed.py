@@ -13,8 +13,8 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.run.replay import replay_steps
 from flangeye.testing import ControllerConformance
 from flangeye_paper.as_printed import controller_as_printed
-from flangeye_plugins.weld.going_on import task_of
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.resuming import task_of
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import DISTANCE, World, curved, planning_error
 from tests.plugins.weld.cell import planned, run

@@ -17,8 +17,8 @@ from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import Body, body_from
 from flangeye_plugins.weld.checks import check_tool
-from flangeye_plugins.weld.going_on import controller_of
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following
 
 DISTANCE = 40e-3

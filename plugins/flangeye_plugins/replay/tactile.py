@@ -17,7 +17,7 @@ from flangeye.run.replay import ReplayedStep
 from flangeye_plugins.sensor.recorded import piece_of
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import Reader
-from flangeye_plugins.weld.going_on import controller_from
+from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 
 SAME = 1e-9

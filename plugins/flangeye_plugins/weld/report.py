@@ -11,8 +11,8 @@ from flangeye.motion.seam_following import Controller, turned
 from flangeye.types import Floats, Seam, WeldReport
 from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.frame import WorkPlane
-from flangeye_plugins.weld.going_on import follower_of
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.resuming import follower_of
 from flangeye_plugins.weld.weld_log import WeldLog, columns
 
 SAMPLES = 2000

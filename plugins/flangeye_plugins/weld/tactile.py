@@ -33,10 +33,10 @@ from flangeye_plugins.weld.finger_camera import (
 )
 from flangeye_plugins.weld.follower import ResumePoint
 from flangeye_plugins.weld.frame import Tool, WorkPlane
-from flangeye_plugins.weld.going_on import controller_of, resume_point_of, set_back
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
+from flangeye_plugins.weld.resuming import controller_of, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.weld_log import WeldLog
 

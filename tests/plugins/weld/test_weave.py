@@ -10,8 +10,8 @@ from flangeye.errors import StageError
 from flangeye_emulators.weld_world.bench import curved, misplanned, try_condition
 from flangeye_emulators.weld_world.conditions import CONDITIONS, Condition
 from flangeye_plugins.weld.checks import check_weave
-from flangeye_plugins.weld.going_on import controller_from, follower_of
 from flangeye_plugins.weld.passes import Passes
+from flangeye_plugins.weld.resuming import controller_from, follower_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.weave import STRAIGHT, Weave
 

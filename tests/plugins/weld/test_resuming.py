@@ -14,8 +14,8 @@ from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simul
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.frame import WorkPlane
-from flangeye_plugins.weld.going_on import RUN_IN, resume_point_of, set_back
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.resuming import RUN_IN, resume_point_of, set_back
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line

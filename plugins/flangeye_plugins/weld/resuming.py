@@ -1,4 +1,4 @@
-"""Going on with a weld that was stopped: what was felt is kept, the torch goes back and overlaps.
+"""Resuming a weld that was stopped: what the tip felt is kept, the torch goes back and overlaps.
 
 What was felt is in the log: the controller is stepped through the logged poses and displacements as
 far as the log goes, so nothing has to be saved when a weld is stopped, not even by kill -9.
