@@ -139,8 +139,8 @@ def test_the_line_cures(tmp_path: Path, fault: Any) -> None:
 
     found = examine(open_session(archive, REGISTRY, recipe), CHECKS).findings
     assert [finding.name for finding in found] == [name]
-    step = found[-1].lines[-1]
-    assert yaml.safe_load(found[-1].fix.rpartition("if it is not: ")[2]) == [step]
+    step = next(line for line in found[-1].lines if "configuration" not in line)
+    assert [step] in [yaml.safe_load(choice) for choice in found[-1].choices]
     corrected_session = recipe_with(tmp_path / "mended.yaml", step)
 
     shift, turn = apart(calibrated(corrected_session, archive), truth)
