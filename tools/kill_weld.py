@@ -35,6 +35,8 @@ OPENING, ENDING = 240.0, 30.0
 """Longest time until the torch follows the seam, and until a struck run has ended [s]."""
 MOVES = 1e-4
 """Speed of the fastest joint above which an arm moves [rad/s]."""
+LOOK = 0.002
+"""Between two looks at the arm [s]: the weld needs the cores itself."""
 RESTS, ENDS = 0.3, 3.0
 """What is asked for: an arm at rest; a program that has ended, where no arm is left to look at [s]."""
 PATIENT = tuple(
@@ -92,6 +94,7 @@ class Trial:
         until = time.monotonic() + ENDING
         while (now := self.controller.control.truth()).time - last < 0.5:
             last = now.time if now.speed > MOVES else last
+            time.sleep(LOOK)
             if time.monotonic() > until:
                 return float("inf")
         return last - began.time
@@ -150,6 +153,7 @@ def camera(trial: Trial) -> float:
     control, last = trial.controller.control, time.time()
     while trial.run.poll() is None:
         last = time.time() if control.truth().speed > MOVES else last
+        time.sleep(LOOK)
     trial.reason = trial.told()
     return last - max(s["time_ns"] for s in trial.notes("sight") if s["tag"]) * 1e-9
 
