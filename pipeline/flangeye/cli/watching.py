@@ -25,6 +25,10 @@ More = Annotated[
     list[Path] | None,
     typer.Argument(metavar="[NEW]...", help="More archives, as with --archive."),
 ]
+Move = Annotated[
+    bool,
+    typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
+]
 HistoryFile = Annotated[
     Path | None,
     typer.Option(help="History file; default monitor.parquet beside the calibration's log."),
@@ -43,10 +47,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         bool, typer.Option("--live", help="Take new scans with the recipe's arm and scanner.")
     ] = False,
     scans: Annotated[int, typer.Option(min=1, help="Number of scans with --live.")] = 3,
-    move: Annotated[
-        bool,
-        typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
-    ] = False,
+    move: Move = False,
     overrides: Overrides = None,
     history: HistoryFile = None,
     false_alarms: Annotated[
