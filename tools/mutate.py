@@ -40,9 +40,13 @@ ROOMS = {
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
-    "run": ("pipeline/flangeye/run", "tests/run"),
-}
-"""Source, and the tests that have to notice."""
+    "run": (
+        "pipeline/flangeye/run", "tests/run", "tests/plugins/reader/test_cell.py",
+        "tests/cli/test_cell_export.py", "tests/result/test_answers.py",
+    ),
+}  # fmt: skip
+"""Source, and the folders or files of the tests that have to notice: a room's tests, and those that
+stand where what it does is read or used."""
 KEPT = ROOT / "build" / "mutation"
 """Which test runs which line, as found once."""
 
@@ -185,9 +189,9 @@ class Copy:
 
     def tests(self, room: str) -> Tests:
         """Return a room's fast tests; what was found of a file before is taken as it is."""
-        found, (source, folder) = Tests(), ROOMS[room]
+        found, (source, *places) = Tests(), ROOMS[room]
         KEPT.mkdir(parents=True, exist_ok=True)
-        for file in sorted((ROOT / folder).rglob("test_*.py")):
+        for file in (file for place in places for file in _test_files(ROOT / place)):
             kept = KEPT / f"{room}-{file.stem}-{_digest(file)}.json"
             if not kept.exists():
                 print(f"{room}: looking which lines {file.name} runs", file=sys.stderr)
@@ -202,7 +206,7 @@ class Copy:
     def collect(self, room: str) -> None:
         """Let the tests of a room be collected, for :meth:`killed_in_fork`."""
         self.close()
-        words = ["-m", "tools.trying", ROOMS[room][1]]
+        words = ["-m", "tools.trying", *ROOMS[room][1:]]
         self._trying = self._start(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def close(self) -> None:
@@ -311,6 +315,10 @@ def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) 
 def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:
     every = [m for m in mutations(room) if re.search(only, f"{m.file}:{m.line}:")]
     return every if only else random.Random(f"{room} {seed}").sample(every, min(count, len(every)))
+
+
+def _test_files(place: Path) -> list[Path]:
+    return sorted(place.rglob("test_*.py")) if place.is_dir() else [place]
 
 
 def _digest(path: Path) -> str:

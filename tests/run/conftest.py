@@ -1,12 +1,19 @@
-"""A finished run of six captures, to go on from."""
+"""Runs of the toy stages, with logs to go on from."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flangeye import stage
+from flangeye.log.read import read_run
+from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
-from flangeye.types import Captures, Resumed, Seed
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.restart import FromNothing, restart_at
+from flangeye.run.runner import Runner
+from flangeye.types import ArchivePath, Captures, Resumed, Seed
 from tests import toy
 from tests.conftest import Call
 
@@ -28,3 +35,25 @@ def done(flangeye: Call, toy_registry: Registry, toy_recipe: Path) -> Call:
     toy_recipe.write_text(toy_recipe.read_text().replace("acquire.toy:", "acquire.toy_again:"))
     assert flangeye("run", toy_recipe, "--out", "done")[0] == 0
     return flangeye
+
+
+@pytest.fixture
+def execute(toy_registry: Registry, tmp_path: Path) -> Callable[..., Any]:
+    """Run recipe text with a log; return the result and the log."""
+    runs: list[Recorder] = []
+
+    def run(text, at=None, log=None):
+        recipe = parse_recipe(text, "toy", toy_registry)
+        start = restart_at(log, recipe, at) if log else FromNothing()
+        path = tmp_path / f"{len(runs)}.mcap"
+        recorder = Recorder(path, {"recipe.yaml": text}, recipe.header.log.clouds == "full")
+        toy_registry.hooks.register(recorder)
+        runs.append(recorder)
+        try:
+            result = Runner(recipe, toy_registry, ArchivePath()).run(start)
+        finally:
+            toy_registry.hooks.unregister(recorder)
+            recorder.close()
+        return result, read_run(path)
+
+    return run

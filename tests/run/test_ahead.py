@@ -3,7 +3,9 @@
 import json
 import threading
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from flangeye import types as t
@@ -74,26 +76,35 @@ def test_threads_are_those_that_openmp_is_told(monkeypatch: pytest.MonkeyPatch) 
 def test_a_run_on_one_core_and_on_many_is_the_same(
     toy_registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    fitted: list[str] = []
+    plain_acquire, plain_fit = toy.acquire.function, toy.fit.function
+
+    def recorded(seed, params):
+        """Recordings of which one has no angles, one cannot be read and one shows nothing."""
+        made = plain_acquire(seed, params)
+        captures = [replace(c, joints=np.full(1, np.nan if c.id == "003" else 0)) for c in made]
+        torn = t.Rejection("torn", "acquire.toy", "cannot be read")
+        return t.Captures([torn, *captures], made.source, None, made.look, recorded=True)
+
+    def fit(cloud, params):
+        fitted.append(threading.current_thread().name)
+        return plain_fit(cloud, params)
+
     def run(threads):
         monkeypatch.setattr(runner, "cores", lambda: threads)
-        recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)
-        running = Runner(recipe, toy_registry, t.ArchivePath())
-        acquire = running._acquire
+        fitted.clear()
+        text = TOY_RECIPE.replace("count: 6", "count: 9, bad: 1, verification: 2")
+        result = Runner(parse_recipe(text, "toy", toy_registry), toy_registry, t.ArchivePath())
+        document = result.run().model_dump(mode="json")
+        calls = {label: timing["calls"] for label, timing in document.pop("timing").items()}
+        return json.dumps(document), calls, list(fitted)
 
-        def recorded():
-            stream = acquire()
-            stream.recorded = True
-            return stream
-
-        monkeypatch.setattr(running, "_acquire", recorded)
-        result = running.run().model_dump(mode="json")
-        timing = result.pop("timing")
-        return json.dumps(result), timing, list(toy.acquired)
-
-    one, timing, acquired = run(1)
-    many, other, _ = run(3)
-    assert one == many
-    assert timing.keys() == other.keys() and acquired
+    with replaced(toy.acquire, recorded), replaced(toy.fit, fit):
+        one, calls, here = run(1)
+        many, other, elsewhere = run(3)
+    assert one == many and calls == other
+    assert set(here) == {"MainThread"} and "MainThread" not in elsewhere
+    assert len(here) == len(elsewhere) == 6  # neither what is set aside nor the kept back one
 
 
 def test_simulated_scans_are_made_ahead_and_give_the_same_calibration(

@@ -12,37 +12,12 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.errors import StageError
-from flangeye.log.read import read_run
-from flangeye.log.record import Recorder
+from flangeye.errors import CalibrationRefused, StageError
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
-from flangeye.run.restart import FromNothing, restart_at, restart_hint
-from flangeye.run.runner import Runner
+from flangeye.run.restart import restart_hint
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
-
-
-@pytest.fixture
-def execute(toy_registry: Registry, tmp_path: Path) -> Callable[..., Any]:
-    """Run recipe text with a log; return the result and the log."""
-    runs: list[Recorder] = []
-
-    def run(text, at=None, log=None):
-        recipe = parse_recipe(text, "toy", toy_registry)
-        start = restart_at(log, recipe, at) if log else FromNothing()
-        path = tmp_path / f"{len(runs)}.mcap"
-        recorder = Recorder(path, {"recipe.yaml": text}, recipe.header.log.clouds == "full")
-        toy_registry.hooks.register(recorder)
-        runs.append(recorder)
-        try:
-            result = Runner(recipe, toy_registry, t.ArchivePath()).run(start)
-        finally:
-            toy_registry.hooks.unregister(recorder)
-            recorder.close()
-        return result, read_run(path)
-
-    return run
 
 
 def without_timing(result):
@@ -103,6 +78,7 @@ def test_a_bad_capture_is_data(execute: Callable[..., Any]) -> None:
         ("000", "segment.toy: no finite point"), ("001", "segment.toy: no finite point"),
     ]  # fmt: skip
     assert [r.id for r in log.rejections] == ["000", "001"]
+    assert [e.capture for e in log.of_kind("segment")] == ["002", "003", "004", "005"]
     assert result.status == "verified"
 
 
@@ -215,6 +191,48 @@ def test_stopwatch_charges_each_step_its_own_time(execute: Callable[..., Any]) -
         "0.acquire.toy", "1.segment.toy", "2.fit.toy", "3.solve.toy", "4.verify.toy",
     }  # fmt: skip
     assert result.timing["1.segment.toy"].calls == 6
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_the_log_charges_each_step_the_time_that_the_result_does(
+    execute: Callable[..., Any], recorded: bool
+) -> None:
+    plain = toy.acquire.function
+
+    def made(seed, params):
+        stream = plain(seed, params)
+        stream.recorded = recorded
+        return stream
+
+    with replaced(toy.acquire, made):
+        result, log = execute(SEAM_RECIPE)
+    logged = dict.fromkeys(result.timing, 0.0)
+    for entry in log.entries:
+        logged[entry.step] += entry.seconds
+    logged["0.acquire.toy"] = sum(meta["seconds"] for meta in log.poses.values())
+    told = {label: timing.seconds for label, timing in result.timing.items()}
+    # To set an acquire step up is charged to it too, before there is a capture.
+    assert logged.pop("0.acquire.toy") <= told.pop("0.acquire.toy")
+    assert logged == pytest.approx(told, rel=1e-6)
+
+
+def test_what_is_read_back_took_no_time(execute: Callable[..., Any]) -> None:
+    _, log = execute(SEAM_RECIPE)
+    _, again = execute(SEAM_RECIPE, "seam.toy", log)
+    read_back = [e.seconds for e in again.entries if e.kind in ("fit", "solve", "scan")]
+    assert read_back and not any(read_back)
+
+
+def test_what_refuses_before_it_solves_keeps_what_was_seen(execute: Callable[..., Any]) -> None:
+    def refuse(observations, params):
+        list(observations)
+        raise CalibrationRefused("no motion")
+
+    with replaced(toy.solve, refuse):
+        result, _ = execute(TOY_RECIPE)
+    assert (result.status, result.refused) == ("refused", "no motion")
+    assert [o.id for o in result.observations] == [f"{k:03d}" for k in range(6)]
+    assert {(o.used, o.reason) for o in result.observations} == {(False, "refused before solving")}
 
 
 def test_values_survive_the_log_bit_for_bit(execute: Callable[..., Any]) -> None:
