@@ -21,6 +21,9 @@ from flangeye_plugins.fit.boards import (
     fit_checkerboard,
     fit_circles,
 )
+from flangeye_plugins.fit.boards import _ambiguity as ambiguity
+from flangeye_plugins.fit.planar import PlanarPose
+from tests.plugins.bounds import check_bound
 
 CAMERA_MATRIX = np.array([[1000.0, 0, 400], [0, 1000, 300], [0, 0, 1]])
 LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
@@ -250,3 +253,74 @@ def test_a_grid_of_circles_that_is_symmetric_or_partly_seen_is_refused() -> None
     pose[0, 3] += 0.2
     told = fit_circles(capture(CIRCLES, pose), OF_CIRCLES)
     assert told.reason == "no grid of 11 rows of 4 circles found; all of it must be seen"
+
+
+def test_a_depth_that_has_too_few_corners_is_as_none() -> None:
+    seen = capture(MARKER, looking(), depth=True)
+    holes = seen.cloud.xyz.copy()
+    holes[:, :400] = np.nan  # two of the four corners
+    params = OF_MARKER.model_copy(update={"depth": "only"})
+    half = Capture("0", PointCloud(CAMERA, holes), by_frame(POSE), image=seen.image)
+    assert fit_aruco(half, params).reason.startswith("the cloud has no depth at the corners")
+    assert fit_aruco(seen, params).figures["by_depth"] == 1
+
+
+def test_a_scanners_distortion_turns_a_small_target_more() -> None:
+    """What is added by depth: the error in each direction, and over the target's size as a turn."""
+    seen = capture(CHARUCO, looking(), depth=True)
+    plain, more = (
+        fit_charuco(
+            seen, OF_CHARUCO.model_copy(update={"depth": "only", "scanner_error": error})
+        ).covariance
+        for error in (0.0, 1e-3)
+    )
+    size = np.hypot(5 * 0.03, 3 * 0.03)  # of the corners inside
+    expected = 1e-6 * np.diag([size**-2] * 3 + [1.0] * 3)
+    assert more - plain == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "name", "refused", "taken"),
+    [
+        (CharucoParams, {"rows": 5, "square": "30 mm", "marker": "20 mm"}, "columns", 2, 3),
+        (CharucoParams, {"columns": 5, "square": "30 mm", "marker": "20 mm"}, "rows", 2, 3),
+        (CharucoParams, {"columns": 5, "rows": 5, "square": "9 mm"}, "marker", "0 mm", "1 um"),
+        (CheckerboardParams, {"rows": 6, "square": "30 mm"}, "columns", 2, 3),
+        (CheckerboardParams, {"columns": 6, "square": "30 mm"}, "rows", 2, 3),
+        (CheckerboardParams, {"columns": 6, "rows": 5}, "square", "0 mm", "1 um"),
+        (CirclesParams, {"rows": 5, "spacing": "9 mm", "diameter": "9 mm"}, "columns", 1, 2),
+        (CirclesParams, {"columns": 5, "spacing": "9 mm", "diameter": "9 mm"}, "rows", 1, 3),
+        (CirclesParams, {"columns": 5, "rows": 5, "diameter": "9 mm"}, "spacing", "0 mm", "1 um"),
+        (CirclesParams, {"columns": 5, "rows": 5, "spacing": "9 mm"}, "diameter", "0 mm", "1 um"),
+        (MarkerParams, {"size": "9 mm"}, "id", -1, 0),
+        (MarkerParams, {}, "size", "0 mm", "1 um"),
+        (MarkerParams, {"size": "9 mm"}, "corner_noise", 0, 0.01),
+        (MarkerParams, {"size": "9 mm"}, "scanner_error", "-1 um", "0 mm"),
+        (MarkerParams, {"size": "9 mm"}, "max_error", 0, 0.01),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(
+    model: Any, given: dict[str, Any], name: str, refused: Any, taken: Any
+) -> None:
+    check_bound(model, name, refused, taken, given)
+
+
+def pose_of(tilt: float, misfit: float) -> PlanarPose:
+    return PlanarPose(looking(tilt), np.eye(6), 0.1, misfit)
+
+
+@pytest.mark.parametrize(
+    ("tilt", "misfit", "said"),
+    [
+        (0.2, 0.02, "two poses 11.5 deg apart fit the corners alike (likelihoods 1 : 2.72): "),
+        (0.2, 0.135, "two poses 11.5 deg apart fit the corners alike (likelihoods 1 : 854): "),
+        (0.2, 0.14, None),  # 1,097 times likelier
+        (1e-3, 0.0, None),  # the same pose
+    ],
+)
+def test_two_poses_are_told_apart_if_one_is_a_thousand_times_likelier(
+    tilt: float, misfit: float, said: str | None
+) -> None:
+    told = ambiguity([pose_of(0.0, 0.0), pose_of(tilt, misfit)])
+    assert (told and told.reason[: len(said or "")]) == said
+    assert ambiguity([pose_of(0.0, 0.0)]) is None

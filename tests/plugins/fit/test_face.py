@@ -59,3 +59,38 @@ def test_points_beyond_the_slab_have_none() -> None:
 def test_a_rough_plane_that_is_right_is_kept() -> None:
     rough = Plane(AT, NORMAL, 0.0)
     assert likeliest_plane(face(np.random.default_rng(2), noise=0.0), rough) is rough
+
+
+def test_a_plane_that_is_kept_from_patches_goes_through_its_points_exactly() -> None:
+    """The rough plane lies half way down to the recesses, and tilted."""
+    points = face(np.random.default_rng(3), floor=0.4, noise=0.0)
+    normal = np.array([0.02, 0.0, -1.0]) / np.hypot(0.02, 1.0)
+    plane = likeliest_plane(points, Plane(AT + [1e-3, 2e-3, 1e-3], normal, 0.0))
+    assert plane.normal == pytest.approx(NORMAL, abs=1e-9)
+    assert np.median(np.abs(plane.heights(points))) < 1e-9
+
+
+def test_only_points_of_the_ring_are_taken() -> None:
+    """A plate stands 5 mm before the middle, and a table lies 5 mm behind all that is outside."""
+    points = face(np.random.default_rng(4))
+    reach = np.hypot(points[:, 0], points[:, 1])
+    points[:, 2] += np.select([reach < 0.015, reach >= 0.026], [-5e-3, 5e-3], 0.0)
+    for ring, height in (((0.015, 0.026), 0.0), ((0.0, 0.015), 5e-3), ((0.026, 1.0), -5e-3)):
+        rough = Plane(AT + height * NORMAL, NORMAL, 0.0)
+        plane = disc_face(points, rough, ring, 20e-3)
+        assert plane is not None and plane.sigma == pytest.approx(1e-4, rel=0.1)
+        assert plane.heights(AT + height * NORMAL) == pytest.approx(0.0, abs=2e-5)
+
+
+def test_three_points_make_a_plane_and_two_do_not() -> None:
+    three = AT + 0.01 * np.array([[1.0, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]])
+    rough = Plane(AT, NORMAL, 0.0)
+    plane = disc_face(three, rough, (0.0, 0.04), 3e-3)
+    assert plane is not None and plane.normal == pytest.approx(NORMAL)
+    assert disc_face(three[:2], rough, (0.0, 0.04), 3e-3) is None
+
+
+def test_the_normal_is_towards_the_scanner_however_it_was_given() -> None:
+    points = face(np.random.default_rng(5))
+    plane = disc_face(points, Plane(AT, -NORMAL, 0.0), (0.0, 0.04), 3e-3)
+    assert plane is not None and plane.normal @ NORMAL > 0.999

@@ -5,14 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.maths.geometry import rotation_exp
+from flangeye.maths.geometry import basis_of_plane, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
 from flangeye.types import CAMERA, CircleFeature, FlangeCloud, PointCloud, Rejected
 from flangeye_plugins.fit.rim import RimParams, fit_rim
+from tests.plugins.bounds import check_bound
 from tests.plugins.fit.scenes import CENTRE, NORMAL, face, flange, placed
 
 UR5 = flange()
+assert UR5.bore is not None
+BORE = UR5.bore
 
 
 def fitted(cloud, model=UR5, **params) -> CircleFeature:
@@ -109,11 +112,90 @@ def test_a_wrist_circle_has_no_bore() -> None:
             placed(face(UR5, arc=0.3 * np.pi)),
             "of the rim lies within 0.3 mm of a circle, at least 30% is needed",
         ),
-        (placed(1.15 * face(UR5)), "rim radius"),
-        (placed(face(UR5)[:40]), "points"),
+        (placed(1.06 * face(UR5)), "rim radius 32.21 mm, expected 30.50 mm within 1.5 mm"),
+        (placed(face(UR5)[:40]), "39 points on the face, at least 100 are needed"),
+        (placed(face(UR5)[:2]), "fewer than 3 of 2 points lie on a common plane"),
     ],
 )
 def test_what_is_no_flange_is_set_aside_with_numbers(cloud: Any, words: str) -> None:
     rejected = fit_rim(cloud, UR5, RimParams())
     assert isinstance(rejected, Rejected)
     assert words in rejected.reason
+
+
+def stated(**params: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariances of a centre and its normal in the face's axes, normal last."""
+    axes = basis_of_plane(NORMAL)
+    none = {"scanner_error": "0 mm", "edge_bias": "0 mm", "flatness": "0 mm"}
+    circle = fitted(placed(face(UR5, pitch=0.6e-3)), **(none | params))
+    assert circle.normal_covariance is not None
+    return axes @ circle.covariance @ axes.T, axes @ circle.normal_covariance @ axes.T
+
+
+@pytest.mark.parametrize(
+    ("params", "centre", "normal"),
+    [
+        ({"scanner_error": "0.1 mm"}, [1e-8, 1e-8, 1e-8], [0, 0, 0]),
+        ({"edge_bias": "0.1 mm"}, [1e-8, 1e-8, 0], [0, 0, 0]),
+        # Anywhere in a band: its width over root 12, and for slopes half the radius as lever.
+        ({"flatness": "0.1 mm"}, [0, 0, 1e-8 / 12], [1e-8 / 12 / (UR5.rim / 2) ** 2] * 2 + [0]),
+    ],
+)
+def test_what_no_scatter_shows_is_added_where_it_belongs(
+    params: dict[str, str], centre: list[float], normal: list[float]
+) -> None:
+    (plain, slopes), (more, tilted) = stated(), stated(**params)
+    assert np.diag(more - plain) == pytest.approx(centre, rel=1e-3, abs=1e-12)
+    assert np.diag(tilted - slopes) == pytest.approx(normal, rel=1e-3, abs=1e-11)
+
+
+def test_the_normal_is_known_as_well_as_its_scatter_says() -> None:
+    tilts, sigmas = [], []
+    for seed in range(25):
+        circle = fitted(placed(face(UR5, pitch=1e-3, noise=1e-4, seed=seed)), flatness="0 mm")
+        tilts.append(circle.normal - NORMAL)
+        sigmas.append(np.trace(circle.normal_covariance))
+    assert np.sqrt(np.mean(sigmas)) == pytest.approx(
+        np.sqrt(np.mean(np.square(tilts)) * 3), rel=0.4
+    )
+
+
+def test_edges_that_are_bent_back_do_not_move_the_plane() -> None:
+    points = face(UR5)
+    reach = np.hypot(points[:, 0], points[:, 1])
+    edge = (reach > UR5.rim - 0.8e-3) | (reach < BORE + 0.8e-3)
+    points[edge, 2] -= 1e-4
+    _, along = in_face(fitted(placed(points)).centre - CENTRE)
+    assert along < 3e-6
+
+
+def test_a_plate_before_a_wrist_circle_is_not_in_its_plane() -> None:
+    model = wrist_circle_of(load_model("robots", "ur10e").flange, 0.09)
+    disc = face(model, pitch=1e-3)
+    disc[np.hypot(*disc[:, :2].T) < 0.0315, 2] += model.details.thickness
+    circle = fitted(placed(disc), model)
+    lifted = CENTRE + model.details.thickness * NORMAL
+    assert np.linalg.norm(circle.centre - lifted) < 0.2e-3
+
+
+def test_points_well_before_or_behind_the_face_are_no_edge() -> None:
+    """A collar about the rim, half a millimetre before or behind the face: no part of it."""
+    rng = np.random.default_rng(0)
+    angle, reach = rng.uniform(0, 2 * np.pi, 4000), UR5.rim + rng.uniform(0, 1e-3, 4000)
+    for height in (-5e-4, 5e-4):
+        collar = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * angle + height], 1)
+        circle = fitted(placed(np.concatenate([face(UR5), collar])))
+        assert circle.radii["rim"] == pytest.approx(UR5.rim, abs=0.15e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("inlier", "0 mm", "1 um"), ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1),
+        ("radius_tolerance", "0 mm", "1 um"), ("plane_gate", "0 mm", "1 um"), ("behind", 0, 0.5),
+        ("before", 0, 0.5), ("scanner_error", "-1 um", "0 mm"), ("edge_bias", "-1 um", "0 mm"),
+        ("flatness", "-1 um", "0 mm"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
+    check_bound(RimParams, name, refused, taken)

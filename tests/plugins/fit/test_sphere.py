@@ -1,5 +1,7 @@
 """fit.sphere: a cap of a sphere, from any side, with what a scanner does to it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +19,15 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.units import SI
-from flangeye_plugins.fit.sphere import SphereParams, fit_sphere, sphere_jacobian
+from flangeye_plugins.fit.sphere import (
+    SphereFit,
+    SphereParams,
+    cap_coverage,
+    fit_sphere,
+    incidence_cosine,
+    sphere_jacobian,
+)
+from tests.plugins.bounds import check_bound
 
 SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.01, 0.06))
 CENTRE = np.array([0.05, -0.03, 0.65])
@@ -162,3 +172,66 @@ def test_the_jacobian_is_the_derivative() -> None:
         distance = [np.linalg.norm(points - CENTRE - s * step, axis=1) for s in (1, -1)]
         assert exact[:, k] == pytest.approx((distance[0] - distance[1]) / 2e-7, abs=1e-6)
     assert (exact[:, 3] == -1).all()
+
+
+@pytest.mark.parametrize("radius", ["known", "free"])
+def test_what_no_scatter_shows_is_added(radius: str) -> None:
+    """In every direction; with a free radius twice more along the view, where it counts double."""
+    points, rough = cap()
+    plain, more = (
+        fit(points, rough, radius=radius, scanner_error=SI(error), radius_error=SI(0)).covariance
+        for error in (0.0, 1e-4)
+    )
+    along = CENTRE / np.linalg.norm(CENTRE)
+    twice = 4 * np.outer(along, along) if radius == "free" else 0.0
+    assert more - plain == pytest.approx(1e-8 * (np.eye(3) + twice), rel=1e-3, abs=1e-12)
+
+
+def test_a_sphere_of_unknown_size_is_fitted_with_its_radius() -> None:
+    unknown = Sphere(size=None, centre_in_flange=SPHERE.centre_in_flange)
+    points, rough = cap(radius=0.025, noise=0.0)
+    found = fit(points, rough, unknown)
+    assert found.radii["sphere"] == pytest.approx(0.025, abs=1e-7)
+    assert np.abs(found.centre - CENTRE).max() < 1e-7
+
+
+def test_a_radius_within_the_tolerance_is_taken() -> None:
+    for off, taken in ((0.45e-3, True), (0.55e-3, False)):
+        found = fit(*cap(noise=0.0, radius=SPHERE.radius + off))
+        assert isinstance(found, Rejected) is not taken
+
+
+def test_incidence_is_the_angle_between_surface_and_view() -> None:
+    sight = CENTRE / np.linalg.norm(CENTRE)
+    aside = basis_of_plane(sight)[0]
+    for turn in np.radians([0.0, 30.0, 80.0]):
+        place = CENTRE + 0.02 * (-np.cos(turn) * sight + np.sin(turn) * aside)
+        off = np.arccos(incidence_cosine(place[None], CENTRE))
+        between = np.arctan2(0.02 * np.sin(turn), np.linalg.norm(CENTRE) - 0.02 * np.cos(turn))
+        assert off == pytest.approx([turn + between], abs=1e-9)
+
+
+def test_the_share_of_a_cap_is_counted_by_area() -> None:
+    """Rings of equal area: seen to half the width, a quarter of the cap is seen."""
+    wide = np.degrees(np.arcsin(0.5 * np.sin(np.radians(60))))
+    for to, share in ((59.9, 1.0), (wide, 1 / 3)):  # of three rings, the inner one and part of none
+        points, _ = cap(to=to, count=20000, noise=0.0)
+        assert cap_coverage(SphereFit(CENTRE, SPHERE.radius, points), np.radians(60)) == share
+
+
+def test_fifty_points_are_enough() -> None:
+    points, rough = cap(count=400, to=60.0, noise=0.0)
+    assert not isinstance(fit(points[:50], rough, min_coverage=0.1), Rejected)
+    assert isinstance(fit(points[:49], rough, min_coverage=0.1), Rejected)
+
+
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("max_incidence", "0 deg", "1 deg"), ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1),
+        ("radius_tolerance", "0 mm", "1 um"), ("radius_error", "-1 um", "0 mm"),
+        ("scanner_error", "-1 um", "0 mm"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
+    check_bound(SphereParams, name, refused, taken)

@@ -23,6 +23,7 @@ from flangeye.types import (
 from flangeye.units import SI
 from flangeye_emulators.acquire.simulated_profiles import ProfilesParams, profile_of
 from flangeye_plugins.fit.sphere_profile import SphereProfileParams, fit_sphere_profile
+from tests.plugins.bounds import check_bound
 
 SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.0))
 CENTRE = np.array([0.012, 0.7 * 0.01905, 0.25])
@@ -124,3 +125,61 @@ def test_a_hidden_half_is_set_aside() -> None:
 def test_the_sphere_hides_what_is_behind_it_from_the_receiver() -> None:
     beside = np.array([0.0, -0.8 * SPHERE.radius, 0.25])  # between receiver and laser
     assert len(profile(beside)) < len(profile(-beside * [1, 1, -1]))
+
+
+def test_what_no_scatter_shows_is_added_where_it_belongs() -> None:
+    """The scanner's distortion along each axis; a larger sphere's centre is farther away."""
+    xyz, none = profile(), {"scanner_error": SI(0), "radius_error": SI(0)}
+    plain = found(xyz, **none).covariance
+    scanner = found(xyz, **(none | {"scanner_error": SI(1e-4)})).covariance
+    sphere = found(xyz, **(none | {"radius_error": SI(1e-5)})).covariance
+    assert scanner - plain == pytest.approx(1e-8 * np.eye(3), rel=1e-4, abs=1e-13)
+    across = (1e-5 * SPHERE.radius / found(xyz).centre[1]) ** 2
+    assert sphere - plain == pytest.approx(np.diag([0, across, 0]), rel=1e-4, abs=1e-15)
+
+
+def test_a_larger_sphere_is_farther_from_the_plane_as_the_covariance_says() -> None:
+    larger = 2e-5
+    xyz = profile_of(CENTRE, SPHERE.radius + larger, UP, ProfilesParams(noise=SI(0)),
+                     np.random.default_rng(0)).astype(np.float64)  # fmt: skip
+    none = {"scanner_error": SI(0), "radius_error": SI(larger)}
+    feature = found(xyz, **none)
+    # The circle is that of the larger sphere: y follows from the smaller radius, too near.
+    assert CENTRE[1] - feature.centre[1] == pytest.approx(
+        np.sqrt(feature.covariance[1, 1]), rel=0.05
+    )
+
+
+@pytest.mark.parametrize(("beside", "taken"), [(0.43, True), (0.37, False), (0.96, True)])
+def test_the_laser_has_to_pass_within_the_distances_asked_for(beside: float, taken: bool) -> None:
+    xyz = profile(np.array([0.0, beside * SPHERE.radius, 0.25]), noise=SI(0))
+    assert isinstance(fit(xyz, min_coverage=0.05), CircleFeature) is taken
+
+
+def test_points_off_the_circle_by_more_than_the_tolerance_are_left_out() -> None:
+    """A wall that the sphere stands before, and a spatter that stands out of it."""
+    xyz = profile(noise=SI(0))
+    rng = np.random.default_rng(0)
+    spatter = xyz[rng.permutation(len(xyz))[:40]] - np.array([0.0, 0.0, 4e-4])
+    assert found(np.concatenate([xyz, spatter])).centre == pytest.approx(CENTRE, abs=2e-6)
+
+
+def test_a_hollow_is_no_sphere() -> None:
+    """Its circle bends towards the scanner."""
+    angle = np.linspace(0.2 * np.pi, 0.8 * np.pi, 300)
+    radius = SPHERE.radius * np.sqrt(1 - 0.49)
+    hollow = np.stack([radius * np.cos(angle), 0 * angle, 0.25 + radius * np.sin(angle)], axis=1)
+    told = fit(hollow)
+    assert isinstance(told, Rejected)
+    assert told.reason.startswith("no circle that a sphere 38.1 mm across leaves in the laser's")
+
+
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("tolerance", "0 mm", "1 um"), ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1),
+        ("radius_error", "-1 um", "0 mm"), ("scanner_error", "-1 um", "0 mm"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
+    check_bound(SphereProfileParams, name, refused, taken, {"side": "+y"})
