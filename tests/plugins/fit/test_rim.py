@@ -154,6 +154,7 @@ def test_the_normal_is_known_as_well_as_its_scatter_says() -> None:
     for seed in range(25):
         circle = fitted(placed(face(UR5, pitch=1e-3, noise=1e-4, seed=seed)), flatness="0 mm")
         tilts.append(circle.normal - NORMAL)
+        assert circle.normal_covariance is not None
         sigmas.append(np.trace(circle.normal_covariance))
     assert np.sqrt(np.mean(sigmas)) == pytest.approx(
         np.sqrt(np.mean(np.square(tilts)) * 3), rel=0.4
