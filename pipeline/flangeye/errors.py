@@ -4,6 +4,9 @@ A message says where, what is wrong, what is allowed and what to do; the command
 it as it is, without a traceback.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class FlangeyeError(Exception):
     """Anything the user can be told in one line; ``exit_code`` is the process's."""
@@ -32,6 +35,14 @@ class RunStopped(FlangeyeError):
 
 
 class NothingMoved(FlangeyeError):
-    """Motion was not asked for: the message is the plan, for people. Nothing is wrong."""
+    """Motion was not asked for: the message is the plan, for people. Nothing is wrong.
+
+    Attributes:
+        plan: The same for programs, as JSON has it; None where the stage has only words.
+    """
 
     exit_code = 0
+
+    def __init__(self, message: str, plan: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.plan = plan

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import re
-from dataclasses import dataclass
-from typing import Any
+import json
+from typing import Any, cast
 
 import numpy as np
 from nicegui import events, ui
@@ -20,34 +19,8 @@ from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
 
-ROW = re.compile(
-    r"^(\d{4}|-)\s+(left out|\w+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s+(?:\d+ deg\s+)?(.*)$"
-)
-TIMES = re.compile(r"^(\d+) stops, (\d+) s of motion", re.MULTILINE)
 HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """How an arm of six joints is drawn that has not said where it stands."""
-
-
-@dataclass(frozen=True)
-class Stop:
-    """One row of the plan that the command prints.
-
-    Attributes:
-        id: Identifier of the capture; ``-`` where none is possible.
-        role: What it is for.
-        place: (3,) of the flange in the base [m].
-        way: How the arm gets there, how long it takes, or why it cannot.
-    """
-
-    id: str
-    role: str
-    place: Floats
-    way: str
-
-    @property
-    def barred(self) -> bool:
-        """Whether the arm cannot be there."""
-        return self.id == "-" or self.way.startswith("barred")
 
 
 def add(project: Project) -> None:
@@ -159,34 +132,37 @@ class Planner:
         if self._recipe.steps[0].stage.name != "acquire.live":
             text = "this recipe drives no arm: its poses come from its recordings or its simulation"
         else:
-            words = ["run", self._project.recipe_path.name]
+            words = ["run", self._project.recipe_path.name, "--json"]
             text = await asyncio.to_thread(self._project.run_command, words)
         self._checked.clear()
         with self._checked:
             self._show(text)
 
     def _show(self, text: str) -> None:
-        stops = stops_of(text)
-        for line in text.splitlines():
+        plan = plan_in(text)
+        for line in plan["text"].splitlines():
             if line.startswith("error: "):
                 mistake(line.removeprefix("error: "))
-        if found := TIMES.search(text):
-            ui.label(f"{found[1]} poses, {found[2]} s of motion").classes("text-subtitle1").props(
-                'role="status"'
-            )
-        ui.code(text, language="text").classes("w-full overflow-x-auto")
-        for stop in stops:
+        rows = plan.get("rows", [])
+        if rows:
+            stops = sum(row["id"] is not None for row in rows)
+            label = ui.label(f"{stops} poses, {plan['seconds']:.0f} s of motion")
+            label.classes("text-subtitle1").props('role="status"')
+        ui.code(plan["text"], language="text").classes("w-full overflow-x-auto")
+        for row in rows:
             with self._scene:
-                colour = "#d64545" if stop.barred else "#2e9e5b"
-                self._scene.sphere(0.012).move(*stop.place.tolist()).material(colour)
-        if any(stop.barred for stop in stops):
+                colour = "#d64545" if row["why_not"] else "#2e9e5b"
+                self._scene.sphere(0.012).move(*row["place"]).material(colour)
+        if any(row["why_not"] for row in rows):
             ui.label("Red poses cannot be reached; the last column says why.")
 
 
-def stops_of(text: str) -> list[Stop]:
-    """Return the stops in a plan as the command prints it."""
-    rows = filter(None, map(ROW.match, text.splitlines()))
-    return [Stop(r[1], r[2], np.array([float(r[i]) for i in (3, 4, 5)]) / 1e3, r[6]) for r in rows]
+def plan_in(printed: str) -> dict[str, Any]:
+    """Return the plan in what ``flangeye run --json`` printed; words alone where there is none."""
+    for line in printed.splitlines():
+        if line.startswith("{"):
+            return cast("dict[str, Any]", json.loads(line))
+    return {"text": printed}
 
 
 def _first(data: dict[str, Any]) -> dict[str, Any] | None:

@@ -31,7 +31,7 @@ from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye_ui import archive_page, cell_page, plan_page, run_page, server, verdict_page
-from flangeye_ui.plan_page import stops_of
+from flangeye_ui.plan_page import plan_in
 from flangeye_ui.project import Project, _mistake
 from flangeye_ui.server import require_free
 from tests.doctor.sessions import clean
@@ -496,16 +496,10 @@ def test_a_recipes_mistake_stands_at_its_field() -> None:
     assert _mistake("cell.yaml: no such file").text == "cell.yaml: no such file"
 
 
-def test_the_plans_rows_are_read_as_the_command_prints_them() -> None:
-    text = """2 stops, 9 s of motion; 4 were requested (2 outside robot.limits.box left out)
-stop  for           flange at (mm, base)    tilt  path      time
-0000  verification    450.0    12.5   310.0   10 deg  direct     4.1 s
-0001  calibration     400.0   -12.5   290.0   20 deg  barred: outside the box
--     left out        380.0    12.5  -90.0           outside robot.limits.box
-"""
-    stops = stops_of(text)
-    assert [s.barred for s in stops] == [False, True, True]
-    np.testing.assert_allclose(stops[1].place, [0.4, -0.0125, 0.29])
+def test_the_plan_is_read_as_the_command_prints_it() -> None:
+    plan = {"text": "1 stop", "seconds": 4.1, "rows": [{"id": "0000", "place": [0.4, 0, 0.29]}]}
+    assert plan_in(json.dumps(plan) + "\nnote: an outdated name") == plan
+    assert plan_in("error: no plan") == {"text": "error: no plan"}
 
 
 def test_thinning_a_large_scan_costs_less_than_making_its_message() -> None:

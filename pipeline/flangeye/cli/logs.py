@@ -218,9 +218,11 @@ def doctor(
     import json
 
     from flangeye.doctor import as_json, as_text, examine, open_session
+    from flangeye.log.read import log_of
+    from flangeye.recipe.find import is_recipe
 
     registry = load_plugins()
-    if recipe is None and _is_recipe(archive):
+    if recipe is None and is_recipe(archive) and log_of(archive) == archive:
         recipe = str(archive)
     checked = read_recipe(recipe, registry, overrides) if recipe else None
     if checked is not None and recipe == str(archive):
@@ -235,23 +237,15 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _is_recipe(path: Path) -> bool:
-    """Whether a path is a YAML file that stands for no run."""
-    from flangeye.log.read import log_of
-
-    return path.suffix in (".yaml", ".yml") and path.is_file() and log_of(path) == path
-
-
 def _archive_of(recipe: Recipe) -> Path:
     """Return what a recipe reads.
 
     Raises:
         RecipeError: Its first step reads no archive.
     """
-    path = getattr(recipe.steps[0].params, "path", None)
-    if not isinstance(path, Path):
+    if recipe.archive is None:
         raise RecipeError(
             f"{recipe.steps[0].stage.name}: reads no archive to examine; name a run's log, or "
             "recordings"
         )
-    return path
+    return recipe.archive

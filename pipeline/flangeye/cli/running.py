@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
 from flangeye.cli.saying import say
-from flangeye.errors import FlangeyeError
+from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
     from flangeye.batch.request import Tls
@@ -74,6 +75,9 @@ Move = Annotated[
 Offline = Annotated[
     bool, typer.Option("--offline", help="Without --move: plan without connecting to the arm.")
 ]
+PlanAsJson = Annotated[
+    bool, typer.Option("--json", help="Without --move: print the plan of acquire.live as JSON.")
+]
 Resume = Annotated[
     str | None,
     typer.Option(metavar="RUN", help="Resume a run that ended early: its folder, log or URL."),
@@ -101,6 +105,7 @@ def run(  # noqa: PLR0913  one for each option
     resume: Resume = None,
     retake: Retake = None,
     leave_out: LeaveOut = None,
+    json_: PlanAsJson = False,
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
@@ -110,6 +115,7 @@ def run(  # noqa: PLR0913  one for each option
     from flangeye.types import ArchivePath
 
     _refuse(move and offline, "--move and --offline: an arm that is not asked cannot be moved")
+    _refuse(move and json_, "--move and --json: only the plan is printed as JSON")
     lonely = (retake and not resume) or (leave_out and not source)
     _refuse(lonely, "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP")
     registry = load_plugins()
@@ -121,11 +127,21 @@ def run(  # noqa: PLR0913  one for each option
         recordings = stack.enter_context(archive_at(archive))
         start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline))
         folder = RunFolder.create(checked.name, results)
-        result = _record(checked, registry, folder, start)
+        with _plan_as_json() if json_ else nullcontext():
+            result = _record(checked, registry, folder, start)
         if result.status == "refused" and checked.header.cell is None:
             _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
+
+
+@contextmanager
+def _plan_as_json() -> Iterator[None]:
+    """Let a plan that is shown instead of a motion end in JSON: its text, and its rows."""
+    try:
+        yield
+    except NothingMoved as shown:
+        raise NothingMoved(json.dumps({"text": str(shown), **(shown.plan or {})})) from None
 
 
 def _refuse(options: object, why: str) -> None:

@@ -17,6 +17,11 @@ def recipe_names() -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def is_recipe(path: Path) -> bool:
+    """Return whether a path is a file that a recipe may be written in."""
+    return path.suffix in (".yaml", ".yml") and path.is_file()
+
+
 def find_recipe(name: str) -> Path:
     """Return the path of a recipe given as a path or as a bundled name.
 

@@ -59,6 +59,12 @@ class Recipe:
         header = self.header.model_copy(update={"seed": seed})
         return replace(self, header=header, context={**self.context, t.Seed: seed})
 
+    @property
+    def archive(self) -> Path | None:
+        """What its first step reads; None where it simulates, or drives an arm."""
+        path = getattr(self.steps[0].params, "path", None)
+        return path if isinstance(path, Path) else None
+
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""
         data = self.header.model_dump(mode="json", exclude_none=True)

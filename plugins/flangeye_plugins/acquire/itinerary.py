@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +38,39 @@ class Stop(NamedTuple):
     id: str
     role: Role
     pose: PlannedPose
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """A line of the plan that is shown without motion; fields as in its JSON.
+
+    Attributes:
+        id: Identifier of the capture; None where no pose is possible.
+        role: What it is for: verification, calibration, or ``left out``.
+        place: Of the flange in ``base`` [m].
+        tilt: Of the flange against the line of sight [rad].
+        path: ``direct`` or ``by home``; None where nobody knows, or there is none.
+        seconds: What the motion takes [s].
+        why_not: Why the arm cannot get there.
+    """
+
+    id: str | None
+    role: str
+    place: list[float]
+    tilt: float | None = None
+    path: str | None = None
+    seconds: float = 0.0
+    why_not: str | None = None
+
+    def line(self) -> str:
+        """Return it for people."""
+        place = _row_mm(self.place)
+        if self.id is None or self.tilt is None:
+            return f"{'-':4}  {self.role:12}  {place}           {self.why_not}"
+        way = f"barred: {self.why_not}" if self.why_not else "not known"
+        if self.path:
+            way = f"{self.path:8}  {self.seconds:4.1f} s"
+        return f"{self.id}  {self.role:12}  {place}  {np.degrees(self.tilt):3.0f} deg  {way}"
 
 
 class Itinerary:
@@ -108,8 +143,8 @@ class Itinerary:
         """Say why poses were impossible, and how often."""
         return self._reach.why_refused() or "none was tried"
 
-    def shown(self, start: Floats | None) -> str:
-        """Return the plan for people: every stop, the way to it, and what it takes.
+    def shown(self, start: Floats | None) -> tuple[str, dict[str, Any]]:
+        """Return the plan for people and for programs: every stop, the way to it, what it takes.
 
         Args:
             start: (n,) where the arm stands [rad]; None where it does not answer.
@@ -117,38 +152,40 @@ class Itinerary:
         Raises:
             StageError: Fewer than three poses are possible.
         """
-        rows, seconds, here = [], 0.0, start
+        rows, here = [], start
         stops = list(self.stops())
         self.require_enough(len(stops) - len(self._checks))
         for stop in stops:
             way = None if here is None else self.way(here, stop)
             rows.append(self._row(stop, way))
             if not isinstance(way, Barred):
-                seconds += way.seconds if way else 0.0
                 here = stop.pose.joints
-        return "\n".join([
+        seconds = sum(row.seconds for row in rows)
+        left_out = self._left_out(stops)
+        more = len(left_out) - LISTED
+        text = "\n".join([
             f"{len(stops)} stops, {seconds:.0f} s of motion; {self._plan.wanted} were requested "
             f"({self.why_not()} left out)",
             "stop  for           flange at (mm, base)    tilt  path      time",
-            *rows,
-            *self._left_out(stops),
+            *(row.line() for row in rows + left_out[:LISTED]),
+            *([f"and {more} more places"] if more > 0 else []),
         ])  # fmt: skip
+        return text, {"seconds": seconds, "rows": [asdict(row) for row in rows + left_out]}
 
-    def _left_out(self, stops: Sequence[Stop]) -> list[str]:
-        """Return a row for each place at which no pose is possible, a few of every reason."""
-        reasons = defaultdict[str, Counter[str]](Counter)
+    def _left_out(self, stops: Sequence[Stop]) -> list[PlanRow]:
+        """Return a row for each place at which no pose is possible, a few of every reason first."""
+        reasons = defaultdict[tuple[float, ...], Counter[str]](Counter)
         for refusal in self._reach.refusals:
-            reasons[_row_mm(refusal.place)][refusal.reason] += 1
+            reasons[_place(refusal.place)][refusal.reason] += 1
         for stop in stops:
-            reasons.pop(_row_mm(stop.pose.base_T_flange[:3, 3]), None)
+            reasons.pop(_place(stop.pose.base_T_flange[:3, 3]), None)
         rows, nth = [], Counter[str]()
         for place, counts in reasons.items():
             ((why, _),) = counts.most_common(1)
             nth[why] += 1
-            rows.append((nth[why], f"{'-':4}  {'left out':12}  {place}           {why}"))
+            rows.append((nth[why], PlanRow(None, "left out", list(place), why_not=why)))
         rows.sort(key=lambda row: row[0])
-        more = [f"and {len(rows) - LISTED} more places"] if len(rows) > LISTED else []
-        return [row for _, row in rows[:LISTED]] + more
+        return [row for _, row in rows]
 
     def require_enough(self, found: int) -> None:
         """Refuse a plan of fewer than three poses.
@@ -163,11 +200,13 @@ class Itinerary:
                 "centre, or widen robot.limits"
             )
 
-    def _row(self, stop: Stop, way: Route | Barred | None) -> str:
+    def _row(self, stop: Stop, way: Route | Barred | None) -> PlanRow:
         pose = stop.pose.base_T_flange
-        tilt = angle_between(pose[:3, 2], self._site.eye - pose[:3, 3])
-        tilted = f"{np.degrees(tilt):3.0f} deg"
-        return f"{stop.id}  {stop.role:12}  {_row_mm(pose[:3, 3])}  {tilted}  {_route_line(way)}"
+        tilt = float(angle_between(pose[:3, 2], self._site.eye - pose[:3, 3]))
+        row = partial(PlanRow, stop.id, stop.role, list(_place(pose[:3, 3])), tilt)
+        if isinstance(way, Barred):
+            return row(why_not=way.reason)
+        return row("by home" if way.via else "direct", way.seconds) if way else row()
 
     def _lost(self) -> set[int]:
         """Return the places in the plan of poses that told nothing."""
@@ -207,16 +246,13 @@ def itinerary_of(
     return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
 
 
-def _route_line(way: Route | Barred | None) -> str:
-    if way is None:
-        return "not known"
-    if isinstance(way, Barred):
-        return f"barred: {way.reason}"
-    return f"{'by home' if way.via else 'direct':8}  {way.seconds:4.1f} s"
+def _place(point: Floats) -> tuple[float, ...]:
+    """Return a point [m] to 0.1 mm, by which the plan tells places apart."""
+    return tuple(round(float(x), 4) + 0.0 for x in point)
 
 
-def _row_mm(point: Floats) -> str:
-    return " ".join(f"{round(1e3 * x, 1) + 0.0:7.1f}" for x in point)
+def _row_mm(place: Sequence[float]) -> str:
+    return " ".join(f"{1e3 * x:7.1f}" for x in place)
 
 
 def _mm(point: Floats) -> str:

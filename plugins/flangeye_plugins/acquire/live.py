@@ -138,7 +138,8 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
 
     if not motion.allowed:
         start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
-        raise NothingMoved("\n".join([planned(start).shown(start), how, HOW_TO_MOVE]))
+        text, plan = planned(start).shown(start)
+        raise NothingMoved("\n".join([text, how, HOW_TO_MOVE]), plan)
     with ExitStack() as opening:
         guard = opening.enter_context(watched(arm, robot, allowed, partial(stage_log, "arm")))
         require_inside(guard.state, allowed)
