@@ -152,3 +152,12 @@ def test_what_was_not_measured_has_no_sigma() -> None:
     assert (
         yaml.safe_load(calibration_yaml(result))["base_T_camera"]["sigma_rotation_rad"][2] is None
     )
+
+
+def test_the_arms_of_a_cell_are_corrected_by_name() -> None:
+    arms = {"one": ArmCorrection(np.zeros(3), OFFSETS, np.ones(6))}
+    result = document(calibration(corrected=CorrectedArm(estimate(3e-3), None, arms=arms)))
+    assert "  one, corrected     joints 0.00, 4.00, -3.00, 5.00, 0.00, 0.00 mrad" in told(result)
+    corrected = yaml.safe_load(calibration_yaml(result))["corrected_arm"]
+    assert corrected["corrections"]["one"]["joint_offsets"] == OFFSETS.tolist()
+    assert "correction" not in corrected

@@ -179,8 +179,9 @@ def _answers(result: Result) -> list[str]:
         turn = ", ".join(f"{x:z.3f}" for x in np.degrees(rpy_from_rotation(pose[:3, :3])))
         error = "" if answer.expected_rms is None else f"; {_mm(answer.expected_rms)} rms expected"
         lines.append(f"  {name:<18} ({at}) mm, ({turn}) deg{error}")
-    lines.append(f"  {'its correction':<18} {_correction(answers.corrected.correction)}")
-    return lines
+    found = [("its correction", answers.corrected.correction)]
+    found = [(f"{n}, corrected", arm) for n, arm in answers.corrected.arms.items()] or found
+    return [*lines, *(f"  {name:<18} {_correction(each)}" for name, each in found)]
 
 
 def _correction(found: CorrectionResult | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from flangeye.handeye.consensus import Consensus, again
 from flangeye.handeye.likelihood import Problem, Solution, weigh
 from flangeye.handeye.loop import COLUMNS
 from flangeye.handeye.nuisance import Nuisance
-from flangeye.types import ArmCorrection, Floats
+from flangeye.types import ArmCorrection, Floats, Mask
 
 FOLDS, LARGEST_FOLD = 5, 20
 """More folds where there are many poses, so that the cost stays linear in them."""
@@ -119,10 +120,34 @@ def better(model: Model, candidate: Model, what: str) -> Model:
     """Return the candidate if it helps on poses held out, else the model; either says so."""
     kept = model.found.inliers | candidate.found.inliers
     before, after = (rms(held_out(m.found)[0][kept]) for m in (model, candidate))
+    helps, told = judged(before, after, what)
+    return (candidate if helps else model).noted(told)
+
+
+def judged(before: float, after: float, what: str) -> tuple[bool, str]:
+    """Return whether held-out errors [m] speak for a candidate, and the note that says so."""
     compared = f"held-out error {after * 1e3:.3f} mm with it, {before * 1e3:.3f} mm without"
     if not after <= HELPFUL * before:
-        return model.noted(f"left out, for it does not help: {what} ({compared})")
-    return candidate.noted(f"{what} ({compared})")
+        return False, f"left out, for it does not help: {what} ({compared})"
+    return True, f"{what} ({compared})"
+
+
+class Fit(NamedTuple):
+    """A fit, linear about its answer.
+
+    Attributes:
+        residuals: (N, 6) rotation before translation.
+        jacobian: (N, 6, P).
+        weights: (N, 6, 6) inverse covariances.
+        covariance: (P, P) of the unknowns.
+        inliers: (N,) which took part.
+    """
+
+    residuals: Floats
+    jacobian: Floats
+    weights: Floats
+    covariance: Floats
+    inliers: Mask
 
 
 def held_out(found: Solution) -> tuple[Floats, Floats]:
@@ -134,13 +159,21 @@ def held_out(found: Solution) -> tuple[Floats, Floats]:
     """
     if found.course is not None:
         return _each_left_out(found)
-    errors, covariances = found.linear.residuals.copy(), np.zeros((len(found.squares), 3, 3))
-    kept = np.flatnonzero(found.inliers)
+    linear = found.linear
+    return by_folds(
+        Fit(linear.residuals, linear.jacobian, found.weights, found.covariance, found.inliers)
+    )
+
+
+def by_folds(fit: Fit) -> tuple[Floats, Floats]:
+    """Return the same of any fit whose measurements are independent; see :func:`held_out`."""
+    errors, covariances = fit.residuals.copy(), np.zeros((len(fit.residuals), 3, 3))
+    kept = np.flatnonzero(fit.inliers)
     folds = max(FOLDS, len(kept) // LARGEST_FOLD)
     order = np.random.default_rng(0).permutation(kept)
     for fold in range(min(folds, len(kept))):
         part = np.sort(order[fold::folds])
-        error, covariance = _without(found, part)
+        error, covariance = _without(fit, part)
         errors[part], n = error, len(part)
         covariances[part] = covariance.reshape(n, 6, n, 6)[np.arange(n), 3:, np.arange(n), 3:]
     return errors[:, 3:], covariances
@@ -154,16 +187,16 @@ def _each_left_out(found: Solution) -> tuple[Floats, Floats]:
     return errors, np.where(kept, share @ noise, 0.0)[:, 3:, 3:]
 
 
-def _without(found: Solution, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _without(fit: Fit, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Return (n, 6) errors of a part by a fit to the rest, and their (6 n, 6 n) covariance."""
     size = 6 * len(part)
-    jacobian = found.linear.jacobian[part].reshape(size, -1)
-    weighted = (found.weights[part] @ found.linear.jacobian[part]).reshape(size, -1)
-    noise = np.linalg.pinv(found.weights[part], rcond=1e-12, hermitian=True)
+    jacobian = fit.jacobian[part].reshape(size, -1)
+    weighted = (fit.weights[part] @ fit.jacobian[part]).reshape(size, -1)
+    noise = np.linalg.pinv(fit.weights[part], rcond=1e-12, hermitian=True)
     own = np.zeros((len(part), 6, len(part), 6))
     own[np.arange(len(part)), :, np.arange(len(part))] = noise
-    right = np.column_stack([found.linear.residuals[part].ravel(), own.reshape(size, size)])
-    share = np.eye(size) - jacobian @ found.covariance @ weighted.T
+    right = np.column_stack([fit.residuals[part].ravel(), own.reshape(size, size)])
+    share = np.eye(size) - jacobian @ fit.covariance @ weighted.T
     left = np.asarray(np.linalg.lstsq(share, right, rcond=1e-9)[0], dtype=np.float64)
     return left[:, 0].reshape(-1, 6), left[:, 1:]
 

@@ -5,29 +5,35 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
-from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.calibration import TYPICAL_ARM
+from flangeye.handeye.cell_arms import (
+    CorrectedArms,
+    Sighted,
+    branches_of,
+    considering_zeros,
+    correcting_zeros,
+)
 from flangeye.handeye.estimates import estimate_at
-from flangeye.handeye.graph import Sighting, Solved, information_of, rows_of, solve_graph
+from flangeye.handeye.graph import Sighting, Solved
 from flangeye.handeye.measurements import measured
 from flangeye.maths.geometry import rigid
-from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import chi2_quantile
-from flangeye.models.cell import Axis, Cell
+from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
-from flangeye.models.robots import RobotModel
-from flangeye.types import Floats, HandEye, Observation, Pair, Transform, TransformEstimate
+from flangeye.types import (
+    CorrectedArm,
+    Floats,
+    HandEye,
+    Observation,
+    Pair,
+    Transform,
+    TransformEstimate,
+)
 
 NOWHERE = np.zeros((6, 0))
-RATIOS = np.logspace(-1, 2.5, 71)
-"""Sizes of joint zeros that are compared, in units of their files' and of the noise's scale."""
-CERTAIN = 0.999
-"""Probability with which zeros are not taken for larger than they are."""
 
 
 def calibrate_cell(
@@ -35,30 +41,45 @@ def calibrate_cell(
     cell: Cell,
     limits: tuple[float, float],
     method: str,
+    joint_offsets: bool = True,
 ) -> HandEye:
     """Return every unknown of a cell with its covariance; the first camera's pose comes first.
 
     What moves is measured with noise; its size is found from the residuals, and sightings beyond
-    that are set aside. ``limits`` are the largest standard deviations of a rotation [rad] and of a
-    translation [m].
+    that are set aside.
+
+    Args:
+        observations: The sightings.
+        cell: What stands on what.
+        limits: Largest standard deviations of a rotation [rad] and of a translation [m].
+        method: Stage that solves it.
+        joint_offsets: Whether to look for the zeros of the arms' joints, and to give the answer
+            for arms so corrected, where that helps on sightings held out.
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    found = solve_cell(observations, cell, limits)
+    sighted = _sighted(observations, cell, limits)
+    found = sighted.solved()
     _require_agreement(found, len(observations))
-    found, zeros = _considering_zeros(found, observations, cell)
-    transforms = {
-        cell.name_of(name): Transform.named(cell.name_of(name), found.places[name])
-        for name in cell.unknown_frames
-    }
-    camera, *others = (
-        _estimate(transform, found, observations) for transform in transforms.values()
+    branches = branches_of(sighted, cell)
+    known, size = considering_zeros(found, sighted, branches)
+    notes = _notes(observations, found, size)
+    corrected = None
+    if branches and joint_offsets:
+        corrected, told = correcting_zeros(found, sighted, branches, size)
+        notes = (*notes, told)
+    camera, *others = _estimates(known, observations, cell)
+    return HandEye(
+        camera,
+        _pairs(observations, cell, known),
+        method,
+        notes,
+        others=tuple(others),
+        corrected=None if corrected is None else _answer(corrected, observations, cell),
     )
-    pairs = _pairs(observations, cell, transforms, found)
-    return HandEye(camera, pairs, method, _notes(observations, found, zeros), others=tuple(others))
 
 
 def solve_cell(
@@ -79,10 +100,7 @@ def solve_cell(
         StageError: No sighting, or one without the pose of something that moves.
         CalibrationRefused: The sightings leave something unknown: it says what.
     """
-    if not observations:
-        raise StageError("no sighting to solve with: every capture was set aside, for its reason")
-    sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
-    return solve_graph(cell.graph(observations), sightings, mover_noise(cell), limits, start)
+    return _sighted(observations, cell, limits).solved(start)
 
 
 def solve_so_far(
@@ -98,79 +116,13 @@ def solve_so_far(
     return None
 
 
-def _considering_zeros(
-    found: Solved, observations: Sequence[Observation], cell: Cell
-) -> tuple[Solved, float]:
-    """Return the solution with what the zeros of the arms' joints may be off by in its covariance.
-
-    They move neighbouring poses alike, so that the answer follows them where independent noise
-    would average out. ("Consider" covariance, Schmidt 1966.) With it how many times as large they
-    are as the robots' files say, as the sightings show it; at least once.
-    """
+def _sighted(
+    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float]
+) -> Sighted:
+    if not observations:
+        raise StageError("no sighting to solve with: every capture was set aside, for its reason")
     sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
-    noise = {name: found.movers * covariance for name, covariance in mover_noise(cell).items()}
-    graph = cell.graph(observations), sightings, found.places, noise
-    kept = found.inliers
-    moves = [
-        (rows_of(*graph, moved=[name])[0] @ zeros)[kept]
-        for name, mover in cell.movers.items()
-        if (zeros := _zeros(mover, np.asarray(graph[0][name].place))) is not None
-    ]
-    if not moves:
-        return found, 1.0
-    rows, errors = (each[kept] for each in rows_of(*graph))
-    zeros = np.concatenate(moves, axis=2)
-    freedom = sum(np.trace(s.projector) for s, used in zip(sightings, kept, strict=True) if used)
-    size, share = size_of_zeros(rows, zeros, errors, float(freedom))
-    followed = size * found.joint @ np.einsum("nij,nik->jk", rows, zeros)
-    joint = share * found.joint + followed @ followed.T
-    blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(found.places)}
-    return replace(found, joint=joint, covariances=blocks), size
-
-
-def size_of_zeros(
-    rows: Floats, zeros: Floats, errors: Floats, freedom: float
-) -> tuple[float, float]:
-    """Return by what factor joint zeros are larger than was said, and what that leaves of noise.
-
-    The restricted likelihood of all sightings (Patterson & Thompson 1971) over the factor, the
-    noise's own scale taken to be the likeliest; one and one where that says no more.
-
-    Args:
-        rows: (N, 6, P) what the sightings tell of the unknowns, whitened.
-        zeros: (N, 6, k) what zeros of one standard deviation do to them.
-        errors: (N, 6) their residuals.
-        freedom: How many numbers those are.
-    """
-    p, k = rows.shape[2], zeros.shape[2]
-    both = np.concatenate([rows, zeros], axis=2)
-    information, told = information_of(both), np.einsum("nij,ni->j", both, errors)
-    total, left = float((errors**2).sum()), max(freedom - p, 1.0)
-
-    def likelihood(ratio: float) -> tuple[float, float]:
-        """Return twice the logarithm, and the noise's scale, by the zeros' size against it."""
-        known = information + np.diag(np.repeat([0.0, ratio**-2], [p, k]))
-        scale = max((total - told @ np.linalg.solve(known, told)) / left, 1e-12)
-        return -left * np.log(scale) - np.linalg.slogdet(known)[1] - 2 * k * np.log(ratio), scale
-
-    ratio = max(RATIOS, key=lambda ratio: likelihood(float(ratio))[0])
-    gain, scale = likelihood(float(ratio))
-    size = float(ratio) * np.sqrt(scale)
-    if size <= 1 or gain - likelihood(1.0)[0] < chi2_quantile(CERTAIN, 1):
-        return 1.0, 1.0
-    return float(size), min(scale, 1.0)
-
-
-def _zeros(mover: RobotModel | Axis, poses: Floats) -> Floats | None:
-    """Return (N, 6, n - 1) what zeros of one deviation do to the flange; None for what has none.
-
-    The first joint's is right by definition: it fixes the base's x axis.
-    """
-    if isinstance(mover, Axis):
-        return None
-    arm = Arm(mover)
-    joints = next(MovedFlange(poses, None, False, arm).branches(starts=12), None)
-    return None if joints is None else mover.joint_accuracy * arm.jacobian(joints)[:, :, 1:]
+    return Sighted(cell.graph(observations), sightings, mover_noise(cell), limits)
 
 
 def mover_noise(cell: Cell) -> dict[str, Floats]:
@@ -194,6 +146,28 @@ def _require_agreement(found: Solved, count: int) -> None:
         )
 
 
+def _answer(
+    corrected: CorrectedArms, observations: Sequence[Observation], cell: Cell
+) -> CorrectedArm:
+    camera, *others = _estimates(corrected.found, observations, cell)
+    return CorrectedArm(camera, None, tuple(others), corrected.corrections)
+
+
+def _estimates(
+    found: Solved, observations: Sequence[Observation], cell: Cell
+) -> list[TransformEstimate]:
+    """Return the unknowns, the first camera's first."""
+    transforms = _transforms(found, cell).values()
+    return [_estimate(transform, found, observations) for transform in transforms]
+
+
+def _transforms(found: Solved, cell: Cell) -> dict[str, Transform]:
+    return {
+        cell.name_of(name): Transform.named(cell.name_of(name), found.places[name])
+        for name in cell.unknown_frames
+    }
+
+
 def _estimate(
     transform: Transform, found: Solved, observations: Sequence[Observation]
 ) -> TransformEstimate:
@@ -203,13 +177,9 @@ def _estimate(
     return estimate_at(transform, found.covariances[transform.child], about, NOWHERE)
 
 
-def _pairs(
-    observations: Sequence[Observation],
-    cell: Cell,
-    transforms: dict[str, Transform],
-    found: Solved,
-) -> tuple[Pair, ...]:
-    mapped, expected = mapped_and_expected(cell.ends(transforms, observations), observations)
+def _pairs(observations: Sequence[Observation], cell: Cell, found: Solved) -> tuple[Pair, ...]:
+    ends = cell.ends(_transforms(found, cell), observations)
+    mapped, expected = mapped_and_expected(ends, observations)
     pairs = []
     for i, (o, used) in enumerate(zip(observations, found.inliers, strict=True)):
         turn, shift = np.linalg.norm(found.residuals[i].reshape(2, 3), axis=1)

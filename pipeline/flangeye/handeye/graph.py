@@ -182,13 +182,27 @@ def rows_of(
     sightings: Sequence[Sighting],
     places: Mapping[str, Floats],
     noise: Mapping[str, Floats],
-    moved: Sequence[str] | None = None,
 ) -> tuple[Floats, Floats]:
     """Return (N, 6, 6 K) what sightings tell of K unknowns, and their (N, 6) errors, whitened.
 
+    See :func:`linear_of`; the sightings need not have taken part.
+    """
+    residuals, jacobian, whiteners = linear_of(frames, sightings, places, noise)
+    return whiteners @ jacobian, (whiteners @ residuals[..., None])[..., 0]
+
+
+def linear_of(
+    frames: Mapping[str, Frame],
+    sightings: Sequence[Sighting],
+    places: Mapping[str, Floats],
+    noise: Mapping[str, Floats],
+    moved: Sequence[str] | None = None,
+) -> tuple[Floats, Floats, Floats]:
+    """Return (N, 6) residuals, their (N, 6, 6 K) Jacobian, and (N, 6, 6) whiteners of both.
+
     Args:
         frames: As for :func:`solve_graph`, with the movers' places at the sightings' times.
-        sightings: N of them, which need not have taken part.
+        sightings: N of them.
         places: (4, 4) of the unknowns.
         noise: (6, 6) covariance of the movers' places, by frame.
         moved: Other frames to tell of than the unknowns, such as what moves.
@@ -196,8 +210,7 @@ def rows_of(
     graph = _Graph.of(frames, sightings)
     residuals, jacobian = graph.linearised(places, moved)
     spread = graph.covariances + graph.carried(places, noise)
-    whiteners = _whiteners(spread, graph.projectors)
-    return whiteners @ jacobian, (whiteners @ residuals[..., None])[..., 0]
+    return residuals, jacobian, _whiteners(spread, graph.projectors)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import displacement
-from flangeye.types import ArmCorrection, Floats, Observation
+from flangeye.types import FLANGE, ArmCorrection, Floats, Observation
 
 REACHED = 1e-9
 """Joint angles belong to a pose when they reach it this closely [rad, m]."""
@@ -53,12 +53,22 @@ def corrected_flange(
 
 
 def corrected_observation(
-    observation: Observation, correction: ArmCorrection | None, arm: Arm | None
+    observation: Observation,
+    correction: ArmCorrection | None,
+    arm: Arm | None,
+    flange: str = FLANGE,
 ) -> Observation:
-    """Return an observation with the flange where the corrected arm has it; see above."""
+    """Return an observation with the flange where the corrected arm has it; see above.
+
+    Args:
+        observation: As it was recorded.
+        correction: What is wrong with the arm, if anything.
+        arm: Its kinematics; needed when joint offsets are corrected.
+        flange: What its flange is called.
+    """
     if correction is None:
         return observation
-    reported = observation.base_T_flange
+    reported = observation.poses[flange]
     pose = corrected_flange(reported.matrix, observation.joints, correction, arm)
     moved = {reported.child: replace(reported, matrix=pose)}
     return replace(observation, poses={**observation.poses, **moved})

@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.maths.arm_correction import corrected_observation
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Ends
 from flangeye.models.robots import RobotModel
-from flangeye.types import Array, Floats, Observation, Transform
+from flangeye.types import Array, Floats, HandEye, Observation, Transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,17 @@ class Cell:
             name: replace(frame, place=places.get(name, frame.place))
             for name, frame in self.frames.items()
         }
+
+    def corrected(
+        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
+    ) -> list[Observation]:
+        """Return observations with the flanges where corrected arms have them; see ``Layout``."""
+        moved = list(observations)
+        for name, correction in calibration.arms.items():
+            mover = self.movers[name]
+            model = None if isinstance(mover, Axis) else Arm(mover)
+            moved = [corrected_observation(o, correction, model, name) for o in moved]
+        return moved
 
     def ends(
         self,

@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.maths.arm_correction import corrected_observation
 from flangeye.maths.kinematics import Arm
 from flangeye.types import (
     BASE,
@@ -30,6 +31,7 @@ from flangeye.types import (
     TARGET,
     Array,
     Floats,
+    HandEye,
     Observation,
     Transform,
 )
@@ -96,6 +98,12 @@ class Configuration:
     def describe(self) -> str:
         """Return one line: the name, the loop and what is unknown in it."""
         return f"{self.name}: {self.equation}; to be found: {', '.join(self.unknowns)}"
+
+    def corrected(
+        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
+    ) -> list[Observation]:
+        """Return observations with the flange where the corrected arm has it."""
+        return [corrected_observation(o, calibration.correction, arm) for o in observations]
 
     def ends(
         self,
@@ -199,6 +207,18 @@ class Layout(Protocol):
     @property
     def is_default(self) -> bool:
         """Whether it is a camera beside the robot that looks at the flange's own circle."""
+        ...
+
+    def corrected(
+        self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
+    ) -> list[Observation]:
+        """Return observations with every flange where a calibration's correction has it.
+
+        Args:
+            observations: N of them.
+            calibration: With what it found wrong.
+            arm: The arm's kinematics, where the recipe has one arm.
+        """
         ...
 
     def ends(

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.maths.arm_correction import corrected_observation
 from flangeye.maths.geometry import covariance_at, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import (
@@ -51,8 +50,10 @@ def _transform(estimate: t.TransformEstimate) -> TransformResult:
 
 def correction_result(correction: t.ArmCorrection | None) -> CorrectionResult | None:
     """Return a correction as ``result.json`` and ``calibration.yaml`` carry it."""
-    if correction is None:
-        return None
+    return None if correction is None else _correction(correction)
+
+
+def _correction(correction: t.ArmCorrection) -> CorrectionResult:
     field = correction.field
     return CorrectionResult(
         tool_offset=correction.tool_offset.tolist(),
@@ -98,6 +99,7 @@ def _answer(calibration: t.HandEye, of_all: float | None, inliers: float | None)
     return AnswerResult(
         transforms=transforms_result(calibration),
         correction=correction_result(calibration.correction),
+        arms={name: _correction(found) for name, found in calibration.arms.items()},
         expected_rms=_expected(calibration, inliers),
         holdout_rms=of_all,
     )
@@ -207,7 +209,7 @@ def _at_work(
     if calibration is None or not unseen:
         return None
     layout, arm = robots
-    corrected = [corrected_observation(o, calibration.correction, arm) for o in unseen]
+    corrected = layout.corrected(unseen, calibration, arm)
     transforms = {name: x.transform for name, x in calibration.transforms.items()}
     mapped, expected = mapped_and_expected(layout.ends(transforms, corrected, arm), corrected)
     return float(np.sqrt(((mapped - expected) ** 2).sum(axis=1).mean()))

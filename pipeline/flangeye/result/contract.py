@@ -199,6 +199,9 @@ class AnswerResult(_Part):
     correction: CorrectionResult | None = Field(
         None, description="What the poses hold with: without it they are another arm's."
     )
+    arms: dict[str, CorrectionResult] = Field(
+        default_factory=dict, description="The same of a cell's arms, by their names."
+    )
     expected_rms: float | None = Field(
         None,
         description="Error to expect at the work, rms: of the pose, of the arm, and of all else "

@@ -16,6 +16,7 @@ from flangeye.files.written import write_whole
 from flangeye.log.record import dump_result
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.result import Result, TransformResult
+from flangeye.result.contract import AnswerResult
 
 EXPORTS = "exports"
 """Where in the folder the files for other programs are."""
@@ -101,9 +102,7 @@ def calibration_yaml(result: Result) -> str:
         document["corrected_arm"] = {
             **_poses(answers.corrected.transforms),
             "expected_rms_at_the_work_m": answers.corrected.expected_rms,
-            "correction": answers.corrected.correction.model_dump(exclude_none=True)
-            if answers.corrected.correction
-            else None,
+            **_corrections(answers.corrected),
         }
     document["recipe_hash"] = result.provenance.recipe_hash
     return HEADER + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
@@ -111,6 +110,15 @@ def calibration_yaml(result: Result) -> str:
 
 def _poses(transforms: Mapping[str, TransformResult]) -> dict[str, Any]:
     return {name: _pose(name, estimate) for name, estimate in transforms.items()}
+
+
+def _corrections(answer: AnswerResult) -> dict[str, Any]:
+    """Return the correction of the one arm, or of each arm of a cell by its name."""
+    if answer.arms:
+        arms = {name: arm.model_dump(exclude_none=True) for name, arm in answer.arms.items()}
+        return {"corrections": arms}
+    one = answer.correction
+    return {"correction": one.model_dump(exclude_none=True) if one else None}
 
 
 def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:

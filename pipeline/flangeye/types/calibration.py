@@ -97,13 +97,15 @@ class CorrectedArm:
 
     Attributes:
         camera: As in :class:`HandEye`.
-        correction: What to correct.
+        correction: What to correct; None in a cell.
         others: As in :class:`HandEye`.
+        arms: As in :class:`HandEye`.
     """
 
     camera: TransformEstimate
-    correction: ArmCorrection
+    correction: ArmCorrection | None
     others: tuple[TransformEstimate, ...] = ()
+    arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,7 @@ class HandEye:
         corrected: Where another pose is the best for the corrected arm: that pose, with its
             correction.
         noise: What differs from pose to pose, as the residuals show it; None where not estimated.
+        arms: In a cell, what it found wrong with each arm, by its name.
     """
 
     camera: TransformEstimate
@@ -149,21 +152,24 @@ class HandEye:
     others: tuple[TransformEstimate, ...] = ()
     corrected: CorrectedArm | None = None
     noise: ScatterNoise | None = None
+    arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
 
     def as_reported(self) -> HandEye:
         """Return the answer for the arm as its controller reports it, alone."""
         known = self.correction and replace(
             self.correction, joint_offsets=None, field=None, lengths=None
         )
-        return replace(self, correction=known, corrected=None)
+        return replace(self, correction=known, corrected=None, arms={})
 
     def as_corrected(self) -> HandEye | None:
         """Return the answer for the arm corrected, alone; None where no error of it was found."""
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
-            return replace(answer, others=found.others or self.others, corrected=None)
-        return self if self.correction is not None and self.correction.of_arm else None
+            others = found.others or self.others
+            return replace(answer, others=others, corrected=None, arms=found.arms)
+        known = (self.correction, *self.arms.values())
+        return self if any(each is not None and each.of_arm for each in known) else None
 
     @property
     def base_T_camera(self) -> TransformEstimate:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+from pydantic import Field
+
 from flangeye import Params, stage
 from flangeye.handeye.cell import calibrate_cell, solve_so_far
 from flangeye.handeye.cell_plan import errors_at_work, is_foretold
@@ -22,6 +26,11 @@ class CellParams(Params):
     )
     translation_limit: Length = param(
         "20 mm", gt=0, description="Refuse when a position has a larger standard deviation."
+    )
+    joint_offsets: Literal["auto", "off"] = Field(
+        "auto",
+        description="Estimate the offsets of the arms' joints too, if that helps on sightings held "
+        "out: the result then has a second answer, for arms with these offsets corrected.",
     )
     required: Length | None = param(
         None,
@@ -46,7 +55,8 @@ def solve_cell(
 
     Takes whole poses, centres with normals, or centres alone, of any target by any camera, each
     with its covariance. The noise of what moves is found from the residuals; sightings beyond it
-    are set aside with their residual. Needs no first guess.
+    are set aside with their residual. Needs no first guess. Where the zeros of the arms' joints
+    explain sightings held out, there is a second answer: for the arms with these corrected.
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
@@ -57,7 +67,7 @@ def solve_cell(
         pulled = list(observations)
     else:
         pulled = _pull(observations, cell, params, params.required, stage_log)
-    return calibrate_cell(pulled, cell, params.limits, "solve.cell")
+    return calibrate_cell(pulled, cell, params.limits, "solve.cell", params.joint_offsets == "auto")
 
 
 def _pull(

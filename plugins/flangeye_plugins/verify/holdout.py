@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
-from flangeye.maths.arm_correction import corrected_flange, corrected_observation
+from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.geometry import covariance_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import (
@@ -181,7 +181,7 @@ def _measure_loop(
 ) -> None:
     """Measure a fold of any layout: where the camera says the target is, and the arms."""
     layout, arm = given
-    poses = [corrected_observation(observations[i], calibration.correction, arm) for i in fold]
+    poses = layout.corrected([observations[i] for i in fold], calibration, arm)
     transforms = {name: x.transform for name, x in calibration.transforms.items()}
     ends = layout.ends(transforms, poses, arm)
     mapped, expected = mapped_and_expected(ends, poses)

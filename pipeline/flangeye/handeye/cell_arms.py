@@ -1,0 +1,381 @@
+"""The zeros of a cell's arms' joints: how large they are, and the answer for arms corrected.
+
+They move neighbouring poses alike, so that the answer for the arms as reported follows them where
+independent noise would average out. ("Consider" covariance, Schmidt 1966.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.handeye.arm import MovedFlange
+from flangeye.handeye.candidates import Fit, by_folds, judged, rms
+from flangeye.handeye.graph import Sighting, Solved, information_of, linear_of, solve_graph
+from flangeye.maths.frame_graph import Frame
+from flangeye.maths.geometry import rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import chi2_quantile, covariance_inflation
+from flangeye.models.cell import Axis, Cell
+from flangeye.types import ArmCorrection, Floats, Mask
+
+RATIOS = np.logspace(-1, 2.5, 71)
+"""Sizes of joint zeros that are compared, in units of their files' and of the noise's scale."""
+CERTAIN = 0.999
+"""Probability with which zeros are not taken for larger than they are."""
+LENGTH, TWIST, WAVE, SAG = 0.1, 0.2, 0.4, 2.0
+"""Of an arm whose zeros are off by 1 rad: how far its lengths [m], twists [rad] and encoders once a
+turn [rad], are, and by what a joint gives way for a metre of lever [rad]. Zeros, lengths and twists
+are as ``refine.arm`` expects them of each other."""
+UP = np.array([0.0, 0.0, 1.0])
+"""Of an arm's base that is level."""
+DELTA = 1e-6
+"""For differences of the flange's pose by a length [m] or a twist [rad]."""
+STEPS = 3
+"""Of Gauss and Newton for joint zeros; each squares the error of the one before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bent:
+    """An arm whose joints are not quite where its controller says.
+
+    Attributes:
+        name: Frame that it moves.
+        kinematics: As its controller believes.
+        joints: (N, n) by which it is where the controller has it [rad].
+        deviation: Standard deviation of a zero, by the robot's file [rad].
+        offsets: (n,) to add to the joints [rad].
+    """
+
+    name: str
+    kinematics: Arm
+    joints: Floats
+    deviation: float
+    offsets: Floats
+
+    @property
+    def poses(self) -> Floats:
+        """(N, 4, 4) of the flange in the arm's base, with the offsets."""
+        return self.kinematics.flange(self.joints + self.offsets)
+
+    @property
+    def twists(self) -> Floats:
+        """(N, 6, n - 1) what zeros of one deviation do to it, in its base.
+
+        The first joint's is right by definition: it fixes the base's x axis.
+        """
+        return self.deviation * self.kinematics.jacobian(self.joints + self.offsets)[:, :, 1:]
+
+    @property
+    def others(self) -> Floats:
+        """(N, 6, m) what all else does that is off where zeros are by one deviation."""
+        joints = self.joints + self.offsets
+        columns, n = self.kinematics.jacobian(joints), self.kinematics.n
+        angles = (
+            WAVE * np.sin(joints),
+            WAVE * np.cos(joints),
+            SAG * _levers(self.kinematics, joints),
+        )
+        turned = [columns * each[:, None, :] for each in angles]
+        steps = np.eye(3 * n).reshape(-1, n, 3) * [LENGTH, LENGTH, TWIST]
+        longer = [self._by_lengths(step)[..., None] for step in steps]
+        return self.deviation * np.concatenate([*turned, *longer], axis=2)
+
+    def _by_lengths(self, step: Floats) -> Floats:
+        """Return (N, 6) how a change (n, 3) of lengths and twists moves the flange, by its size."""
+        arm, joints = self.kinematics, self.joints + self.offsets
+        before, after = arm.flange(joints), arm.altered(DELTA * step).flange(joints)
+        turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
+        moved = after[:, :3, 3] - before[:, :3, 3]
+        return np.concatenate([turned, moved], axis=1) / DELTA
+
+    def moved(self, deviations: Floats) -> Bent:
+        """Return the arm with (n - 1,) more added to its offsets, in units of the deviation."""
+        return replace(self, offsets=self.offsets + self.deviation * np.pad(deviations, (1, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sighted:
+    """What was sighted of a cell.
+
+    Attributes:
+        frames: With the poses at the sightings' times.
+        sightings: N of them.
+        noise: (6, 6) covariance believed of what moves, by frame.
+        limits: As for :func:`flangeye.handeye.graph.solve_graph`.
+    """
+
+    frames: Mapping[str, Frame]
+    sightings: Sequence[Sighting]
+    noise: Mapping[str, Floats]
+    limits: tuple[float, float]
+
+    def solved(self, start: Mapping[str, Floats] | None = None) -> Solved:
+        """Return the unknowns."""
+        return solve_graph(self.frames, self.sightings, self.noise, self.limits, start)
+
+    def with_arms(self, arms: Sequence[Bent]) -> Sighted:
+        """Return the same with the arms where their offsets put them."""
+        poses = {arm.name: arm.poses for arm in arms}
+        frames = {n: replace(f, place=poses.get(n, f.place)) for n, f in self.frames.items()}
+        return replace(self, frames=frames)
+
+    def linear(self, found: Solved, arms: Sequence[Bent] = ()) -> Linear:
+        """Return what the sightings tell of the unknowns, and of the arms' zeros."""
+        noise = {name: found.movers * covariance for name, covariance in self.noise.items()}
+        graph = self.frames, self.sightings, found.places, noise
+        residuals, jacobian, whiteners = linear_of(*graph)
+        zeros = others = np.zeros((*residuals.shape, 0))
+        for arm in arms:
+            moves = linear_of(*graph, moved=[arm.name])[1]
+            zeros = np.concatenate([zeros, moves @ arm.twists], axis=2)
+            others = np.concatenate([others, moves @ arm.others], axis=2)
+        kept = found.inliers
+        freedom = sum(np.trace(s.projector) for s, k in zip(self.sightings, kept, strict=True) if k)
+        return Linear(residuals, jacobian, zeros, others, whiteners, kept, float(freedom))
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Sightings, linear about an answer.
+
+    Attributes:
+        residuals: (N, 6).
+        jacobian: (N, 6, P) by the unknowns.
+        zeros: (N, 6, k) by the joint zeros, in units of their deviations.
+        others: (N, 6, m) by all else that is off in an arm, in such units.
+        whiteners: (N, 6, 6).
+        kept: (N,) which count.
+        freedom: How many numbers those are.
+    """
+
+    residuals: Floats
+    jacobian: Floats
+    zeros: Floats
+    others: Floats
+    whiteners: Floats
+    kept: Mask
+    freedom: float
+
+    @property
+    def whitened(self) -> tuple[Floats, Floats, Floats]:
+        """Of those that count: rows of the unknowns, of the zeros, and errors (N, 6)."""
+        w, kept = self.whiteners[self.kept], self.kept
+        errors = (w @ self.residuals[kept][..., None])[..., 0]
+        return w @ self.jacobian[kept], w @ self.zeros[kept], errors
+
+    def follows(self, covariance: Floats, errors: Floats) -> Floats:
+        """Return (q, m) how the first q unknowns follow errors (N, 6, m) of unit size."""
+        rows, zeros, _ = self.whitened
+        told = np.concatenate([rows, zeros], axis=2)[:, :, : len(covariance)]
+        moved = self.whiteners[self.kept] @ errors[self.kept]
+        return np.asarray(covariance @ np.einsum("nij,nik->jk", told, moved))
+
+    def information(self, size: float) -> Floats:
+        """Return (P + k, P + k) of the unknowns and of zeros expected to be of a size."""
+        rows, zeros, _ = self.whitened
+        p, k = rows.shape[2], zeros.shape[2]
+        known = np.diag(np.repeat([0.0, size**-2], [p, k]))
+        return information_of(np.concatenate([rows, zeros], axis=2)) + known
+
+    def fit(self, size: float) -> Fit:
+        """Return the fit that left the residuals, zeros of a size expected."""
+        jacobian = np.concatenate([self.jacobian, self.zeros], axis=2)
+        weights = np.swapaxes(self.whiteners, 1, 2) @ self.whiteners
+        return Fit(self.residuals, jacobian, weights, _inverse(self.information(size)), self.kept)
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedArms:
+    """The answer for arms corrected.
+
+    Attributes:
+        found: The unknowns, and their covariances.
+        arms: The arms.
+    """
+
+    found: Solved
+    arms: Sequence[Bent]
+
+    @property
+    def corrections(self) -> dict[str, ArmCorrection]:
+        """What to correct, by arm."""
+        tool = np.zeros(3)
+        return {arm.name: ArmCorrection(tool, arm.offsets, arm.joints[0]) for arm in self.arms}
+
+
+def branches_of(sighted: Sighted, cell: Cell) -> list[list[Bent]]:
+    """Return each arm whose model reaches its poses, with the joints of every branch."""
+    return [arms for name in cell.movers if (arms := _branches(name, sighted, cell))]
+
+
+def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]) -> list[Bent]:
+    """Return each arm on the branch whose zeros explain most."""
+    chosen = [arms[0] for arms in branches]
+    size = _size(sighted.linear(found, chosen))[0]
+    for i, arms in enumerate(branches):
+        tried = [[*chosen[:i], arm, *chosen[i + 1 :]] for arm in arms]
+        chosen = max(tried, key=lambda arms: _explained(sighted.linear(found, arms), size))
+    return chosen
+
+
+def considering_zeros(
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]
+) -> tuple[Solved, float]:
+    """Return the solution with what joint zeros may be off by in its covariance, and their size.
+
+    The size is in units of what the robots' files say, as the sightings show it; at least one.
+    """
+    if not branches:
+        return found, 1.0
+    linear = sighted.linear(found, likeliest(found, sighted, branches))
+    size, share = _size(linear)
+    errors = np.concatenate([linear.zeros, linear.others], axis=2)
+    followed = size * linear.follows(found.joint, errors)
+    return _with_joint(found, share * found.joint + followed @ followed.T), size
+
+
+def correcting_zeros(
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]], size: float
+) -> tuple[CorrectedArms | None, str]:
+    """Return the answer for corrected arms if it helps on sightings held out, and what to say.
+
+    Args:
+        found: The answer for the arms as reported.
+        sighted: What was sighted.
+        branches: Of each arm, as its controller has it on every branch.
+        size: Expected of the zeros, in units of what the robots' files say.
+    """
+    begun = likeliest(found, sighted, branches)
+    corrected, linear, arms = _corrected(found, sighted, begun, size)
+    # What noise is left without the zeros tells branches apart that looked alike before.
+    quieter = likeliest(replace(found, movers=corrected.movers), sighted, branches)
+    if any(a is not b for a, b in zip(begun, quieter, strict=True)):
+        corrected, linear, arms = _corrected(found, sighted, quieter, size)
+    bare, either = sighted.linear(found), found.inliers | corrected.inliers
+    before, after = (rms(by_folds(each.fit(size))[0][either]) for each in (bare, linear))
+    helps, told = judged(before, after, _told(arms))
+    return (CorrectedArms(_known(corrected, linear, size), arms) if helps else None), told
+
+
+def _corrected(
+    found: Solved, sighted: Sighted, arms: Sequence[Bent], size: float
+) -> tuple[Solved, Linear, Sequence[Bent]]:
+    linear = sighted.linear(found, arms)
+    for _ in range(STEPS):
+        arms = _stepped(linear, arms, size)
+        moved = sighted.with_arms(arms)
+        found = moved.solved(found.places)
+        linear = moved.linear(found, arms)
+    return found, linear, arms
+
+
+def _branches(name: str, sighted: Sighted, cell: Cell) -> list[Bent]:
+    """Return an arm with the joints of every branch it may be on; none of what is no arm."""
+    mover = cell.movers[name]
+    if isinstance(mover, Axis):
+        return []
+    arm = Arm(mover)
+    flange = MovedFlange(np.asarray(sighted.frames[name].place), None, False, arm)
+    return [
+        Bent(name, arm, joints, mover.joint_accuracy, np.zeros(arm.n))
+        for joints in flange.branches()
+    ]
+
+
+def _explained(linear: Linear, size: float) -> float:
+    """Return how much of the squared errors the unknowns and zeros explain."""
+    rows, zeros, errors = linear.whitened
+    told = np.einsum("nij,ni->j", np.concatenate([rows, zeros], axis=2), errors)
+    return float(told @ np.linalg.solve(linear.information(size), told))
+
+
+def _stepped(linear: Linear, arms: Sequence[Bent], size: float) -> list[Bent]:
+    """Return the arms with their offsets a step nearer to the likeliest."""
+    rows, zeros, errors = linear.whitened
+    told = np.einsum("nij,ni->j", np.concatenate([rows, zeros], axis=2), errors)
+    so_far = np.concatenate([arm.offsets[1:] / arm.deviation for arm in arms])
+    told[rows.shape[2] :] += so_far / size**2
+    step = -np.linalg.solve(linear.information(size), told)[rows.shape[2] :]
+    ends = np.cumsum([arm.twists.shape[2] for arm in arms])
+    return [arm.moved(x) for arm, x in zip(arms, np.split(step, ends[:-1]), strict=True)]
+
+
+def _known(found: Solved, linear: Linear, size: float) -> Solved:
+    """Return the solution with the covariance that it has together with the zeros."""
+    p, covariance = linear.jacobian.shape[2], _inverse(linear.information(size))
+    taken = linear.zeros.shape[2] - np.trace(covariance[p:, p:]) / size**2
+    left = max(linear.freedom - p - taken, 1.0)
+    scale = max(float((linear.whitened[2] ** 2).sum()) / left, 1.0)
+    followed = size * linear.follows(covariance, linear.others)[:p]
+    joint = scale * covariance_inflation(left, 6) * covariance[:p, :p] + followed @ followed.T
+    return _with_joint(found, joint)
+
+
+def _with_joint(found: Solved, joint: Floats) -> Solved:
+    blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(found.places)}
+    return replace(found, joint=joint, covariances=blocks)
+
+
+def _inverse(information: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+def _levers(arm: Arm, joints: Floats) -> Floats:
+    """Return (N, n) the horizontal lever about each joint of what hangs on it [m].
+
+    Its weight is taken to be spread evenly over the links' origins beyond the joint.
+    """
+    origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
+    beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
+    return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ UP)
+
+
+def _told(arms: Sequence[Bent]) -> str:
+    listed = (
+        f"{arm.name} are off by ({', '.join(f'{x * 1e3:.2f}' for x in arm.offsets)}) mrad"
+        for arm in arms
+    )
+    return f"the joints of {', of '.join(listed)}; the second answer is for them so corrected"
+
+
+def _size(linear: Linear) -> tuple[float, float]:
+    rows, zeros, errors = linear.whitened
+    others = linear.whiteners[linear.kept] @ linear.others[linear.kept]
+    return size_of_zeros(rows, np.concatenate([zeros, others], axis=2), errors, linear.freedom)
+
+
+def size_of_zeros(
+    rows: Floats, zeros: Floats, errors: Floats, freedom: float
+) -> tuple[float, float]:
+    """Return by what factor joint zeros are larger than was said, and what that leaves of noise.
+
+    The restricted likelihood of all sightings (Patterson & Thompson 1971) over the factor, the
+    noise's own scale taken to be the likeliest; one and one where that says no more.
+
+    Args:
+        rows: (N, 6, P) what the sightings tell of the unknowns, whitened.
+        zeros: (N, 6, k) what zeros of one standard deviation, and all else, do to them.
+        errors: (N, 6) their residuals.
+        freedom: How many numbers those are.
+    """
+    p, k = rows.shape[2], zeros.shape[2]
+    both = np.concatenate([rows, zeros], axis=2)
+    information, told = information_of(both), np.einsum("nij,ni->j", both, errors)
+    total, left = float((errors**2).sum()), max(freedom - p, 1.0)
+
+    def likelihood(ratio: float) -> tuple[float, float]:
+        """Return twice the logarithm, and the noise's scale, by the zeros' size against it."""
+        known = information + np.diag(np.repeat([0.0, ratio**-2], [p, k]))
+        scale = max((total - told @ np.linalg.solve(known, told)) / left, 1e-12)
+        return -left * np.log(scale) - np.linalg.slogdet(known)[1] - 2 * k * np.log(ratio), scale
+
+    gains, scales = np.transpose([likelihood(float(ratio)) for ratio in RATIOS])
+    # Few zeros tell little of their size: its square is expected over all that are likely.
+    weights = np.exp((gains - gains.max()) / 2)
+    size = np.sqrt((weights * scales * RATIOS**2).sum() / weights.sum())
+    if size <= 1 or gains.max() - likelihood(1.0)[0] < chi2_quantile(CERTAIN, 1):
+        return 1.0, 1.0
+    return float(size), min(float(scales[gains.argmax()]), 1.0)
