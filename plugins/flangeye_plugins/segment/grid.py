@@ -96,7 +96,8 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
     spacing = _typical_angle(few[:, 0] / few[:, 2], few[:, 1] / few[:, 2]) * np.sqrt(share)
     enough = min(1.0, ROOMY * (spacing / wanted) ** 2)
     angle = max(wanted, 1.6 * spacing / np.sqrt(enough))
-    return project(_before_scanner(_drawn(points, lot, enough)), angle)
+    drawn = _before_scanner(_drawn(points, lot, enough))
+    return project(drawn if len(drawn) else few, angle)  # all of them may be at one place
 
 
 def _before_scanner(points: Singles) -> Singles:

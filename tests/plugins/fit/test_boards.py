@@ -211,7 +211,7 @@ def test_a_wrong_camera_matrix_is_told_by_the_corners() -> None:
         (CheckerboardParams, {"columns": 8, "rows": 6, "square": SI(0.02)},
          "a board of 8 x 6 squares looks the same after half a turn; use one with an odd and an "
          "even number of squares, or a ChArUco board"),
-        (CharucoParams, {"columns": 7, "rows": 5, "square": SI(0.02), "marker": SI(0.03)},
+        (CharucoParams, {"columns": 7, "rows": 5, "square": SI(0.02), "marker": SI(0.02)},
          "the markers of a ChArUco board are smaller than its squares"),
         (MarkerParams, {"size": SI(0.02), "dictionary": "4X4_51"}, "no dictionary '4X4_51'; known:"),
     ],
@@ -285,6 +285,7 @@ def test_a_scanners_distortion_turns_a_small_target_more() -> None:
         (CharucoParams, {"rows": 5, "square": "30 mm", "marker": "20 mm"}, "columns", 2, 3),
         (CharucoParams, {"columns": 5, "square": "30 mm", "marker": "20 mm"}, "rows", 2, 3),
         (CharucoParams, {"columns": 5, "rows": 5, "square": "9 mm"}, "marker", "0 mm", "1 um"),
+        (CharucoParams, {"columns": 5, "rows": 5, "marker": "9 mm"}, "square", "0 mm", "9.1 mm"),
         (CheckerboardParams, {"rows": 6, "square": "30 mm"}, "columns", 2, 3),
         (CheckerboardParams, {"columns": 6, "square": "30 mm"}, "rows", 2, 3),
         (CheckerboardParams, {"columns": 6, "rows": 5}, "square", "0 mm", "1 um"),

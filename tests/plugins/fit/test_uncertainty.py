@@ -56,3 +56,13 @@ def test_a_plane_is_known_as_well_as_its_patches_let_it() -> None:
     assert np.diag(mean) == pytest.approx(scatter, rel=0.2)
     # One draw alone states it to within a third.
     assert np.std([np.trace(s) for s in stated]) < 0.35 * np.trace(mean)
+
+
+def test_three_rings_of_twenty_four_sectors_err_by_themselves() -> None:
+    """One point in each; what rings of a sector miss by cancels, and is there none the less."""
+    angle = np.radians(np.arange(-180 + 7.5, 180, 15.0))
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    offsets = np.concatenate([radius * around for radius in (0.005, 0.015, 0.03)])
+    heights = np.repeat([1.0, -2.0, 1.0], 24)
+    found = plane_covariance(offsets, heights)
+    assert found[2, 2] == pytest.approx(72 / 69 * (heights**2).sum() / 72**2)

@@ -1,6 +1,7 @@
 """segment.sphere: the sphere, not the arm, the table or a hole."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +14,18 @@ from flangeye.units import SI
 from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
 from flangeye_plugins.fit.sphere import SphereParams, fit_sphere
 from flangeye_plugins.plan.grid import GridParams, grid
+from flangeye_plugins.segment.grid import Grid
 from flangeye_plugins.segment.sphere import (
+    Candidate,
     SegmentSphereParams,
+    _apart,
+    _with_neighbours,
     find_spheres,
     most_voted,
     segment_sphere,
     surface_normals,
 )
+from tests.plugins.bounds import check_bound
 
 SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.06))
 
@@ -167,7 +173,117 @@ def test_votes_are_counted_where_they_are_densest() -> None:
 
 
 def test_no_surface_gives_no_candidates() -> None:
-    from flangeye_plugins.segment.grid import Grid
-
     nothing = np.full((5, 5, 3), np.nan, dtype=np.float32)
     assert find_spheres(Grid(nothing, 1e-3, None), 0.02, 1e-3) == []
+
+
+ANGLE = 2e-3
+AT = np.array([0.05, -0.04, 0.6])
+
+
+def ball(radius=SPHERE.radius, centre=AT, wall=0.9) -> Grid:
+    """Return a grid of a ball before a wall."""
+    u, v = np.meshgrid(ANGLE * np.arange(-150, 150), ANGLE * np.arange(-120, 120))
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+    along, squared = rays @ centre, (rays**2).sum(axis=-1)
+    inside = along**2 - squared * (centre @ centre - radius**2)
+    near = (along - np.sqrt(np.maximum(inside, 0.0))) / squared
+    depth = np.where(inside > 0, near, wall)
+    return Grid((depth[..., None] * rays).astype(np.float32), ANGLE, None)
+
+
+def test_a_ball_is_found_where_it_is_and_seen_whole() -> None:
+    best, *others = find_spheres(ball(), SPHERE.radius, 1e-3)
+    assert best.centre == pytest.approx(AT, abs=1e-5)
+    assert best.radius == SPHERE.radius
+    assert best.seen == pytest.approx(1.0, abs=0.06)
+    assert all(other.seen < 0.1 for other in others)
+
+
+@pytest.mark.parametrize("share", [0.92, 1.08])
+def test_a_ball_of_unknown_size_is_measured_within_a_tenth(share: float) -> None:
+    best = find_spheres(ball(), share * SPHERE.radius, 1e-3, sized=False)[0]
+    assert best.centre == pytest.approx(AT, abs=2e-5)
+    assert best.radius == pytest.approx(SPHERE.radius, abs=2e-5)
+    assert best.seen == pytest.approx(1.0, abs=0.06)
+    other = find_spheres(ball(), 1.3 * SPHERE.radius, 1e-3, sized=False)
+    assert all(each.seen < 0.3 for each in other)
+
+
+def test_what_is_missing_of_a_ball_is_not_seen_and_what_sticks_out_speaks_against_it() -> None:
+    whole = ball().xyz
+    half = np.where(whole[..., :1] < AT[0], np.nan, whole)
+    assert find_spheres(Grid(half, ANGLE, None), SPHERE.radius, 1e-3)[0].seen == pytest.approx(
+        0.5, abs=0.06
+    )
+    off = np.linalg.norm(whole - AT, axis=-1) < 1.01 * SPHERE.radius
+    off &= (whole[..., 0] < AT[0]) & (np.indices(off.shape).sum(axis=0) % 2 == 0)
+    spoilt = np.where(off[..., None], whole * (1 - 3e-3 / 0.6), whole)  # 3 mm before it
+    seen = find_spheres(Grid(spoilt, ANGLE, None), SPHERE.radius, 1e-3)[0].seen
+    assert seen == pytest.approx(0.5, abs=0.08)  # a quarter is not there, a quarter against it
+
+
+def test_spheres_that_overlap_are_one_the_better() -> None:
+    def at(x, seen, radius=0.02):
+        return Candidate(np.array([x, 0.0, 0.5]), seen, radius)
+
+    kept = _apart([at(0, 0.9), at(0.039, 0.8), at(0.041, 0.7), at(0.09, 0.6, 0.03)])
+    assert [one.seen for one in kept] == [0.9, 0.7]
+
+
+def test_a_cell_has_its_votes_and_those_of_the_26_around_it() -> None:
+    rng = np.random.default_rng(0)
+    shape = (7, 6, 8)
+    grid = np.zeros(shape, dtype=int)
+    inner = tuple(slice(1, n - 1) for n in shape)  # one empty layer to each side
+    grid[inner] = rng.poisson(0.4, grid[inner].shape)
+    keys = np.flatnonzero(grid)
+    found = _with_neighbours(keys, grid.ravel()[keys], shape)
+    for key, total in zip(keys, found, strict=True):
+        i, j, k = np.unravel_index(key, shape)
+        assert total == grid[i - 1 : i + 2, j - 1 : j + 2, k - 1 : k + 2].sum()
+
+
+def test_as_many_places_as_are_looked_at_and_no_more() -> None:
+    places = np.array([[x, y, 0.5] for x in (0.0, 0.3, 0.6) for y in (0.0, 0.3, 0.6)])
+    votes = np.repeat(places, np.arange(9, 0, -1), axis=0)
+    assert np.array(most_voted(votes, 0.01, 0.1)) == pytest.approx(places[:6])
+    assert len(most_voted(votes[:20], 0.01, 0.1)) == 3
+
+
+def test_normals_are_across_the_surface_whatever_its_tilt() -> None:
+    for normal in ([0.3, -0.2, -0.9], [-0.5, 0.1, -0.8]):
+        normal = np.array(normal) / np.linalg.norm(normal)
+        rays = ball().xyz / ball().xyz[..., 2:]
+        plane = rays * (normal @ AT / (rays @ normal))[..., None]
+        found = surface_normals(plane.astype(np.float32))[1:-1, 1:-1].reshape(-1, 3)
+        assert found == pytest.approx(np.tile(normal, (len(found), 1)), abs=1e-3)
+
+
+def test_what_is_cut_out_lies_within_the_margin_of_the_surface() -> None:
+    xyz = ball().xyz
+    found = segment(of(xyz), margin=SI(4e-4))
+    off = np.abs(np.linalg.norm(xyz.reshape(-1, 3) - found.centre, axis=1) - SPHERE.radius)
+    assert len(found.cloud.xyz) == (off < 4e-4).sum() > 400
+    assert found.normal == pytest.approx(-found.centre / np.linalg.norm(found.centre))
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "found"), [(0.5, 0.7, True), (0.595, 0.9, False), (0.1, 0.57, False)]
+)
+def test_only_what_lies_between_near_and_far_is_looked_at(
+    near: float, far: float, found: bool
+) -> None:
+    told = segment(of(ball().xyz), near=SI(near), far=SI(far))
+    assert isinstance(told, FlangeCloud) is found
+
+
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("near", "-1 mm", "0 mm"), ("far", "0 mm", "1 mm"), ("min_coverage", 0, 0.01),
+        ("min_coverage", 1.01, 1), ("tolerance", "0 mm", "1 um"), ("margin", "0 mm", "1 um"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
+    check_bound(SegmentSphereParams, name, refused, taken)

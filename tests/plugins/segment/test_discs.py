@@ -1,0 +1,206 @@
+"""Whether a flat part is the flange, by its size, rim, bore, plate and tilt."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye import StageError
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.planes import Plane
+from flangeye.models.loading import load_model
+from flangeye.models.targets import wrist_circle_of
+from flangeye_plugins.segment.choice import choose
+from flangeye_plugins.segment.discs import (
+    Disc,
+    DiscLimits,
+    compare,
+    incidence,
+    of_size,
+    ring_shares,
+    width,
+)
+from flangeye_plugins.segment.flange import SegmentParams
+from flangeye_plugins.segment.parts import Part
+from flangeye_plugins.segment.scale import check_scale
+from tests.plugins.bounds import check_bound
+from tests.plugins.segment.test_choice import BORE, UR5
+
+WRIST = wrist_circle_of(load_model("robots", "ur10e").flange, 0.09)
+PITCH = 1e-3
+AT = np.array([0.0, 0.0, 0.6])
+FACING = Plane(AT, np.array([0.0, 0.0, -1.0]), 1e-5)
+LIMITS = DiscLimits(incidence=np.radians(55), coverage=0.3, crease=0.8e-3)
+
+
+def ring(inner, outer, height=0.0, arc=2 * np.pi) -> np.ndarray:
+    """Return (N, 3) points of a ring that faces the scanner, so high before the plane."""
+    ticks = np.arange(-outer, outer + PITCH / 2, PITCH / 2)
+    flat = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    reach, angle = np.hypot(*flat.T), np.arctan2(flat[:, 1], flat[:, 0]) % (2 * np.pi)
+    flat = flat[(reach <= outer) & (reach >= inner) & (angle <= arc)]
+    return AT + np.column_stack([flat, np.full(len(flat), -height)])
+
+
+def disc(points, plane=FACING, flange=UR5) -> Disc:
+    part = Part(plane, points.astype(np.float32), np.arange(len(points)))
+    return of_size(part, (10, 20), PITCH, flange)
+
+
+def compared(points, nearby=None, flange=UR5, **limits) -> Disc:
+    nearby = points if nearby is None else nearby
+    return compare(
+        disc(points, flange=flange), points, nearby, PITCH, flange, LIMITS._replace(**limits)
+    )
+
+
+def test_the_width_is_the_largest_over_all_directions() -> None:
+    corners = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.08], [0.06, 0.08]])
+    assert width(corners) == pytest.approx(0.1, rel=0.004)  # within 5 deg of the diagonal
+    for angle in np.radians([0, 35, 90, 125, 170]):
+        line = np.outer([-0.05, 0.05], [np.cos(angle), np.sin(angle)])
+        assert width(line) == pytest.approx(0.1, rel=0.004)
+
+
+@pytest.mark.parametrize("turn", [0.0, 20.0, 70.0])
+def test_the_incidence_is_the_angle_to_the_line_of_sight(turn: float) -> None:
+    sight = np.array([0.2, -0.1, 0.7]) / np.linalg.norm([0.2, -0.1, 0.7])
+    normal = -np.cos(np.radians(turn)) * sight + np.sin(np.radians(turn)) * basis_of_plane(sight)[0]
+    assert np.degrees(incidence(0.6 * sight, normal)) == pytest.approx(turn, abs=1e-6)
+
+
+def test_a_part_is_of_the_flanges_size_or_its_width_is_its_flaw() -> None:
+    whole = disc(ring(0, UR5.rim))
+    assert whole.flaw is None and whole.rank == 0 and whole.seen == 0
+    assert whole.across == pytest.approx(2 * UR5.rim, abs=PITCH)
+    assert whole.centre == pytest.approx(AT, abs=PITCH)
+    largest, smallest = UR5.outer + 2 * PITCH, UR5.rim / 8
+    assert disc(ring(0, largest - PITCH / 2)).flaw is None
+    assert disc(ring(0, largest + PITCH)).flaw == "69 mm across"
+    assert disc(ring(0, smallest + PITCH / 2)).flaw is None
+    assert str(disc(ring(0, smallest - PITCH)).flaw).endswith(" mm across")
+
+
+@pytest.mark.parametrize(("arc", "share"), [(2 * np.pi, 1.0), (np.pi, 0.5)])
+def test_the_rims_centre_and_what_is_seen_of_it_and_of_the_bore(arc: float, share: float) -> None:
+    flat = ring(BORE, UR5.rim, arc=arc)[:, :2]
+    start = np.array([2e-3, 3e-3])
+    centre, shares = ring_shares(flat, start, PITCH, UR5)
+    assert np.linalg.norm(centre) < 0.6e-3
+    assert shares == pytest.approx([share, share], abs=0.07)
+    _, shares = ring_shares(ring(0, UR5.rim)[:, :2], start, PITCH, UR5)
+    assert shares == [1.0, 0.0]
+    _, shares = ring_shares(ring(BORE, UR5.rim - 8 * PITCH)[:, :2], 0 * start, PITCH, UR5)
+    assert shares[0] < 0.3 and shares[1] == 1.0
+
+
+def test_what_fits_has_no_flaw_and_got_farthest() -> None:
+    found = compared(ring(BORE, UR5.rim))
+    assert (found.flaw, found.rank) == (None, 4)
+    assert found.seen == pytest.approx(1.0, abs=0.02)
+    assert found.centre == pytest.approx(AT, abs=0.5e-3)
+
+
+def test_a_disc_says_what_is_wrong_with_it() -> None:
+    half = compared(ring(BORE, UR5.rim, arc=np.pi), coverage=0.8)
+    assert half.rank == 1 and half.flaw is not None
+    assert half.flaw.endswith("% of a rim of 61.0 mm, at least 80% is needed")
+    blind = compared(ring(0, UR5.rim))
+    assert (blind.rank, blind.flaw) == (
+        1, "a disc 61 mm across has 0% of a bore of 33.0 mm, at least 30% is needed",
+    )  # fmt: skip
+    aside = np.array([0.4, 0.0, 0.0])
+    steep = compared(ring(BORE, UR5.rim) + aside, incidence=np.radians(30))
+    assert (steep.rank, steep.flaw) == (3, "incidence 34 deg over the limit of 30 deg")
+
+
+@pytest.mark.parametrize(
+    ("height", "flaw"),
+    [(1.0, None), (0.55, None), (1.45, None), (0.4, 0.4), (1.6, 1.6), (-1.0, -1.0)],
+)
+def test_before_a_wrist_circle_stands_its_plate(height: float, flaw: float | None) -> None:
+    """Within half its thickness, from where it has ended to the rim."""
+    thickness = 1e3 * WRIST.details.thickness
+    circle = ring(0.87 * WRIST.rim, WRIST.rim)
+    plate = ring(0, 0.7 * WRIST.rim, height=height * WRIST.details.thickness)
+    found = compared(circle, np.concatenate([circle, plate]), WRIST)
+    said = None if flaw is None else (
+        f"a disc 90 mm across has no plate {thickness:.1f} mm before it, its middle stands "
+        f"{flaw * thickness:.1f} mm out"
+    )  # fmt: skip
+    assert (found.flaw, found.rank) == (said, 4 if flaw is None else 2)
+
+
+def test_a_plate_that_is_not_seen_is_not_missed() -> None:
+    circle = ring(0.87 * WRIST.rim, WRIST.rim)
+    assert compared(circle, flange=WRIST).flaw is None
+    few = ring(0.55 * WRIST.rim, 0.6 * WRIST.rim)[:9]
+    assert compared(circle, np.concatenate([circle, few]), WRIST).flaw is None
+
+
+def scored(seen: float, x: float = 0.0) -> Disc:
+    return disc(ring(0, WRIST.rim), flange=WRIST)._replace(
+        seen=seen, rank=4, centre=AT + [x, 0.0, 0.0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("discs", "chosen"),
+    [
+        ([scored(0.9), scored(0.53, 0.2)], 0.9),
+        ([scored(0.3), scored(0.8, 0.2)], 0.8),
+        ([scored(0.5), scored(0.9, 0.04)], 0.9),  # at one place
+        ([scored(0.21)], 0.21),
+        ([scored(0.9), scored(0.95, 0.2)._replace(flaw="steep")], 0.9),
+    ],
+)
+def test_the_disc_that_is_seen_clearly_best_is_the_flange(discs: Any, chosen: float) -> None:
+    found = choose(discs, lambda d: np.full((1, 3), d.seen), WRIST)
+    assert not isinstance(found, str), found
+    assert found[0].seen == chosen
+    assert found[1][0, 0] == chosen  # its own points
+
+
+@pytest.mark.parametrize(
+    ("discs", "said"),
+    [
+        ([], "no flat surface in sight"),
+        ([scored(0.9), scored(0.6, 0.2)],
+         "2 discs look like the flange: at (0, 0, 600) mm and (200, 0, 600) mm; hide one or narrow "
+         "near and far"),
+        ([scored(0.1)], "a disc 90 mm across with a bore has no threaded holes"),
+        ([scored(0.1)._replace(flaw="low", rank=1), scored(0.2)._replace(flaw="high", rank=2)],
+         "high"),
+        ([scored(0.1)._replace(flaw="one", rank=1), scored(0.2)._replace(flaw="better", rank=1)],
+         "better"),
+        ([scored(0)._replace(across=a, flaw=f"{a:.2f}", rank=0) for a in (0.04, 0.16, 0.3)],
+         "no plane of the flange's size: nearest candidate 0.16, flange 90 mm"),
+    ],
+)  # fmt: skip
+def test_why_none_is_the_flange(discs: Any, said: str) -> None:
+    assert choose(discs, lambda d: np.zeros((1, 3)), WRIST) == said
+
+
+@pytest.mark.parametrize(
+    ("depth", "unit"), [(29.9, None), (30.1, "unit mm"), (0.0101, None), (0.0099, "unit m")]
+)
+def test_a_depth_is_between_a_centimetre_and_thirty_metres(depth: float, unit: str | None) -> None:
+    xyz = np.full((500, 600, 3), np.nan, dtype=np.float32)
+    xyz[::2] = [1e-4, 50.0, depth]
+    if unit is None:
+        check_scale(xyz, "a")
+        return
+    with pytest.raises(StageError, match=f"state {unit} where"):
+        check_scale(xyz, "a")
+
+
+@pytest.mark.parametrize(
+    ("name", "refused", "taken"),
+    [
+        ("near", "-1 mm", "0 mm"), ("far", "0 mm", "1 mm"), ("max_incidence", "0 deg", "1 deg"),
+        ("min_coverage", 0, 0.01), ("min_coverage", 1.01, 1), ("crease", "0 mm", "1 um"),
+        ("margin", "0 mm", "1 um"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
+    check_bound(SegmentParams, name, refused, taken)

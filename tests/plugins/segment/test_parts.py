@@ -1,0 +1,88 @@
+"""Flat parts: of a piece that is flat, of one that is bent, and of none."""
+
+import numpy as np
+import pytest
+
+from flangeye.maths.planes import Plane
+from flangeye_plugins.segment.parts import Patch, Piece, _principal, flat_parts
+
+PITCH = 2e-3
+SCATTER = 3e-4
+
+
+def piece(height, rows=60, columns=60, first=0) -> Piece:
+    """Return a piece whose height over a plane 0.7 m away is a function of place."""
+    y, x = (PITCH * a.ravel() for a in np.indices((rows, columns)))
+    points = np.stack([x, y, 0.7 - height(x, y)], axis=1).astype(np.float32)
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return Piece(points, first + np.arange(rows * columns), row // 10 * 100 + column // 10)
+
+
+def flat(x, y):
+    return 0.1 * x + 0 * y
+
+
+def roof(x, y):
+    return 0.5 * np.minimum(x, 0.12 - x) + 0 * y
+
+
+def test_a_piece_that_is_flat_is_one_part_with_its_plane() -> None:
+    both = [piece(flat), piece(lambda x, y: 0.02 + 0 * x, first=5000)]
+    parts = flat_parts(both, 0.1, SCATTER, 50)
+    assert [len(part.points) for part in parts] == [3600, 3600]
+    assert parts[1].at.tolist() == list(range(5000, 8600))
+    normal = np.array([-0.1, 0, -1]) / np.hypot(0.1, 1)
+    assert parts[0].plane.normal == pytest.approx(normal, abs=1e-6)
+    assert parts[1].plane.point[2] == pytest.approx(0.68, abs=1e-6)
+
+
+def test_a_few_points_off_its_plane_are_no_part_of_it() -> None:
+    wall = piece(lambda x, y: np.where(x + y < 0.03, 0.01, 0.0))
+    (part,) = flat_parts([wall], 0.1, SCATTER, 500)
+    assert (part.points[:, 2] == np.float32(0.7)).all()
+    assert len(part.points) == (wall.points[:, 2] == np.float32(0.7)).sum()
+
+
+def test_a_bent_piece_has_a_part_for_each_side() -> None:
+    parts = flat_parts([piece(roof)], 0.2, SCATTER, 50)
+    found = sorted(part.plane.normal[0] for part in parts if len(part.points) > 1500)
+    slope = 0.5 / np.hypot(0.5, 1)
+    assert found == pytest.approx([-slope, slope], abs=1e-4)
+    assert sum(len(part.points) for part in parts) <= 3660  # few belong to both
+
+
+def test_a_part_of_a_bent_piece_reaches_no_farther_than_it_may() -> None:
+    parts = flat_parts([piece(roof)], 0.03, SCATTER, 50)
+    assert parts
+    for part in parts:
+        assert np.linalg.norm(np.ptp(part.points, axis=0)) <= 2 * 0.03 * np.sqrt(2) + 1e-3
+
+
+def test_what_is_nowhere_flat_has_no_part_and_little_is_not_searched() -> None:
+    ball = piece(lambda x, y: np.sqrt(0.1**2 - (x - 0.06) ** 2 - (y - 0.06) ** 2))
+    assert all(len(part.points) < 50 for part in flat_parts([ball], 0.1, 5e-5, 50))
+    assert not flat_parts([piece(roof)], 0.2, SCATTER, 3601)
+    assert not flat_parts([], 0.2, SCATTER, 50)
+
+
+def test_points_around_a_patch_are_those_within_reach_or_a_sample() -> None:
+    wall = piece(flat)
+    patch = Patch(wall, Plane(wall.points[1830].astype(float), np.array([0, 0, -1.0]), 0.0),
+                  np.arange(12), np.arange(100, 3600))  # fmt: skip
+    near = np.linalg.norm(wall.points - wall.points[1830], axis=1) < 0.021
+    assert patch.around(0.021).tolist() == [k for k in np.flatnonzero(near) if k >= 100]
+    sample = patch.around(0.021, 300)  # every third of 12 members' fifty patches
+    assert set(sample) == {k for k in np.flatnonzero(near) if k >= 100 and (k - 100) % 3 == 0}
+
+
+def test_groups_have_the_means_variances_and_normals_of_their_points() -> None:
+    rng = np.random.default_rng(0)
+    points, sizes = rng.standard_normal((60, 3)) * [3, 2, 1], np.array([10, 30, 20])
+    starts = np.array([0, 10, 40])
+    means, variances, normals = _principal(points, starts, sizes)
+    for k, (start, size) in enumerate(zip(starts, sizes, strict=True)):
+        group = points[start : start + size]
+        values, axes = np.linalg.eigh(np.cov(group.T, bias=True))
+        assert means[k] == pytest.approx(group.mean(axis=0))
+        assert variances[k] == pytest.approx(values[0])
+        assert abs(normals[k] @ axes[:, 0]) == pytest.approx(1)
