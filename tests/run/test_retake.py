@@ -19,6 +19,9 @@ def test_a_capture_is_taken_again_and_the_rest_is_kept(done: Call) -> None:
     assert list(log.poses) == ["003", "000", "001", "002", "004", "005"]
     assert log.observations()[0].id == "003"
     assert log.complete
+    kept = [e.seconds for e in log.entries if e.capture not in (None, "003")]
+    kept += [meta["seconds"] for capture, meta in log.poses.items() if capture != "003"]
+    assert len(kept) == 15 and not any(kept)  # what was taken before cost this run nothing
 
 
 def test_a_capture_is_left_out_and_named_so(done: Call) -> None:

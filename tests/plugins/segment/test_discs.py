@@ -155,10 +155,10 @@ def scored(seen: float, x: float = 0.0) -> Disc:
     ],
 )
 def test_the_disc_that_is_seen_clearly_best_is_the_flange(discs: Any, chosen: float) -> None:
-    found = choose(discs, lambda d: np.full((1, 3), d.seen), WRIST)
+    found = choose(discs, lambda d: np.full((1, 3), d.seen, np.float32), WRIST)
     assert not isinstance(found, str), found
     assert found[0].seen == chosen
-    assert found[1][0, 0] == chosen  # its own points
+    assert found[1][0, 0] == np.float32(chosen)  # its own points
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_the_disc_that_is_seen_clearly_best_is_the_flange(discs: Any, chosen: fl
     ],
 )  # fmt: skip
 def test_why_none_is_the_flange(discs: Any, said: str) -> None:
-    assert choose(discs, lambda d: np.zeros((1, 3)), WRIST) == said
+    assert choose(discs, lambda d: np.zeros((1, 3), np.float32), WRIST) == said
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,9 @@ def test_what_is_nearer_to_the_scanner_takes_up_more_of_the_window() -> None:
 
 def test_a_cut_out_disc_has_the_points_near_its_plane_and_circle() -> None:
     rng = np.random.default_rng(0)
-    points = rng.uniform(-0.06, 0.06, (30000, 3)).astype(np.float32) + np.float32([0, 0, 0.5])
+    points = rng.uniform(-0.06, 0.06, (30000, 3)).astype(np.float32) + np.array(
+        [0, 0, 0.5], np.float32
+    )
     points[::7] = np.nan
     normal = np.array([0.6, 0.0, -0.8])
     centre = np.array([0.002, -0.004, 0.5])
