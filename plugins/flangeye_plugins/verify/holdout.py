@@ -101,7 +101,9 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     ``predicted_worst_p95``: with 95 % probability no point of the workspace is off by more.
     """
     poses = [pair.observation for pair in calibration.pairs]
-    folds = deal(len(poses), params.folds, seed)
+    folds = (
+        deal_moments(poses, params.folds, seed) if cell else deal(len(poses), params.folds, seed)
+    )
     try:
         solved = solve_without(poses, solve, folds)
     except (StageError, CalibrationRefused) as error:
@@ -137,6 +139,22 @@ def deal(count: int, folds: int, seed: int) -> list[NDArray[np.intp]]:
     order = np.random.default_rng(seed).permutation(count)
     folds = min(folds, count)
     return [np.sort(order[fold::folds]) for fold in range(folds)]
+
+
+def deal_moments(
+    observations: Sequence[Observation], folds: int, seed: int
+) -> list[NDArray[np.intp]]:
+    """Return the indices of each fold; what cameras saw of the same poses falls in one.
+
+    Else the error of a pose that one camera saw would be known from what the other saw.
+    """
+    moments: dict[bytes, list[int]] = {}
+    for i, o in enumerate(observations):
+        poses = [o.poses[name].matrix for name in sorted(o.poses)]
+        moments.setdefault(np.array(poses).tobytes(), []).append(i)
+    groups = list(moments.values())
+    dealt = deal(len(groups), folds, seed)
+    return [np.sort(np.concatenate([groups[k] for k in fold])) for fold in dealt]
 
 
 def solve_without(

@@ -1,6 +1,7 @@
 """verify.holdout: folds, figures, outliers, and the prediction over the workspace."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from flangeye_plugins.verify.holdout import (
     _beyond_gate,
     _corrected_figures,
     deal,
+    deal_moments,
     verify_holdout,
 )
 
@@ -268,3 +270,13 @@ def test_figures_of_a_corrected_arm_are_those_of_the_errors_lengths() -> None:
             "corrected_rms_inliers": np.sqrt(13.0),
         }
     )
+
+
+def test_what_cameras_saw_of_one_pose_is_held_out_together() -> None:
+    once = simulate(6, 1e-4)
+    twice = [replace(o, id=f"{o.id}-{camera}", camera=camera) for o in once for camera in "ab"]
+    folds = deal_moments(twice, 3, seed=0)
+    assert sorted(np.concatenate(folds)) == list(range(12))
+    for fold in folds:
+        assert len(fold) == 4
+        assert {i ^ 1 for i in fold} == set(fold.tolist())
