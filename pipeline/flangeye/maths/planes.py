@@ -101,9 +101,8 @@ def robust_planes(
     few = [points[:: 1 + len(points) // ENOUGH] for points in groups]
     rows, slabs = _Rows.of(few, rough), _Slabs.at(rough, gates)
     more = any(len(some) < len(points) for some, points in zip(few, groups, strict=True))
-    restless = RESTLESS if more else 0.0
-    _of_majority(rows, slabs, restless)
-    _opened(rows, slabs, sigmas, restless)
+    _of_majority(rows, slabs, RESTLESS)
+    _opened(rows, slabs, sigmas, RESTLESS if more else 0.0)
     if more:
         _opened(_Rows.of(groups, rough), slabs, sigmas, 0.0)
     return slabs.planes(rough)
@@ -166,7 +165,7 @@ class _Slabs:
 
     def fit(self, rows: _Rows, chosen: Mask, which: Mask) -> None:
         """Turn some planes to the (Q, K) points chosen: total least squares."""
-        counts = np.count_nonzero(chosen, axis=1)[:, None]
+        counts = chosen.sum(axis=1)[:, None]
         weighted = rows.xyz * chosen[:, None]
         means = weighted.sum(axis=2, dtype=np.float64) / counts
         about_rough = weighted @ rows.xyz.transpose(0, 2, 1) / counts[..., None]
@@ -197,7 +196,7 @@ def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
         half = _medians(off, some.there & (off <= slabs.gates[going][:, None]))
         slabs.halves[going] = np.where(np.isnan(half), slabs.gates[going], half)
         nearest = some.there & (off <= slabs.halves[going][:, None])
-        enough = np.count_nonzero(nearest, axis=1) >= 3
+        enough = nearest.sum(axis=1) >= 3
         changed = enough & _differ(nearest, chosen[going], restless)
         going[going] = changed
         if not changed.any():
@@ -215,7 +214,7 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
         some = rows.some(going)
         thickness = np.maximum(slabs.halves[going], THINNEST)[:, None]
         near = some.there & (slabs.off(some, going) <= thickness)
-        slabs.found[going] = enough = np.count_nonzero(near, axis=1) >= 3
+        slabs.found[going] = enough = near.sum(axis=1) >= 3
         changed = enough & _differ(near, chosen[going], restless)
         going[going] = changed
         some, chosen[going] = some.some(changed), near[changed]
@@ -226,8 +225,8 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
 
 def _differ(chosen: Mask, before: Mask, share: float) -> Mask:
     """Return (P,) whether more than a share of the points that a plane has chosen are new."""
-    changed = np.count_nonzero(chosen != before, axis=1)
-    return np.asarray(changed > share * np.count_nonzero(chosen, axis=1))
+    changed = (chosen != before).sum(axis=1)
+    return np.asarray(changed > share * chosen.sum(axis=1))
 
 
 def _medians(values: Floats, which: Mask) -> Floats:
@@ -236,7 +235,7 @@ def _medians(values: Floats, which: Mask) -> Floats:
         return np.array([np.median(values[which]) if which.any() else np.nan])
     # What is not chosen sorts to the end.
     ordered = np.sort(np.where(which, values, values.dtype.type(np.inf)), axis=1)
-    count = np.count_nonzero(which, axis=1)
+    count = which.sum(axis=1)
     row = np.arange(len(values))
     middle = (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2]) / 2
     return np.where(count > 0, middle, np.nan)

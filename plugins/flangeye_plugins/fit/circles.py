@@ -52,23 +52,25 @@ def fit_concentric(points: Floats, ring: NDArray[np.intp], start: Circles, scale
         scale: Distance at which a point's weight is a half [m].
     """
     circles, residual = start, circle_residuals(start, points, ring)
+    loss = cauchy_loss(residual, scale)
     for _ in range(50):
-        jacobian = circle_jacobian(circles, points, ring)
-        for bend in (cauchy_curvature(residual, scale), cauchy_weights(residual, scale)):
-            step = _step(jacobian, residual, bend, scale)
+        jacobian, weights = circle_jacobian(circles, points, ring), cauchy_weights(residual, scale)
+        slope = jacobian.T @ (weights * residual)
+        for bend in (cauchy_curvature(residual, scale), weights):
+            step = _step(jacobian, slope, bend)
             moved = Circles(circles.centre + step[:2], circles.radii + step[2:])
             after = circle_residuals(moved, points, ring)
-            if cauchy_loss(after, scale) < cauchy_loss(residual, scale):
+            reached = cauchy_loss(after, scale)
+            if reached < loss:
                 break
-        circles, residual = moved, after
+        circles, residual, loss = moved, after, reached
         if np.abs(step).max() < 1e-8:
             break
     return circles
 
 
-def _step(jacobian: Floats, residual: Floats, bend: Floats, scale: float) -> Floats:
+def _step(jacobian: Floats, slope: Floats, bend: Floats) -> Floats:
     """Return the step down the loss's slope where its residuals' curvatures are ``bend`` (N,)."""
-    slope = jacobian.T @ (cauchy_weights(residual, scale) * residual)
     damping = DAMPING * np.eye(len(slope))
     return np.asarray(-np.linalg.solve((jacobian.T * bend) @ jacobian + damping, slope))
 
