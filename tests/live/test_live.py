@@ -67,6 +67,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
     assert result["status"] == "verified"
     assert result["truth"]["rms_over_workspace"] < 1e-3
     assert [o["id"] for o in result["observations"]] == cell.captures("again")
+    assert 0 < result["timing"]["0.acquire.live"]["idle"] < 1
 
 
 TIP = np.array([0.0, 0.0, 0.15])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import io
 import json
 import re
 from collections.abc import Callable
@@ -11,15 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from flangeye import FlangeyeError
+from flangeye.cli.terminal import print_result
 from flangeye.log.read import RunLog, read_run
 from flangeye.report import write_report
-from flangeye.report.account import set_aside_of, timings_of, without_numbers
+from flangeye.report.account import idle_of, set_aside_of, timings_of, without_numbers
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.report.units import degrees, duration, millimetres
+from flangeye.result import StageTiming
 
 Make = Callable[..., RunLog]
 
@@ -160,6 +164,16 @@ def test_timing_is_in_the_order_of_the_recipe(make_run: Make) -> None:
         "0.acquire.simulated", "1.segment.flange", "2.fit.rim", "3.solve.svd", "4.verify.holdout",
     ]  # fmt: skip
     assert found["0.acquire.simulated"] == ("1.20 s", 12, "100 ms")
+
+
+def test_an_arm_that_waited_says_how_long(make_run: Make) -> None:
+    facts = facts_of(make_run())
+    assert idle_of(facts) == ""
+    facts.result.timing["0.acquire.live"] = StageTiming(seconds=9.0, calls=3, idle=0.123)
+    assert idle_of(facts) == "12.3%"
+    out = io.StringIO()
+    print_result(Console(file=out, width=120), facts.result)
+    assert "  arm idle           12.3% of its session" in out.getvalue()
 
 
 def test_notes_provenance_and_recipe_are_there(make_run: Make) -> None:

@@ -191,6 +191,7 @@ def test_stopwatch_charges_each_step_its_own_time(execute: Callable[..., Any]) -
         "0.acquire.toy", "1.segment.toy", "2.fit.toy", "3.solve.toy", "4.verify.toy",
     }  # fmt: skip
     assert result.timing["1.segment.toy"].calls == 6
+    assert all(spent.idle is None for spent in result.timing.values())
 
 
 @pytest.mark.parametrize("recorded", [False, True])

@@ -94,6 +94,7 @@ def print_result(console: Console, result: Result) -> None:
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
         lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
     lines += _errors(result)
+    lines += _idle(result)
     lines += _answers(result)
     lines += _seam(result)
     lines += _weld(result)
@@ -192,6 +193,11 @@ def _correction(found: CorrectionResult | None) -> str:
     if found and found.field:
         parts.append(f"a smooth field of {len(found.field.weights)} weights")
     return f"{' and '.join(parts)}; in calibration.yaml"
+
+
+def _idle(result: Result) -> list[str]:
+    shares = [spent.idle for spent in result.timing.values() if spent.idle is not None]
+    return [f"  arm idle           {share:.1%} of its session" for share in shares]
 
 
 def _seam(result: Result) -> list[str]:

@@ -11,7 +11,7 @@ from flangeye.files.bundled import VERSION
 from flangeye.files.written import write_whole
 from flangeye.log.read import RunLog
 from flangeye.plugin.stage import Stage
-from flangeye.report.account import provenance_of, set_aside_of, timings_of
+from flangeye.report.account import idle_of, provenance_of, set_aside_of, timings_of
 from flangeye.report.cell import cell_drawing
 from flangeye.report.checks import drawings_of
 from flangeye.report.clouds import cloud_panels
@@ -93,6 +93,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "weld": weld_drawing(facts),
         "set_aside": set_aside_of(facts),
         "timings": timings_of(facts),
+        "idle": idle_of(facts),
         "provenance": provenance_of(facts),
         "version": VERSION,
     }

@@ -224,6 +224,10 @@ class StageTiming(_Part):
 
     seconds: float
     calls: int
+    idle: float | None = Field(
+        None,
+        description="Share of a live session in which the arm stood while nothing was exposed.",
+    )
 
 
 class Provenance(_Part):

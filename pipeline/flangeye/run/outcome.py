@@ -122,7 +122,7 @@ def _robots(recipe: Recipe) -> tuple[Layout, Arm | None]:
 
 def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:
     return {
-        label: r.StageTiming(seconds=seconds, calls=watch.calls[label])
+        label: r.StageTiming(seconds=seconds, calls=watch.calls[label], idle=watch.idle.get(label))
         for label, seconds in sorted(watch.seconds.items())
     }
 

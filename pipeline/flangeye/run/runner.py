@@ -153,6 +153,7 @@ class Runner:
         """Let go of the source at once: a solver that has enough stops the arm."""
         if self._captures is not None:
             self._captures.close()
+            self._watch.idle[self._steps("acquire")[0].label] = self._captures.idle
 
     def _fitted(self, stream: t.Captures) -> Iterator[t.Observation]:
         acquire = self._steps("acquire")[0]

@@ -8,11 +8,18 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Exclusive time per label: while an inner step runs, the outer one stands still."""
+    """Exclusive time per label: while an inner step runs, the outer one stands still.
+
+    Attributes:
+        seconds: By label.
+        calls: By label.
+        idle: By label, share of the time in which an arm had nothing to do; None without an arm.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.calls: dict[str, int] = {}
+        self.idle: dict[str, float | None] = {}
         self._running: list[str] = []
         self._since = 0.0
 

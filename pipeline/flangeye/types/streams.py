@@ -73,6 +73,11 @@ class Captures(Stream[Capture | Rejection]):
     def __iter__(self) -> Iterator[Capture | Rejection]:
         return self._items
 
+    @property
+    def idle(self) -> float | None:
+        """Share of the time in which an arm stood while nothing was exposed; None without one."""
+        return None
+
     def close(self) -> None:
         """Tell the source that nothing more is wanted: a generator's ``finally`` runs now."""
         if isinstance(self._items, Generator):

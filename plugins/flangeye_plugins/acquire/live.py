@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated
 
@@ -53,6 +53,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.units import Angle, JointPosition, Length, param
+from flangeye_plugins.acquire.idle import Idle
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 HOW_TO_MOVE = "dry run, nothing moved; add --move to execute"
@@ -218,7 +219,12 @@ class LiveCaptures(Captures):
     def __init__(self, session: LiveSession, source: Source, release: ExitStack) -> None:
         super().__init__(session.captures(), source, session.itinerary.total)
         session.itinerary.outcomes = self.outcomes
-        self._release = release
+        self._session, self._release = session, release
+
+    @property
+    def idle(self) -> float | None:
+        """Share of the session in which the arm stood while nothing was exposed."""
+        return self._session.idle.share
 
     def close(self) -> None:
         """Stop the arm; let go of arm and scanner."""
@@ -237,6 +243,7 @@ class LiveSession:
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
         stage_log: Hears where the arm goes next, and why there.
+        idle: How long the arm had nothing to do.
     """
 
     itinerary: Itinerary
@@ -245,6 +252,7 @@ class LiveSession:
     moved: float
     done: frozenset[str]
     stage_log: StageLog
+    idle: Idle = field(default_factory=Idle)
 
     def captures(self) -> Iterator[Capture | Rejection]:
         """Take the captures; while one is transferred and fitted the arm is under way again."""
@@ -257,21 +265,23 @@ class LiveSession:
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
             self.stage_log("next", {"id": stop.id, "why": stop.pose.why})
+            self.idle.leaves(time.time_ns())
             self.arm.go(way)
             if taken:
                 yield taken()
-            self.arm.wait()
-            taken = self._expose(stop)
+            taken = self._expose(stop, self.arm.wait().time_ns)
         if taken:
             yield taken()
 
-    def _expose(self, stop: Stop) -> Callable[[], Capture | Rejection]:
+    def _expose(self, stop: Stop, arrived_ns: int) -> Callable[[], Capture | Rejection]:
         """Expose at a stop; what is returned waits for the data."""
         began = time.time_ns()
         try:
             transfer = self.scanner.expose()
         except FrameDropped as dropped:
             return partial(_rejected, stop, str(dropped))
+        finally:
+            self.idle.exposed(arrived_ns, began, time.time_ns())
         return partial(self._capture, stop, transfer, self.arm.during(began, time.time_ns()))
 
     def _capture(

@@ -7,6 +7,7 @@ import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.motion.supervision import Sample
+from flangeye_plugins.acquire.idle import Idle
 from flangeye_plugins.acquire.live import movement, within
 
 
@@ -37,3 +38,14 @@ def test_movement_counts_shifts_and_turns() -> None:
     assert movement(samples(0, 1, 2)) == 0.0
     assert movement(samples(0, 1, 2, move=1e-4)) == pytest.approx(2e-4)
     assert movement(samples(0, 1, 2, turn=1e-3)) == pytest.approx(2e-4, rel=1e-3)
+
+
+def test_an_arm_is_idle_while_it_stands_and_nothing_is_exposed() -> None:
+    idle = Idle()
+    assert idle.share is None
+    idle.leaves(100)
+    assert idle.share is None
+    idle.exposed(110, 112, 115)  # what was computed on the way took 2 too long
+    idle.leaves(118)  # 3 were spent on choosing where to go
+    idle.exposed(130, 120, 150)  # another clock may tell the arrival a little late
+    assert idle.share == 5 / 50
