@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -264,6 +265,66 @@ def test_arrays_are_read_as_their_names_say(folder: Path, made: Callable[[Path],
     assert np.allclose([r.camera_T_target for r in recorded], SEEN, atol=1e-9)
 
 
+def transform(pose):
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return {"translation": dict(zip("xyz", map(float, pose[:3, 3]), strict=True)),
+            "rotation": dict(zip("xyzw", map(float, turn), strict=True))}  # fmt: skip
+
+
+def rows_of(poses, kind):
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    turns = {"vector": turns.as_rotvec, "kuka": lambda: turns.as_euler("ZYX", degrees=True)}[kind]()
+    return np.hstack([(1.0 if kind == "vector" else 1e3) * poses[:, :3, 3], turns])
+
+
+def yaml_of_two_transforms(folder):
+    pairs = [{"optical": transform(s), "robot": transform(a)}
+             for a, s in zip(ARM, SEEN, strict=True)]  # fmt: skip
+    (folder / "samples.yaml").write_text(yaml.safe_dump(pairs))
+
+
+def a_json_file_each(folder):
+    for k, (a, s) in enumerate(zip(ARM, SEEN, strict=True)):
+        text = json.dumps({"robot": transform(a), "marker2camera": s.tolist(), "timestamp": k})
+        (folder / f"{k:03}.json").write_text(text)
+
+
+def json_lines_with_opencv_vectors(folder):
+    seen = Rotation.from_matrix(SEEN[:, :3, :3]).as_rotvec()
+    lines = [json.dumps({"pose": a.ravel().tolist(), "rvec": r.tolist(), "tvec": s[:3, 3].tolist()})
+             for a, r, s in zip(ARM, seen, SEEN, strict=True)]  # fmt: skip
+    (folder / "log.jsonl").write_text("\n".join(lines))
+
+
+def a_kukas_program(folder):
+    text = ["DECL E6POS XP={{X {},Y {},Z {},A {},B {},C {}}}".format(*row)
+            for row in rows_of(ARM, "kuka")]  # fmt: skip
+    (folder / "targets.dat").write_text("\n".join(text))
+    np.savetxt(folder / "seen.csv", SEEN.reshape(-1, 16), delimiter=",")
+
+
+def what_a_ur_prints(folder):
+    text = [f"p[{', '.join(map(repr, row.tolist()))}]" for row in rows_of(ARM, "vector")]
+    (folder / "a.txt").write_text("\n".join(text))
+    np.savetxt(folder / "b.csv", SEEN.reshape(-1, 16), delimiter=",")
+
+
+@pytest.mark.parametrize(
+    "made",
+    [yaml_of_two_transforms, a_json_file_each, json_lines_with_opencv_vectors, a_kukas_program,
+     what_a_ur_prints],
+)  # fmt: skip
+def test_records_and_programs_are_read_as_they_say(
+    folder: Path, made: Callable[[Path], None]
+) -> None:
+    made(folder)
+    init("--camera", "flange")
+    first = recipe(folder).steps[0].params
+    recorded = first.reader(first.path).recordings
+    assert np.allclose([r.base_T_flange for r in recorded], ARM, atol=1e-9)
+    assert np.allclose([r.camera_T_target for r in recorded], SEEN, atol=1e-9)
+
+
 def test_each_capture_may_have_a_folder_of_its_own(folder: Path) -> None:
     clouds(folder)
     for k, pose in enumerate(ARM):
@@ -342,6 +403,17 @@ def arrays_of_the_arm(folder):
     np.save(folder / "robot.npy", ARM)
 
 
+def two_tables_of_nobody(folder):
+    for name in ("a.csv", "b.csv"):
+        table(folder, "x,y,z,qx,qy,qz,qw", quaternion, name)
+
+
+def two_poses_of_nobody(folder):
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    heading = ",".join(f"{group}_{name}" for group in "ab" for name in names)
+    table(folder, heading, lambda *pose: quaternion(*pose) * 2)
+
+
 @pytest.mark.parametrize(
     ("made", "words", "line"),
     [
@@ -367,6 +439,12 @@ def arrays_of_the_arm(folder):
         (lambda folder: table(folder, "x,y,z,qx,qy,qz,qw", quaternion), [],
          "rec/log.csv: has poses of the arm, but there are no scans beside it, and no "
          "columns of what the camera saw; add --target-columns NAMES, or put the scans there"),
+        (lambda folder: (folder / "poses.xlsx").write_text("x"), [],
+         "rec: poses.xlsx is a table that is not read; save it as .csv"),
+        (two_tables_of_nobody, [], "which table is the arm's (a.csv, b.csv): nothing tells; add "
+         "--table a.csv"),
+        (two_poses_of_nobody, [], "rec/log.csv: which columns are the arm's pose is not plain from "
+         "a_x, a_y, a_z, a_qx, a_qy, a_qz, a_qw, b_x, b_y, b_z, b_qx, b_qy, b_qz, b_qw; add --col"),
         (lambda folder: (folder / "notes.md").write_text("x"), [],
          "rec: holds no scans and no table of poses; rec: no reader knows this layout"),
         (lambda folder: None, [],

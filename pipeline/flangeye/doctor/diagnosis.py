@@ -251,7 +251,7 @@ _DEFAULT = ("arms", "both")
 
 OR_ELSE = "  # or, if it is not: "
 """Between two lines of which a person has to choose one."""
-_LINE = re.compile(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}")
+_LINE = re.compile(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}(  # .*)?")
 _NAME = re.compile(r"[A-Za-z_][\w.-]*(?: [\w.-]+)*")
 _QUANTITY = re.compile(r"-?[\d.]+ [A-Za-z]+")
 

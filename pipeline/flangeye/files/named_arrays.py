@@ -19,6 +19,7 @@ from flangeye.files.children import python_command
 from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import MAX_TEXT, read_regular, read_text
+from flangeye.files.tables import natural
 from flangeye.types import Floats
 
 MAX_MATLAB = 1_000_000
@@ -34,7 +35,6 @@ _IN_XML = re.compile(
     r"<(?P<name>[\w-]+) type_id=\"opencv-matrix\">\s*<rows>(?P<rows>\d{1,9})</rows>\s*"
     r"<cols>(?P<cols>\d{1,9})</cols>\s*<dt>[a-z]</dt>\s*<data>(?P<data>[^<]*)</data>"
 )
-_DIGITS = re.compile(r"(\d+)")
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -51,7 +51,7 @@ def arrays_at(folder: Path, place: str) -> tuple[list[Path], list[tuple[str, Flo
         StageError: A file cannot be read, or holds no such array.
     """
     name, _, key = place.partition(":")
-    files = sorted((p for p in folder.glob(name) if p.is_file()), key=lambda p: _natural(str(p)))
+    files = sorted((p for p in folder.glob(name) if p.is_file()), key=lambda p: natural(str(p)))
     if not files:
         raise NotThisLayout(f"{folder}: holds no {name}")
     found: list[tuple[str, Floats]] = []
@@ -63,13 +63,8 @@ def arrays_at(folder: Path, place: str) -> tuple[list[Path], list[tuple[str, Flo
     return files, found
 
 
-def _natural(text: str) -> list[tuple[int, str]]:
-    """Return a key that sorts pose_2 before pose_10."""
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in _DIGITS.split(text)]
-
-
 def _chosen(file: Path, arrays: dict[str, Floats], key: str) -> list[tuple[str, Floats]]:
-    names = sorted(arrays, key=_natural)
+    names = sorted(arrays, key=natural)
     pattern = re.compile(re.escape(key).replace(r"\*", ".*") or ".*")
     chosen = [name for name in names if pattern.fullmatch(name)]
     if not chosen or (not key and len(chosen) > 1):

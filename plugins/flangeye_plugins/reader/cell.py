@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.tables import Column, TextTable
+from flangeye.files.tables import Column, Table, files_at
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import (
     STILL_ANGLE,
@@ -125,14 +125,14 @@ class Moved:
 
     Attributes:
         name: Of what moves.
-        file: The table.
+        text: The table.
         values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
         keys: Of each row: the pose's number, its place in the table; None where it has a time.
         times: (N,) [s], or None.
     """
 
     name: str
-    file: Path
+    text: Table
     values: Floats
     keys: dict[str, int] | None
     times: Floats | None
@@ -143,7 +143,7 @@ class Seen:
     """What a camera recorded of a target: (4, 4), (3,) or a scan, None where it did not see it."""
 
     given: SightingsParams | ScansParams
-    text: TextTable
+    text: Table
     values: Sequence[Floats | Path | None]
     keys: dict[str, int] | None
     times: Floats | None
@@ -153,7 +153,7 @@ class Seen:
 def cell(path: Path, params: CellParams) -> Archive:
     """Read the tables of a cell: of what each controller reported, and of what each camera saw."""
     files = {given.file for given in params.sightings} | {given.file for given in params.scans}
-    if not any((path / file).is_file() for file in files):
+    if not any(files_at(path, file) for file in files):
         raise NotThisLayout(f"{path}: holds no {' or '.join(sorted(files))}")
     moved = [*_arms(path, params), *_axes(path, params)]
     seen = [*_sightings(path, params), *_scans(path, params)]
@@ -163,7 +163,8 @@ def cell(path: Path, params: CellParams) -> Archive:
         found, told = _joined(sightings, moved, params.join)
         recordings += found
         notes += told
-    read = list(dict.fromkeys([each.file for each in moved] + [each.text.file for each in seen]))
+    tables = [each.text for each in moved] + [each.text for each in seen]
+    read = list(dict.fromkeys(file for text in tables for file in text.files))
     layout = f"tables of a cell, {', '.join(table.name for table in read)}"
     return Archive(layout, path, recordings, read, None, notes)
 
@@ -173,27 +174,27 @@ def cell(path: Path, params: CellParams) -> Archive:
 
 def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
     for name, given in params.arms.items():
-        text = table_with_rows(folder / given.file)
+        text = table_with_rows(folder, given.file)
         found = readings_of(text, given, _taken(given))
         for row, value in enumerate(found.values):
             if value is None:
                 raise StageError(f"{text.where(row)}: has no pose of '{name}'")
         poses = np.array(found.values)
         poses = poses if given.pose == "base_T_flange" else inverted(poses)
-        yield Moved(name, text.file, poses, _keys(text, given.number, found.times), found.times)
+        yield Moved(name, text, poses, _keys(text, given.number, found.times), found.times)
 
 
 def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
     for name, given in params.axes.items():
-        text = table_with_rows(folder / given.file)
+        text = table_with_rows(folder, given.file)
         values = text.numbers([text.index(given.column)])[:, 0] * PER_UNIT[given.unit]
         times = times_of(text, given.time, given.time_unit)
-        yield Moved(name, text.file, values, _keys(text, given.number, times), times)
+        yield Moved(name, text, values, _keys(text, given.number, times), times)
 
 
 def _sightings(folder: Path, params: CellParams) -> Iterator[Seen]:
     for given in params.sightings:
-        text = table_with_rows(folder / given.file)
+        text = table_with_rows(folder, given.file)
         found = readings_of(text, given, _taken(given))
         values = found.values
         if given.pose == "target_T_camera" and given.rotation != POINT:
@@ -203,7 +204,7 @@ def _sightings(folder: Path, params: CellParams) -> Iterator[Seen]:
 
 def _scans(folder: Path, params: CellParams) -> Iterator[Seen]:
     for given in params.scans:
-        text = table_with_rows(folder / given.file)
+        text = table_with_rows(folder, given.file)
         names = text.texts(text.index(given.scan))
         for row, name in enumerate(names):
             if name and not (folder / name).is_file():
@@ -216,7 +217,7 @@ def _taken(given: OwnTableParams) -> list[Column]:
     return [] if given.number is None else [given.number]
 
 
-def _keys(text: TextTable, number: Column | None, times: Floats | None) -> dict[str, int] | None:
+def _keys(text: Table, number: Column | None, times: Floats | None) -> dict[str, int] | None:
     """Return where the row of each number is, or of each row where there are no numbers.
 
     Raises:
@@ -240,7 +241,7 @@ def _keys(text: TextTable, number: Column | None, times: Floats | None) -> dict[
 def _require_one_join(seen: Seen, moved: Sequence[Moved]) -> None:
     for each in moved:
         if (each.times is None) != (seen.times is None):
-            files = (seen.text.file, each.file)
+            files = (seen.text.file, each.text.file)
             timed, other = files if each.times is None else files[::-1]
             raise StageError(
                 f"{timed}: has times, and {other.name} has none; join all tables by time, or all "
@@ -261,8 +262,8 @@ def _by_number(seen: Seen, moved: Sequence[Moved]) -> Iterator[Recording]:
         for each in moved:
             if key not in (each.keys or {}):
                 raise StageError(
-                    f"{seen.text.where(row)}: pose {key} is not in {each.file.name}; every pose "
-                    f"needs its row of '{each.name}'"
+                    f"{seen.text.where(row)}: pose {key} is not in {each.text.file.name}; "
+                    f"every pose needs its row of '{each.name}'"
                 )
         at = {each.name: each.values[(each.keys or {})[key]] for each in moved}
         yield _recording(seen, key, seen.values[row], at)

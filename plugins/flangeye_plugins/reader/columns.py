@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import StageError
-from flangeye.files.tables import Column, TextTable, read_text_table
+from flangeye.files.tables import Column, Table, read_table
 from flangeye.types import Floats
 from flangeye_plugins.reader.written import WrittenParams
 
@@ -23,7 +23,8 @@ class ColumnsParams(WrittenParams):
 
     columns: tuple[Column, ...] = Field(
         (), description="Names in the heading, or numbers from 1, in the order of the convention: "
-        "position first; all that nothing else takes if not given.",
+        "position first; of JSON and YAML also a list's, by its own name; all that nothing else "
+        "takes if not given.",
     )  # fmt: skip
     time: Column | None = Field(None, description="Column of the time.")
     time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
@@ -32,24 +33,24 @@ class ColumnsParams(WrittenParams):
 class Readings(NamedTuple):
     """Poses or points of a table, None where cells are empty; their times [s], if given."""
 
-    file: Path
+    table: Table
     values: list[Floats | None]
     times: Floats | None
 
 
-def table_with_rows(file: Path) -> TextTable:
+def table_with_rows(folder: Path, name: str) -> Table:
     """Return a table that holds something.
 
     Raises:
         StageError: It cannot be read, or holds no rows.
     """
-    text = read_text_table(file)
+    text = read_table(folder, name)
     if not text.rows:
-        raise StageError(f"{file}: holds no poses")
+        raise StageError(f"{text.file}: holds no poses")
     return text
 
 
-def readings_of(own: TextTable, given: ColumnsParams, taken: Sequence[Column] = ()) -> Readings:
+def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) -> Readings:
     """Return the values of one thing in a table.
 
     Args:
@@ -63,24 +64,24 @@ def readings_of(own: TextTable, given: ColumnsParams, taken: Sequence[Column] = 
     other = [own.index(column) for column in (given.time, *taken) if column is not None]
     width = max(len(cells) for _, cells in own.rows)  # empty last cells are not counted
     free = [i for i in range(width) if i not in other]
-    columns = [own.index(column) for column in given.columns] or free
+    columns = own.indices(given.columns) or free
     values = [
         None if all(_is_empty(cells, c) for c in columns) else _value(own, row, columns, given)
         for row, (_, cells) in enumerate(own.rows)
     ]
-    return Readings(own.file, values, times_of(own, given.time, given.time_unit))
+    return Readings(own, values, times_of(own, given.time, given.time_unit))
 
 
 def _is_empty(cells: Sequence[str], column: int) -> bool:
     return column >= len(cells) or cells[column].lower() in ("", "nan")
 
 
-def _value(own: TextTable, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:
+def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:
     one = replace(own, rows=(own.rows[row],))
     return given.value(own.where(row), one.numbers(columns)[0])
 
 
-def times_of(text: TextTable, column: Column | None, unit: str) -> Floats | None:
+def times_of(text: Table, column: Column | None, unit: str) -> Floats | None:
     """Return the times of a column [s], None without one; they ascend.
 
     Raises:

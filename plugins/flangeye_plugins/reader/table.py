@@ -2,8 +2,10 @@
 
 CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
 commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
-the recipe names. YAML or JSON: ``{scan.ply: [numbers], …}``, or a list of ``{scan: scan.ply,
-pose: [numbers]}``. Without names the scans belong to the rows in the order of their names.
+the recipe names. JSON, JSON lines and YAML: ``{scan.ply: [numbers], …}``, or records such as
+``{scan: scan.ply, pose: {x: …}}``, each a row with dotted columns; or a file a pose, by a pattern
+of their names. Robot programs: a row each position. Without names the scans belong to the rows in
+the order of their names.
 
 What the camera measured may stand in the table in place of scans, as ``target``, and so may a
 second arm's pose, as ``second``; either in the same rows, or in a table of its own that is joined
@@ -12,10 +14,10 @@ by time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -24,7 +26,7 @@ from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import recording_of, scans_in
-from flangeye.files.tables import Column, TextTable, number_of
+from flangeye.files.tables import Column, Table, files_at, number_of
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, turning
 from flangeye.types import FLANGE, FLANGE2, Floats
@@ -38,9 +40,6 @@ from flangeye_plugins.reader.columns import (
 )
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
 from flangeye_plugins.reader.written import POINT
-from flangeye_plugins.reader.yaml_poses import numbers, read_document, value_at
-
-DOCUMENTS = (".yaml", ".yml", ".json")
 
 
 class OtherParams(ColumnsParams):
@@ -86,7 +85,9 @@ class TableParams(ColumnsParams):
     """The convention of the poses; nothing of it is guessed."""
 
     file: str = Field(
-        "poses.csv", description="The table's name: .yaml, .yml or .json, or text of any ending."
+        "poses.csv",
+        description="The table's name: .json, .jsonl, .yaml, or text of any ending; "
+        "or a pattern of files that hold a row each, poses/*.json.",
     )
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
         description="Whose pose it is: the flange's in the base, as controllers show, or inverse."
@@ -115,14 +116,12 @@ class Row(NamedTuple):
 @part("reader.table")
 def table(path: Path, params: TableParams) -> Archive:
     """Read a table of poses in the stated convention, with scans beside it or the target in it."""
-    folder, file = (path.parent, path) if path.is_file() else (path, path / params.file)
-    if not file.is_file():
-        raise NotThisLayout(f"{folder}: holds no {file.name}")
-    if file.suffix in DOCUMENTS:
-        return _of_rows(folder, file, _from_yaml(file), params)
-    text = table_with_rows(file)
+    folder, name = (path.parent, path.name) if path.is_file() else (path, params.file)
+    if not files_at(folder, name):
+        raise NotThisLayout(f"{folder}: holds no {name}")
+    text = table_with_rows(folder, name)
     if params.target is None:
-        archive = _of_rows(folder, file, _from_text(text, params), params)
+        archive = _of_rows(folder, text, _from_text(text, params), params)
         return _with_times(archive, text, params)
     return _measured(folder, text, params)
 
@@ -130,12 +129,13 @@ def table(path: Path, params: TableParams) -> Archive:
 # --- scans beside the table
 
 
-def _of_rows(folder: Path, file: Path, rows: Sequence[Row], params: TableParams) -> Archive:
+def _of_rows(folder: Path, text: Table, rows: Sequence[Row], params: TableParams) -> Archive:
     recordings = [
         recording_of(scans[0].stem, _arm_pose(row.where, row.numbers, params), scans)
-        for row, scans in zip(rows, _scans(folder, file, rows), strict=True)
+        for row, scans in zip(rows, _scans(folder, text.file, rows), strict=True)
     ]
-    return Archive(f"table, {file.name}", folder, recordings, [file], cloud_unit=params.cloud_unit)
+    layout = f"table, {text.file.name}"
+    return Archive(layout, folder, recordings, text.files, cloud_unit=params.cloud_unit)
 
 
 def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
@@ -143,7 +143,7 @@ def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
     return pose if params.pose == "base_T_flange" else inverted(pose)
 
 
-def _from_text(text: TextTable, params: TableParams) -> list[Row]:
+def _from_text(text: Table, params: TableParams) -> list[Row]:
     scan = _scan_column(text, params)
     columns = _columns(text, params, scan)
     names = [None] * len(text.rows) if scan is None else text.texts(scan)
@@ -151,29 +151,29 @@ def _from_text(text: TextTable, params: TableParams) -> list[Row]:
     return [Row(text.where(i), names[i], values[i]) for i in range(len(values))]
 
 
-def _scan_column(text: TextTable, params: TableParams) -> int | None:
+def _scan_column(text: Table, params: TableParams) -> int | None:
     if params.scan is not None:
         return text.index(params.scan)
     return 0 if number_of(text.rows[0][1][0]) is None and not params.columns else None
 
 
-def _columns(text: TextTable, params: TableParams, scan: int | None) -> list[int]:
+def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
     """Return where the arm's numbers are: where the recipe says, or whatever else is free."""
     if params.columns:
-        return [text.index(column) for column in params.columns]
+        return text.indices(params.columns)
     others = [o for o in (params.target, params.second) if o and o.file is None]
-    taken = {text.index(c) for other in others for c in other.columns}
+    taken = {at for other in others for at in text.indices(other.columns)}
     times = [o.time for o in (params, *others) if o.time is not None]
     taken |= {text.index(time) for time in times} | ({scan} if scan is not None else set())
     return [i for i in range(len(text.rows[0][1])) if i not in taken]
 
 
-def _with_times(archive: Archive, text: TextTable, params: TableParams) -> Archive:
+def _with_times(archive: Archive, text: Table, params: TableParams) -> Archive:
     """Return the archive with its times, and the second arm of the same rows."""
     times = times_of(text, params.time, params.time_unit)
     second = _second(archive.root, text, params)
-    if second is not None and second.file != text.file:
-        raise StageError(f"{second.file}: a second arm beside scans stands in the same table")
+    if second is not None and second.table is not text:
+        raise StageError(f"{second.table.file}: a second arm beside scans stands in the same table")
     recordings = [
         replace(
             recording,
@@ -188,29 +188,30 @@ def _with_times(archive: Archive, text: TextTable, params: TableParams) -> Archi
 # --- the target in the table
 
 
-def _measured(folder: Path, text: TextTable, params: TableParams) -> Archive:
+def _measured(folder: Path, text: Table, params: TableParams) -> Archive:
     """Return poses with what was measured there, row by row or joined by time."""
     rows = _from_text(text, params)
     poses = np.array([_arm_pose(row.where, row.numbers, params) for row in rows])
     target = _target(folder, text, params)
     second = _second(folder, text, params)
-    files = list(dict.fromkeys([text.file, target.file, *([second.file] if second else [])]))
+    tables = [text, target.table, *([second.table] if second else [])]
+    files = list(dict.fromkeys(file for table in tables for file in table.files))
     times = times_of(text, params.time, params.time_unit)
-    if times is not None and target.times is not None and target.file != text.file:
+    if times is not None and target.times is not None and target.table is not text:
         recordings, notes = _joined((times, poses), target, second, params)
     else:
         for other in (target, *([second] if second else [])):
             _same_rows(text, other)
         recordings, notes = _row_by_row(times, poses, target, second), []
-    layout = f"table, {', '.join(file.name for file in files)}"
+    layout = f"table, {', '.join(dict.fromkeys(t.file.name for t in tables))}"
     return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
 
 
-def _same_rows(text: TextTable, other: Readings) -> None:
+def _same_rows(text: Table, other: Readings) -> None:
     if len(other.values) != len(text.rows):
         raise StageError(
-            f"{other.file}: has {len(other.values)} rows, {text.file.name} has {len(text.rows)}; "
-            "give each a time: to join them by it"
+            f"{other.table.file}: has {len(other.values)} rows, {text.file.name} has "
+            f"{len(text.rows)}; give each a time: to join them by it"
         )
 
 
@@ -237,7 +238,7 @@ def _joined(
     try:
         pairs, notes = pair(arm, events, signals, params.join)
     except StageError as error:
-        raise StageError(f"{target.file}: {error}") from None
+        raise StageError(f"{target.table.file}: {error}") from None
     recordings = [
         replace(
             _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time),
@@ -275,7 +276,7 @@ def _poses(pose: Floats, second: Floats | None) -> dict[str, Floats]:
     return {FLANGE: pose} if second is None else {FLANGE: pose, FLANGE2: second}
 
 
-def _target(folder: Path, text: TextTable, params: TableParams) -> Readings:
+def _target(folder: Path, text: Table, params: TableParams) -> Readings:
     given = params.target
     assert given is not None  # noqa: S101  for type checkers: there is one, or nobody asks
     found = readings_of(_own(folder, text, given), given)
@@ -284,7 +285,7 @@ def _target(folder: Path, text: TextTable, params: TableParams) -> Readings:
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
 
 
-def _second(folder: Path, text: TextTable, params: TableParams) -> Readings | None:
+def _second(folder: Path, text: Table, params: TableParams) -> Readings | None:
     if params.second is None:
         return None
     found = readings_of(_own(folder, text, params.second), params.second)
@@ -293,31 +294,12 @@ def _second(folder: Path, text: TextTable, params: TableParams) -> Readings | No
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
 
 
-def _own(folder: Path, text: TextTable, given: OtherParams) -> TextTable:
+def _own(folder: Path, text: Table, given: OtherParams) -> Table:
     """Return the table that has something: its own, or the same."""
-    return text if given.file is None else table_with_rows(folder / given.file)
+    return text if given.file is None else table_with_rows(folder, given.file)
 
 
-# --- YAML, and the scans of rows
-
-
-def _from_yaml(file: Path) -> list[Row]:
-    document = read_document(file)
-    data: Any = document.data
-    if isinstance(data, Mapping):
-        return [
-            Row(f"{file}:{document.line((scan,))}", str(scan), numbers(f"{file}: {scan}", values))
-            for scan, values in data.items()
-        ]
-    if not isinstance(data, list):
-        raise StageError(f"{file}: expected {{scan.ply: [numbers], …}} or a list of poses")
-    rows = []
-    for index, entry in enumerate(data):
-        where = f"{file}:{document.line((index,))}"
-        values = entry if isinstance(entry, list) else value_at(entry, where, "pose")
-        scan = None if isinstance(entry, list) else entry.get("scan")
-        rows.append(Row(where, scan, numbers(where, values)))
-    return rows
+# --- the scans of rows
 
 
 def _scans(folder: Path, file: Path, rows: Sequence[Row]) -> list[list[Path]]:

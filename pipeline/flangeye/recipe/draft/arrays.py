@@ -1,21 +1,17 @@
-"""Arrays of a folder that may be poses: where they are, and what their names say.
-
-A name of two frames says what is moved by it, and which way round: ``gripper2base`` is a pose of
-the arm, ``camera_T_target``, ``T_cam_board`` and ``cHt`` are the target's as the camera sees it.
-"""
+"""Arrays of a folder that may be poses: where they are, and what their names say."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.named_arrays import arrays_of
 from flangeye.recipe.draft.convention import SHAPES
-from flangeye.recipe.draft.headings import SEEN
+from flangeye.recipe.draft.frames import frames_in, is_inverse, role_in
 from flangeye.types import Floats
 
 FILES = (".npz", ".npy", ".mat", ".xml", ".yml", ".yaml", ".json")
@@ -27,23 +23,6 @@ FEWEST = 3
 """Poses; so many arrays or files that are named alike are one list of them."""
 FULL, ROTATIONS = ((4, 4), (3, 4)), ((3, 3),)
 
-_FRAMES: Mapping[str, str] = {
-    name: frame
-    for frame, names in {
-        "base": "b base robotbase",
-        "flange": "f g e h flange gripper hand ee eef effector endeffector tool tcp",
-        "camera": "c cam camera sensor scanner",
-        "target": "o t m target object obj board marker tag pattern checkerboard chessboard",
-        "world": "w world",
-    }.items()
-    for name in names.split()
-}
-_ARMS = ({"base", "flange"}, {"world", "flange"})
-_SIGHTS = ({"camera", "target"}, {"camera", "world"})
-_TO = re.compile(r"(?<![a-zA-Z])([a-zA-Z]+)(?:2|_to_|To)([a-zA-Z]+)")
-_IN = re.compile(r"(?<![a-zA-Z])([a-z]+)_?[TH]_?([a-z]+)(?![a-zA-Z])")
-_OF = re.compile(r"(?<![a-zA-Z])[TH]_([a-z]+)_([a-z]+)")
-_ARM = re.compile(r"robot|arm|gripper|flange|hand|tool|tcp|effector|(?<![a-z])ee(?![a-z])")
 _PART = re.compile(r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])")
 
 
@@ -71,33 +50,17 @@ class PoseArrays:
     @property
     def role(self) -> str | None:
         """``arm`` or ``target``, as the name says; None where it does not."""
-        if self.frames is not None:
-            return "target" if "camera" in self.frames else "arm"
-        name = self.at.lower()
-        found = {"target": SEEN.search(name), "arm": _ARM.search(name)}
-        roles = [role for role, match in found.items() if match]
-        return roles[0] if len(roles) == 1 else None
+        return role_in(self.at)
 
     @property
     def frames(self) -> tuple[str, str] | None:
         """Frames A and B of A_T_B, as the name says."""
-        name = self.at.rpartition(":")[2]
-        to = _TO.search(name)
-        match = to or _IN.search(name) or _OF.search(name)
-        if match is None:
-            return None
-        first, second = (_FRAMES.get(word.lower()) for word in match.groups())
-        if first is None or second is None:
-            return None
-        pair = (second, first) if to else (first, second)
-        return pair if set(pair) in _ARMS or set(pair) in _SIGHTS else None
+        return frames_in(self.at.rpartition(":")[2])
 
     @property
     def inverse(self) -> bool:
         """Whether the name says flange_T_base, or target_T_camera."""
-        return self.frames is not None and (
-            self.frames[0] == "flange" or self.frames[1] == "camera"
-        )
+        return self.frames is not None and is_inverse(self.frames)
 
 
 # --- where they are
@@ -107,7 +70,7 @@ def pose_arrays(folder: Path) -> list[PoseArrays]:
     """Return what a folder, and the folders in it, hold of arrays that may be poses."""
     found = [
         arrays
-        for place, files in _places(folder)
+        for place, files in places(folder, (*FILES, *TEXTS))
         for arrays in (
             _in_files(folder, place, files) if len(files) > 1 else _in_file(place, *files)
         )
@@ -116,11 +79,11 @@ def pose_arrays(folder: Path) -> list[PoseArrays]:
     return [a for a in found if a.count in counts]
 
 
-def _places(folder: Path) -> Iterator[tuple[str, list[Path]]]:
+def places(folder: Path, suffixes: Sequence[str]) -> Iterator[tuple[str, list[Path]]]:
     """Yield files as a recipe names them, those that are named alike under one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
     for file in sorted([*folder.glob("*"), *folder.glob("*/*")]):
-        if file.suffix.lower() in (*FILES, *TEXTS) and file.is_file():
+        if file.suffix.lower() in suffixes and file.is_file():
             alike = re.sub(r"\d+$", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
     single = [file for files in groups.values() if len(files) < FEWEST for file in files]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from flangeye.files.tables import Column, TextTable, number_of
+from flangeye.files.tables import Column, Table, number_of
+from flangeye.recipe.draft.frames import SEEN, role_in
 
 POSITION = ("x", "y", "z")
 ROTATIONS: Mapping[tuple[str, ...], str | None] = {
@@ -18,19 +20,29 @@ ROTATIONS: Mapping[tuple[str, ...], str | None] = {
     ("w", "p", "r"): "fanuc",
     ("a", "b", "c"): "kuka",
     ("o", "a", "t"): "kawasaki",
+    ("rx", "ry", "rz", "rw"): "xyzw",
+    ("vx", "vy", "vz"): "vector",
     ("rx", "ry", "rz"): None,
 }
 """Names of a rotation's columns in the order of its convention; None where several have them."""
 
 _LENGTHS, _ANGLES, _TIMES = ("m", "mm"), ("rad", "deg"), ("s", "ms", "us", "ns")
-_PLACES = ("position", "pos", "translation", "trans", "t", "p")
-_TURNS = ("orientation", "ori", "quaternion", "quat", "rotation", "rot", "q", "r")
+_PLACES = ("position", "pos", "translation", "trans", "tvec", "t", "p")
+_TURNS: Mapping[str, str] = {
+    "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
+    "rotation": "r", "rot": "r", "r": "r", "rvec": "v", "rotvec": "v",
+}  # fmt: skip
+"""Names of rotations, and what the names of their columns begin with."""
+_OPENCV = ("rvec", "tvec")
+"""What OpenCV calls the pose of what a camera sees."""
 _SCANS = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
 _CLOCKS = ("time", "timestamp", "stamp", "secs", "sec", "t")
 _TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _ROUNDED = 1e-3
 """By how much the length of a written quaternion may differ from 1."""
-SEEN = re.compile(r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object")
+_POSES = (6, 7, 12, 16)
+"""Numbers of a list that is a whole pose."""
+_ENTRY = re.compile(r"(.+?)(?:\.\d+)+")
 _MATRIX = re.compile(r"[a-z_]*\d[_ ]?\d|[a-z]*\d{1,2}")
 
 
@@ -40,11 +52,15 @@ class Group:
 
     Attributes:
         columns: Name in the heading by what it is: x, y, z, qx, …
+        whole: Name of a list that is a whole pose.
+        many: Numbers in that list.
         length: Unit that a name states, if any does.
         angle: The same for angles.
     """
 
     columns: dict[str, Column] = field(default_factory=dict)
+    whole: str | None = None
+    many: int = 0
     length: str | None = None
     angle: str | None = None
 
@@ -53,8 +69,20 @@ class Group:
         """Names of the rotation's columns, in order; None where there is none."""
         return next((names for names in ROTATIONS if set(names) <= set(self.columns)), None)
 
+    @property
+    def has_position(self) -> bool:
+        """Whether it holds a point or a pose."""
+        return self.whole is not None or set(POSITION) <= set(self.columns)
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it holds a rotation too."""
+        return self.whole is not None or self.rotation is not None
+
     def in_order(self) -> list[Column]:
         """Return the columns of the pose, or of the point, position first."""
+        if self.whole is not None:
+            return [self.whole]
         return [self.columns[name] for name in (*POSITION, *(self.rotation or ()))]
 
 
@@ -77,30 +105,58 @@ class Headings:
     time_unit: str | None = None
 
 
-def headings_of(table: TextTable) -> Headings:
+def headings_of(table: Table) -> Headings:
     """Return what a table's columns hold, as far as their names tell."""
     if not table.heading:
         return _of_trajectory(table)
     found = Headings()
     groups: dict[str, Group] = {}
+    sizes = list_sizes(table.heading)
     for index, name in enumerate(table.heading):
-        words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.lower().replace("°", "deg")) if w]
+        words = _words(name, sizes)
         cell = table.rows[0][1][index]
         if number_of(cell) is None:
             if (words and words[-1] in _SCANS) or (table.file.parent / cell).is_file():
                 found.scan = name
+        elif list_name(name) in sizes and sizes[list_name(name)] in _POSES:
+            listed = list_name(name)
+            groups["_".join(words)] = Group(whole=listed, many=sizes[listed])
         elif words and not _is_time(found, name, words):
             _group(groups, name, words)
-    whole = {prefix: g for prefix, g in groups.items() if set(POSITION) <= set(g.columns)}
+    whole = {prefix: g for prefix, g in groups.items() if g.has_position}
     seen = [prefix for prefix in whole if SEEN.search(prefix)]
-    arms = [prefix for prefix in whole if prefix not in seen and whole[prefix].rotation]
+    arms = [prefix for prefix in whole if prefix not in seen and whole[prefix].is_pose]
+    named = [prefix for prefix in arms if not prefix or role_in(prefix) == "arm"]
+    arms = named or arms
     others = seen or [prefix for prefix in whole if prefix not in arms[:1]]
-    found.arm = whole[arms[0]] if arms else None
+    found.arm = whole[arms[0]] if named or len(arms) == 1 else None
     found.target = whole[others[0]] if others else None
     return found
 
 
-def _of_trajectory(table: TextTable) -> Headings:
+def list_sizes(names: Sequence[str]) -> Counter[str]:
+    """Return how many of the columns are entries of each list: 16 of ``pose`` in ``pose.3.3``."""
+    return Counter(listed for name in names if (listed := list_name(name)))
+
+
+def list_name(name: str) -> str:
+    """Return the list that a column is an entry of; empty if it is none."""
+    match = _ENTRY.fullmatch(name)
+    return match[1] if match else ""
+
+
+def _words(name: str, sizes: Mapping[str, int]) -> list[str]:
+    """Return the words of a column's name; entries of short lists are called x, y, z and w."""
+    listed = list_name(name)
+    size = sizes[listed] if listed else 0
+    if size in (3, 4):
+        name = f"{listed}.{'xyzw'[int(name.rpartition('.')[2]) % 4]}"
+    elif size in _POSES:
+        name = listed
+    return [w for w in re.split(r"[^0-9a-zA-Z°]+", name.lower().replace("°", "deg")) if w]
+
+
+def _of_trajectory(table: Table) -> Headings:
     """Return what a file of TUM's format holds: time, position, quaternion, without a heading."""
     if {len(cells) for _, cells in table.rows} != {len(_TUM)}:
         return Headings()
@@ -130,13 +186,15 @@ def _group(groups: dict[str, Group], name: str, words: list[str]) -> None:
     """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres."""
     unit = words.pop() if words[-1] in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
     axis, before = words[-1], words[:-1]
+    called = before[-1] if before else ""
     if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
         axis = axis[1]
     if before and before[-1] in _PLACES:
         before = before[:-1]
     elif before and before[-1] in _TURNS and axis in ("x", "y", "z", "w"):
-        quaternion = before[-1][:1] in "oq"
-        axis, before = ("q" if quaternion else "r") + axis, before[:-1]
+        axis, before = _TURNS[before[-1]] + axis, before[:-1]
+    if not before and called in _OPENCV:
+        before = ["target"]
     group = groups.setdefault("_".join(before), Group())
     group.columns.setdefault(axis, name)
     if axis in POSITION and unit in _LENGTHS:

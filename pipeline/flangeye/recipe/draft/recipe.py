@@ -15,6 +15,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import read_cloud
 from flangeye.files.recording import Archive
 from flangeye.files.scans import CLOUDS, IMAGES
+from flangeye.files.tables import Table
 from flangeye.files.yaml_lines import parse_value
 from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
@@ -22,6 +23,7 @@ from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
+from flangeye.recipe.draft.headings import headings_of
 from flangeye.recipe.draft.matrices import array_params
 from flangeye.recipe.draft.questions import Questions
 from flangeye.recipe.draft.survey import FolderSurvey
@@ -32,6 +34,8 @@ PLATE = "ISO 9409-1-50-4-M6"
 POSES_LINE = "cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
 PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
+CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
+"""Tables that other programs keep; some of them can hold code."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,17 @@ def _reader(
     if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
     scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
-    if survey.arrays:
+    if survey.arrays and not any(_is_whole(table, scans) for table in survey.tables):
         return {"matrices": array_params(survey.folder, survey.arrays, questions, scans)}
     if survey.tables:
         return {"table": table_params(survey.tables, questions, _maker(robot), scans)}
     raise StageError(_missing(survey, reason))
+
+
+def _is_whole(table: Table, scans: bool) -> bool:
+    """Return whether a table names the arm's poses, and a scan or the target for each."""
+    heads = headings_of(table)
+    return heads.arm is not None and (heads.target is not None or (scans and bool(heads.scan)))
 
 
 def _bound(reader: Any, registry: Registry) -> BoundPart:
@@ -131,6 +141,9 @@ def _missing(survey: FolderSurvey, reason: str) -> str:
             f"was; put poses.csv beside them, its first line: {POSES_LINE}; then a line for each, "
             f"{scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
+    closed = survey.of(CLOSED)
+    if closed:
+        return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
     return f"{survey.folder}: holds no scans and no table of poses; {reason}"
 
 

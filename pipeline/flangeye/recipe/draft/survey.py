@@ -9,10 +9,11 @@ from pathlib import Path
 
 from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.scans import CLOUDS, IMAGES, VENDOR
-from flangeye.files.tables import TextTable, number_of, read_text_table
-from flangeye.recipe.draft.arrays import PoseArrays, pose_arrays
+from flangeye.files.tables import KINDS, Table, number_of, read_table
+from flangeye.recipe.draft.arrays import PoseArrays, places, pose_arrays
+from flangeye.recipe.draft.headings import list_name, list_sizes
 
-TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum")
+TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".mod", ".src", ".ls", ".script", *KINDS)
 FEWEST_ROWS, FEWEST_COLUMNS = 3, 6
 
 
@@ -29,7 +30,7 @@ class FolderSurvey:
 
     folder: Path
     files: Sequence[Path]
-    tables: Sequence[TextTable]
+    tables: Sequence[Table]
     arrays: Sequence[PoseArrays]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
@@ -63,24 +64,30 @@ def look(folder: Path) -> FolderSurvey:
     files = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
-    tables = [table for p in files if p.parent == folder and (table := _table(p)) is not None]
+    found = (_table(folder, place, len(of)) for place, of in places(folder, TABLES))
+    tables = [table for table in found if table is not None]
     return FolderSurvey(folder, files, tables, pose_arrays(folder))
 
 
-def _table(file: Path) -> TextTable | None:
-    if file.suffix.lower() not in TABLES:
-        return None
+def _table(folder: Path, place: str, files: int) -> Table | None:
+    """Return a table of poses, or the one that files with a pose each are together."""
     try:
-        table = read_text_table(file)
+        table = read_table(folder, place)
     except FlangeyeError:
+        return None
+    if files > 1 and len(table.rows) != files:
         return None
     wide = bool(table.rows) and len(table.rows[0][1]) >= FEWEST_COLUMNS
     target = bool(table.heading) and len(table.heading) >= 3
     if len(table.rows) < FEWEST_ROWS or not (wide or target):
         return None
-    return table if number_of(table.rows[0][1][-1]) is not None else None
+    numbers = sum(number_of(cell) is not None for cell in table.rows[0][1])
+    return table if numbers >= 3 else None
 
 
-def _of_table(table: TextTable) -> str:
-    heading = ", ".join(table.heading) or f"no heading, {len(table.rows[0][1])} columns"
-    return f"{table.file.name}, {len(table.rows)} rows: {heading}"
+def _of_table(table: Table) -> str:
+    sizes = list_sizes(table.heading)
+    names = dict.fromkeys(list_name(name) or name for name in table.heading)
+    shown = [f"{name} ({sizes[name]} numbers)" if name in sizes else name for name in names]
+    heading = ", ".join(shown) or f"no heading, {len(table.rows[0][1])} columns"
+    return f"{table.name}, {len(table.rows)} rows: {heading}"

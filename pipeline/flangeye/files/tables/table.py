@@ -1,8 +1,7 @@
-"""Text tables as people and programs write them: any separator, decimal commas, with a heading."""
+"""Rows of named cells, whatever file they are from."""
 
 from __future__ import annotations
 
-import csv
 import difflib
 import re
 from collections.abc import Sequence
@@ -12,32 +11,37 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.regular import read_text
 from flangeye.types import Floats
 
 Column = str | int
 """A column by its name in the heading, or by its number from 1."""
+Row = tuple[str, tuple[str, ...]]
+"""Where a row stands, as messages begin with it, and its cells."""
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
-class TextTable:
+class Table:
     """A table of text.
 
     Attributes:
-        file: Where it is from.
+        name: Of the file in its folder, or the pattern of files.
+        file: The same with the folder, for messages.
         heading: Names of the columns; empty without a heading.
-        rows: Line number and cells of each row.
+        rows: Of each row, where it stands and its cells.
+        files: The files that were read.
     """
 
+    name: str
     file: Path
     heading: tuple[str, ...]
-    rows: tuple[tuple[int, tuple[str, ...]], ...]
+    rows: tuple[Row, ...]
+    files: tuple[Path, ...]
 
     def where(self, row: int) -> str:
         """Return what messages about a row begin with."""
-        return f"{self.file}:{self.rows[row][0]}"
+        return self.rows[row][0]
 
     def index(self, column: Column) -> int:
         """Return which column is meant, from 0.
@@ -56,6 +60,14 @@ class TextTable:
         known = f"known: {', '.join(near)}" if near else "it has no heading; give numbers from 1"
         raise StageError(f"{self.file}: has no column '{column}'; {known}")
 
+    def indices(self, columns: Sequence[Column]) -> list[int]:
+        """Return which columns are meant, from 0; ``pose`` is also all of ``pose.0``, ``pose.1``.
+
+        Raises:
+            StageError: There is none of a name; names the nearest.
+        """
+        return [i for column in columns for i in (self._listed(column) or [self.index(column)])]
+
     def numbers(self, columns: Sequence[int]) -> Floats:
         """Return the numbers (N, k) of columns.
 
@@ -68,14 +80,21 @@ class TextTable:
         """Return the cells of a column."""
         return [cells[column] for _, cells in self.rows]
 
+    def _listed(self, column: Column) -> list[int]:
+        """Return the columns of a list's entries, in their order."""
+        if column in self.heading:
+            return []
+        entry = re.compile(re.escape(str(column)) + r"(\.\d+)+")
+        return [i for i, name in enumerate(self.heading) if entry.fullmatch(name)]
+
     def _row(self, row: int, columns: Sequence[int]) -> list[float]:
-        line, cells = self.rows[row]
+        where, cells = self.rows[row]
         if columns and len(cells) <= max(columns):
-            raise StageError(f"{self.file}:{line}: has {len(cells)} columns, too few")
+            raise StageError(f"{where}: has {len(cells)} columns, too few")
         found = [number_of(cells[column]) for column in columns]
         for column, number in zip(columns, found, strict=True):
             if number is None:
-                raise StageError(f"{self.where(row)}: '{cells[column]}' is not a number")
+                raise StageError(f"{where}: '{cells[column]}' is not a number")
         return [number for number in found if number is not None]
 
 
@@ -86,46 +105,3 @@ def number_of(cell: str) -> float | None:
         return float(text)
     except ValueError:
         return None
-
-
-def read_text_table(file: Path) -> TextTable:
-    """Read a table; ``#`` and ``%`` begin a comment, of which the last may be the heading.
-
-    Raises:
-        StageError: It cannot be read, or has no rows.
-    """
-    lines = read_text(file).splitlines()
-    numbered = [(n, line.strip()) for n, line in enumerate(lines, 1) if line.strip()]
-    plain = [(n, line) for n, line in numbered if line[0] not in "#%"]
-    if not plain:
-        return TextTable(file, (), ())
-    split = _splitter([line for _, line in plain])
-    rows = [(n, split(line)) for n, line in plain]
-    rows = [(n, cells) for n, cells in rows if cells]
-    if number_of(rows[0][1][-1]) is None:
-        return TextTable(file, rows[0][1], tuple(rows[1:]))
-    comments = [split(line[1:].strip()) for n, line in numbered if n < plain[0][0]]
-    fitting = [c for c in comments if len(c) == len(rows[0][1])]
-    return TextTable(file, fitting[-1] if fitting else (), tuple(rows))
-
-
-class _splitter:  # noqa: N801  a function with a memory
-    """Splits lines at the mark that the first of them shows."""
-
-    def __init__(self, lines: Sequence[str]) -> None:
-        # Where blanks separate, every comma is a decimal one: "1,5 2,0 3,25".
-        blanks = all(len(line.split()) > 2 and _plain(line) for line in lines[-3:])
-        marks = ";\t" if blanks else ";\t,"
-        self.mark = next((m for m in marks if m in lines[0]), " ")
-
-    def __call__(self, line: str) -> tuple[str, ...]:
-        if self.mark == " ":
-            return tuple(line.split())
-        (cells,) = csv.reader([line], delimiter=self.mark, skipinitialspace=True)
-        # A mark at the line's end makes an empty last cell.
-        return tuple(cell.strip() for cell in (cells[:-1] if not cells[-1].strip() else cells))
-
-
-def _plain(line: str) -> bool:
-    """Return whether each word but the first, split at blanks, is a number by itself."""
-    return all(number_of(word) is not None for word in line.split()[1:])
