@@ -11,9 +11,14 @@ import pytest
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_rpy, rpy_from_rotation
-from flangeye_plugins.verify.sphere import SphereParams, verify_sphere
+from flangeye.units import SI
+from flangeye_plugins.verify.drift import DriftParams
+from flangeye_plugins.verify.holdout import HoldoutParams
+from flangeye_plugins.verify.icp import IcpParams
+from flangeye_plugins.verify.sphere import Bar, SphereParams, verify_sphere
 from flangeye_plugins.verify.stitch import StitchParams, verify_stitch
 from flangeye_plugins.verify.touch import Touch, TouchParams, verify_touch
+from tests.plugins.bounds import check_bound
 
 TRUTH = rigid(rotation_from_rpy(np.pi - 0.2, 0.1, 0.5), np.array([0.5, -0.1, 1.1]))
 CENTRE = np.array([0.45, 0.0, 0.4])
@@ -143,3 +148,113 @@ def test_what_cannot_be_checked_is_one_line() -> None:
         StageError, match="0 pairs of poses are 900 mm or more apart, 10 are needed"
     ):
         verify_sphere(calibration(), SphereParams(shortest="900 mm"))
+
+
+def test_touchs_figures_are_those_of_the_errors() -> None:
+    """Four points, of which one was touched 3 mm too low and another 1 mm too far along y."""
+    made = list(touches().touches)
+    for k, axis, by in ((1, 2, -3e-3), (2, 1, 1e-3)):
+        place = [float(x) for x in made[k].position]
+        place[axis] += by
+        made[k] = made[k].model_copy(update={"position": tuple(place)})
+    asked = touches().model_copy(update={"touches": tuple(made)})
+    found = verify_touch(calibration(), asked)
+    assert found.errors == pytest.approx(
+        {"touch 1": 0.0, "touch 2": 3e-3, "touch 3": 1e-3, "touch 4": 0.0}, abs=1e-8
+    )
+    assert found.figures == pytest.approx(
+        {"points": 4, "rms": np.sqrt(10e-6 / 4), "max": 3e-3, "x": 0.0, "y": -0.25e-3,
+         "z": 0.75e-3, "explained": 0.5}, abs=1e-8,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("sigmas", "explained"), [(2.79, 1.0), (2.80, 0.0)])
+def test_what_jogging_and_covariance_allow_is_explained(sigmas: float, explained: float) -> None:
+    """The 95 % point of chi squared with three degrees of freedom is 2.795 squared."""
+    shift = sigmas * np.sqrt(2e-4**2 + 1e-10)
+    found = verify_touch(calibration(shift=(0, shift, 0)), touches(1))
+    assert found.figures["explained"] == explained
+
+
+def test_stitchs_figures_are_those_of_the_views() -> None:
+    """Two views of one pose, of which one lies 0.3 mm higher and 0.4 mm aside."""
+    (first,) = views(1)
+    pose = first.base_T_flange.matrix
+    moved = pose @ rigid(np.eye(3), np.array([4e-4, 0.0, 3e-4]))
+    second = replace(first, id="1", base_T_flange=t.Transform(t.BASE, t.FLANGE, moved))
+    found = verify_stitch(calibration(), t.Views([first, second]), StitchParams())
+    assert found.passed and found.figures["views"] == 2
+    assert found.errors == pytest.approx({"0": 2e-4, "1": 2e-4}, abs=2e-6)
+    assert found.figures["slide"] == pytest.approx(2e-4, abs=2e-6)
+    for name in ("spread", "p95", "max"):
+        assert found.figures[name] == pytest.approx(3e-4 / np.sqrt(2), abs=2e-6)
+    assert found.reason == (
+        "2 views spread by 0.212 mm rms in height and 0.200 mm in the plane, within 0.5 mm"
+    )
+
+
+def test_spheres_figures_are_those_of_the_distances() -> None:
+    errors = np.array([1e-4, -3e-4, 2e-4, 1e-4])
+    bars = [
+        {"first": _m((0.0, 0.0, 0.8)), "second": _m((0.2 + e, 0.0, 0.8)), "length": "200 mm"}
+        for e in errors
+    ]
+    drawn: dict[str, Any] = {}
+    limit = {"bars": bars, "max_error": "0.2 mm"}
+    found = verify_sphere(
+        calibration(), SphereParams.model_validate(limit), stage_log=drawn.__setitem__
+    )
+    assert found.figures == pytest.approx(
+        {"pairs": 4, "rms": np.sqrt(np.mean(errors**2)), "mean": 0.25e-4, "p95": 2.85e-4,
+         "max": 3e-4, "scale": 1.25e-4}, abs=1e-12,
+    )  # fmt: skip
+    assert not found.passed
+    assert found.reason == (
+        "95 % of 4 distances agree to 0.285 mm, above the limit of 0.2 mm; scale +125 ppm"
+    )
+    series = np.array(drawn["comparison"]["series"][""])
+    assert series == pytest.approx(np.column_stack([np.full(4, 200.0), 1e3 * errors]))
+
+
+def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
+    places = np.array([np.linalg.inv(TRUTH) @ pose for pose in poses(12)])[:, :3, 3]
+    gaps = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(12, 1)]
+    shortest = float(np.median(gaps))
+    found = verify_sphere(calibration(), SphereParams(shortest=SI(shortest)))
+    assert found.figures["pairs"] == (gaps >= shortest).sum() == 33
+    aside = calibration()
+    pairs = (replace(aside.pairs[0], used=False), *aside.pairs[1:])
+    assert verify_sphere(replace(aside, pairs=pairs), SphereParams()).figures["pairs"] <= 55
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "name", "refused", "taken"),
+    [
+        (StitchParams, {}, "max_spread", "0 mm", "1 um"),
+        (StitchParams, {}, "fewest", 0, 1),
+        (SphereParams, {}, "max_error", "0 mm", "1 um"),
+        (SphereParams, {}, "shortest", "0 mm", "1 um"),
+        (SphereParams, {}, "fewest", 2, 3),
+        (Bar, {"first": _m(CENTRE), "second": _m(TIP)}, "length", "0 mm", "1 um"),
+        (TouchParams, {"tip": _m(TIP)}, "touches", [], touches(1).touches),
+        (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "accuracy", "0 mm", "1 um"),
+        (TouchParams, {"tip": _m(TIP), "touches": touches(1).touches}, "max_error", "0 mm", "1 um"),
+        (HoldoutParams, {}, "folds", 1, 2),
+        (HoldoutParams, {}, "max_rms", "0 mm", "1 um"),
+        (HoldoutParams, {}, "max_outliers", -0.1, 0),
+        (HoldoutParams, {}, "max_outliers", 1, 0.99),
+        (HoldoutParams, {}, "gate", 0.5, 0.51),
+        (HoldoutParams, {}, "gate", 1, 0.9999),
+        (DriftParams, {"reference": "a.mcap"}, "limit", "0 mm", "1 um"),
+        (DriftParams, {"reference": "a.mcap"}, "false_alarms", 0, 1e-9),
+        (DriftParams, {"reference": "a.mcap"}, "false_alarms", 0.1, 0.09),
+        (IcpParams, {}, "reach", "0 mm", "1 um"),
+        (IcpParams, {}, "distance", "0 mm", "1 um"),
+        (IcpParams, {}, "max_translation", "0 mm", "1 um"),
+        (IcpParams, {}, "max_tilt", "0 deg", "0.1 deg"),
+    ],
+)  # fmt: skip
+def test_a_parameter_has_its_bounds(
+    model: Any, given: dict[str, Any], name: str, refused: Any, taken: Any
+) -> None:
+    check_bound(model, name, refused, taken, given)

@@ -1,0 +1,103 @@
+"""ICP of points against a shape: the motion between them, and what they cannot tell."""
+
+import numpy as np
+import pytest
+
+from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
+from flangeye_plugins.verify.registration import Registration, _least_squares, _limits, register
+from flangeye_plugins.verify.surface import Surface, surface_of
+from tests.plugins.verify.test_icp import FLANGE_50, MM
+
+SHAPE = surface_of(FLANGE_50, 0.6 * MM)
+FACE = Surface(SHAPE.points[SHAPE.points[:, 2] == 0], SHAPE.normals[SHAPE.points[:, 2] == 0])
+MOVED = rigid(rotation_exp([0.02, -0.03, 0.0]), np.array([1.5, -0.8, 2.0]) * MM)
+
+
+def apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+def found(points: np.ndarray, shape: Surface = SHAPE, distance: float = 1 * MM) -> Registration:
+    registered = register(points, shape, 20 * MM, distance)
+    assert isinstance(registered, Registration), registered
+    return registered
+
+
+def test_a_shape_that_was_moved_is_taken_back() -> None:
+    seen = apply(np.linalg.inv(MOVED), SHAPE.points[::2])
+    registered = found(seen)
+    left = registered.motion @ np.linalg.inv(MOVED)
+    assert np.linalg.norm(left[:3, 3]) < 0.02 * MM
+    assert np.linalg.norm(rotation_log(left[:3, :3])[:2]) < 1e-4
+    assert registered.rms < 0.01 * MM and registered.overlap == 1.0
+    assert not registered.roll_seen  # a plate is round, and holes have no normals
+
+
+def test_a_corner_shows_every_motion() -> None:
+    rng, turn = np.random.default_rng(0), rotation_exp([0.02, -0.01, 0.03])
+    sides = [np.insert(rng.uniform(0, 0.05, (1500, 2)), k, 0.0, axis=1) for k in range(3)]
+    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), 1500, axis=0))
+    moved = rigid(turn, np.array([1.0, -0.5, 0.7]) * MM)
+    registered = found(apply(np.linalg.inv(moved), corner.points), corner)
+    assert registered.motion == pytest.approx(moved, abs=2e-5)
+    assert registered.roll_seen
+
+
+def test_the_rms_is_that_of_what_matched_and_the_overlap_its_share() -> None:
+    noise = 0.05 * MM * np.random.default_rng(0).standard_normal((len(SHAPE.points), 1))
+    seen = SHAPE.points + noise * SHAPE.normals
+    away = SHAPE.points[: len(seen) // 3] + [0.3, 0.0, 0.0]
+    registered = found(np.concatenate([seen, away]))
+    assert registered.rms == pytest.approx(0.05 * MM, rel=0.1)
+    assert registered.overlap == pytest.approx(0.75, abs=0.01)
+
+
+def test_more_points_than_are_needed_are_thinned() -> None:
+    many = np.repeat(SHAPE.points, 4, axis=0)
+    assert np.abs(found(many).motion - np.eye(4)).max() < 1e-4
+
+
+def test_a_turn_that_the_shape_does_not_show_stays_zero() -> None:
+    round_ = Surface(SHAPE.points[SHAPE.points[:, 2] < 0], SHAPE.normals[SHAPE.points[:, 2] < 0])
+    turned = rigid(rotation_exp([0.01, 0.0, 0.05]), np.array([1.0, 0.0, 0.0]) * MM)
+    registered = found(apply(np.linalg.inv(turned), round_.points), round_)
+    assert not registered.roll_seen
+    turn = rotation_log(registered.motion[:3, :3])
+    assert turn[0] == pytest.approx(0.01, abs=1e-3) and abs(turn[2]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("points", "why"),
+    [
+        (SHAPE.points + [0.3, 0, 0], "no points came within 20 mm of the flange's shape"),
+        (np.concatenate([SHAPE.points[::3], SHAPE.points + [0.3, 0, 0]]),
+         "25% of the points came within 1 mm of the flange's shape"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_registered_says_why(points: np.ndarray, why: str) -> None:
+    assert register(points, SHAPE, 20 * MM, 1 * MM) == why
+
+
+def test_a_face_alone_does_not_tell_a_shift_along_it() -> None:
+    assert register(FACE.points, FACE, 20 * MM, 1 * MM) == (
+        "the matched points are too flat to tell a shift along the face"
+    )
+
+
+@pytest.mark.parametrize(
+    ("reach", "distance", "expected"),
+    [(20, 1, [20, 10, 5, 2.5, 1.25, 1]), (8, 1, [8, 4, 2, 1]), (1, 1, [1]), (0.5, 1, [1])],
+)
+def test_the_limit_falls_by_halves(reach: float, distance: float, expected: list[float]) -> None:
+    assert _limits(reach, distance) == expected
+
+
+def test_a_step_is_the_least_squares_along_what_is_determined() -> None:
+    rng = np.random.default_rng(0)
+    jacobian = rng.standard_normal((50, 6)) * ([0.03] * 3 + [1.0] * 3)
+    jacobian[:, 2] = 0.0  # no distance changes with a turn about z
+    distances = rng.standard_normal(50)
+    step, unknown = _least_squares(jacobian, distances)
+    expected = np.linalg.lstsq(jacobian, -distances, rcond=None)[0]
+    assert step == pytest.approx(expected)
+    assert np.abs(unknown) == pytest.approx(np.array([[0, 0, 1.0, 0, 0, 0]]))
