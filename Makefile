@@ -23,11 +23,11 @@ demo: $(VENV)/.run
 	$(BIN)/flangeye run ur5_phoxi-m_simulated
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m "not slow and not realtime"
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow and not realtime"
 	$(REALTIME) -m "not slow and realtime" || $(REALTIME) -m "not slow and realtime" --last-failed
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m "not realtime" --hypothesis-profile=search
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not realtime" --hypothesis-profile=search
 	$(REALTIME) -m realtime || $(REALTIME) -m realtime --last-failed
 
 check: $(VENV)/.dev

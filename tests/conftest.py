@@ -1,6 +1,10 @@
 """Fixtures shared by all tests."""
 
 import os
+
+# Two workers on two cores: a second thread of BLAS only spins, which doubles what the tests cost.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
+
 import signal
 import sys
 import tempfile
