@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PoseConvention
@@ -43,9 +44,20 @@ def test_any_order_of_angles_is_the_product_of_its_turns(pose: Any, order: Any, 
     turns = [about(axis.lower(), value) for axis, value in zip(order, degrees, strict=True)]
     # Turns about fixed axes are applied from the left, about turned ones from the right.
     product = turns[0] @ turns[1] @ turns[2] if order.isupper() else turns[2] @ turns[1] @ turns[0]
-    # Within 1e-7 rad of the orders' singularity SciPy gives the third angle as zero.
+    # Within 1e-7 rad of the orders' singularity the third angle is zero.
     np.testing.assert_allclose(product, pose[:3, :3], atol=2e-7)
     np.testing.assert_allclose(convention.matrix([0, 0, 0, *angles])[:3, :3], product, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:Gimbal lock")
+@pytest.mark.parametrize("order", EULER_ORDERS)
+@pytest.mark.parametrize("middle", [0.3, -1.2, 0.0, np.pi / 2, -np.pi / 2, np.pi])
+def test_angles_are_those_of_scipy_locked_or_not(order: str, middle: float) -> None:
+    convention = PoseConvention(order, ("X", "Y", "Z", "1", "2", "3"), order, "m")
+    turn = Rotation.from_euler(order, [1.0, middle, -2.5])
+    angles = convention.numbers(rigid(turn.as_matrix(), np.zeros(3)))[3:]
+    apart = angles - turn.as_euler(order)
+    np.testing.assert_allclose(np.sin(apart / 2), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -41,6 +40,9 @@ EULER_ORDERS = tuple(
 )
 """The twelve orders about fixed axes (``xyz``, extrinsic) and about turned ones (``ZYX``,
 intrinsic), spelt as scipy spells them."""
+
+LOCKED = 1e-7
+"""So near to gimbal lock [rad] only the sum of the first and the last angle is known."""
 
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180}
@@ -210,18 +212,42 @@ class PoseConvention:
 
 
 def _from_euler(order: str, radians: Floats) -> Floats:
-    from scipy.spatial.transform import Rotation
+    turns = [rotation_exp(angle * _axis(name)) for name, angle in zip(order, radians, strict=True)]
+    first, second, third = reversed(turns) if order.islower() else turns
+    return np.asarray(first @ second @ third)
 
-    return np.asarray(Rotation.from_euler(order, radians).as_matrix())
+
+def _axis(name: str) -> Floats:
+    return np.asarray(np.eye(3)["xyz".index(name.lower())])
 
 
 def _to_euler(order: str, rotation: Floats) -> Floats:
-    from scipy.spatial.transform import Rotation
+    """Return the (3,) angles about axes in an order; at gimbal lock, of many, that with the last 0.
 
-    with warnings.catch_warnings():
-        # At gimbal lock scipy warns and sets the third angle to zero: one answer of many.
-        warnings.simplefilter("ignore", UserWarning)
-        return np.asarray(Rotation.from_matrix(rotation).as_euler(order))
+    Bernardes and Viollet, "Quaternion to Euler angles conversion" (PLOS ONE, 2022).
+    """
+    *vector, w = quaternion_from_rotation(rotation)
+    i, j, k = ("xyz".index(name) for name in (order if order.islower() else order[::-1].lower()))
+    proper = i == k
+    k = 3 - i - j
+    sign = (i - j) * (j - k) * (k - i) // 2
+    a, b, c, d = w, vector[i], vector[j], vector[k] * sign
+    if not proper:
+        a, b, c, d = a - c, b + d, c + a, d - b
+    middle = 2 * np.arctan2(np.hypot(c, d), np.hypot(a, b))
+    half_sum, half_difference = np.arctan2(b, a), np.arctan2(d, c)
+    angles = np.array([half_sum - half_difference, middle, half_sum + half_difference])
+    if not order.islower():
+        angles = angles[::-1]
+    if middle < LOCKED:
+        angles[[0, 2]] = 2 * half_sum, 0.0
+    elif middle > np.pi - LOCKED:
+        angles[[0, 2]] = 2 * half_difference * (-1 if order.islower() else 1), 0.0
+    if not proper:
+        angles[2 if order.islower() else 0] *= sign
+        angles[1] -= np.pi / 2
+    # To half a turn at most; half a turn less a rounding error back is half a turn.
+    return np.asarray(angles - 2 * np.pi * np.ceil(angles / (2 * np.pi) - 0.5 - 1e-12))
 
 
 _XYZ = ("X", "Y", "Z")
