@@ -111,6 +111,7 @@ def tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator)
     return rigid(rotation_from_rpy(roll, pitch, yaw) @ facing, place)
 
 
-def angle_between(first: Floats, second: Floats) -> float:
-    """Return the angle of two vectors (3,) [rad]."""
-    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
+def angle_between(first: Floats, second: Floats) -> Floats:
+    """Return the (...) angles of vectors (..., 3) [rad]."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.arctan2(across, (first * second).sum(axis=-1)))

@@ -147,10 +147,14 @@ class Reach:
         if not self.in_view(base_T_flange):
             self._refuse(base_T_flange, "out of the scanner's view")
             return None
-        possible = self._possible(base_T_flange)
-        if not possible:
+        reachable = self._unwound(self.arm.inverse(base_T_flange))
+        turns = [_turn(joints, self.home) for joints in reachable]
+        nearby = reachable[np.argsort(turns, kind="stable")]
+        # What a posture touches takes longest to find out: no more are asked than have to be.
+        nearest: Floats | None = next((each for each in nearby if self._allowed(each)), None)
+        if nearest is None:
+            self._refuse(base_T_flange, self._why_not(reachable))
             return None
-        nearest = min(possible, key=lambda joints: _turn(joints, self.home))
         if self._start is not None and _turn(nearest, self.home) > FOLD:
             self._refuse(base_T_flange, "only with the arm folded over")
             return None
@@ -175,12 +179,20 @@ class Reach:
 
     def _possible(self, base_T_flange: Floats) -> list[Floats]:
         reachable = self._unwound(self.arm.inverse(base_T_flange))
-        clear = [joints for joints in reachable if self._clear(joints)]
-        possible = [joints for joints in clear if not self._too_near(joints)]
+        possible = [joints for joints in reachable if self._allowed(joints)]
         if not possible:
-            why = "with the arm in the way" if len(reachable) else "out of the arm's reach"
-            self._refuse(base_T_flange, str(self._too_near(clear[0])) if clear else why)
+            self._refuse(base_T_flange, self._why_not(reachable))
         return possible
+
+    def _allowed(self, joints: Floats) -> bool:
+        return self._clear(joints) and not self._too_near(joints)
+
+    def _why_not(self, reachable: Floats) -> str:
+        """Say why none of (K, n) postures is allowed."""
+        clear = next((joints for joints in reachable if self._clear(joints)), None)
+        if clear is not None:
+            return str(self._too_near(clear))
+        return "with the arm in the way" if len(reachable) else "out of the arm's reach"
 
     def _unwound(self, joints: Floats) -> Floats:
         """Take (K, n) angles by whole turns as near to home as the limits allow."""

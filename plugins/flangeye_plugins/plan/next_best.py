@@ -108,16 +108,12 @@ class Chooser:
         region, params = self._region, self._params
         places = region.centre + region.size * self._rng.uniform(-0.5, 0.5, (params.candidates, 3))
         turns = self._rng.uniform(-params.tilt, params.tilt, (params.candidates, 3))
-        drawn = (
+        drawn = np.array([
             rigid(rotation_from_rpy(*turn) @ facing, place)
             for turn, place in zip(turns, places, strict=True)
-        )
-        faces = [
-            pose
-            for pose in drawn
-            if angle_between(pose[:3, 2], self._site.eye - pose[:3, 3]) <= params.facing
-        ]
-        return np.array(faces).reshape(-1, 4, 4)
+        ])  # fmt: skip
+        off = angle_between(drawn[:, :3, 2], self._site.eye - places)
+        return np.asarray(drawn[off <= params.facing])
 
     def _expected_errors(self, candidates: Floats) -> Floats:
         """Return the (M,) expected square error over the work after each candidate [m^2]."""
