@@ -1,11 +1,11 @@
 """Change the source in small ways and see which changes no fast test notices.
 
-python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE]: a sample over the
-rooms below, each in a copy of the repository, under those fast tests of its room that run the changed
-line (coverage.py says which, once for each file of tests: build/mutation), the file's own first, then
-the fastest: in a fork of a process that has them collected (tools/trying.py), and if it lives there,
-in a new process. A change that fails no test is a survivor: its place and what was changed are
-printed, and the share that was killed.
+python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE] [--tests FILE …]: a
+sample over the rooms below, each in a copy of the repository, under those fast tests of its room (or
+those named) that run the changed line (coverage.py says which, once for each file of tests:
+build/mutation), the file's own first, then the fastest: in a fork of a process that has them
+collected (tools/trying.py), and if it lives there, in a new process. A change that fails no test is a
+survivor: its place and what was changed are printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 from tools.covering import FAST
 
 ROOT = Path(__file__).parents[1]
-ROOMS = {
+ROOMS: dict[str, tuple[str, ...]] = {
     "motion": ("pipeline/flangeye/motion", "tests/motion"),
     "estimator": ("pipeline/flangeye/handeye", "tests/handeye"),
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
@@ -275,12 +275,14 @@ def main() -> None:
     parser.add_argument(
         "--only", default="", help="a pattern of FILE:LINE: those changes alone, all"
     )
+    parser.add_argument("--tests", nargs="+", default=[], help="those alone, in place of a room's")
     parser.add_argument("--budget", type=float, default=60, help="of tests for a change [CPU s]")
     asked = parser.parse_args()
     killed = tried = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
         for room in asked.room:
+            ROOMS[room] = (ROOMS[room][0], *(asked.tests or ROOMS[room][1:]))
             chosen = _chosen(room, asked.sample // len(asked.room), asked.seed, asked.only)
             if not chosen:
                 continue

@@ -21,8 +21,10 @@ from flangeye_plugins.segment.discs import (
     width,
 )
 from flangeye_plugins.segment.flange import SegmentParams
+from flangeye_plugins.segment.grid import Grid
 from flangeye_plugins.segment.parts import Part
 from flangeye_plugins.segment.scale import check_scale
+from flangeye_plugins.segment.search import _patches, _scatter
 from tests.plugins.bounds import check_bound
 from tests.plugins.segment.test_choice import BORE, UR5
 
@@ -204,3 +206,26 @@ def test_a_depth_is_between_a_centimetre_and_thirty_metres(depth: float, unit: s
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
     check_bound(SegmentParams, name, refused, taken)
+
+
+def test_what_is_flat_scatters_by_noise_and_a_plate_whose_step_noise_hides() -> None:
+    step = WRIST.details.thickness
+    hides = step / (5 * np.sqrt(6))
+    for flange, noise, scatter in (
+        (UR5, 5e-5, 3e-4),  # no scanner is better over a whole face
+        (UR5, 4e-4, 1.2e-3),
+        (UR5, 1.1 * hides, 3.3 * hides),
+        (WRIST, 0.9 * hides, 2.7 * hides),
+        (WRIST, 1.1 * hides, 3.3 * hides + step),
+    ):
+        assert _scatter(flange, noise) == pytest.approx(scatter)
+
+
+@pytest.mark.parametrize(("side", "points"), [(4.6, 5), (1.0, 3)])
+def test_patches_are_squares_of_three_points_at_least(side: float, points: int) -> None:
+    view = Grid(np.zeros((20, 30, 3), np.float32), 1e-3, None)
+    patch = _patches(np.arange(600), view, side).reshape(20, 30)
+    rows, columns = np.indices((20, 30)) // points
+    assert len(np.unique(patch)) == len(np.unique(rows)) * len(np.unique(columns))
+    for r, c in ((0, 0), (1, 2)):
+        assert len(np.unique(patch[(rows == r) & (columns == c)])) == 1
