@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.coverage import coverage_of
+from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import RunFolder
@@ -43,6 +46,31 @@ def test_it_says_of_every_pose_what_the_solver_would(run: Path) -> None:
     for pair in calibration.pairs:
         name = pair.observation.id
         assert found.residuals[name] == pytest.approx(np.linalg.norm(pair.residual), rel=1e-6)
+
+
+def test_the_error_is_that_of_the_worst_corner_of_the_work(run: Path) -> None:
+    log = read_run(run)
+    found, calibration = outlook_of_log(log, load_registry()), log.calibration()
+    assert calibration is not None and log.source is not None
+    camera, box = calibration.camera, work_of(calibration, log.source, None)
+    assert box is not None and found.error is not None
+    corners = corners_of(box.centre, box.size)
+    assert found.error == pytest.approx(
+        largest_error_quantile(camera.covariance, camera.about, corners), rel=1e-6
+    )
+    assert found.error > largest_error_quantile(camera.covariance, camera.about, camera.about[None])
+
+
+def test_a_pose_that_the_solver_sets_aside_is_told_with_its_reason(run: Path) -> None:
+    log, registry = read_run(run), load_registry()
+    first, *others = log.observations()
+    circle = first.circle
+    wrong = replace(first, feature=replace(circle, centre=circle.centre + [0.05, 0.0, 0.0]))
+    recipe = parse_recipe(RECIPE, "small", registry)
+    found = outlook(recipe, registry, [wrong, *others], t.Source(fingerprint=""))
+    assert set(found.residuals) == {o.id for o in others}
+    assert found.set_aside[first.id] not in ("", "not used")
+    assert f"{first.id}  set aside: {found.set_aside[first.id]}" in found.lines()
 
 
 def test_it_names_the_motion_that_is_missing(run: Path) -> None:
