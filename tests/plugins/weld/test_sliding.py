@@ -104,3 +104,13 @@ def test_the_sigma_of_a_climb_is_that_of_the_difference_of_two_means() -> None:
     assert np.sqrt(np.mean(np.square(sigmas), axis=0)) == pytest.approx(
         np.std(climbs, axis=0), rel=0.2
     )
+
+
+def test_a_tip_that_is_never_seen_costs_eleven_seconds_and_four_millimetres() -> None:
+    sliding, time, way = Sliding(0), 0.0, [0.0]
+    while sliding.state != "over":
+        way.append(way[-1] + PERIOD * sliding.velocity(PERIOD))
+        time += PERIOD
+    assert time == pytest.approx(4.0 + 2.0 + 0.8 + 4.0, abs=0.1)
+    assert max(way) == pytest.approx(4e-3)
+    assert sliding.climbed() is None
