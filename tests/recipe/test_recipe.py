@@ -304,8 +304,8 @@ def test_what_is_demanded_is_what_is_used() -> None:
     """An archive's poses need no kinematics; its flange needs a plate, a marker needs none."""
     registry = load_registry()
     assert mistakes(ARCHIVE, registry) == [
-        *(f"r.yaml:{line}: steps.{line - 3}.{name}: needs the plate to look for: write robot: "
-          "{flange: ISO 9409-1-50-4-M6} ('flangeye standards' lists them), or a robot's model"
+        *(f"r.yaml:{line}: steps.{line - 3}.{name}: needs the plate to look for: write feature: "
+          "{standard: ISO 9409-1-50-4-M6} ('flangeye standards' lists them), or a robot's model"
           for line, name in ((4, "segment.flange"), (5, "fit.rim"))),
         "r.yaml:6: steps.3.solve.robust: needs the arm's kinematics, to correct its joints: write "
         "robot: ur10e ('flangeye robots' lists them), or robot: {urdf: arm.urdf}",

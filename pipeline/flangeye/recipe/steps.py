@@ -19,8 +19,6 @@ from flangeye.recipe.header import LimitsSection
 
 Complain = Callable[[Sequence[Hashable], str], None]
 
-PLATE = "{flange: ISO 9409-1-50-4-M6}"
-
 
 class Offer(NamedTuple):
     """Where in a recipe's header something comes from.
@@ -53,7 +51,8 @@ SECTIONS: Mapping[Any, Offer] = {
     Flange: Offer(
         "the plate to look for",
         ("robot", "feature"),
-        f"robot: {PLATE} ('flangeye standards' lists them), or a robot's model",
+        "feature: {standard: ISO 9409-1-50-4-M6} ('flangeye standards' lists them), or a robot's "
+        "model",
     ),
     Sphere: Offer(
         "a sphere",
