@@ -270,6 +270,29 @@ def _read_poses(path):
     _registry().part("reader.folder").bind()(folder)
 
 
+def _records(folder):
+    record = {"robot": {"x": 0.4, "y": -1e-3}, "seen": [[1, 0], [0, 1]], "image": "0.png"}
+    return [json.dumps([record, record]).encode(), json.dumps({"a.ply": [1, 2.5]}).encode()]
+
+
+def _programs(folder):
+    return [
+        b"movel(p[0.4, -0.1, 0.3, 2.2, 0.1, 0], a=1.2)\nend\n",
+        b"XP={X 400,Y -1.5e2,Z 300,A 10,B 0,C 180,S 2,T 35}\n",
+        b"X = 4.0 mm,\tY = 1 mm,\tZ = 3 mm,\n W = 1 deg,\tP = 0 deg,\tR = 2 deg\n",
+        b"p:=[[400,-100,300],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n",
+        b"# t x y\n1;2,5;3\n4;5;6\n",
+    ]
+
+
+def _read_table(path):
+    from flangeye.files.tables import number_of, read_table
+
+    table = read_table(path.parent, path.name)
+    first = table.rows[0][1] if table.rows else ()
+    table.numbers([i for i, cell in enumerate(first) if number_of(cell) is not None])
+
+
 def _matrices(suffix):
     def written(folder):
         import cv2
@@ -338,6 +361,8 @@ TARGETS = {
     "bag-db3": Target(".db3", _bags(".db3"), _read_bag),
     "image": Target(".png", _images, _read_image),
     "poses": Target(".csv", _poses, _read_poses),
+    "records": Target(".json", _records, _read_table),
+    "table": Target(".txt", _programs, _read_table),
     "log": Target(".mcap", _logs, _read_log),
     "log-rewritten": Target(".txt", _rewritten, _read_rewritten),
     "json": Target(".json", lambda f: [json.dumps({"a": [1.5, "x"]}).encode()], _read_json),

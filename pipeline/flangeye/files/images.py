@@ -19,6 +19,7 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
 # What is wrong is said once, by us.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
+PNG = b"\x89PNG\r\n\x1a\n"
 TOO_LARGE = f"is an image of more than {MAX_PIXELS} pixels"
 
 
@@ -40,6 +41,8 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
 
     if _stated_pixels(raw) > MAX_PIXELS:
         raise ImageError(TOO_LARGE)
+    if _is_cut_png(raw):
+        raise ImageError("is a damaged image")
     try:
         pixels = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), flags) if raw else None
     except cv2.error as error:
@@ -52,10 +55,19 @@ def decode_image(raw: bytes, flags: int) -> NDArray[Any]:
 
 def _stated_pixels(raw: bytes) -> int:
     """Return how many pixels a PNG's or BMP's header states; OpenCV fills them before it looks."""
-    if raw[:8] == b"\x89PNG\r\n\x1a\n" and len(raw) >= 24:
+    if raw.startswith(PNG) and len(raw) >= 24:
         width, height = struct.unpack_from(">II", raw, 16)
     elif raw[:2] == b"BM" and len(raw) >= 26:
         width, height = map(abs, struct.unpack_from("<ii", raw, 18))
     else:
         return 0
     return int(width * height)
+
+
+def _is_cut_png(raw: bytes) -> bool:
+    """Return whether a PNG's chunk states more bytes than there are; OpenCV makes room for them."""
+    at, kind = len(PNG), b""
+    while raw.startswith(PNG) and kind != b"IEND" and at + 8 <= len(raw):
+        length, kind = struct.unpack_from(">I4s", raw, at)
+        at += 12 + length
+    return raw.startswith(PNG) and at > len(raw)

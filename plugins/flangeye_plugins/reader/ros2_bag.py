@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -148,14 +149,13 @@ def _first_look(path: Path) -> Bag:
     for raw in messages(files, wanted):
         kind = bag.topics[raw.topic]
         if kind == TF:
-            bag.frames.take(raw.decode(), raw.topic.endswith("tf_static"))
+            raw.read(partial(bag.frames.take, static=raw.topic.endswith("tf_static")))
         elif kind == POSE:
-            _append(bag.poses, raw, _pose_stamped(raw))
+            _append(bag.poses, raw, raw.read(partial(_pose_stamped, raw.topic)))
         elif kind == JOINTS:
-            message = raw.decode()
-            _append(bag.joints, raw, dict(zip(message.name, message.position, strict=False)))
+            _append(bag.joints, raw, raw.read(_joint_angles))
         elif kind == INFO:
-            bag.cameras[raw.topic] = _intrinsics(raw.decode())
+            bag.cameras[raw.topic] = raw.read(_intrinsics)
         else:
             bag.stamps.setdefault(raw.topic, []).append(raw.stamp)
     return bag
@@ -167,9 +167,13 @@ def _append(into: dict[str, tuple[list[float], list[Any]]], raw: Raw, value: Any
     values.append(value)
 
 
-def _pose_stamped(raw: Raw) -> Floats:
-    pose = raw.decode().pose
-    return pose_of(raw.topic, pose.position, pose.orientation)
+def _pose_stamped(topic: str, message: Any) -> Floats:
+    return pose_of(topic, message.pose.position, message.pose.orientation)
+
+
+def _joint_angles(message: Any) -> dict[str, float]:
+    angles = zip(message.name, message.position, strict=False)
+    return {str(name): float(angle) for name, angle in angles}
 
 
 def _intrinsics(message: Any) -> tuple[Floats, Floats]:
@@ -298,7 +302,7 @@ class Scans:
         """How much each differs from the one before, where they come often enough to tell."""
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / OFTEN:
             return None
-        looks = [_look(raw.decode()) for raw in messages(self.bag.files, [self.first])]
+        looks = [raw.read(_look) for raw in messages(self.bag.files, [self.first])]
         alike = all(look.shape == looks[0].shape for look in looks)
         changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks)]
         between = (self.times[1:] + self.times[:-1]) / 2
@@ -339,7 +343,7 @@ class Scans:
         for number, raw in enumerate(messages(self.bag.files, [topic])):
             if number in wanted:
                 name = f"{topic.strip('/').replace('/', '_')}-{number:05}"
-                files[number] = save(folder / name, raw.decode())
+                files[number] = raw.read(partial(save, folder / name))
         return files
 
 

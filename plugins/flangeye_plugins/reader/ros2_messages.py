@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
 from flangeye.log.records import Channel, LogFile
 from flangeye.types import Singles
+
+T = TypeVar("T")
 
 SHORTEST = 12
 """A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
@@ -35,16 +37,34 @@ class Raw:
     """A message, not yet decoded.
 
     Attributes:
+        file: The bag's file.
         topic: Its topic.
         received: When it was recorded [s].
         data: CDR.
         decode: Gives the message.
     """
 
+    file: Path
     topic: str
     received: float
     data: bytes
     decode: Callable[[], Any]
+
+    def read(self, use: Callable[[Any], T]) -> T:
+        """Return what a function makes of the message.
+
+        Raises:
+            StageError: It is damaged, or not what its type says.
+        """
+        try:
+            return use(self.decode())
+        except StageError:
+            raise
+        except Exception as error:  # a damaged schema makes messages without their fields
+            reason = reason_of(error)
+            raise StageError(
+                f"{self.file}: a message of {self.topic} is damaged: {reason}"
+            ) from None
 
     @property
     def stamp(self) -> float:
@@ -91,11 +111,7 @@ def messages(files: list[Path], topics: Collection[str]) -> Iterator[Raw]:
         read = _mcap_messages if file.suffix == ".mcap" else _db3_messages
         found = read(file, topics)
         while (raw := _guarded(file, lambda _: next(found, None))) is not None:  # noqa: B023
-            yield replace(raw, decode=partial(_guarded, file, _decoder(raw)))
-
-
-def _decoder(raw: Raw) -> Callable[[Path], Any]:
-    return lambda _: raw.decode()
+            yield raw
 
 
 def _guarded(file: Path, read: Callable[[Path], Any]) -> Any:
@@ -141,7 +157,7 @@ def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
                 schema = Schema(len(decoders) + 1, *described)
                 decoders[channel] = factory.decoder_for(channel.encoding, schema)
             if (decode := decoders[channel]) is not None:
-                yield Raw(channel.topic, time_ns * 1e-9, data, partial(decode, data))
+                yield Raw(file, channel.topic, time_ns * 1e-9, data, partial(decode, data))
 
 
 def _db3_topics(file: Path) -> dict[str, str]:
@@ -168,7 +184,7 @@ def _db3_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
     )
     try:
         for topic, kind, stamp, data in rows:
-            yield Raw(topic, stamp * 1e-9, data, partial(store.deserialize_cdr, data, kind))
+            yield Raw(file, topic, stamp * 1e-9, data, partial(store.deserialize_cdr, data, kind))
     finally:
         database.close()
 

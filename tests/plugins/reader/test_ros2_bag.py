@@ -234,7 +234,7 @@ def test_a_message_that_is_damaged_is_one_line(tmp_path: Path) -> None:
         database.execute("UPDATE messages SET data = x'00010000ffff' WHERE id = 2")
     with pytest.raises(StageError) as refused:
         ros2_bag(file, BagParams())
-    assert str(refused.value).startswith(f"{file}: cannot be read as a ROS 2 bag: ")
+    assert str(refused.value).startswith(f"{file}: a message of /pose is damaged: Could not ")
     assert "\n" not in str(refused.value)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flangeye.files.tables.table import Row, Table
 
-_NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+_NUMBER = r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
 
 
 def _list_of(count: int) -> str:

@@ -42,8 +42,9 @@ class _splitter:  # noqa: N801  a function with a memory
         if self.mark == " ":
             return tuple(line.split())
         (cells,) = csv.reader([line], delimiter=self.mark, skipinitialspace=True)
+        cells = [cell.strip() for cell in cells]
         # A mark at the line's end makes an empty last cell.
-        return tuple(cell.strip() for cell in (cells[:-1] if not cells[-1].strip() else cells))
+        return tuple(cells[:-1] if cells and not cells[-1] else cells)
 
 
 def _plain(line: str) -> bool:
