@@ -195,9 +195,10 @@ class Copy:
             kept = KEPT / f"{room}-{file.stem}-{_digest(file)}.json"
             if not kept.exists():
                 print(f"{room}: looking which lines {file.name} runs", file=sys.stderr)
-                words = ["-m", "tools.covering", source, str(kept), str(file.relative_to(ROOT))]
-                self._run(words)
-                gathered = json.loads(kept.read_text("utf-8"))
+                found_now = self._root / "covering.json"
+                words = ["-m", "tools.covering", source, str(found_now)]
+                self._run([*words, str(file.relative_to(ROOT))])
+                gathered = json.loads(found_now.read_text("utf-8"))
                 gathered["sources"] = {name: _digest(ROOT / name) for name in gathered["lines"]}
                 kept.write_text(json.dumps(gathered), "utf-8")
             found.add(json.loads(kept.read_text("utf-8")))
