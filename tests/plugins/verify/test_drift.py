@@ -41,3 +41,4 @@ def test_a_cell_that_moved_is_refused(run: Path, shift: float, passed: bool) -> 
     if not passed:
         assert found.figures["shift"] == pytest.approx(1e-3, rel=0.25)
         assert "the cell has moved since" in found.reason
+        assert found.figures["turn"] < 4e-4, "it was shifted, not turned"

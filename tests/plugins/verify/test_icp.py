@@ -120,6 +120,15 @@ def test_the_camera_origin_shows_the_rotation_times_the_distance() -> None:
     )
 
 
+def test_translations_are_the_lengths_of_their_coordinates() -> None:
+    off = off_by(np.array([0.002, -0.001, 0.003]), np.array([0.5, -0.3, 0.4]) * MM)
+    figures = verify_icp(calibration(off), Views([view()]), FLANGE_50, IcpParams()).figures
+    for whole in ("translation", "camera_translation"):
+        prefix = whole.removesuffix("translation")
+        parts = [figures[f"{prefix}{name}"] for name in "xyz"]
+        assert figures[whole] == pytest.approx(np.linalg.norm(parts))
+
+
 def test_a_right_calibration_passes_and_a_wrong_one_does_not() -> None:
     views = Views([view()])
     right = verify_icp(calibration(off_by(np.zeros(3), np.zeros(3))), views, FLANGE_50, IcpParams())
