@@ -20,13 +20,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def later(run: Path, shift: float) -> HandEye:
-    """Return the same poses, seen by a scanner that is nearer by ``shift`` [m]."""
+    """Return the same poses, seen by a scanner that is aside and nearer by ``shift`` [m]."""
     found = read_run(run / "run.mcap").calibration()
     assert found is not None
     rng, moved = np.random.default_rng(4), []
     for pair in found.pairs:
         circle = pair.observation.circle
-        centre = circle.centre + [0.0, 0.0, shift] + rng.normal(0, 5e-5, 3)
+        centre = circle.centre + shift * np.array([0.6, 0.0, 0.8]) + rng.normal(0, 5e-5, 3)
         observation = replace(pair.observation, feature=replace(circle, centre=centre))
         moved.append(Pair(observation, pair.residual))
     return replace(found, pairs=tuple(moved))
