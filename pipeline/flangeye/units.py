@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from decimal import Decimal
 from typing import Annotated, Any
 
@@ -105,6 +106,11 @@ def param(default: Any = ..., *, description: str = "", **limits: Any) -> Any:
     recipe's, the limits are in SI, and type checkers see the field's own type.
     """
     return Field(default, description=description or None, validate_default=True, **limits)
+
+
+def in_mm(point: Iterable[float]) -> str:
+    """Return a point [m] for people: ``600, 0, 950 mm``."""
+    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"
 
 
 class SI:

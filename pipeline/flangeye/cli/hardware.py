@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -44,13 +45,19 @@ def tactile_calibrate(
     registry = load_plugins()
     checked = read_recipe(recipe, registry, overrides)
 
+    guide = registry.part("guide.tool" if body else "guide.tactile")
+    say(guide(checked, MotionAllowed(move), _asker(yes), out))
+
+
+def _asker(yes: bool) -> Callable[[str], None]:
+    """Return what says a text and, unless everything is confirmed, waits for Enter."""
+
     def ask(text: str) -> None:
         say(text)
         if not yes:
             typer.prompt("then press Enter", default="", show_default=False)
 
-    guide = registry.part("guide.tool" if body else "guide.tactile")
-    say(guide(checked, MotionAllowed(move), ask, out))
+    return ask
 
 
 @app.command()
@@ -79,13 +86,8 @@ def touch(
     """
     from flangeye.cli.touching import touch_points
 
-    def ask(text: str) -> None:
-        say(text)
-        if not yes:
-            typer.prompt("then press Enter", default="", show_default=False)
-
     registry = load_plugins()
-    for line in touch_points(run, registry, (seen, tip), move, ask, out):
+    for line in touch_points(run, registry, (seen, tip), move, _asker(yes), out):
         say(line)
 
 

@@ -87,11 +87,8 @@ def pairs_of(
 
 
 def hand_eye_of(
-    estimates: Sequence[TransformEstimate],
-    pairs: tuple[Pair, ...],
-    method: str,
-    notes: Sequence[str] = (),
+    estimates: Sequence[TransformEstimate], pairs: tuple[Pair, ...], method: str
 ) -> HandEye:
     """Return the calibration: the camera's pose first, then the other unknowns."""
     camera, *others = estimates
-    return HandEye(camera, pairs, method, tuple(notes), others=tuple(others))
+    return HandEye(camera, pairs, method, others=tuple(others))

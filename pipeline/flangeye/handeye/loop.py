@@ -16,7 +16,7 @@ from flangeye.handeye.components import FINEST, Noise
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.handeye.walk import Course, Of
-from flangeye.maths.geometry import hat, rotation_between, rotation_exp, rotation_log
+from flangeye.maths.geometry import each_applied, hat, rotation_between, rotation_exp, rotation_log
 from flangeye.types import Floats
 
 COLUMNS = 20
@@ -140,7 +140,7 @@ class _Chain:
         self._eye = at.x[:3, :3].T
         self._to_carrier = np.swapaxes(measurements.a[:, :3, :3], 1, 2)
         self._seen = measurements.offsets @ at.z[:3, :3].T + at.z[:3, 3]
-        carried = _apply(measurements.b, self._seen)
+        carried = each_applied(measurements.b, self._seen)
         self._from_base2 = carried @ at.y[:3, :3].T
         self._in_base = in_base = self._from_base2 + at.y[:3, 3]
         in_carrier = (self._to_carrier @ (in_base - measurements.a[:, :3, 3])[..., None])[..., 0]
@@ -189,10 +189,6 @@ class _Chain:
         out = np.zeros((len(self._s), 6, 6))
         out[:, :3, :3], out[:, 3:, :3], out[:, 3:, 3:] = turn, lever, shift
         return out
-
-
-def _apply(poses: Floats, points: Floats) -> Floats:
-    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[..., 0] + poses[:, :3, 3])
 
 
 def free_columns(

@@ -9,18 +9,16 @@ from flangeye.maths.smooth_field import displacement_covariance
 from flangeye.types import Floats, HandEye, Observation
 
 
-def prediction_covariance(
-    calibration: HandEye, observation: Observation, corrected: bool = True
-) -> Floats:
+def prediction_covariance(calibration: HandEye, observation: Observation) -> Floats:
     """Return the (3, 3) covariance in ``base`` of a seen centre from where the flange is [m^2].
 
     Of a camera beside the robot. Its 95 % region, drawn with the chi-square quantile, holds its
-    share: it is widened for what is unknown of the noise.
+    share: it is widened for what is unknown of the noise. The arm is corrected as the calibration
+    has it.
 
     Args:
         calibration: The calibration.
         observation: A pose that took no part in it.
-        corrected: Whether the arm is corrected as the calibration has it, not taken as reported.
     """
     estimate, feature = calibration.camera, observation.feature
     turn = estimate.transform.rotation
@@ -33,5 +31,5 @@ def prediction_covariance(
     shared = np.zeros((3, 3))
     if calibration.correction is not None and calibration.correction.field is not None:
         field, place = calibration.correction.field, observation.base_T_flange.translation
-        shared = displacement_covariance(field, place[None], corrected)[0]
+        shared = displacement_covariance(field, place[None], corrected=True)[0]
     return np.asarray(of_matrix + noise.widening * (differing + shared))

@@ -58,14 +58,14 @@ def pose_in_frame(transform: Transform, time_ns: int) -> Any:
     return message
 
 
-def compressed_image(image: Image, time_ns: int, frame: str = "camera") -> Any:
+def compressed_image(image: Image, time_ns: int) -> Any:
     """Return the pixels as a foxglove.CompressedImage, PNG: nothing is lost."""
     import cv2
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
     colour = image.pixels[..., ::-1] if image.pixels.ndim == 3 else image.pixels
     _, data = cv2.imencode(".png", np.ascontiguousarray(colour))
-    message = CompressedImage(frame_id=frame, format="png", data=data.tobytes())
+    message = CompressedImage(frame_id="camera", format="png", data=data.tobytes())
     message.timestamp.FromNanoseconds(time_ns)
     return message
 

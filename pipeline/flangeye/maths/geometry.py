@@ -149,6 +149,17 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Floats:
     return out
 
 
+def each_applied(transforms: Floats, points: Floats) -> Floats:
+    """Return (N, 3) points, each mapped by its own of (N, 4, 4) transforms."""
+    return np.asarray((transforms[:, :3, :3] @ points[:, :, None])[..., 0] + transforms[:, :3, 3])
+
+
+def angle_between(first: Floats, second: Floats) -> Floats:
+    """Return the (...) angles of vectors (..., 3), exact for small ones too [rad]."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.arctan2(across, (first * second).sum(axis=-1)))
+
+
 def invert(transforms: Floats) -> Floats:
     """Return the inverses of rigid (..., 4, 4) matrices."""
     out = np.zeros_like(transforms)

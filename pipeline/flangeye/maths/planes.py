@@ -72,9 +72,9 @@ def thinned(points: NDArray[T], enough: int = ENOUGH) -> NDArray[T]:
     return points[:: 1 + len(points) // enough]
 
 
-def robust_plane(points: Floats, rough: Plane, gate: float, sigmas: float = 3.0) -> Plane | None:
+def robust_plane(points: Floats, rough: Plane, gate: float) -> Plane | None:
     """Return the plane most points near a rough one lie on; see :func:`robust_planes`."""
-    return robust_planes([points], [rough], np.array([gate]), sigmas)[0]
+    return robust_planes([points], [rough], np.array([gate]))[0]
 
 
 def robust_planes(

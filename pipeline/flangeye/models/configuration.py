@@ -21,6 +21,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.maths.arm_correction import corrected_observation
+from flangeye.maths.geometry import each_applied
 from flangeye.maths.kinematics import Arm
 from flangeye.types import (
     BASE,
@@ -241,8 +242,4 @@ def mapped_and_expected(ends: Ends, observations: Sequence[Observation]) -> tupl
     """Return where targets were seen, and where they should be: (N, 3) each, in ``base``."""
     seen = np.array([o.feature.centre for o in observations]).reshape(-1, 3)
     offsets = np.array([o.centre_in_mount for o in observations]).reshape(-1, 3)
-    return _apply(ends.camera, seen), _apply(ends.target, offsets)
-
-
-def _apply(poses: Floats, points: Floats) -> Floats:
-    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[..., 0] + poses[:, :3, 3])
+    return each_applied(ends.camera, seen), each_applied(ends.target, offsets)

@@ -44,6 +44,11 @@ class Flange(BaseModel):
         """How far the circle lies behind the origin of ``flange``: a wrist's circle does [m]."""
         return self.details.thickness if self.bore is None else 0.0
 
+    @property
+    def radii(self) -> dict[str, float]:
+        """The radii to expect by name: rim, and bore if the flange shows one [m]."""
+        return {"rim": self.rim} | ({} if self.bore is None else {"bore": self.bore})
+
 
 def plate_of(robot: RobotModel) -> Flange:
     """Return the plate that an arm's own file names.

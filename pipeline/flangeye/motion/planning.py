@@ -109,9 +109,3 @@ def tilted(place: Floats, facing: Floats, tilt: float, rng: np.random.Generator)
     """Return a pose (4, 4) at a point whose roll, pitch and yaw from facing stay below ``tilt``."""
     roll, pitch, yaw = rng.uniform(-tilt, tilt, 3)
     return rigid(rotation_from_rpy(roll, pitch, yaw) @ facing, place)
-
-
-def angle_between(first: Floats, second: Floats) -> Floats:
-    """Return the (...) angles of vectors (..., 3) [rad]."""
-    across = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.asarray(np.arctan2(across, (first * second).sum(axis=-1)))

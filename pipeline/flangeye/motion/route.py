@@ -11,6 +11,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.types import Floats
+from flangeye.units import in_mm
 
 STEP = np.radians(2.0)
 """Largest turn of a joint between two checked postures [rad]."""
@@ -96,9 +97,9 @@ class Router:
         """Say why the arm must not be in a posture."""
         axes = self._volume.axes(frames)
         if not self._volume.above(axes, TABLE):
-            return f"touches the table with the flange at {_mm(place)}"
+            return f"touches the table with the flange at {in_mm(place)}"
         if not self._volume.apart(axes):
-            return f"touches itself with the flange at {_mm(place)}"
+            return f"touches itself with the flange at {in_mm(place)}"
         return self._limits.outside(place) or self._limits.beyond(joints)
 
     def _timed(self, start: Floats, goal: Floats, count: int) -> Leg:
@@ -113,7 +114,3 @@ class Router:
         acceleration = min(JOINT_ACCELERATION, limits.acceleration / max(lever, 1e-6))
         ramp = min(speed / acceleration, np.sqrt(turn / acceleration))
         return Leg(goal, speed, acceleration, turn / speed + ramp)
-
-
-def _mm(place: Floats) -> str:
-    return ", ".join(f"{1e3 * x:.0f}" for x in place) + " mm"

@@ -38,7 +38,7 @@ from flangeye.types import (
     Truth,
     by_frame,
 )  # fmt: skip
-from flangeye.units import param
+from flangeye.units import in_mm, param
 from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import Cell
@@ -180,7 +180,7 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
     if len(found) < count:
         raise StageError(
             f"acquire.simulated: no pose for verification near the middle of the workspace "
-            f"({_mm(plan.centre)}); move the plan's centre, or set verification: 0"
+            f"({in_mm(plan.centre)}); move the plan's centre, or set verification: 0"
         )
     return [pose.joints for pose in found]
 
@@ -210,10 +210,6 @@ def _fingerprint(seed: int, *models: BaseModel | None) -> str:
     given = [model.model_dump(mode="json") for model in models if model is not None]
     text = json.dumps([VERSION, seed, given], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _mm(point: Floats) -> str:
-    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.maths.geometry import angle_between
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange
-from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between, poses_near
+from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
 from flangeye.motion.reach import Margins, Reach
 from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, Role
+from flangeye.units import in_mm
 
 FEWEST = 3
 """Poses without which no camera pose can be found."""
@@ -108,7 +110,7 @@ class Itinerary:
         if len(self._checks) < verification:
             raise StageError(
                 f"acquire.live: no pose for verification near the middle of the work "
-                f"({_mm(self._plan.centre)}): {self.why_not()}; move the plan's centre, widen "
+                f"({in_mm(self._plan.centre)}): {self.why_not()}; move the plan's centre, widen "
                 "robot.limits, or set verification: 0"
             )
 
@@ -241,7 +243,7 @@ def itinerary_of(
         reasons = reach.why_refused() or "no posture is possible"
         raise StageError(
             f"acquire.live: {robot.model} cannot show its flange to {scanner.model} at "
-            f"{_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
+            f"{in_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
         )
     return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
 
@@ -253,7 +255,3 @@ def _place(point: Floats) -> tuple[float, ...]:
 
 def _row_mm(place: Sequence[float]) -> str:
     return " ".join(f"{1e3 * x:7.1f}" for x in place)
-
-
-def _mm(point: Floats) -> str:
-    return ", ".join(f"{1e3 * x:.0f}" for x in point) + " mm"

@@ -101,18 +101,13 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     if len(flat) < FEWEST_POINTS:
         return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
     start = face.flatten(cloud.centre[None])[0]
-    nominal = np.array(list(nominal_radii(flange).values()))
+    nominal = np.array(list(flange.radii.values()))
     rings = find_rings(flat, nominal, start, params.inlier / 2)
     problem = _why_not(rings, flange, params)
     if problem:
         return Rejected(problem)
     plane = away_from_edges(points, face, rings, flange)
     return _feature(points, plane, face, rings, flange, params)
-
-
-def nominal_radii(flange: Flange) -> dict[str, float]:
-    """Return the radii to expect by name: rim, and bore if the flange shows one [m]."""
-    return {"rim": flange.rim} | ({} if flange.bore is None else {"bore": flange.bore})
 
 
 def _ring_of(flange: Flange) -> tuple[float, float]:
@@ -128,7 +123,7 @@ def _on_face(face: Plane, points: Floats, params: RimParams) -> NDArray[np.bool_
 def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
     """Return why the circles are not the flange's, or None."""
     coverage = rings.coverage(params.inlier)
-    for k, (name, expected) in enumerate(nominal_radii(flange).items()):
+    for k, (name, expected) in enumerate(flange.radii.items()):
         if coverage[k] < params.min_coverage:
             return (
                 f"{coverage[k]:.0%} of the {name} lies within {params.inlier * 1e3:g} mm of a "
@@ -179,7 +174,7 @@ def _feature(
     return CircleFeature(
         centre=centre + to_flange * plane.normal,
         normal=plane.normal,
-        radii=dict(zip(nominal_radii(flange), rings.circles.radii.tolist(), strict=True)),
+        radii=dict(zip(flange.radii, rings.circles.radii.tolist(), strict=True)),
         covariance=axes.T @ _centre_covariance(rings, of_plane, params) @ axes,
         normal_covariance=axes[:2].T @ of_plane[:2, :2] @ axes[:2],
         arc_coverage=float(rings.coverage(params.inlier)[0]),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between, tilted
+from flangeye.maths.geometry import angle_between
+from flangeye.motion.planning import Plan, PlannedPose, Site, tilted
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, param

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.handeye.observability import in_base
-from flangeye.maths.geometry import hat, rigid, rotation_from_rpy
-from flangeye.motion.planning import Plan, PlannedPose, Site, angle_between
+from flangeye.maths.geometry import angle_between, hat, rigid, rotation_from_rpy
+from flangeye.motion.planning import Plan, PlannedPose, Site
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Box, Floats
 from flangeye.units import Angle, Length, param

@@ -106,7 +106,7 @@ def compare(
 def _missing_ring(
     disc: Disc, shares: list[float], flange: Flange, limits: DiscLimits
 ) -> str | None:
-    for share, (name, radius) in zip(shares, _rings(flange).items(), strict=True):
+    for share, (name, radius) in zip(shares, flange.radii.items(), strict=True):
         if share < limits.coverage:
             return (
                 f"a disc {disc.across * 1e3:.0f} mm across has {share:.0%} of a {name} of "
@@ -142,10 +142,6 @@ def _too_steep(disc: Disc, limits: DiscLimits) -> str | None:
     return f"incidence {angle:.0f} deg over the limit of {limit:.0f} deg" if angle > limit else None
 
 
-def _rings(flange: Flange) -> dict[str, float]:
-    return {"rim": flange.rim} | ({} if flange.bore is None else {"bore": flange.bore})
-
-
 def width(flat: Floats) -> float:
     """Return the largest width of (N, 2) points over all directions, in steps of 10 degrees."""
     angle = np.arange(18) * np.pi / 18
@@ -178,7 +174,7 @@ def ring_shares(
         centre = vote_centre(tuple(votes), centre, 0.5 * flange.bore)
     tolerance = 1e-3 + pitch
     shares = []
-    for k, radius in enumerate(_rings(flange).values()):
+    for k, radius in enumerate(flange.radii.values()):
         edge = flat[edge_points(flat, centre, SECTORS, outer=k == 0)] - centre
         off = np.abs(np.hypot(edge[:, 0], edge[:, 1]) - radius)
         shares.append(float((off < tolerance).sum() / SECTORS))

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
-from flangeye.maths.geometry import covariance_at
+from flangeye.maths.geometry import angle_between, covariance_at
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import (
     chi2_quantile,
@@ -208,7 +208,7 @@ def _measure_loop(
     for i, pose, turn, axis in zip(fold, poses, turns, axes, strict=True):
         held.covariances[i] = turn @ pose.feature.centre_covariance @ turn.T
         if pose.feature.normal is not None:
-            held.tilts[i] = _angle(turn @ pose.feature.normal, axis)
+            held.tilts[i] = angle_between(turn @ pose.feature.normal, axis)
 
 
 def expected_flange(calibration: HandEye, observation: Observation, arm: Arm | None) -> Floats:
@@ -227,12 +227,7 @@ def _measure(
     of_pose = covariance_at(estimate.covariance, estimate.about, mapped[None])[0]
     held.covariances[i] = rotation @ circle.covariance @ rotation.T + of_pose
     if circle.normal is not None:
-        held.tilts[i] = _angle(rotation @ circle.normal, expected[:3, 2])
-
-
-def _angle(first: Floats, second: Floats) -> float:
-    """Return the angle between unit vectors, exact for small angles too."""
-    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
+        held.tilts[i] = angle_between(rotation @ circle.normal, expected[:3, 2])
 
 
 def _beyond_gate(held: HeldOut, probability: float) -> NDArray[np.bool_]:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flangeye.motion.planning import Site, angle_between
+from flangeye.maths.geometry import angle_between
+from flangeye.motion.planning import Site
 from flangeye_plugins.plan.next_best import NextBestParams, next_best
 from tools.study_next_best import compare
 
