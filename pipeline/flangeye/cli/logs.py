@@ -217,7 +217,14 @@ def doctor(
     """
     import json
 
-    from flangeye.doctor import as_json, as_text, examine, open_session
+    from flangeye.doctor import (
+        as_json,
+        as_text,
+        examine,
+        examine_cell,
+        open_cell,
+        open_session,
+    )
     from flangeye.log.read import log_of
     from flangeye.recipe.find import is_recipe
 
@@ -229,11 +236,13 @@ def doctor(
         archive = _archive_of(checked)
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     with of_foreign(archive, "it cannot be examined"):
-        session = open_session(archive, registry, checked)
-        say_notes(session.damage)
-        diagnosis = examine(session, checks)
+        cell = open_cell(archive, registry, checked)
+        if cell is None:
+            session = open_session(archive, registry, checked)
+            say_notes(session.damage)
+        diagnosis = examine_cell(*cell) if cell else examine(session, checks)
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
-    if diagnosis.findings or session.damage:
+    if diagnosis.findings or diagnosis.session.damage:
         raise typer.Exit(1)
 
 

@@ -154,17 +154,18 @@ def _refuse(options: object, why: str) -> None:
 def _advise(log: Path, registry: Registry) -> None:
     """Say what to do about a refusal: the doctor's command, and what it finds first."""
     from flangeye.cli.logs import of_foreign
-    from flangeye.doctor import examine, fix_lines, open_session
+    from flangeye.doctor import examine, examine_cell, fix_lines, open_cell, open_session
     from flangeye.files.elsewhere import with_urls
 
     say(with_urls(f"\nwhat to do: flangeye doctor {log}"))
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
         with of_foreign(log, "it cannot be examined"):
-            findings = examine(open_session(log, registry, None), checks).findings
+            cell = open_cell(log, registry)
+            told = examine_cell(*cell) if cell else examine(open_session(log, registry), checks)
     except FlangeyeError:
         return  # the doctor needs more than this log has, and says so when it is asked
-    if findings:
+    if findings := told.findings:
         say(f"  likely: {findings[0].name}: {findings[0].what}")
         say("\n".join(fix_lines(findings[0], "  ")))
     else:

@@ -45,7 +45,7 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
     """
     bound = [check.bind() for check in checks]
     found, current = list(session.remarks), session
-    _require_enough(session)
+    require_enough(session)
     offered, idle = _offered(current, bound)
     if made_up := [f for f in offered if f.hopeless]:
         # What else these samples seem to show is made up like them.
@@ -85,7 +85,12 @@ def _offered(
     return found, idle
 
 
-def _require_enough(session: RecordedSession) -> None:
+def require_enough(session: RecordedSession) -> None:
+    """Go on only with samples enough to tell anything from.
+
+    Raises:
+        StageError: There are fewer.
+    """
     seen = int(session.seen.sum())
     if seen < FEWEST:
         raise StageError(

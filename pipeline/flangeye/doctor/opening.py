@@ -18,8 +18,9 @@ from flangeye.doctor.diagnosis import Finding, Reader, RecordedSession
 from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, Recording, check_ids
-from flangeye.log.read import RunLog, is_log, log_of, read_run
+from flangeye.log.read import is_log, log_of, read_run
 from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Cell
 from flangeye.models.configuration import DEFAULT, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
@@ -27,6 +28,7 @@ from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart, Params
 from flangeye.recipe.load import Recipe, parse_recipe
 from flangeye.recipe.steps import Step
+from flangeye.run.runner import Runner
 from flangeye.types import Floats
 
 
@@ -51,6 +53,33 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
     return _of_recipe(path, registry, recipe)
 
 
+def open_cell(
+    path: Path, registry: Registry, recipe: Recipe | None = None
+) -> tuple[Sequence[t.Observation], Cell, Mapping[str, Any]] | None:
+    """Return a cell's sightings, what stands on what, and how tables were read; None if it is none.
+
+    Args:
+        path: A run.mcap, or a folder that the recipe's reader knows.
+        registry: The plugins on offer.
+        recipe: Says what stands on what; a log brings its own.
+
+    Raises:
+        StageError: The recordings cannot be read.
+    """
+    log = read_run(log_of(path)) if path.suffix == ".mcap" or is_log(log_of(path)) else None
+    text = log.text("recipe.yaml") if log else None
+    if recipe is None and text is not None:
+        recipe = parse_recipe(text, path.name, registry)
+    cell = recipe.context.get(Cell) if recipe else None
+    if recipe is None or cell is None:
+        return None
+    reader = _written(getattr(recipe.steps[0].params, "reader", None))
+    tables = {} if isinstance(reader, str) else reader.get("cell", {})
+    if log:
+        return log.observations(), cell, tables
+    return Runner(recipe, registry, t.ArchivePath(path)).take(None), cell, tables
+
+
 def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSession:
     log = read_run(path)
     text = log.text("recipe.yaml")
@@ -59,7 +88,6 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
         raise StageError(f"{path}: the run ended early; nothing was gathered yet")
     if recipe is None and text is not None:
         recipe = parse_recipe(text, path.name, registry)
-    _require_one_camera(path, log)
     found = {o.id: o.feature for o in log.observations()}
     calibration = [meta for meta in log.poses.values() if meta["role"] == "calibration"]
     given = {o.id: o.base_T_flange.matrix for o in log.observations()}
@@ -68,14 +96,6 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     session = replace(_session({**given, **poses}, found, times), damage=tuple(log.notes))
     states = {meta["id"]: _state_of(meta) for meta in calibration}
     return session if recipe is None else _as_recipe(session, recipe, states)
-
-
-def _require_one_camera(path: Path, log: RunLog) -> None:
-    if any(t.FLANGE not in o.poses for o in log.observations()):
-        raise StageError(
-            f"{path}: is of a cell with several cameras; the doctor looks at one arm with "
-            "one camera and one target"
-        )
 
 
 def _state_of(meta: Mapping[str, Any]) -> State:

@@ -61,7 +61,7 @@ def calibrate_cell(
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    sighted = _sighted(observations, cell, limits)
+    sighted = sighted_of(observations, cell, limits)
     found = sighted.solved()
     _require_agreement(found, len(observations))
     branches = branches_of(sighted, cell)
@@ -100,7 +100,7 @@ def solve_cell(
         StageError: No sighting, or one without the pose of something that moves.
         CalibrationRefused: The sightings leave something unknown: it says what.
     """
-    return _sighted(observations, cell, limits).solved(start)
+    return sighted_of(observations, cell, limits).solved(start)
 
 
 def solve_so_far(
@@ -116,9 +116,10 @@ def solve_so_far(
     return None
 
 
-def _sighted(
+def sighted_of(
     observations: Sequence[Observation], cell: Cell, limits: tuple[float, float]
 ) -> Sighted:
+    """Return observations of a cell as its graph takes them; see :func:`solve_cell`."""
     if not observations:
         raise StageError("no sighting to solve with: every capture was set aside, for its reason")
     sightings = [sighting_of(i, o) for i, o in enumerate(observations)]

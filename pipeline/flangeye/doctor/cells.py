@@ -1,0 +1,311 @@
+"""What is wrong with the recordings of a cell: each mistake tried on its whole graph.
+
+A mistake is named only where the cell without it foretells sightings held out far better, of all
+cameras together, and is mended by a line of the recipe: of the reader's tables, or of ``cell:``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from flangeye.doctor.diagnosis import Change, Finding, Misfit, RecordedSession
+from flangeye.doctor.examine import Diagnosis, require_enough
+from flangeye.errors import FlangeyeError
+from flangeye.handeye.candidates import by_folds
+from flangeye.handeye.cell import sighted_of
+from flangeye.handeye.graph import LIMITS
+from flangeye.maths.geometry import invert, rigid
+from flangeye.models.cell import Axis, Cell
+from flangeye.types import CAMERA, TARGET, Floats, Observation, PoseFeature, Transform
+
+HELPS = 0.5
+"""A mistake that is one leaves at most this share of the errors held out once it is mended."""
+ORDINARY = 0.02, np.radians(1.0)
+"""Errors of sound sightings, as a share of how far they are apart, and of their rotations [rad]."""
+NEAREST, FARTHEST = 0.02, 10.0
+"""Sightings and poses in the middle of a cell are so far from camera and base [m]."""
+GROSS = 5.0
+"""A sighting set aside belongs elsewhere when it is off by so many times what others are."""
+EACH = 12
+"""Sightings of each camera and target that are looked at."""
+UNITS = {"mm": 1e-3, "m": 1e3}
+"""Factors on lengths, by the unit they are in if the recipe says the other one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Suspicion:
+    """A mistake that may have been made.
+
+    Attributes:
+        name: In a word or two.
+        what: In a sentence.
+        fix: The line that mends it.
+        observations: The sightings without it.
+        cell: The cell without it.
+    """
+
+    name: str
+    what: str
+    fix: str
+    observations: Sequence[Observation]
+    cell: Cell
+
+
+def examine_cell(
+    observations: Sequence[Observation], cell: Cell, tables: Mapping[str, Any] | None = None
+) -> Diagnosis:
+    """Return the mistake that explains most; else sightings that do not belong to their poses.
+
+    Args:
+        observations: Every sighting.
+        cell: What the recipe says stands on what.
+        tables: Parameters of ``reader.cell``, where it read them.
+
+    Raises:
+        StageError: There are too few sightings to tell anything.
+    """
+    session = _session(observations)
+    require_enough(session)
+    some = _thinned(observations)
+    before = foretold(some, cell)
+    found = [] if before.ordinary else _likeliest(before, suspicions(some, cell, tables or {}))
+    found = found or _mispaired(observations, cell)
+    return Diagnosis(session, tuple(found), (), ("cell",), {})
+
+
+def _likeliest(before: Foretold, suspected: Iterator[Suspicion]) -> list[Finding]:
+    """Return the mistake whose cure foretells sightings best, if it does so far better."""
+    tried = [(foretold(s.observations, s.cell), s) for s in suspected if _possible(s)]
+    if not tried:
+        return []
+    after, best = min(tried, key=lambda each: each[0].size)
+    if not after.ordinary or after.size > HELPS * before.size:
+        return []
+    known = before.misfit if np.isfinite(before.size) else None
+    return [Finding(best.name, best.what, best.fix, before=known, after=known and after.misfit)]
+
+
+def suspicions(
+    observations: Sequence[Observation], cell: Cell, tables: Mapping[str, Any]
+) -> Iterator[Suspicion]:
+    """Yield each mistake that may have been made, mended."""
+    yield from _of_sightings(observations, cell, tables.get("sightings", ()))
+    yield from _of_arms(observations, cell, tables.get("arms", {}))
+    yield from _of_mountings(observations, cell)
+
+
+def _of_sightings(
+    observations: Sequence[Observation], cell: Cell, tables: Sequence[Mapping[str, Any]]
+) -> Iterator[Suspicion]:
+    """Yield inverted markers and wrong units of what cameras saw."""
+    stated = {(each["camera"], each["target"]): each.get("pose") for each in tables}
+    pairs = {(o.camera, o.target) for o in observations if isinstance(o.feature, PoseFeature)}
+    for camera, target in sorted(pairs):
+
+        def mended(change: Change, pair: tuple[str, str] = (camera, target)) -> list[Observation]:
+            return [_seen(o, change) if (o.camera, o.target) == pair else o for o in observations]
+
+        of = f"{{camera: {camera}, target: {target}, "
+        seen = f"what {camera} saw of {target}"
+        pose = _other(stated.get((camera, target)), "camera_T_target", "target_T_camera")
+        yield Suspicion(
+            "inverted marker",
+            f"{seen} are poses {pose}, not the other way round",
+            f"sightings: [{of}pose: {pose}}}]",
+            mended(invert),
+            cell,
+        )
+        for unit, factor in UNITS.items():
+            yield Suspicion(
+                "unit",
+                f"{seen} is in {unit}",
+                f"sightings: [{of}length: {unit}}}]",
+                mended(partial(_scaled, factor=factor)),
+                cell,
+            )
+
+
+def _other(stated: str | None, usual: str, otherwise: str) -> str:
+    """Return whose pose it is if it is not what was stated."""
+    return usual if stated == otherwise else otherwise
+
+
+def _of_arms(
+    observations: Sequence[Observation], cell: Cell, tables: Mapping[str, Mapping[str, Any]]
+) -> Iterator[Suspicion]:
+    """Yield inverted poses, wrong units and exchanged tables of the arms."""
+    arms = [name for name, mover in cell.movers.items() if not isinstance(mover, Axis)]
+    for arm in arms:
+        pose = _other(tables.get(arm, {}).get("pose"), "base_T_flange", "flange_T_base")
+        yield Suspicion(
+            "inverted pose",
+            f"the poses of {arm} are {pose}, not the other way round",
+            f"arms: {{{arm}: {{pose: {pose}}}}}",
+            [_moved(o, {arm: invert(o.poses[arm].matrix)}) for o in observations],
+            cell,
+        )
+        for unit, factor in UNITS.items():
+            yield Suspicion(
+                "unit",
+                f"the poses of {arm} are in {unit}",
+                f"arms: {{{arm}: {{length: {unit}}}}}",
+                [_moved(o, {arm: _scaled(o.poses[arm].matrix, factor)}) for o in observations],
+                cell,
+            )
+    files = {arm: tables.get(arm, {}).get("file", f"the table of {arm}") for arm in arms}
+    for one, two in combinations(arms, 2):
+        yield Suspicion(
+            "swapped arms",
+            f"the poses of {one} are those of {two}, and the other way round",
+            f"arms: {{{one}: {{file: {files[two]}}}, {two}: {{file: {files[one]}}}}}",
+            [_moved(o, {one: o.poses[two].matrix, two: o.poses[one].matrix}) for o in observations],
+            cell,
+        )
+
+
+def _of_mountings(observations: Sequence[Observation], cell: Cell) -> Iterator[Suspicion]:
+    """Yield cameras and targets that stand on something else than the recipe says."""
+    for group, names in (("cameras", cell.cameras), ("targets", cell.targets)):
+        for name in names:
+            stands = cell.frames[name].parent
+            for other in ("base", *cell.movers):
+                if other == stands or cell.frames[name].place is not None:
+                    continue
+                frame = replace(cell.frames[name], parent=other)
+                yield Suspicion(
+                    "mounting",
+                    f"{name} stands on {other}, not on {stands}",
+                    f"cell: {{{group}: {{{name}: {{on: {other}}}}}}}",
+                    observations,
+                    replace(cell, frames={**cell.frames, name: frame}),
+                )
+
+
+def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]:
+    """Return the sightings that do not belong to the poses beside them, if others agree."""
+    try:
+        sighted = sighted_of(observations, cell, LIMITS)
+        found = sighted.solved()
+    except (FlangeyeError, np.linalg.LinAlgError):
+        return []
+    errors = np.linalg.norm(by_folds(sighted.linear(found).fit(1.0))[0], axis=1)
+    ordinary = GROSS * np.sqrt((errors[found.inliers] ** 2).mean())
+    wrong = ~found.inliers & (errors > ordinary)
+    far = [o.id for o, gone in zip(observations, wrong, strict=True) if gone]
+    if not far or 3 * len(far) > len(observations):
+        return []
+    return [
+        Finding(
+            "mis-paired pose",
+            f"{len(far)} of {len(observations)} sightings do not belong to the poses beside them: "
+            "the others agree without them",
+            f"- acquire.samples: {{leave_out: [{', '.join(far)}]}}",
+            tuple(far),
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class Foretold:
+    """How well sightings are foretold that took no part.
+
+    Attributes:
+        misfit: Medians over the sightings, of the pair where they are largest.
+        share: That of places, as a share of how far the pair's sightings are apart: a unit that
+            changes no error is no finding.
+    """
+
+    misfit: Misfit
+    share: float
+
+    @property
+    def size(self) -> float:
+        """Of the errors, in units of ordinary ones."""
+        return float(max(self.share / ORDINARY[0], (self.misfit.angle or 0.0) / ORDINARY[1]))
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether sound sightings have such errors, too."""
+        return self.size <= 1
+
+
+def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
+    """Return how well sightings are foretold by the others; infinite where there is no answer."""
+    try:
+        sighted = sighted_of(observations, cell, LIMITS)
+        found = sighted.solved()
+    except (FlangeyeError, np.linalg.LinAlgError):
+        return Foretold(Misfit(np.inf), np.inf)
+    places = np.linalg.norm(by_folds(sighted.linear(found).fit(1.0))[0], axis=1)
+    turns = np.linalg.norm(found.residuals[:, :3], axis=1)
+    centres = np.array([o.feature.centre for o in observations])
+    of_pairs = []
+    for of in _by_pair(observations).values():
+        spread = max(float(np.linalg.norm(centres[of].std(axis=0))), 1e-12)
+        place, turn = float(np.median(places[of])), float(np.median(turns[of]))
+        of_pairs.append(Foretold(Misfit(place, turn), place / spread))
+    return max(of_pairs, key=lambda pair: pair.size)
+
+
+def _possible(suspicion: Suspicion) -> bool:
+    """Whether everything is as near as things in a cell are."""
+    seen = np.array([np.linalg.norm(o.feature.centre) for o in suspicion.observations])
+    reach = [x.translation for o in suspicion.observations for x in o.poses.values()]
+    far = np.linalg.norm(reach, axis=1)
+    return bool(NEAREST < np.median(seen) < FARTHEST and NEAREST < np.median(far) < FARTHEST)
+
+
+def _by_pair(observations: Sequence[Observation]) -> dict[tuple[str, str], list[int]]:
+    pairs: dict[tuple[str, str], list[int]] = {}
+    for i, o in enumerate(observations):
+        pairs.setdefault((o.camera, o.target), []).append(i)
+    return pairs
+
+
+def _thinned(observations: Sequence[Observation]) -> list[Observation]:
+    """Return some sightings of each pair, evenly over the session."""
+    return [
+        observations[of[i]]
+        for of in _by_pair(observations).values()
+        for i in np.unique(np.linspace(0, len(of) - 1, EACH).round().astype(int))
+    ]
+
+
+def _session(observations: Sequence[Observation]) -> RecordedSession:
+    """Return the sightings as the other checks' text counts them."""
+    n = len(observations)
+    nothing = np.full((n, 3), np.nan)
+    return RecordedSession(
+        tuple(o.id for o in observations),
+        np.broadcast_to(np.eye(4), (n, 4, 4)),
+        np.array([o.feature.centre for o in observations]).reshape(-1, 3),
+        nothing,
+        np.full((n, 3, 3), np.nan),
+        nothing,
+        np.full(n, np.nan),
+    )
+
+
+def _seen(observation: Observation, change: Change) -> Observation:
+    """Return an observation of a marker whose pose was another one."""
+    feature = observation.feature
+    if not isinstance(feature, PoseFeature):
+        return observation
+    pose = Transform(CAMERA, TARGET, change(feature.camera_T_target.matrix))
+    return replace(observation, feature=replace(feature, camera_T_target=pose))
+
+
+def _moved(observation: Observation, poses: Mapping[str, Floats]) -> Observation:
+    """Return an observation at which controllers reported other poses (4, 4)."""
+    moved = {name: replace(observation.poses[name], matrix=pose) for name, pose in poses.items()}
+    return replace(observation, poses={**observation.poses, **moved})
+
+
+def _scaled(pose: Floats, factor: float) -> Floats:
+    return rigid(pose[:3, :3], factor * pose[:3, 3])
