@@ -9,7 +9,7 @@ are found in the arm's motion, and clouds and poses are paired by time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -88,7 +88,7 @@ class Bag:
     Attributes:
         path: The bag.
         files: Its files.
-        topics: Topic -> type.
+        topics: Topic -> type, of those with messages.
         frames: What tf tells.
         poses: Topic -> times and poses, of PoseStamped.
         joints: Topic -> times and, each, name -> angle.
@@ -146,8 +146,10 @@ def _first_look(path: Path) -> Bag:
     files = bag_files(path)
     bag = Bag(path, files, topics_of(files))
     wanted = bag.of_type(CLOUD, POSE, *IMAGES, INFO, JOINTS, TF)
+    heard = set()
     for raw in messages(files, wanted):
         kind = bag.topics[raw.topic]
+        heard.add(raw.topic)
         if kind == TF:
             raw.read(partial(bag.frames.take, static=raw.topic.endswith("tf_static")))
         elif kind == POSE:
@@ -158,7 +160,7 @@ def _first_look(path: Path) -> Bag:
             bag.cameras[raw.topic] = raw.read(_intrinsics)
         else:
             bag.stamps.setdefault(raw.topic, []).append(raw.stamp)
-    return bag
+    return replace(bag, topics={t: kind for t, kind in bag.topics.items() if t in heard})
 
 
 def _append(into: dict[str, tuple[list[float], list[Any]]], raw: Raw, value: Any) -> None:

@@ -238,6 +238,21 @@ def test_a_message_that_is_damaged_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(refused.value)
 
 
+def test_a_topic_that_lost_its_messages_is_none(tmp_path: Path) -> None:
+    times, held, middles = stops(np.tile(np.eye(4), (3, 1, 1)))
+    told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
+    told.append(("/scan", middles[0], point_cloud(middles[0], CLOUDS[0])))
+    file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        lost = "SELECT id FROM topics WHERE name = '/scan'"
+        database.execute(f"DELETE FROM messages WHERE topic_id = ({lost})")
+    with pytest.raises(StageError) as refused:
+        ros2_bag(file, BagParams())
+    assert str(refused.value).startswith(
+        f"{file}: holds neither clouds nor images; name the target"
+    )
+
+
 def test_standstills_of_two_samples_each(bag: Callable[..., Any]) -> None:
     times, held, middles = stops(POSES, hold=0.5, way=0.5, rate=2.0)
     told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
