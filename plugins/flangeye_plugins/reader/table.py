@@ -41,6 +41,9 @@ from flangeye_plugins.reader.columns import (
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
 from flangeye_plugins.reader.written import POINT
 
+SCAN = "scan"
+"""How the column of the scans' file names is called, if the recipe does not say."""
+
 
 class OtherParams(ColumnsParams):
     """Something else that was measured: in the same rows, or in a table of its own."""
@@ -93,7 +96,9 @@ class TableParams(ColumnsParams):
         description="Whose pose it is: the flange's in the base, as controllers show, or inverse."
     )
     scan: Column | None = Field(
-        None, description="Column of the scans' file names; the first where it holds text."
+        None,
+        description="Column of the scans' file names; if not given, the one called scan, or "
+        "the first where it holds text.",
     )
     target: TargetParams | None = Field(
         None, description="The target as the camera measured it, in place of scans."
@@ -154,7 +159,10 @@ def _from_text(text: Table, params: TableParams) -> list[Row]:
 def _scan_column(text: Table, params: TableParams) -> int | None:
     if params.scan is not None:
         return text.index(params.scan)
-    return 0 if number_of(text.rows[0][1][0]) is None and not params.columns else None
+    first = text.rows[0][1]
+    if SCAN in text.heading and number_of(first[text.index(SCAN)]) is None:
+        return text.index(SCAN)
+    return 0 if number_of(first[0]) is None and not params.columns else None
 
 
 def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:

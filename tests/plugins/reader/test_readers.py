@@ -167,6 +167,17 @@ def test_a_table_in_every_convention(
     assert [r.image.name for r in archive.recordings] == [f"s{i}.png" for i in range(5)]
 
 
+def test_records_name_their_scan_wherever_it_stands(tmp_path: Path) -> None:
+    write_images(tmp_path)
+    rows = [convention_of("xyzw", "m", "rad").numbers(pose).tolist() for pose in POSES]
+    records = [{"pose": row, "scan": f"s{4 - i}.png"} for i, row in enumerate(rows)]
+    (tmp_path / "poses.json").write_text(json.dumps(records))
+    params = TableParams(file="poses.json", rotation="xyzw", length="m", pose="base_T_flange")
+    archive = table(tmp_path, params)
+    assert [r.image.name for r in archive.recordings] == [f"s{4 - i}.png" for i in range(5)]
+    assert np.allclose([r.base_T_flange for r in archive.recordings], POSES, atol=1e-9)
+
+
 def test_a_table_of_the_inverse_without_names_goes_by_the_scans_order(tmp_path: Path) -> None:
     write_images(tmp_path)
     convention = convention_of("wxyz", "m", "rad")
