@@ -1,5 +1,6 @@
 """The stages and their baselines, on one simulated PhoXi M scan of 3.2 M points."""
 
+import atexit
 import itertools
 import os
 import shutil
@@ -239,6 +240,7 @@ def record() -> tuple[Work, Work]:
 
     capture, folder = stages().capture, Path(tempfile.mkdtemp())
     recorder = Recorder(folder / "run.mcap", {}, full_clouds=True)
+    atexit.register(recorder.close)
 
     def compressed() -> None:
         import zstandard
