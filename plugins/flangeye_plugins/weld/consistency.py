@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,49 @@ LIKELY, SURE = 2.0, 5.0
 """Standard deviations of what is judged, to reckon with it and to stop for it."""
 
 
+class _Sweep(NamedTuple):
+    """The sweep at the start: its middle along the seam, mean height, and that one's sigma [m]."""
+
+    at: float
+    height: float
+    sigma: float
+
+
+class _Trail:
+    """Samples (K, 3) in the order in which they came; those far behind are let go of."""
+
+    def __init__(self, longest: float) -> None:
+        """Begin; a sample is kept until the tip is ``longest`` beyond it [m]."""
+        self._longest, self._first, self._end = longest, 0, 0
+        self._rows = np.empty((1024, 3))
+
+    @property
+    def rows(self) -> Floats:
+        """(K, 3) arc lengths, offsets and heights [m]; a view."""
+        return self._rows[self._first : self._end]
+
+    def add(self, s: float, offset: float, height: float) -> None:
+        """Take a sample."""
+        if self._end == len(self._rows):
+            kept = self.rows.copy()
+            self._rows = np.empty((max(1024, 2 * len(kept)), 3))
+            self._rows[: len(kept)] = kept
+            self._first, self._end = 0, len(kept)
+        self._rows[self._end] = s, offset, height
+        self._end += 1
+        while s - self._rows[self._first, 0] > self._longest:
+            self._first += 1
+
+    def behind(self, s: float) -> Floats:
+        """Return the samples (K, 3) that lie behind the tip."""
+        away = s - self.rows[:, 0]
+        return self.rows[(BEFORE[0] < away) & (away < BEFORE[1])]
+
+    def clear(self) -> None:
+        """Let go of all."""
+        self._first = self._end = 0
+
+
 class Seating:
     """Holds the newest samples against a line through those before.
 
@@ -51,10 +94,10 @@ class Seating:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
         self._side, self.doubt, self.risen = side, 0.0, 0.0
         self._flat = flat
-        self._samples: deque[tuple[float, float, float]] = deque()
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=NEWEST)
-        self._seated: deque[tuple[float, float, float]] = deque()
+        self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
         self._swept: list[tuple[float, float]] = []
+        self._sweep = _Sweep(0.0, 0.0, 0.0)
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
@@ -64,8 +107,11 @@ class Seating:
 
     def seated(self, s: float, offset: float, height: float) -> None:
         """Take a sample of a tip that is known to be seated; see :meth:`judge`."""
-        self._seated.append((s, offset, height))
+        self._seated.add(s, offset, height)
         self._swept.append((s, height))
+        at, heights = np.array(self._swept).T
+        sigma = float(heights.std() / np.sqrt(len(heights)))
+        self._sweep = _Sweep(float(at.mean()), float(heights.mean()), sigma)
 
     def judge(self, s: float, offset: float, height: float) -> str | None:
         """Take a sample; return what is wrong.
@@ -76,12 +122,10 @@ class Seating:
             height: Above the plan's [m].
         """
         self._newest.append((s, offset, height))
-        self._samples.append((s, offset, height))
-        while s - self._samples[0][0] > BEFORE[1]:
-            self._samples.popleft()
-        newest, before = np.array(self._newest), self._before(self._samples, s)
-        self._seated.append((s, offset, height))
-        known = self._before(self._seated, s)
+        self._samples.add(s, offset, height)
+        newest, before = np.array(self._newest), self._samples.behind(s)
+        self._seated.add(s, offset, height)
+        known = self._seated.behind(s)
         if len(known) >= 2 * NEWEST:
             self._doubt_newest(*_newest_from(known, newest, PLANNED))
         self.risen = self._risen(s) * self._flat / STEEP
@@ -100,19 +144,13 @@ class Seating:
 
     def _risen(self, s: float) -> float:
         """Return how much higher than in the sweep the tip is for long; 0 if it may be [m]."""
-        if len(self._swept) < NEWEST or s - self._samples[0][0] < LASTING:
+        if len(self._swept) < NEWEST or s - self._samples.rows[0, 0] < LASTING:
             return 0.0
-        heights = np.array([height for at, _, height in self._samples if s - at < LASTING])
-        at, swept = np.array(self._swept).T
-        tilted = TILTED * abs(s - LASTING / 2 - float(at.mean()))
-        rise = float(np.median(heights) - swept.mean()) - tilted
-        sigma = float(np.hypot(*(each.std() / np.sqrt(len(each)) for each in (heights, swept))))
+        heights = self._samples.rows[s - self._samples.rows[:, 0] < LASTING, 2]
+        tilted = TILTED * abs(s - LASTING / 2 - self._sweep.at)
+        rise = float(np.median(heights)) - self._sweep.height - tilted
+        sigma = float(np.hypot(heights.std() / np.sqrt(len(heights)), self._sweep.sigma))
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
-
-    def _before(self, samples: Iterable[tuple[float, float, float]], s: float) -> Floats:
-        """Return the samples (K, 3) that lie behind the tip."""
-        near = [sample for sample in samples if BEFORE[0] < s - sample[0] < BEFORE[1]]
-        return np.array(near).reshape(-1, 3)
 
     def _doubt_newest(self, aside: tuple[float, float], lifted: tuple[float, float]) -> None:
         """Note how far the tip may have climbed; later ones are held against an unlifted tip."""
@@ -120,8 +158,7 @@ class Seating:
         likely = towards > LIKELY * aside[1] and up > LIKELY * lifted[1]
         self.doubt = min(towards, up * self._flat / STEEP) if likely else 0.0
         if up > SURE * lifted[1]:  # lower ones would bend the line by their noise alone
-            s, offset, height = self._seated[-1]
-            self._seated[-1] = s, offset - self._side * self.doubt, height - up
+            self._seated.rows[-1] -= 0.0, self._side * self.doubt, up
 
 
 def _newest_from(
