@@ -391,6 +391,18 @@ def test_a_tip_that_stays_higher_is_doubted_whatever_it_does_aside() -> None:
     assert risen(0.2, last=38e-3) == 0.0  # a tack weld of 8 mm
 
 
+def test_what_lies_far_behind_is_neither_looked_at_nor_kept() -> None:
+    rng = np.random.default_rng(0)
+    samples = [(0.1e-3 * i, *(0.1e-3 * rng.standard_normal(2))) for i in range(6000)]
+    long, late = Seating(1.0, 1.0), Seating(1.0, 1.0)
+    for i, sample in enumerate(samples):
+        long.judge(*sample)
+        if i > 4000:
+            late.judge(*sample)
+            assert i < 5000 or (long.doubt, long.risen) == (late.doubt, late.risen)
+    assert len(long._seated.rows) < 1000  # a cycle's cost goes with it
+
+
 def test_a_noisy_tip_on_a_short_line_is_not_taken_for_one_that_is_lifted() -> None:
     for seed in range(20):
         seating, rng = Seating(1.0, 1.0), np.random.default_rng(seed)
