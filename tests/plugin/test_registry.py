@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import pytest
+from typing_extensions import TypeAliasType
 
 from flangeye import hookimpl, stage
 from flangeye import types as t
@@ -107,6 +108,18 @@ def test_a_part_keeps_the_contract_of_its_kind(name: str, declare: str, message:
     with pytest.raises(TypeError) as caught:
         part(name)(given["x"])
     assert str(caught.value) == message
+
+
+def test_an_alias_of_a_class_is_that_class() -> None:
+    """As NumPy's NDArray is from 2.5 on."""
+    alias = TypeAliasType("Kilograms", float)  # type: ignore[misc]
+
+    def cost(error: t.PoseError) -> alias:  # type: ignore[valid-type]
+        """Cost as much."""
+        return 1.0
+
+    cost.__annotations__ = {"error": t.PoseError, "return": alias}
+    assert part("cost.alias")(cost)
 
 
 def test_every_kind_of_part_has_a_protocol_in_the_engine() -> None:

@@ -501,8 +501,15 @@ def _fits(got: Any, wanted: Any) -> bool:
     """Return whether a value of type ``got`` may stand where ``wanted`` is asked for."""
     if Any in (got, wanted) or got == wanted:
         return True
-    got, wanted = get_origin(got) or got, get_origin(wanted) or wanted
+    got, wanted = _class_of(got), _class_of(wanted)
     return isinstance(got, type) and isinstance(wanted, type) and issubclass(got, wanted)
+
+
+def _class_of(annotation: Any) -> Any:
+    """Return the class behind an annotation; NumPy's NDArray is an alias of one since 2.5."""
+    origin = get_origin(annotation) or annotation
+    aliased = getattr(origin, "__value__", None)
+    return origin if aliased is None else _class_of(aliased)
 
 
 def _called(annotation: Any) -> str:
