@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -160,33 +162,28 @@ def _mcap_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
                 yield Raw(file, channel.topic, time_ns * 1e-9, data, partial(decode, data))
 
 
-def _db3_topics(file: Path) -> dict[str, str]:
-    import sqlite3
+def _opened(file: Path) -> AbstractContextManager[sqlite3.Connection]:
+    return closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True))
 
-    with sqlite3.connect(f"file:{file}?mode=ro", uri=True) as database:
-        rows = database.execute("SELECT name, type FROM topics").fetchall()
-    database.close()
-    return dict(rows)
+
+def _db3_topics(file: Path) -> dict[str, str]:
+    with _opened(file) as database:
+        return dict(database.execute("SELECT name, type FROM topics").fetchall())
 
 
 def _db3_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
-    import sqlite3
-
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    database = sqlite3.connect(f"file:{file}?mode=ro", uri=True)
     marks = ",".join("?" * len(topics))
-    rows = database.execute(
-        "SELECT topics.name, topics.type, timestamp, data FROM messages JOIN topics "
-        f"ON messages.topic_id = topics.id WHERE topics.name IN ({marks}) ORDER BY timestamp",
-        list(topics),
-    )
-    try:
+    with _opened(file) as database:
+        rows = database.execute(
+            "SELECT topics.name, topics.type, timestamp, data FROM messages JOIN topics "
+            f"ON messages.topic_id = topics.id WHERE topics.name IN ({marks}) ORDER BY timestamp",
+            list(topics),
+        )
         for topic, kind, stamp, data in rows:
             yield Raw(file, topic, stamp * 1e-9, data, partial(store.deserialize_cdr, data, kind))
-    finally:
-        database.close()
 
 
 @cache

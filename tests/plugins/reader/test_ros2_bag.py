@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -230,7 +231,7 @@ def test_a_message_that_is_damaged_is_one_line(tmp_path: Path) -> None:
     times, held, _ = stops(np.tile(np.eye(4), (3, 1, 1)))
     told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
     file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
-    with sqlite3.connect(file) as database:
+    with closing(sqlite3.connect(file)) as database, database:
         database.execute("UPDATE messages SET data = x'00010000ffff' WHERE id = 2")
     with pytest.raises(StageError) as refused:
         ros2_bag(file, BagParams())
@@ -243,7 +244,7 @@ def test_a_topic_that_lost_its_messages_is_none(tmp_path: Path) -> None:
     told = [("/pose", t, pose_stamped(t, pose)) for t, pose in zip(times, held, strict=True)]
     told.append(("/scan", middles[0], point_cloud(middles[0], CLOUDS[0])))
     file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
-    with sqlite3.connect(file) as database:
+    with closing(sqlite3.connect(file)) as database, database:
         lost = "SELECT id FROM topics WHERE name = '/scan'"
         database.execute(f"DELETE FROM messages WHERE topic_id = ({lost})")
     with pytest.raises(StageError) as refused:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from typing_extensions import Buffer
 
@@ -18,10 +19,9 @@ __all__ = ["Channel", "Message", "follow"]
 class WaitingFile(io.RawIOBase):
     """A file whose end is not its end: reading waits until there is more."""
 
-    def __init__(self, path: Path, wait: Callable[[], None]) -> None:
-        """Open it; ``wait`` is called while there is nothing new, and may raise to give up."""
-        self._file = open_regular(path)
-        self._wait = wait
+    def __init__(self, file: BinaryIO, wait: Callable[[], None]) -> None:
+        """Take a file; ``wait`` is called while there is nothing new, and may raise to give up."""
+        self._file, self._wait = file, wait
 
     def readinto(self, buffer: Buffer) -> int:
         """Fill as much of the buffer as there is, and at least a byte."""
@@ -57,7 +57,7 @@ def follow(
     def damaged(what: str) -> None:
         note(f"damaged: {what}")
 
-    with WaitingFile(path, wait) as file:
+    with WaitingFile(open_regular(path), wait) as file:
         try:
             yield from LogFile(damaged).messages(io.BufferedReader(file))
         except NotMcapError:
