@@ -37,18 +37,6 @@ def documents_at(path: Path) -> Iterator[tuple[Path, Document]]:
                 raise StageError(str(error)) from None
 
 
-def read_document(path: Path) -> Document:
-    """Read a YAML file.
-
-    Raises:
-        StageError: It is not YAML; names the line.
-    """
-    try:
-        return read_yaml(path)
-    except RecipeError as error:
-        raise StageError(str(error)) from None
-
-
 def value_at(data: Any, where: str, *keys: Hashable) -> Any:
     """Return what is at a path of keys.
 
