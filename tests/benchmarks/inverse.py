@@ -29,7 +29,7 @@ def main():
         starts = arm._starting_points(48)
         ours = median_ms(arm.inverse, poses)
         many = median_ms(lambda pose, arm=arm, starts=starts: arm.inverse_near(pose, starts), poses)
-        how = "closed form" if arm.in_closed_form else "iterated"
+        how = "closed form" if arm.in_closed_form else "searched" if arm._search else "iterated"
         print(
             f"{name:20}  {ours:7.3f} ms  {how:11}  {many / ours:6.1f} times faster than many starts"
         )

@@ -7,7 +7,7 @@ axes, and most arms sold are one or the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -31,13 +31,19 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
     Returns:
         None where EAIK is not installed or knows no decomposition.
     """
-    snapped = np.round(directions), _snapped(np.round(directions), points)
-    for axes, origins in ((directions, points), snapped):
-        if np.allclose(np.linalg.norm(axes, axis=1), 1.0):
-            solve = _decomposed(axes, origins, flange)
-            if solve is not None:
-                return solve
-    return None
+    forms = (_decomposed(*axes, flange) for axes in as_meant(directions, points))
+    return next((form for form in forms if form is not None), None)
+
+
+def as_meant(directions: Floats, points: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Yield (6, 3) directions and points of axes, and those of the arm they may be a copy of.
+
+    A calibrated arm differs a little from one whose axes are parallel, meet or are in line.
+    """
+    yield directions, points
+    snapped = np.round(directions)
+    if np.allclose(np.linalg.norm(snapped, axis=1), 1.0):
+        yield snapped, _snapped(snapped, points)
 
 
 def _snapped(directions: Floats, points: Floats) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 
 from flangeye.maths.closed_form import ClosedForm, closed_form
 from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
+from flangeye.maths.offset_wrist import OffsetWrist, offset_wrist
 from flangeye.types import Floats
 
 SOLVED = 1e-9
@@ -225,11 +226,12 @@ class Arm:
         """Return joint angles within the limits that reach a pose, (K, n), K may be zero.
 
         In closed form where six joints allow it (:mod:`flangeye.maths.closed_form`); an arm that
-        differs a little from such a one, as a calibrated arm does, is polished from there. Of the
-        continuum of a seven-joint arm it gives a sample: one joint is held at a row of angles,
-        which leaves six. Else, and where those give nothing, from many points of a fixed
-        sequence, so that all branches of a six-joint arm are normally found. Nothing random is
-        in it.
+        differs a little from such a one, as a calibrated arm does, is polished from there. Six
+        joints whose wrist is not spherical are mostly solved by a search over one of them
+        (:mod:`flangeye.maths.offset_wrist`). Of the continuum of a seven-joint arm it gives a
+        sample: one joint is held at a row of angles, which leaves six. Else, and where those give
+        nothing, from many points of a fixed sequence, so that all branches of a six-joint arm are
+        normally found. Nothing random is in it.
 
         Args:
             base_T_flange: (4, 4) pose to reach.
@@ -241,17 +243,20 @@ class Arm:
         """
         if self._closed_form is not None:
             return self._polished(base_T_flange, self._closed_form(base_T_flange))
+        if self._search is not None:
+            return self._polished(base_T_flange, self._search(base_T_flange), each=True)
         if self._held:
             found = np.concatenate([held(base_T_flange) for held in self._held])
             if len(solved := self._polished(base_T_flange, found)):
                 return solved
         return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
 
-    def _polished(self, base_T_flange: Floats, joints: Floats) -> Floats:
-        """Return what closed forms gave (M, n) as solutions, iterated if they only come near."""
+    def _polished(self, base_T_flange: Floats, joints: Floats, each: bool = False) -> Floats:
+        """Return joints near a pose (M, n) as solutions; iterate if none, or not each, is one."""
         error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2), initial=0.0)
-        if (error < SOLVED).any():
-            return self._distinct(self._within_limits(joints[error < SOLVED]))
+        solved = error < SOLVED
+        if solved.all() or (solved.any() and not each):
+            return self._distinct(self._within_limits(joints[solved]))
         return self.inverse_near(base_T_flange, joints[error < CLOSE], POLISH)
 
     def inverse_near(self, base_T_flange: Floats, joints: Floats, iterations: int = 40) -> Floats:
@@ -280,10 +285,20 @@ class Arm:
 
     @cached_property
     def _closed_form(self) -> ClosedForm | None:
+        at_zero = self._six_turning_at_zero
+        return at_zero and closed_form(*at_zero)
+
+    @cached_property
+    def _search(self) -> OffsetWrist | None:
+        at_zero = self._six_turning_at_zero
+        return at_zero and offset_wrist(*at_zero)
+
+    @property
+    def _six_turning_at_zero(self) -> tuple[Floats, Floats, Floats] | None:
+        """The axes and the flange of an arm of six turning joints, all at zero."""
         if self.n != 6 or self.slides.any():
             return None
-        directions, points = self.axes(np.zeros(self.n))
-        return closed_form(directions, points, self.flange(np.zeros(self.n)))
+        return (*self.axes(np.zeros(self.n)), self.flange(np.zeros(self.n)))
 
     @cached_property
     def _held(self) -> list[ClosedForm]:

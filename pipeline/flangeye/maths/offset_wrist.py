@@ -1,0 +1,281 @@
+"""Inverse kinematics of six revolute joints whose wrist is not spherical. Arrays only.
+
+Of most such arms axis 2 stands square to axis 1 and parallel to axis 3, and axis 5 meets axis 4.
+Where they meet is a point of link 3 and of link 5: with joint 6 held, the pose says where it is.
+Joints 1 to 3 follow in closed form, in four ways; that axes 4 and 5 keep their angle is the
+one equation left, in joint 6. Its roots are bracketed on a row of angles and refined (a search in
+one dimension over Paden-Kahan subproblems: Elias and Wen, "IK-Geo", Mechanism and Machine Theory
+2025).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.closed_form import as_meant
+from flangeye.types import Floats, Indices
+
+Numbers = NDArray[np.complex128]
+
+EXACT = 1e-9
+"""Axes that meet, are parallel or are square do so within this [m, rad]."""
+
+SAMPLES = 128
+"""Angles of joint 6 at which the equation is looked at."""
+
+FINER = 16
+"""Samples for one, where a root may hide."""
+
+CLOSER = 3
+"""How often the samples are spaced, more closely each time."""
+
+STEPS = 12
+"""Steps from a bracket to a root at most; most take two."""
+
+NEAR = 1e-7
+"""So near to a root the next step is the last."""
+
+DIP = 0.25
+"""Two roots may hide where the equation comes this near to zero, in its second differences."""
+
+END = 2.0
+"""Where the reach ends, the equation may change by this, times the root of the pitch [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetWrist:
+    """What a pose is solved with, in a frame whose z is axis 1 and whose y is axis 2 at zero.
+
+    Parts across axis 2 are complex numbers z + ix: turning joints 2 and 3 multiplies them. So are
+    vectors across axis 1, y - ix where joint 1 is looked for.
+
+    Attributes:
+        to_axes: (4, 4) from the base's frame to that one, its origin on axis 1 as high as axis 2.
+        from_zero: (4, 4) from there to the flange, all joints at zero.
+        orbits: (4, 6) where axes 4 and 5 meet, homogeneous, and axis 5: what joint 6 turned back
+            makes of each is its three columns @ (cos, sin, 1).
+        shoulder: Axis 2 from axis 1 [m].
+        aside: Where axes 4 and 5 meet, along axis 2 [m].
+        upper: From axis 2 to axis 3, across them [m].
+        fore: From axis 3 to where axes 4 and 5 meet, across axis 3 [m].
+        sense: 1 or -1: axis 3 points as axis 2 does, or the other way.
+        fourth: (3,) axis 4.
+        meant: Cosine between axes 4 and 5.
+        about_fourth: (2, 3) axis 4 cross axis 5, and axis 5 across axis 4.
+        about_fifth: (6, 3) the same of axis 5 and axis 4, after a turn of joint 6: three pairs
+            of rows, to be taken (cos, sin, 1) times.
+    """
+
+    to_axes: Floats
+    from_zero: Floats
+    orbits: Floats
+    shoulder: float
+    aside: float
+    upper: complex
+    fore: complex
+    sense: float
+    fourth: Floats
+    meant: float
+    about_fourth: Floats
+    about_fifth: Floats
+
+    def __call__(self, base_T_flange: Floats) -> Floats:
+        """Return (K, 6) joint angles at or near the solutions for a (4, 4) pose [rad]."""
+        moved = self.to_axes @ base_T_flange @ self.from_zero
+        x, y, z, hx, hy, hz = (
+            (moved[:3] @ self.orbits).reshape(3, 2, 3).swapaxes(0, 1).reshape(6, 3)
+        )
+        orbits = np.array([y - 1j * x, z, hx + 1j * hy, hz])
+        orbits[1, 2] -= 1j * self.shoulder
+        with np.errstate(invalid="ignore", divide="ignore"):
+            brackets, seeds = self._brackets(orbits)
+            angles = np.concatenate([self._refined(orbits, brackets), seeds[1]])
+            ways = np.concatenate([brackets[0], seeds[0]]).astype(int)
+            return self._joints(moved[:3, :3], orbits, angles, ways)
+
+    def _posture(
+        self, orbits: Numbers, angles: Floats, way: Indices
+    ) -> tuple[Floats, tuple[Numbers, Numbers], tuple[Numbers, Numbers, Numbers]]:
+        """Return how far axes 4 and 5 are from their angle, and of what that was made.
+
+        Args:
+            orbits: (4, 3) where they meet, and axis 5, as angles of joint 6 make them.
+            angles: (...) such angles.
+            way: (...) which of four ways the arm stands.
+
+        Returns:
+            Three of (...), NaN where the arm does not reach: the value; axis 5, two numbers; joints
+            1 to 3, as numbers whose arguments they are but for a constant.
+        """
+        seen = orbits @ _circle(angles.ravel())
+        place, height, axis, upwards = seen.reshape(4, *angles.shape)
+        shoulder, elbow = _WAYS[:, way]
+        across = place.real**2 + place.imag**2
+        forward = shoulder * np.sqrt(across - self.aside**2)
+        turn = place * (forward + self.aside) / across
+        reach = height + forward
+        upper, fore = abs(self.upper), abs(self.fore)
+        squares = reach.real**2 + reach.imag**2
+        cosine = (squares - (upper**2 + fore**2)) * (0.5 / (upper * fore))
+        bend = cosine + elbow * np.sqrt(1.0 - cosine * cosine)
+        lift = reach / (1.0 + (fore / upper) * bend)
+        level = axis * turn.conjugate()
+        ahead = lift * bend * (complex(self.fourth[2], self.fourth[0]) * fore / upper / self.fore)
+        value = ahead.imag * level.real + ahead.real * upwards.real - self.meant
+        return value + self.fourth[1] * level.imag, (axis, upwards), (turn, lift, bend)
+
+    def _brackets(self, orbits: Numbers) -> tuple[Floats, Floats]:
+        """Return where the equation changes sign, and where it may without having been seen to.
+
+        Each row of samples is a way that the arm stands; what is doubtful is sampled more closely.
+
+        Returns:
+            (5, K) way, two angles and the values there; (2, S) way and angle.
+        """
+        ways, starts, pitch, row = np.arange(4), np.array([-np.pi]), _PITCH, _COARSE
+        doubts = np.zeros(0)
+        found = []
+        for _ in range(CLOSER):
+            angles = starts[:, None] + pitch * row
+            values = self._posture(orbits, angles, ways[:, None])[0]
+            angles = np.broadcast_to(angles, values.shape)
+            here, after = values[:, 1:-1], values[:, 2:]
+            i, k = np.nonzero(here * after <= 0)
+            places = angles[i, k + 1]
+            found.append(np.array([ways[i], places, places + pitch, here[i, k], after[i, k]]))
+            i, k = np.nonzero(_doubtful(values, END * np.sqrt(pitch)))
+            ways, doubts = ways[i], angles[i, k + 1]
+            if not len(ways):
+                break
+            starts, row, pitch = doubts - pitch, _FINE, pitch / FINER
+        return np.hstack(found), np.array([ways, doubts])
+
+    def _refined(self, orbits: Numbers, brackets: Floats) -> Floats:
+        """Return (K,) roots in (5, K) brackets.
+
+        By inverse quadratic interpolation, or half way where that leads out of a bracket.
+        """
+        way, (a, b, fa, fb) = brackets[0].astype(int), brackets[1:]
+        at = a + (b - a) * fa / (fa - fb)
+        for _ in range(STEPS):
+            value = self._posture(orbits, at, way)[0]
+            same = value * fa > 0
+            c, fc = np.where(same, a, b), np.where(same, fa, fb)
+            b, fb = np.where(same, b, a), np.where(same, fb, fa)
+            a, fa = at, value
+            ab, bc, ca = fa - fb, fb - fc, fc - fa
+            at = (a * fb * fc * bc + b * fc * fa * ca + c * fa * fb * ab) / -(ab * bc * ca)
+            at = np.where((at - a) * (at - b) <= 0, at, (a + b) / 2)
+            if np.abs(value).max(initial=0.0) < NEAR:
+                break
+        return np.asarray(at)
+
+    def _joints(self, turned: Floats, orbits: Numbers, angles: Floats, way: Indices) -> Floats:
+        """Return the (K, 6) joints for (K,) angles of joint 6 and ways."""
+        _, (axis, upwards), (turn, lift, bend) = self._posture(orbits, angles, way)
+        second = lift / self.upper
+        third = bend * (abs(self.fore) * self.upper / (self.fore * abs(self.upper)))
+        both = second * third
+        both = both / np.abs(both)
+        # Axis 5 as link 3 sees it, and axis 4 as link 5 does: one turns about 4, the other about 5.
+        level = axis * turn.conjugate()
+        plane = (upwards + 1j * level.real) * both.conjugate()
+        fourth = self.about_fourth @ np.array([plane.imag, level.imag, plane.real])
+        plane = both * complex(self.fourth[2], self.fourth[0])
+        level = (plane.imag + 1j * self.fourth[1]) * turn
+        ahead = turned.T @ np.array([level.real, level.imag, plane.real])
+        fifth = np.einsum(
+            "ijk,ik->jk", (self.about_fifth @ ahead).reshape(3, 2, -1), _circle(angles)
+        )
+        joints = np.angle([turn, second, third])
+        joints[2] *= self.sense
+        wrist = [np.arctan2(*fourth), -np.arctan2(*fifth), angles]
+        found = np.vstack([joints, wrist]).T
+        return np.asarray(found[np.isfinite(found).all(axis=1)])
+
+
+def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist | None:
+    """Return the search for an arm, or for the nominal one it differs from a little.
+
+    Args:
+        directions: (6, 3) of the axes, all joints at zero.
+        points: (6, 3) one on each axis [m].
+        flange: (4, 4) base_T_flange, all joints at zero.
+
+    Returns:
+        None where the axes do not stand as it needs.
+    """
+    searches = (_prepared(*axes, flange) for axes in as_meant(directions, points))
+    return next((search for search in searches if search is not None), None)
+
+
+def _prepared(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist | None:
+    first, second, third, fourth, fifth, _ = directions
+    normal = np.cross(fourth, fifth)
+    between = points[4] - points[3]
+    sine = np.linalg.norm(normal)
+    if abs(first @ second) > EXACT or np.linalg.norm(np.cross(second, third)) > EXACT:
+        return None
+    if sine < 0.1 or abs(normal @ between) > EXACT:
+        return None
+    met = points[3] + fourth * (np.cross(between, fifth) @ normal / sine**2)
+    to_axes = np.eye(4)
+    to_axes[:3, :3] = np.array([np.cross(second, first), second, first])
+    height = first * (first @ (points[1] - points[0]))
+    to_axes[:3, 3] = -to_axes[:3, :3] @ (points[0] + height)
+    _, p2, p3, *_, p6, p45 = np.vstack([points, met]) @ to_axes[:3, :3].T + to_axes[:3, 3]
+    *_, h4, h5, h6 = directions @ to_axes[:3, :3].T
+    at_sixth = np.append(p6, 1.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    about_fourth = np.array([np.cross(h4, h5), h5 - h4 * (h4 @ h5)])
+    about_fifth = np.array([np.cross(h5, h4), h4 - h5 * (h4 @ h5)])
+    along, cross = np.outer(h6, h6), np.cross(np.eye(3), h6)
+    return OffsetWrist(
+        to_axes,
+        np.asarray(np.linalg.inv(to_axes @ flange)),
+        np.hstack([_orbit(h6, p45 - p6) + at_sixth, _orbit(h6, h5)]),
+        shoulder=float(p2[0]),
+        aside=float(p45[1]),
+        upper=_across(p3 - p2),
+        fore=_across(p45 - p3),
+        sense=float(np.sign(second @ third)),
+        fourth=h4,
+        meant=float(h4 @ h5),
+        about_fourth=about_fourth,
+        about_fifth=np.vstack([about_fifth @ part for part in (np.eye(3) - along, cross, along)]),
+    )
+
+
+def _doubtful(values: Floats, change: float) -> Floats:
+    """Return at which of (M, S) samples, the first and last left out, roots may hide beside it.
+
+    Where the equation comes near zero and turns; and where the arm's reach ends.
+    """
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    size, bent, slope = np.abs(here), before - 2 * here + after, after - before
+    dips = (size < DIP * np.abs(bent)) & (np.abs(slope) < 2 * np.abs(bent)) & (here * bent > 0)
+    dips &= (here * before > 0) & (here * after > 0)
+    return np.asarray(dips | (np.isnan(slope) & (size < change)))
+
+
+def _circle(angles: Floats) -> Floats:
+    return np.array([np.cos(angles), np.sin(angles), np.ones_like(angles)])
+
+
+def _orbit(axis: Floats, vector: Floats) -> Floats:
+    """Return the (4, 3) that makes (cos, sin, 1) a vector turned back about an axis."""
+    along = axis * (axis @ vector)
+    return np.vstack([np.array([vector - along, -np.cross(axis, vector), along]).T, np.zeros(3)])
+
+
+def _across(vector: Floats) -> complex:
+    return complex(vector[2], vector[0])
+
+
+# One sample more at each end: each has both its neighbours.
+_PITCH = 2 * np.pi / SAMPLES
+_COARSE = np.arange(-1.0, SAMPLES + 1)
+_FINE = np.arange(-1.0, 2 * FINER + 1)
+_WAYS = np.array([[1j, 1j, -1j, -1j], [1j, -1j, 1j, -1j]])
