@@ -53,6 +53,18 @@ def test_a_urdf_has_a_joint_for_every_transform(run: Any) -> None:
         assert np.allclose(place, np.array(result.transforms[name].matrix)[:3, 3], atol=1e-8)
 
 
+def test_a_refused_run_says_on_the_console_which_motion_is_missing(tmp_path: Path) -> None:
+    words = ["--set", "steps.0.spread=0.01 deg", "--set", "steps.0.sightings=8"]
+    told = subprocess.run(
+        [sys.executable, "-m", "flangeye.cli", "run", str(TWO), *words, "--out", "still"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert told.returncode == 1
+    assert "refused: the sightings do not tell where left and right and marker are" in told.stdout
+    assert "turn arm about (" in told.stdout
+    assert "of arm_base by 20 deg or more, and see it again" in told.stdout
+
+
 def test_one_camera_is_chosen_where_a_format_carries_one(run: Any) -> None:
     path, result = run
     told = export(path, "--to", "matrix")

@@ -1,5 +1,6 @@
 """Several cameras, arms, rails and targets at once."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -141,8 +142,81 @@ def test_what_nothing_ties_is_named() -> None:
     frames, _, _ = CELLS["two fixed scanners and one arm"]
     given = {**frames, "left": Frame("base"), "other": Frame("base"), "marker": Frame("flange")}
     sightings = seen(frames, [("left", "marker")], np.random.default_rng(0))
-    with pytest.raises(CalibrationRefused, match="do not tell where other is"):
+    told = "do not tell where other is: .*; no sighting has other in it: let one see the other$"
+    with pytest.raises(CalibrationRefused, match=told):
         solve_graph(given, sightings)
+
+
+def still(places):
+    return np.tile(places[:1], (N, 1, 1))
+
+
+def turned(places, axis, span=0.5):
+    return np.array(
+        [places[0] @ pose(*(a * np.array(axis)), 0, 0, 0) for a in np.linspace(-span, span, N)]
+    )
+
+
+def moved_only(places):
+    out = still(places)
+    out[:, :3, 3] += np.random.default_rng(0).uniform(-0.2, 0.2, (N, 3))
+    return out
+
+
+MISSING = {
+    # name: (cell, what moves in it, how it moved instead, who stays unknown, what would tell)
+    "the second arm stood still": (
+        "two arms with a scanner each and one between", "flange2", still,
+        "base2 and hand2 and plate2 are", r"turn flange2 about \S+, \S+, \S+ and .* of base2 by 20 deg",
+    ),
+    "the second arm turned about one axis": (
+        "two arms with a scanner each and one between", "flange2", lambda x: turned(x, [0, 0, 1]),
+        "base2 and hand2 and plate2 are", r"turn flange2 about \(\S+, \S+, \S+\) of base2 by 20 deg",
+    ),
+    "the arm moved without turning": (
+        "two fixed scanners and one arm", "flange", moved_only,
+        "left and right and marker are", r"turn flange about \S+, \S+, \S+ and .* of base by 20 deg",
+    ),
+    "an arm with two cameras that see no common target stood still": (
+        "a scanner in the hand and one on the wall that never see the same thing", "flange", still,
+        "hand and wall and table and marker are", r"turn flange about .* of base by 20 deg",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISSING)
+def test_the_motion_that_is_missing_is_named_and_is_enough(name: str) -> None:
+    cell, mover, instead, who, cure = MISSING[name]
+    frames, unknown, pairs = CELLS[cell]
+    lame = {**frames, mover: replace(frames[mover], place=instead(frames[mover].place))}
+
+    def given(frames):
+        return {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+
+    with pytest.raises(CalibrationRefused, match=f"where {who}: .*; {cure} or more, and") as told:
+        solve_graph(given(lame), seen(lame, pairs, np.random.default_rng(0)))
+    assert "see the other" not in str(told.value)
+    (text,) = re.findall(rf"turn {mover} about (.*?) of base", str(told.value))
+    axes = [np.array(list(map(float, x.strip("()").split(", ")))) for x in text.split(" and ")]
+    place = lame[mover].place.copy()
+    for i, axis in enumerate((axes * N)[: N // 2]):
+        place[i, :3, :3] = rotation_exp(np.radians(20) * axis) @ place[i, :3, :3]
+    cured = {**lame, mover: replace(lame[mover], place=place)}
+    found = solve_graph(given(cured), seen(cured, pairs, np.random.default_rng(0)))
+    assert set(found.places) == set(unknown)
+
+
+def test_a_rail_that_did_not_move_is_named_with_its_direction() -> None:
+    frames, _, pairs = CELLS["an arm on a rail"]
+    unknown = ("base", "camera", "marker")
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    given["carriage"] = replace(given["carriage"], place=still(given["carriage"].place))
+    actual = {**frames, "carriage": given["carriage"]}
+    along = np.array([0, 0, 0, 1, 0, 0.0])[:, None]
+    sightings = seen(actual, pairs, np.random.default_rng(0))
+    told = r"move carriage along \(1.00, 0.00, 0.00\) of world by 0.1 m or more"
+    with pytest.raises(CalibrationRefused, match=told):
+        solve_graph(given, sightings, freedoms={"carriage": along, "flange": np.eye(6)})
 
 
 def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands() -> None:
@@ -152,10 +226,13 @@ def test_a_rail_alone_does_not_tell_where_on_it_the_arm_stands() -> None:
         **frames,
         **{name: Frame(frames[name].parent) for name in ("base", "camera", "marker")},
     }
-    with pytest.raises(
-        CalibrationRefused, match="where base and camera are: a common shift hardly"
-    ):
-        solve_graph(given, seen(frames, pairs, np.random.default_rng(0)))
+    along = {"carriage": np.array([0, 0, 0, 1, 0, 0.0])[:, None], "flange": np.eye(6)}
+    told = (
+        r"where base and camera are: a common shift hardly changes them; no motion shows where base "
+        r"and camera stand: say it of base \(place: in the recipe\)"
+    )
+    with pytest.raises(CalibrationRefused, match=told):
+        solve_graph(given, seen(frames, pairs, np.random.default_rng(0)), freedoms=along)
 
 
 def test_the_link_between_two_parts_that_is_missing_is_named() -> None:

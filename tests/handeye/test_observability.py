@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.handeye.observability import require_right_handed, robust_sigma
+from flangeye.handeye.observability import require_right_handed, robust_sigma, telling
 from flangeye.maths.geometry import kabsch, rotation_exp
 
 
@@ -30,3 +30,14 @@ def test_the_noise_that_residuals_show_is_the_noise_of_one_coordinate() -> None:
         rotation, shift = kabsch(centres, tcps)
         found.append(robust_sigma(tcps - centres @ rotation.T - shift))
     assert np.mean(found) == pytest.approx(sigma, rel=0.06)
+
+
+def test_as_few_motions_are_named_as_show_what_is_weak() -> None:
+    known, limits = np.diag([4.0, 0.0, 0.0, 0.0]), np.ones(4)
+    motions = {"first": np.diag([9.0, 0, 0, 0]), "second": np.diag([0, 9.0, 0, 0]),
+               "third": np.diag([0, 9.0, 9.0, 0])}  # fmt: skip
+    chosen, left = telling(known, limits, motions)
+    assert chosen == ["third"]
+    assert np.abs(left.moves).argmax(axis=0).tolist() == [3]
+    assert telling(np.diag([4.0] * 4), limits, motions)[0] == []
+    assert telling(known, limits, {})[0] == []

@@ -7,6 +7,7 @@ import pytest
 
 from flangeye.errors import RecipeError
 from flangeye.models.cell import Axis, Cell
+from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
@@ -47,6 +48,17 @@ def test_rails_and_positioners_move_along_and_about_their_axis() -> None:
     assert isinstance(rail, Axis)
     assert rail.place(0.5)[:3, 3] == pytest.approx([0, 0.5, 0])
     assert table.place(np.pi / 2)[:3, 0] == pytest.approx([0, 1, 0])
+    assert cell.freedoms["rail"][:, 0] == pytest.approx([0, 0, 0, 0, 1, 0])
+    assert cell.freedoms["table"][:, 0] == pytest.approx([0, 0, 1, 0, 0, 0])
+    assert cell.freedoms["arm"] == pytest.approx(np.eye(6))
+
+
+def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
+    ur5 = load_model("robots", "ur5")
+    upright = tuple(joint.model_copy(update={"alpha": 0.0}) for joint in ur5.joints[:4])
+    four = ur5.model_copy(update={"joints": upright})
+    able = Cell({}, {"arm": four}, (), ()).freedoms["arm"]
+    assert able == pytest.approx(np.eye(6)[:, 2:])
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,8 @@ def sighted_of(
     if not observations:
         raise StageError("no sighting to solve with: every capture was set aside, for its reason")
     sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
-    return Sighted(cell.graph(observations), sightings, mover_noise(cell), limits)
+    frames = cell.graph(observations)
+    return Sighted(frames, sightings, mover_noise(cell), limits, cell.freedoms)
 
 
 def mover_noise(cell: Cell) -> dict[str, Floats]:

@@ -105,16 +105,19 @@ class Sighted:
         sightings: N of them.
         noise: (6, 6) covariance believed of what moves, by frame.
         limits: As for :func:`flangeye.handeye.graph.solve_graph`.
+        freedoms: Likewise.
     """
 
     frames: Mapping[str, Frame]
     sightings: Sequence[Sighting]
     noise: Mapping[str, Floats]
     limits: tuple[float, float]
+    freedoms: Mapping[str, Floats] | None = None
 
     def solved(self, start: Mapping[str, Floats] | None = None) -> Solved:
         """Return the unknowns."""
-        return solve_graph(self.frames, self.sightings, self.noise, self.limits, start)
+        graph = self.frames, self.sightings, self.noise, self.limits
+        return solve_graph(*graph, start, self.freedoms)
 
     def with_arms(self, arms: Sequence[Bent]) -> Sighted:
         """Return the same with the arms where their offsets put them."""

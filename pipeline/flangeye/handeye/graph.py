@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
+from flangeye.handeye.missing import Loops, Move
 from flangeye.handeye.observability import weak_moves
 from flangeye.maths.frame_graph import Frame, chain, composed, root_of
 from flangeye.maths.geometry import (
@@ -49,6 +50,8 @@ TURNS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 """Onto the rotation of a residual."""
 SIZES = np.logspace(-3, 4, 141)
 """Factors on the movers' variances that are compared."""
+FURTHER = np.repeat([np.radians(20), 0.1], 3)
+"""By how much what moves is turned [rad] or moved [m] to find out what that would show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,7 @@ def solve_graph(
     noise: Mapping[str, Floats] | None = None,
     limits: tuple[float, float] = LIMITS,
     start: Mapping[str, Floats] | None = None,
+    freedoms: Mapping[str, Floats] | None = None,
 ) -> Solved:
     """Find every frame whose place is unknown.
 
@@ -135,13 +139,16 @@ def solve_graph(
         limits: Largest standard deviations of an unknown's rotation [rad] and translation [m].
         start: (4, 4) of every unknown, where a solution of most of the sightings is known already;
             without it none is needed.
+        freedoms: (6, k) unit twists, in its parent, that what moves can do, by frame; by default
+            all that are measured can turn about, and move along, every axis.
 
     Raises:
         StageError: A frame stands on nothing that leads to the root, or the graph has two roots.
-        CalibrationRefused: The sightings leave something unknown: it says what.
+        CalibrationRefused: The sightings leave something unknown: it says what, and which motion
+            or sighting would tell.
     """
     root_of(frames)
-    graph = _Graph.of(frames, sightings)
+    graph = _Graph.of(frames, sightings, freedoms)
     own = _whiteners(graph.covariances, graph.projectors)
     places = _descend(graph, start, own, robust=True) if start else _best(graph, own)
     every = np.ones(len(sightings), bool)
@@ -163,7 +170,12 @@ def _solved(
     whiteners, kept, size = weighed
     residuals, jacobian = graph.linearised(places)
     information = information_of(whiteners[kept] @ jacobian[kept])
-    _refuse_unknown(graph, information, list(places), limits)
+    scale = np.tile(np.repeat(limits, 3), len(places))
+    if weak_moves(information, scale):
+        seen = dict.fromkeys((pair.camera, pair.target) for pair in graph.pairs)
+        again = graph.seen_again(places, whiteners * kept[:, None, None])
+        loops = Loops(graph.frames, list(seen), list(places), scale)
+        raise CalibrationRefused(loops.told_unknown(information, again))
     freedom = float(graph.freedoms[kept].sum()) - len(information)
     wider = covariance_inflation(max(freedom, 1.0), 6)
     joint = np.asarray(np.linalg.inv(information) * wider, dtype=np.float64)
@@ -215,18 +227,26 @@ def linear_of(
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
-    """Frames and what was sighted."""
+    """Frames and what was sighted, and what moves can do."""
 
     frames: Mapping[str, Frame]
     pairs: Sequence[_Pair]
     covariances: Floats
     projectors: Floats
+    freedoms_of: Mapping[str, Floats]
 
     @classmethod
-    def of(cls, frames: Mapping[str, Frame], sightings: Sequence[Sighting]) -> _Graph:
+    def of(
+        cls,
+        frames: Mapping[str, Frame],
+        sightings: Sequence[Sighting],
+        freedoms: Mapping[str, Floats] | None = None,
+    ) -> _Graph:
         projectors = np.array([s.projector for s in sightings]).reshape(-1, 6, 6)
         covariances = np.array([s.covariance for s in sightings]).reshape(-1, 6, 6)
-        return cls(frames, _pairs(sightings), covariances, projectors)
+        measured = [n for n, f in frames.items() if f.place is not None and f.place.ndim == 3]
+        able = freedoms or {name: np.eye(6) for name in measured}
+        return cls(frames, _pairs(sightings), covariances, projectors, able)
 
     @property
     def unknown(self) -> list[str]:
@@ -257,6 +277,39 @@ class _Graph:
         for i, covariance in enumerate(noise.values()):
             stated[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = covariance
         return np.asarray(effects @ stated @ np.swapaxes(effects, 1, 2))
+
+    def seen_again(self, places: Mapping[str, Floats], whiteners: Floats) -> dict[Move, Floats]:
+        """Return the (P, P) that all would tell with one thing moved, by its frame and twist."""
+        again = {}
+        for name, twists in self.freedoms_of.items():
+            for twist in np.transpose(twists):
+                told = [self._moved_tells(places, whiteners, name, x) for x in (twist, -twist)]
+                again[name, tuple(map(float, twist))] = np.sum(told, axis=0)
+        return again
+
+    def _moved_tells(
+        self, places: Mapping[str, Floats], whiteners: Floats, name: str, twist: Floats
+    ) -> Floats:
+        turn, shift = (twist * FURTHER)[:3], (twist * FURTHER)[3:]
+        at = np.array(self.frames[name].place)
+        at[..., :3, :3], at[..., :3, 3] = (
+            rotation_exp(turn) @ at[..., :3, :3],
+            at[..., :3, 3] + shift,
+        )
+        moved = replace(self, frames={**self.frames, name: replace(self.frames[name], place=at)})
+        before, after = (graph._turns(places) for graph in (self, moved))
+        # What is not measured of a circle turns with it.
+        back = np.kron(np.eye(2), before @ np.swapaxes(after, 1, 2))
+        return information_of(whiteners @ back @ moved._effects(places, list(places)))
+
+    def _turns(self, places: Mapping[str, Floats]) -> Floats:
+        """Return (N, 3, 3) camera_R_target, as predicted."""
+        out = np.zeros((len(self.projectors), 3, 3))
+        for pair in self.pairs:
+            frames = self._at(pair, places)
+            camera, target = (_each(frames, end, pair) for end in (pair.camera, pair.target))
+            out[pair.rows] = np.swapaxes(camera[:, :3, :3], 1, 2) @ target[:, :3, :3]
+        return out
 
     def _at(self, pair: _Pair, places: Mapping[str, Floats]) -> dict[str, Frame]:
         """Return the frames at the times of a pair, all places known."""
@@ -437,34 +490,3 @@ def _moved(places: Mapping[str, Floats], step: Floats) -> dict[str, Floats]:
         turn, shift = step[6 * i : 6 * i + 3], step[6 * i + 3 : 6 * i + 6]
         out[name] = rigid(rotation_exp(turn) @ place[:3, :3], place[:3, 3] + shift)
     return out
-
-
-def _refuse_unknown(
-    graph: _Graph, information: Floats, unknown: Sequence[str], limits: tuple[float, float]
-) -> None:
-    """Refuse when a common move of the unknowns hardly changes the sightings; name what moves."""
-    scale = np.tile(np.repeat(limits, 3), len(unknown))
-    weak = weak_moves(information, scale)
-    if not weak:
-        return
-    share = np.abs((weak.moves[:, 0] / scale).reshape(-1, 6))
-    named = [name for name, row in zip(unknown, share, strict=True) if row.max() > 0.1]
-    turns = share[:, :3].max() > share[:, 3:].max()
-    raise CalibrationRefused(
-        f"the sightings do not tell where {' and '.join(named)} {'are' if len(named) > 1 else 'is'}"
-        f": a common {'turn' if turns else 'shift'} hardly changes them; {_cure(graph, named)}"
-    )
-
-
-def _cure(graph: _Graph, named: Sequence[str]) -> str:
-    """Return what would tell: another motion, or the sighting that ties two parts of the graph."""
-    ends = dict.fromkeys(end for pair in graph.pairs for end in (pair.camera, pair.target))
-    moved = [end for end in ends if {*chain(graph.frames, end)} & {*named}]
-    still = [end for end in ends if end not in moved]
-    tied = any((pair.camera in moved) != (pair.target in moved) for pair in graph.pairs)
-    if tied or not still:
-        return "move the arms about more axes, or let a camera see what ties them"
-    return (
-        f"no sighting ties {' and '.join(moved)} to {' and '.join(still)}: let a camera of the one "
-        "see a target of the other"
-    )

@@ -6,7 +6,9 @@ their limits (:func:`weak_moves`). What is refused because of them says which mo
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,11 @@ STILL = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
 PARALLEL = 0.03
 """Axes of rotation are parallel when they spread by less [rad]."""
+TELLS, UNKNOWN = 2.0, 1e3
+"""What shows a weak move makes it known so many times better, at least; of one that is known worse
+than so many times its limit nothing is known."""
+
+Motion = TypeVar("Motion")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +66,34 @@ def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
     weak = values < 1.0
     excess = 1.0 / np.sqrt(np.maximum(values[weak], 1e-12))
     return WeakMoves(limits[:, None] * vectors[:, weak], excess)
+
+
+def telling(
+    information: Floats, limits: Floats, further: Mapping[Motion, Floats]
+) -> tuple[list[Motion], WeakMoves]:
+    """Return the motions that would show the weak moves, as few as do, and what stays weak.
+
+    Greedy: each time the motion that makes the weak moves known best.
+
+    Args:
+        information: (P, P) so far.
+        limits: (P,) largest standard deviation of each unknown [rad, m].
+        further: (P, P) that each motion would add.
+    """
+    chosen: list[Motion] = []
+    weak = weak_moves(information, limits)
+    while weak:
+        left = {m: weak_moves(information + more, limits) for m, more in further.items()}
+        best = min(left, key=lambda motion: _weakness(left[motion]), default=None)
+        if best is None or _weakness(left[best]) > _weakness(weak) - np.log(TELLS):
+            break
+        chosen.append(best)
+        information, weak = information + further[best], left[best]
+    return chosen, weak
+
+
+def _weakness(weak: WeakMoves) -> float:
+    return float(np.log(np.minimum(weak.excess, UNKNOWN)).sum())
 
 
 @dataclass(frozen=True)

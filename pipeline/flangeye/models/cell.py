@@ -36,6 +36,12 @@ class Axis:
     turns: bool
     travel: tuple[float, float]
 
+    @property
+    def freedoms(self) -> Floats:
+        """(6, 1) the unit twist of its motion, rotation before translation."""
+        along, still = np.asarray(self.direction), np.zeros(3)
+        return np.concatenate([along, still] if self.turns else [still, along])[:, None]
+
     def place(self, value: float) -> Floats:
         """Return (4, 4) of carriage or plate in its base, at a value [rad or m]."""
         moved = value * np.asarray(self.direction)
@@ -72,6 +78,14 @@ class Cell:
     def unknowns(self) -> tuple[str, ...]:
         """Names of the transforms to find, the cameras' first."""
         return tuple(map(self.name_of, self.unknown_frames))
+
+    @property
+    def freedoms(self) -> dict[str, Floats]:
+        """(6, k) unit twists that each thing can be moved by, in its base; see ``solve_graph``."""
+        return {
+            name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(Arm(mover))
+            for name, mover in self.movers.items()
+        }
 
     def name_of(self, frame: str) -> str:
         """Return ``parent_T_frame``."""
@@ -128,6 +142,18 @@ class Cell:
             _of_each(frames, [o.camera for o in observations]),
             _of_each(frames, [o.target for o in observations]),
         )
+
+
+def _freedoms_of(arm: Arm) -> Floats:
+    """Return (6, k) unit twists: those axes of ``base`` that it can turn about, and all shifts.
+
+    An arm of four joints turns about one.
+    """
+    bent = np.linspace(0.3, 0.7, arm.n)
+    axes = arm.axes(bent)[0][~arm.slides]
+    reached = np.linalg.lstsq(axes.T, np.eye(3), rcond=1e-9)[0]
+    able = np.linalg.norm(axes.T @ reached - np.eye(3), axis=0) < 1e-6
+    return np.eye(6)[:, [*able, True, True, True]]
 
 
 def _measured(name: str, observations: Sequence[Observation]) -> Floats:
