@@ -3,7 +3,7 @@
 The plan is wrong mostly as a whole, shifted and turned, so the offset changes slowly even where
 the seam curves. What that leaves is a smooth field: a Gaussian process of two parts. One is what a
 plan's shape is off by in any case (``wander``, over :data:`SLOW`); the other has the amplitude of
-what is left, and the correlation length of the greatest restricted likelihood. Where nothing was
+what is left, and the correlation length of the greatest likelihood. Where nothing was
 felt (before the start, in a gap, beyond the end) the shifted and turned plan and the field's
 continuation stand in. Both are found together, by generalised least squares: bins that are off
 alike are not taken for independent witnesses (Rasmussen and Williams 2006, 2.7).
@@ -355,8 +355,8 @@ def _explained(
     """Return the motion (3,) that explains offsets (K,) best, if a field leaves the rest.
 
     With its covariance (3, 3), by how much the rest is larger than the field expects, and the
-    logarithm of the restricted likelihood (Rasmussen and Williams 2006, 2.45), the field's scale
-    left free.
+    logarithm of the marginal likelihood (Rasmussen and Williams 2006, 2.45), the scale of field and
+    prior left free: a motion that hardly any plan is off by explains no waves.
     """
     nugget = noise + 1e-6 * field.variance
     root = np.linalg.cholesky(field.covariance(along, along) + np.diag(nugget))
@@ -366,7 +366,8 @@ def _explained(
     inverse = np.linalg.inv(gram)
     shift = inverse @ (white_rows.T @ white_felt)
     freedom = max(len(felt) - 3, 1)
-    scale = max(float(np.sum((white_felt - white_rows @ shift) ** 2)) / freedom, 1e-9)
+    left = np.sum((white_felt - white_rows @ shift) ** 2) + np.sum((shift / PRIOR) ** 2)
+    scale = max(float(left) / freedom, 1e-9)
     volume = 2.0 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(gram)[1])
     excess = max(scale, 1.0)
     return shift, excess * inverse, excess, -0.5 * (freedom * math.log(scale) + volume)

@@ -313,6 +313,21 @@ def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) 
         assert off < 4 * np.sqrt(refined.variance(s)) < 4e-3
 
 
+def test_waves_felt_in_two_short_pieces_are_not_taken_for_a_plan_turned_far() -> None:
+    """A turn by 16 deg and a shift by 35 mm explain both; between them the wave goes on."""
+    refined = RefinedPath(Path(curved(0.1)), 0.05)
+    refined.noise, rng = 60e-6, np.random.default_rng(0)
+
+    def wave(s):
+        return -1.3e-3 * np.cos(2 * np.pi * (s - 10.5e-3) / 28e-3) - 0.9e-3
+
+    for s in [*np.arange(6e-3, 13e-3, 0.6e-3).tolist(), 27.5e-3, 28e-3]:
+        refined.add(0.0, s, wave(s) + refined.noise * rng.standard_normal(), 0.0)
+    refined.confirm(1.0)
+    for s in np.arange(14e-3, 27e-3, 1e-3):
+        assert abs(refined.offset(s) - wave(s)) < 4 * np.sqrt(refined.variance(s))
+
+
 def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
     few, many = RefinedPath(Path(straight()), 0.05), RefinedPath(Path(straight()), 0.05)
     for refined, end in ((few, 1e-3), (many, 40e-3)):
