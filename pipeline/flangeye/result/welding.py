@@ -61,10 +61,11 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
     """Compare with the true seam that is nearest, where the torch was between its ends.
 
     Not while the tip still feels for the groove, and not before the torch was near enough to the
-    seam to be lit: that of a weld that is gone on with comes back to the seam first, unlit.
+    seam to be lit: that of a weld that is gone on with comes back to the seam first, unlit. Passes
+    after the root's are beside the seam, as they were asked to be.
     """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
-    welds = ~np.isin(weld.phases, ("seeking", "probing"))
+    welds = ~np.isin(weld.phases, ("seeking", "probing", "returning", "passing"))
     torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
     found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)

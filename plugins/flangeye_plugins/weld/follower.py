@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,10 +67,16 @@ class ResumePoint:
     Attributes:
         samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
         torch: Arc length of the torch's progress [m].
+        learned: What the sweep found.
+        traced: (K, 3) how high the tool was, where there are later passes; see ``passes.Traced``.
+        number: Which pass was stopped, the root's is 0.
     """
 
     samples: Floats
     torch: float
+    learned: Learned = field(default_factory=Learned)
+    traced: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    number: int = 0
 
 
 class Follower:
@@ -149,7 +155,9 @@ class Follower:
 
     def kept(self) -> ResumePoint | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
-        return None if self.lit is None else ResumePoint(self.refined.samples(), self.torch)
+        if self.lit is None:
+            return None
+        return ResumePoint(self.refined.samples(), self.torch, self.learned)
 
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""
@@ -408,9 +416,9 @@ class Follower:
         if isinstance(found, str):
             self._stop(found)
             return
-        self.learned = found
+        self.learned = replace(found, noise=max(found.noise, float(self._search.sigma[1])))
         self._response.dead_time, self._response.lag = found.dead_time, found.lag
-        self.refined.noise = max(found.noise, float(self._search.sigma[1]))
+        self.refined.noise = self.learned.noise
         self._began = self._time or 0.0
         for pose, touch in self._swept:
             s, self._felt, self.wanted = self._located(pose, touch)

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
-from flangeye_plugins.weld.follower import Follower
+from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams
@@ -41,30 +42,36 @@ TURNED = math.radians(0.2)
 
 
 class Traced:
-    """What the root pass leaves: where the seam is, how well known, and how high the tool was."""
+    """What the root pass leaves: where the seam is, how well known, and how high the tool was.
 
-    def __init__(self, root: Follower, plan: Path) -> None:
+    Attributes:
+        rows: Of each piece of the root pass: the torch's arc length, the end point's height and the
+            torch's standard deviation [m].
+    """
+
+    def __init__(self, root: Follower, plan: Path, before: Floats) -> None:
+        """Begin; ``before`` (K, 3) is what an earlier weld has left that is gone on with."""
         self._root, self._plan = root, plan
-        self._rows: list[tuple[float, float, float]] = []
+        self.rows: list[tuple[float, ...]] = [tuple(row) for row in before.tolist()]
+        self._along, self._sigma = before[:, 0], before[:, 2]
 
     def note(self, height: float) -> None:
         """Remember a cycle of the root pass, in which the end point was so high [m]."""
         root = self._root
-        if not self._rows or root.torch > self._rows[-1][0]:
-            self._rows.append((root.torch, height, root.sigma))
+        if not self.rows or root.torch >= self.rows[-1][0] + STEP:
+            self.rows.append((root.torch, height, root.sigma))
 
     def path(self, chosen: PassParams) -> Path:
         """Return the torch's path of a pass; its height is that of the tool's end point."""
         s = np.arange(max(chosen.along, 0.0), self._plan.length + STEP / 2, STEP)
         frames = [self._root.refined.frame(x) for x in s.tolist()]
         planar = np.array([point + chosen.across * normal for point, normal in frames])
-        torch, height, _ = np.array(self._rows).T
-        return Path(np.column_stack([planar, np.interp(s, torch, height) + chosen.up]))
+        self._along, height, self._sigma = np.array(self.rows).T
+        return Path(np.column_stack([planar, np.interp(s, self._along, height) + chosen.up]))
 
     def sigma(self, s: float) -> float:
         """Return the standard deviation of the seam at an arc length of the root pass [m]."""
-        torch, _, sigma = np.array(self._rows).T
-        return float(np.interp(s, torch, sigma))
+        return float(np.interp(s, self._along, self._sigma))
 
 
 class Passes:
@@ -76,17 +83,51 @@ class Passes:
         aim: How far to the left of the seam the torch is to be [m].
     """
 
-    def __init__(self, root: Follower, plan: Path, belief: Belief, settings: Following) -> None:
-        """Follow the root first, then ``settings.passes``."""
+    def __init__(
+        self,
+        root: Follower,
+        plan: Path,
+        belief: Belief,
+        settings: Following,
+        before: ResumePoint | None = None,
+    ) -> None:
+        """Follow the root first, then ``settings.passes``; or go on ``before``'s pass."""
         self.root, self.number = root, 0
         self.mode, self.side = root.mode, root.side
         self._belief, self._settings = belief, settings
-        self._traced = Traced(root, plan)
+        self._traced = Traced(root, plan, np.zeros((0, 3)) if before is None else before.traced)
         self._response = Response()
         self._path = plan
         self._began: float | None = None
-        self._over = 0.0
+        self._over = self._start = 0.0
         self._take_over()
+        if before is not None and before.number:
+            self._go_on(before)
+
+    def _go_on(self, before: ResumePoint) -> None:
+        """Begin in a later pass, where the torch is to be lit again."""
+        root, settings = self.root, self._settings
+        root.learned, root.lit = before.learned, settings.offset_along
+        root.refined.noise = before.learned.noise
+        self.number = before.number - 1
+        self._learned()
+        self._next_pass(0.0)
+        self._start = self.torch = max(settings.offset_along - self._pass.along, 0.0)
+
+    def _learned(self) -> None:
+        """Take over the arm's delay as the root pass has found it."""
+        learned = self.root.learned
+        self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
+
+    def kept(self) -> ResumePoint | None:
+        """Return what is left to who goes on; None before the torch was on the seam."""
+        root = self.root.kept()
+        if root is None:
+            return None
+        root = replace(root, traced=np.array(self._traced.rows))
+        if not self.number:
+            return root
+        return replace(root, torch=self.torch + self._pass.along, number=self.number)
 
     def _take_over(self) -> None:
         root = self.root
@@ -115,24 +156,23 @@ class Passes:
         self._traced.note(float(pose.position[2]))
         self._take_over()
         if self.phase == "done":
-            learned = self.root.learned
-            self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
-            self._next_pass(pose)
+            self._learned()
+            self._next_pass(float(pose.position[2]))
         return command
 
     @property
     def _pass(self) -> PassParams:
         return self._settings.passes[self.number - 1]
 
-    def _next_pass(self, pose: ToolPose) -> None:
-        """Go back for the next pass; after the last one it is done."""
+    def _next_pass(self, height: float) -> None:
+        """Go back for the next pass, from a height of the end point; after the last it is done."""
         if self.number == len(self._settings.passes):
             self.phase = "done"
             return
         self.number += 1
         self._path, self._began = self._traced.path(self._pass), None
         self._weave = Weave(self._pass.weave_width, self._pass.weave_frequency)
-        self._over = float(max(pose.position[2], self._path.points[:, 2].max())) + OVER
+        self._over, self._start = max(height, float(self._path.points[:, 2].max())) + OVER, 0.0
         self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
         self.wanted = self.sigma = self.bound = self.band = 0.0
         self.aim = self._pass.across
@@ -140,8 +180,8 @@ class Passes:
     # --- back to the start, above the work -------------------------------------------------------
 
     def _return(self, pose: ToolPose) -> Command:
-        """Up, across to the start, down."""
-        start = self._path.at(0.0)
+        """Up, across to where the pass begins, down."""
+        start = self._path.at(self._start)
         aside = self._tool_at(start)[:2] - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
         there = float(np.hypot(*aside)) < THERE and abs(turn) < TURNED
@@ -171,7 +211,7 @@ class Passes:
         self.torch = self._path.advance(torch, self.torch, settings.speed * 0.1)
         self.tip = self.torch + self._pass.along + distance
         if self.torch >= self._path.length:
-            self._next_pass(pose)
+            self._next_pass(float(pose.position[2]))
             return STILL
         self._began = pose.time if self._began is None else self._began
         sway = self._swayed(pose.time)

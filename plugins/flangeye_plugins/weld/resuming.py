@@ -7,6 +7,7 @@ far as the log goes, so nothing has to be saved when a weld is stopped, not even
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -22,6 +23,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import SETTLING, Follower, ResumePoint
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 
 SAME_PLAN = 1e-6
@@ -42,7 +44,9 @@ def controller_of(
         controller: Controller = mode(task_of(plan, belief.distance, settings))
         return controller
     root = Follower(plan, belief, settings, mode == "tactile", kept)
-    return Passes(root, plan, belief, settings) if settings.passes and mode == "tactile" else root
+    if settings.passes and mode == "tactile":
+        return Passes(root, plan, belief, settings, kept)
+    return root
 
 
 def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
@@ -75,11 +79,20 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     """Return the controller of a logged weld, as it was at its start."""
     belief = Belief(**{**start["belief"], "noise": tuple(start["belief"]["noise"])})
     settings = Following.model_validate(start["settings"])
-    kept = start.get("kept")
-    return controller_of(
-        Path(np.array(start["points"])), belief, settings, _mode_of(start["mode"]),
-        None if kept is None else ResumePoint(np.array(kept["samples"]), kept["torch"]),
-    )  # fmt: skip
+    plan, kept = Path(np.array(start["points"])), start.get("kept")
+    before = None if kept is None else _kept_from(kept)
+    return controller_of(plan, belief, settings, _mode_of(start["mode"]), before)
+
+
+def kept_value(kept: ResumePoint) -> dict[str, Any]:
+    """Return what a stopped weld has left as plain values, for the log of the one that goes on."""
+    return {**asdict(kept), "samples": kept.samples.tolist(), "traced": kept.traced.tolist()}
+
+
+def _kept_from(value: Mapping[str, Any]) -> ResumePoint:
+    samples, traced = np.array(value["samples"]), np.array(value["traced"]).reshape(-1, 3)
+    learned = Learned(**value["learned"])
+    return ResumePoint(samples, value["torch"], learned, traced, value["number"])
 
 
 def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
@@ -99,12 +112,12 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
             again = _Again(controller_from(note.value))
         elif again is not None:
             again.take(note)
-    root = None if again is None else follower_of(again.controller)
-    if root is None:
+    controller = None if again is None else again.controller
+    if not isinstance(controller, Follower | Passes):
         raise StageError(f"{log}: holds no tactile weld to resume")
-    if root.phase == "done":
+    if controller.phase == "done":
         raise StageError(f"{log}: this weld is complete; there is nothing to resume")
-    return root.kept()
+    return controller.kept()
 
 
 class _Again:
@@ -141,22 +154,32 @@ def set_back(
 ) -> WeldTactileParams:
     """Return the parameters with which the tip is set down so that the torch overlaps.
 
-    It is lit where the overlap begins, and set down a run-in before that.
+    It is lit where the overlap begins, and set down a run-in before that; in a later pass, which
+    touches nothing, it comes down right there.
 
     Raises:
         StageError: The tip would be beyond where it can press.
     """
+    if kept.number:
+        lit = max(kept.torch - params.overlap, params.passes[kept.number - 1].along)
+        return _standing(params, plan, distance, lit, _ahead(plan, lit, distance))
     release = params.speed * params.deflection / params.release
     last = plan.length - params.ending - release - PRESSING
     lit = kept.torch - params.overlap
     tip = min(_ahead(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
     if tip < params.inset:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
+    return _standing(params, plan, distance, max(lit, params.offset_along), tip)
+
+
+def _standing(
+    params: WeldTactileParams, plan: Path, distance: float, lit: float, tip: float
+) -> WeldTactileParams:
+    """Return the parameters with which tip and torch stand on the plan, lit there."""
     place = plan.at(tip)
     torch = plan.at(_behind(plan, tip, distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    lit = max(lit, params.offset_along)
     return params.model_copy(update={"inset": tip, "start_angle": angle, "offset_along": lit})
 
 

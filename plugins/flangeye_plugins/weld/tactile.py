@@ -36,7 +36,7 @@ from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
-from flangeye_plugins.weld.resuming import controller_of, resume_point_of, set_back
+from flangeye_plugins.weld.resuming import controller_of, kept_value, resume_point_of, set_back
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -128,6 +128,6 @@ def start_of(
         "finger": finger.model_dump(mode="json"),
         "belief": asdict(belief),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],
-        "kept": None if kept is None else {"samples": kept.samples.tolist(), "torch": kept.torch},
+        "kept": None if kept is None else kept_value(kept),
         "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
     }

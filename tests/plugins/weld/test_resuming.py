@@ -76,6 +76,34 @@ def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any
     assert resume_point_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 
 
+def test_a_later_pass_goes_back_overlaps_and_the_passes_after_it_follow(tmp_path: Any) -> None:
+    seam = planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=0.045)
+    asked = {"speed": "10 mm/s", "passes": [{"across": "2 mm"}, {"across": "-2 mm", "up": "5 mm"}]}
+    _, journal = run(seam, seed=3, **asked)
+    second = [i for i, (_, value) in enumerate(journal) if _welds(value, "passing", 0.02)]
+    log = logged(journal[: second[0] + 1], tmp_path / "stopped.mcap")
+    stopped_at = journal[second[0]][1]["torch"][-1]
+    report, journal = run(seam, seed=4, **asked, resume=log, overlap="8 mm")
+    assert report.completed
+    assert set(report.phases) == {"returning", "passing", "done"}
+    welding = np.array(report.phases) == "passing"
+    assert report.along[welding][0] == pytest.approx(stopped_at - 8e-3, abs=1e-3)
+    first = welding & (np.cumsum(~welding & (report.along == 0.0)) == 0)
+    line = true_line("v-straight", 0.045)
+    for kept in (first, welding & ~first):
+        inside = kept & (report.along > 5e-3)
+        away = torch_deviation(report.true_torch[inside], line, report.opening)
+        np.testing.assert_allclose(away, 2e-3, atol=0.3e-3)
+    ((_, redone),) = replay_steps(logged(journal, tmp_path / "again.mcap"), load_registry())
+    assert redone.same
+
+
+def _welds(value: Any, phase: str, torch: float) -> bool:
+    """Whether a note is of cycles in a phase, beyond an arc length [m]."""
+    cycles = isinstance(value, dict) and "phase" in value
+    return cycles and value["phase"][-1] == phase and value["torch"][-1] > torch
+
+
 PARAMS = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFingerParams()))
 
 
