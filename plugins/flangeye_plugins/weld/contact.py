@@ -31,38 +31,32 @@ class Contact:
         self.state: State = "seeking"
         self.since = -math.inf
         self.deflection = 0.0
-        self._crossed: float | None = None
-        self._time: float | None = None
+        self._crossed = math.inf
+        self._time = -math.inf
 
     def update(self, time: float, deflection: float, wanted: float) -> None:
         """Take one measurement [m] at ``time`` [s]; ``wanted`` is positive."""
-        self._filter(time, deflection)
+        left = math.exp(-(time - self._time) / SMOOTHING)  # none of what was before the first
+        self.deflection = deflection + left * (self.deflection - deflection)
+        self._time = time
         held = self.state == "held"
         level = (LOST if held else REGAINED) * wanted
         if (self.deflection < level) != held:
-            self._crossed = None
+            self._crossed = math.inf
             return
-        self._crossed = time if self._crossed is None else self._crossed
+        self._crossed = min(self._crossed, time)
         if time - self._crossed >= DWELL:
             self.state, self.since = ("lost" if held else "held"), time
-            self._crossed = None
+            self._crossed = math.inf
 
     def hold(self, time: float, deflection: float) -> None:
         """Take it for certain that the wall is pressed, by ``deflection`` [m]."""
         self.state, self.since = "held", time
-        self.deflection, self._time, self._crossed = deflection, time, None
+        self.deflection, self._time, self._crossed = deflection, time, math.inf
 
     def doubted(self, deflection: float, wanted: float) -> bool:
         """Whether one measurement alone speaks against contact."""
         return self.state != "held" or deflection < LOST * wanted
-
-    def _filter(self, time: float, deflection: float) -> None:
-        if self._time is None:
-            self.deflection = deflection
-        else:
-            weight = 1.0 - math.exp(-(time - self._time) / SMOOTHING)
-            self.deflection += weight * (deflection - self.deflection)
-        self._time = time
 
 
 LEANING = 0.1e-3
@@ -87,7 +81,7 @@ class Release:
         other: Whether the other wall holds it.
     """
 
-    def __init__(self, two_walls: bool, sliding: float = 0.0) -> None:
+    def __init__(self, two_walls: bool, sliding: float) -> None:
         """Begin; friction alone displaces a tip that no wall holds by ``sliding`` [m]."""
         self.loose = self.other = False
         self._two_walls, self._sliding = two_walls, sliding

@@ -15,7 +15,6 @@ from flangeye.types import Transform
 from flangeye_emulators.weld_world.groove import Contact as Tip3D
 from flangeye_emulators.weld_world.groove import Groove, Section, Tip
 from flangeye_plugins.weld.consistency import Seating
-from flangeye_plugins.weld.contact import DWELL, LOST, REGAINED, SMOOTHING, Contact, Release
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
@@ -127,67 +126,6 @@ def test_a_long_seam_costs_a_cycle_no_more_than_a_short_one() -> None:
     assert len(refined._nearest(20, 120)) == len(refined._nearest(4000, 120)) == 240
     assert refined.offset(2.0) == pytest.approx(1e-3, abs=1e-6)
     assert refined.offset(4.5) == pytest.approx(1e-3, abs=1e-5)  # half a metre beyond
-
-
-# --- contact --------------------------------------------------------------------------------------
-
-
-def fed(contact, values, start=0.0, wanted=2e-3):
-    states = []
-    for i, value in enumerate(values):
-        contact.update(start + i * 0.03, value, wanted)
-        states.append(contact.state)
-    return states
-
-
-def test_contact_filters_by_its_time_constant() -> None:
-    contact = Contact()
-    contact.update(1.0, 1e-3, 2e-3)
-    assert contact.deflection == 1e-3
-    for step in (0.01, 0.05, 0.2):
-        before, since = contact.deflection, contact._time
-        assert before is not None and since is not None
-        contact.update(since + step, 3e-3, 2e-3)
-        left = np.exp(-step / SMOOTHING)
-        assert contact.deflection == pytest.approx(3e-3 + left * (before - 3e-3), rel=1e-12)
-
-
-def test_contact_is_believed_and_doubted_after_its_dwell_and_at_its_levels() -> None:
-    contact = Contact()
-    times = iter(np.arange(0.0, 60.0, 0.01))
-
-    def until_changed(value):
-        """Return how long a constant deflection takes to change the state, at most two seconds."""
-        contact.deflection, began = value, None
-        for time in times:
-            began, before = time if began is None else began, contact.state
-            contact.update(time, value, 2e-3)
-            if contact.state != before:
-                assert contact.since == time
-                return time - began
-            if time - began > 2.0:
-                return None
-
-    assert until_changed(REGAINED * 2e-3 * 0.999) is None
-    assert until_changed(REGAINED * 2e-3 * 1.001) == pytest.approx(DWELL, abs=0.011)
-    assert contact.state == "held"
-    assert until_changed(LOST * 2e-3 * 1.001) is None
-    assert until_changed(LOST * 2e-3 * 0.999) == pytest.approx(DWELL, abs=0.011)
-    assert [contact.state] == ["lost"]
-    assert contact.doubted(3e-3, 2e-3)
-
-
-def test_contact_has_hysteresis_in_size_and_in_time() -> None:
-    contact = Contact()
-    assert fed(contact, [1e-3] * 20)[-1] == "seeking"
-    assert fed(contact, [2e-3] * 20, 1.0)[-1] == "held"
-    assert fed(contact, [1e-3] * 20, 2.0)[-1] == "held"
-    assert fed(contact, [0.0] * 2 + [2e-3] * 10, 3.0)[-1] == "held"
-    assert fed(contact, [0.0] * 20, 4.0)[-1] == "lost"
-    assert fed(contact, [1e-3] * 20, 5.0)[-1] == "lost"
-    assert fed(contact, [2e-3] * 20, 6.0)[-1] == "held"
-    assert contact.doubted(0.5e-3, 2e-3)
-    assert not contact.doubted(1e-3, 2e-3)
 
 
 # --- where the tool was ---------------------------------------------------------------------------
@@ -338,30 +276,6 @@ def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
 
 
 # --- whether the tip is where the seam is ---------------------------------------------------------
-
-
-def released(deflections, expected, two_walls=True, sigma=10e-6, sliding=0.0):
-    release = Release(two_walls, sliding)
-    for deflection, wanted in zip(deflections, expected, strict=True):
-        release.judge(deflection, wanted, sigma)
-    return release.loose
-
-
-def test_a_tip_that_is_let_go_of_and_should_still_be_pressed_has_lost_its_wall() -> None:
-    assert released([0.0] * 5, [0.5e-3] * 5)
-    assert not released([0.0] * 4, [0.5e-3] * 4)  # never on fewer
-    assert not released([0.0] * 5, [0.05e-3] * 5)
-    assert not released([0.3e-3] * 5, [0.5e-3] * 5)
-    assert not released([0.0] * 5, [0.2e-3] * 5, sigma=0.2e-3)  # a finger too noisy to say so
-
-
-def test_the_other_wall_tells_where_the_seam_is_though_the_wall_seemed_lost() -> None:
-    pressed_back = [0.0] * 5 + [-0.5e-3] * 5
-    assert not released(pressed_back, [0.5e-3] * 10)
-    assert released(pressed_back, [0.5e-3] * 10, two_walls=False)
-    # What friction alone may give is no wall: a tip that drags agrees with any place.
-    assert released(pressed_back, [0.5e-3] * 10, sliding=0.9e-3)
-    assert not released([0.0] * 5 + [-1e-3] * 5, [0.5e-3] * 10, sliding=0.9e-3)
 
 
 def climbing(aside, lifted):
