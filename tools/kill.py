@@ -147,8 +147,8 @@ class Trial:
         for pid, command in left.items():
             yield f"a process is left: {command}"
             os.kill(pid, signal.SIGKILL)
-        forgotten = [*map(str, _temporary(out).iterdir()), *sorted(shared)]
-        yield from (f"{path} is left" for path in forgotten if Path(path).exists())
+        forgotten = {*_temporary(out).iterdir(), *map(Path, shared)} - {_scratch(out)}
+        yield from (f"{path} is left" for path in sorted(forgotten) if path.exists())
 
     def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
         """Yield what of a log cannot be read though it was finished before."""
@@ -177,6 +177,7 @@ class Trial:
         _, told = again.communicate()
         if again.returncode not in (0, 1):
             yield f"{' '.join(command)}: {told.decode().strip()}"
+        yield from (f"{path} is left" for path in _scratch(out).glob("*/"))
 
     def _start(
         self, command: tuple[str, ...], out: Path, stderr: int = subprocess.DEVNULL
@@ -194,6 +195,11 @@ class Trial:
 
 def _temporary(out: Path) -> Path:
     return out.with_name(f"{out.name}-tmp")
+
+
+def _scratch(out: Path) -> Path:
+    """Return where dask's workers have their folders; its next start removes the killed ones'."""
+    return _temporary(out) / "dask-scratch-space"
 
 
 def _finished(log: Path) -> list[str]:

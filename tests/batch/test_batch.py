@@ -178,6 +178,26 @@ def test_ctrl_c_keeps_what_came_so_far(recipe: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "summary.html").exists()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="what a process has mapped is read from /proc")
+def test_a_killed_group_leaves_no_semaphore() -> None:
+    code = (
+        "from flangeye.batch.cluster import local_client\n"
+        "if __name__ == '__main__':\n"
+        "    with local_client(1) as client:\n"
+        "        print(*client.run(lambda: open('/proc/self/maps').read()).values())\n"
+        "        print('end', flush=True)\n"
+        "        input()\n"
+    )
+    with running([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
+        told = "".join(iter(process.stdout.readline, "end\n"))
+    semaphores = [Path(word) for word in told.split() if word.startswith("/dev/shm/sem.")]
+    assert semaphores
+    deadline = time.monotonic() + PATIENCE
+    while any(path.exists() for path in semaphores):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 SBATCH = f"""\
 #!{sys.executable}
 # Stands in for SLURM: starts the job's script on this machine.

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from itertools import groupby, islice
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from flangeye.batch.plan import BatchSession
 from flangeye.batch.request import BatchError, Tls
 from flangeye.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
 from flangeye.errors import FlangeyeError
-from flangeye.files.children import keep_current_folder_out
+from flangeye.files.children import keep_current_folder_out, python_command
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
@@ -123,12 +123,28 @@ def _interrupts_kept_here() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    resource_tracker.ensure_running()  # or its start inside would lift the mask again
+    _track_semaphores()  # or its start inside would lift the mask again
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _track_semaphores() -> None:
+    """Start what removes the workers' semaphores when all of them are gone, in a group of its own.
+
+    multiprocessing starts it in ours: who kills the group leaves them in the system's memory.
+    """
+    tracker: Any = resource_tracker._resource_tracker
+    if tracker._fd is not None:
+        return
+    heard, tracker._fd = os.pipe()
+    os.set_inheritable(heard, True)
+    command = f"from multiprocessing.resource_tracker import main; main({heard})"
+    words = python_command("-c", command)
+    tracker._pid = os.posix_spawn(sys.executable, words, os.environ, setpgroup=0)
+    os.close(heard)
 
 
 @contextmanager
