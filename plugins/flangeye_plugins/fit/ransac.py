@@ -71,6 +71,10 @@ def fit_ransac_circle(
     if plane is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
     points = points[np.abs(plane.heights(points)) <= params.plane]
+    if len(points) < params.min_points:
+        return Rejected(
+            f"{len(points)} points on the face, at least {params.min_points} are needed"
+        )
     largest = params.radius or flange.rim
     hypotheses = draw_circles(points, (largest - params.e_r, largest), params, seed)
     if len(hypotheses.radii) == 0:
@@ -90,9 +94,7 @@ def fit_ransac_circle(
 def draw_circles(
     points: Floats, radii: tuple[float, float], params: RansacCircleParams, seed: int
 ) -> CircleHypotheses:
-    """Return the scored circles through random triples whose radius lies between two limits."""
-    if len(points) < 3:
-        return CircleHypotheses(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp))
+    """Return the scored circles through random triples of the points, of radii between two."""
     rng = np.random.default_rng(seed)
     triples = points[rng.integers(len(points), size=(params.k_max, 3))]
     centres, found = circles_through(triples)

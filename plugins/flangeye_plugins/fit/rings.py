@@ -106,8 +106,8 @@ def _sectors_for(flat: Floats, nominal: Floats) -> Indices:
 
     Narrower ones often hold no point at the edge itself, wider ones lose detail.
     """
-    inner = nominal[1] if len(nominal) > 1 else 0.0
-    spacing = np.sqrt(np.pi * (nominal[0] ** 2 - inner**2) / len(flat))
+    rim, *bore = nominal**2
+    spacing = np.sqrt(np.pi * (rim - sum(bore)) / len(flat))
     bins: Indices = np.clip(np.rint(np.pi * nominal / spacing), 24, 360).astype(np.intp)
     return bins
 

@@ -171,8 +171,8 @@ def _candidates(
     reach = np.maximum(near[first] - first, 1)[:, None]
     others = first[:, None] + (rng.random((SAMPLES, 2)) * reach).astype(np.intp)
     centres, radii = circles_through(flat[np.column_stack([first, others])])
-    least, most = (radius * np.sqrt(1 - share**2) for share in reversed(params.offset))
-    fitting = (radii > 0.5 * least) & (radii < min(1.1 * most, radius + params.tolerance))
+    least = radius * np.sqrt(1 - params.offset[1] ** 2)
+    fitting = (radii > 0.5 * least) & (radii < radius + params.tolerance)
     return centres[fitting][:, [0, 2]], radii[fitting]
 
 

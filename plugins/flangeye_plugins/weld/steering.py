@@ -33,7 +33,7 @@ class Steering:
     usual: float = 0.8
 
     def turn(
-        self, velocity: Floats, tool: Floats, normal: Floats, error: float, sway: float = 0.0
+        self, velocity: Floats, tool: Floats, normal: Floats, error: float, sway: float
     ) -> float:
         """Return the angular velocity [rad/s], never beyond :attr:`rate`.
 
@@ -45,15 +45,15 @@ class Steering:
             sway: How fast it is to leave that path to the left all the same [m/s].
         """
         cosine, sine = _cos_sin(tool, normal)
-        most = self.share * float(np.hypot(*velocity))
-        back = min(max(self.gain * error, -most), most)
         trusted = self.trust(cosine)
         # Near n_d perpendicular to n_t equation (16) divides by zero and below it the torch would
         # be pushed, not pulled: there the tool is turned into the path's direction instead.
         aligning = -float(np.copysign(self.rate, sine))
-        asked = float(velocity @ normal) + back - sway
-        solved = asked / (self.distance * cosine) if trusted else 0.0
-        wanted = trusted * solved + (1.0 - trusted) * aligning
+        if not trusted:
+            return aligning
+        most = self.share * float(np.hypot(*velocity))
+        asked = float(velocity @ normal) + min(max(self.gain * error, -most), most) - sway
+        wanted = trusted * asked / (self.distance * cosine) + (1.0 - trusted) * aligning
         return float(min(max(wanted, -self.rate), self.rate))
 
     def trust(self, cosine: float) -> float:
@@ -70,9 +70,10 @@ class Steering:
             along: (2,) unit tangent of the path at the tip.
         """
         cosine, _ = _cos_sin(tool, normal)
-        turn = speed * abs(float(along @ normal)) / (self.distance * max(cosine, 1e-3))
-        turning = self.usual * self.rate / max(turn, 1e-9)
-        return speed * min(max(min(cosine / self.regular, turning), SLOWEST), 1.0)
+        pace, across = cosine / self.regular, speed * abs(float(along @ normal))
+        if across:
+            pace = min(pace, self.usual * self.rate * self.distance * cosine / across)
+        return speed * min(max(pace, SLOWEST), 1.0)
 
 
 def _cos_sin(tool: Floats, normal: Floats) -> tuple[float, float]:

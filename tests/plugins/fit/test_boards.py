@@ -1,5 +1,6 @@
 """Printed targets in rendered images: perspective, lens, blur and noise, with known truth."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -162,8 +163,16 @@ def test_a_print_in_another_size_is_named_by_depth(kind: str) -> None:
     said = params.model_copy(update={field: getattr(params, field) / 1.03})
     rejected = fit(capture(board, looking(), depth=True), said)
     assert isinstance(rejected, Rejected)
-    assert "times as large as the recipe says" in rejected.reason
-    assert float(rejected.reason.split("target is ")[1].split()[0]) == pytest.approx(1.03, abs=5e-3)
+    told = re.fullmatch(
+        r"by the scanner's depth the target is ([\d.]+) times as large as the recipe says: "
+        r"([\d.]+) mm is ([\d.]+) mm; measure the print",
+        rejected.reason,
+    )
+    assert told
+    scale, stated, measured = map(float, told.groups())
+    assert scale == pytest.approx(1.03, abs=5e-3)
+    assert stated == pytest.approx(1e3 * getattr(said, field), rel=1e-3)
+    assert measured == pytest.approx(scale * stated, rel=1e-3)
 
 
 def blank():

@@ -194,3 +194,18 @@ def test_measured_points_give_pose_and_size_with_the_scatter_they_have() -> None
     )
     assert np.mean(sizes) == pytest.approx(1.02, abs=2e-4)
     assert np.mean(sigmas) == pytest.approx(np.std(sizes), rel=0.12)
+
+
+def test_where_a_target_has_its_origin_does_not_change_its_size() -> None:
+    measured = 1.02 * (POINTS @ POSE[:3, :3].T + POSE[:3, 3])
+    assert scale_of(POINTS + [0.3, -0.2, 0.1], measured)[0] == pytest.approx(1.02, rel=1e-12)
+
+
+def test_of_four_corners_scatter_and_error_of_the_size_are_unbiased() -> None:
+    """Four corners have 12 numbers, a pose takes up 6 of them and the size a seventh."""
+    few, rng = POINTS[[0, 5, 18, 23]], np.random.default_rng(0)
+    draws = few + 1e-4 * rng.standard_normal((2000, 4, 3))
+    noises = [pose_from_points(few, measured).noise for measured in draws]
+    sizes, sigmas = np.array([scale_of(few, measured) for measured in draws]).T
+    assert np.mean(np.square(noises)) == pytest.approx(1e-8, rel=0.05)
+    assert np.mean(sigmas**2) == pytest.approx(np.var(sizes), rel=0.08)

@@ -72,3 +72,14 @@ def test_the_stated_covariance_is_that_of_the_centres() -> None:
         stated.append(rings.covariance(SCALE))
     scatter, mean = np.std(found, axis=0), np.sqrt(np.diag(np.mean(stated, axis=0)))
     assert mean == pytest.approx(scatter, rel=0.35)
+
+
+@pytest.mark.parametrize("bore", [0.016, 0.0])
+def test_a_sector_is_two_points_wide_at_its_ring(bore: float) -> None:
+    ticks = np.arange(-0.0305, 0.031, 1e-3)
+    flat = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    reach = np.hypot(*flat.T)
+    flat = flat[(reach < 0.03) & (reach >= bore)]
+    radii = np.array([0.03, bore][: 1 + bool(bore)])
+    found = find_rings(flat, radii, np.zeros(2), SCALE)
+    assert found.bins == pytest.approx(np.pi * radii / 1e-3, abs=1.5)

@@ -23,6 +23,7 @@ from flangeye_plugins.fit.sphere import (
     SphereFit,
     SphereParams,
     cap_coverage,
+    fit_cap,
     fit_sphere,
     incidence_cosine,
     sphere_jacobian,
@@ -235,3 +236,13 @@ def test_fifty_points_are_enough() -> None:
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
     check_bound(SphereParams, name, refused, taken)
+
+
+def test_four_points_are_enough_for_a_sphere() -> None:
+    """A view from the origin; their normals all point at it within the limit."""
+    centre, radius = np.array([0.01, -0.02, 0.4]), 0.02
+    flat = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.6], [-0.4, -0.5]])
+    points = centre + radius * np.column_stack([flat, -np.sqrt(1 - (flat**2).sum(axis=1))])
+    found = fit_cap(points, centre + 1e-4, 1.01 * radius, np.radians(80), free=True)
+    assert found.centre == pytest.approx(centre, abs=1e-8)
+    assert found.radius == pytest.approx(radius, abs=1e-8)

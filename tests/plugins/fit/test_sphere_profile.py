@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flangeye.maths.circles import sectors
 from flangeye.models.targets import Sphere
 from flangeye.types import (
     CAMERA,
@@ -22,7 +23,21 @@ from flangeye.types import (
 )
 from flangeye.units import SI
 from flangeye_emulators.acquire.simulated_profiles import ProfilesParams, profile_of
-from flangeye_plugins.fit.sphere_profile import SphereProfileParams, fit_sphere_profile
+from flangeye_plugins.fit.circles import (
+    Circles,
+    cauchy_curvature,
+    cauchy_weights,
+    circle_jacobian,
+    circle_residuals,
+)
+from flangeye_plugins.fit.sphere_profile import (
+    Arc,
+    SphereProfileParams,
+    _covariance,
+    _why_not,
+    fit_sphere_profile,
+)
+from flangeye_plugins.fit.uncertainty import clustered_covariance
 from tests.plugins.bounds import check_bound
 
 SPHERE = Sphere(size=0.01905, centre_in_flange=(0.0, 0.0, 0.0))
@@ -93,6 +108,16 @@ def test_a_profile_near_the_middle_is_worth_little_across() -> None:
     ("xyz", "reason"),
     [
         (np.zeros((0, 3)), "0 points, at least 20 are needed"),
+        (profile()[:19], "19 points, at least 20 are needed"),
+        (profile()[:20], "the laser passes 0.00 radii beside the sphere's centre, "),
+        (
+            profile(np.array([0.0, 0.992 * SPHERE.radius, 0.25]), noise=SI(0)),
+            "the laser passes 0.99 radii beside the sphere's centre, 0.4 to 0.97 are asked for ",
+        ),
+        (
+            profile(np.array([0.0, 0.994 * SPHERE.radius, 0.25]), noise=SI(0)),
+            "no circle that a sphere 38.1 mm across leaves in the laser's plane, ",
+        ),
         (
             np.random.default_rng(0).uniform(0.2, 0.3, (100, 3)),
             "no profile: points lie up to 298 mm off the plane y = 0; ",
@@ -183,3 +208,37 @@ def test_a_hollow_is_no_sphere() -> None:
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
     check_bound(SphereProfileParams, name, refused, taken, {"side": "+y"})
+
+
+def test_the_distances_asked_for_are_taken_themselves() -> None:
+    params = SphereProfileParams.model_validate({"side": "+y", "offset": (0.6, 0.8)})
+    for offset, taken in ((0.6, True), (0.8, True), (0.5999, False), (0.8001, False)):
+        assert (_why_not(offset, 1.0, params) is None) is taken
+    assert _why_not(0.7, params.min_coverage, params) is None
+
+
+def test_the_circles_covariance_is_carried_to_the_centre() -> None:
+    """By the slopes of centre = (x, sqrt(R^2 - r^2), z), found by small steps."""
+    rng, radius = np.random.default_rng(0), 0.02
+    angle = rng.uniform(-2.5, -0.6, 500)
+    points = (0.016 + 1e-4 * rng.standard_normal(500))[:, None] * np.stack(
+        [np.cos(angle), np.sin(angle)], axis=1
+    )
+    arc, ring = Arc(Circles(np.zeros(2), np.array([0.016])), points, 2e-4), np.zeros(500, int)
+    residual = circle_residuals(arc.circles, points, ring)
+    of_circle = clustered_covariance(
+        circle_jacobian(arc.circles, points, ring), residual, cauchy_weights(residual, 2e-4),
+        sectors(points, 24), cauchy_curvature(residual, 2e-4),
+    )  # fmt: skip
+
+    def centre(circle: Floats) -> Floats:
+        x, z, r = circle
+        return np.array([x, np.sqrt(radius**2 - r**2), z])
+
+    at, step = np.array([0.0, 0.0, 0.016]), 1e-7
+    slopes = np.stack([centre(at + s) - centre(at - s) for s in step * np.eye(3)], 1) / (2 * step)
+    none = SphereProfileParams.model_validate(
+        {"side": "+y", "scanner_error": "0 mm", "radius_error": "0 mm"}
+    )
+    stated = _covariance(arc, 0.012, radius, none)
+    assert stated == pytest.approx(slopes @ of_circle @ slopes.T, rel=1e-6)

@@ -108,14 +108,14 @@ def test_the_steering_is_equation_b_where_that_is_regular() -> None:
         velocity, e = np.array([5e-3, rng.normal() * 1e-3]), rng.normal() * 1e-3
         normal = np.array([0.0, 1.0])
         expected = corrected(1.0)(velocity, angle, None, normal, e)
-        assert steering.turn(velocity, tool, normal, e) == pytest.approx(expected)
+        assert steering.turn(velocity, tool, normal, e, 0.0) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("degrees", np.arange(-180, 181, 15))
 def test_the_turn_is_bounded_everywhere_and_turns_a_crooked_tool_back(degrees: Any) -> None:
     steering = Steering(LENGTH, 1.0, rate=0.35)
     tool, _ = directions(np.deg2rad(float(degrees)))
-    turn = steering.turn(np.array([5e-3, 5e-3]), tool, np.array([0.0, 1.0]), 0.0)
+    turn = steering.turn(np.array([5e-3, 5e-3]), tool, np.array([0.0, 1.0]), 0.0, 0.0)
     assert abs(turn) <= 0.35
     if abs(degrees) >= 90:
         assert turn == pytest.approx(-np.copysign(0.35, tool[1]))

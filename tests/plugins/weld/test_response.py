@@ -36,7 +36,10 @@ def test_a_late_arm_comes_to_where_its_commands_lead(dead: float, lag: float) ->
         speed = followed + left * (speed - followed)
 
 
-@pytest.mark.parametrize(("dead", "lag"), [(0.0, 0.0), (0.0, 0.1), (0.08, 0.2)])
+@pytest.mark.parametrize(
+    ("dead", "lag"),
+    [(0.0, 0.0), (0.0, 0.1), (0.08, 0.2), (0.04, 0.05), (0.12, 0.15), (0.16, 0.3)],
+)
 def test_what_an_arm_does_to_a_stroke_tells_how_late_it_is(dead: float, lag: float) -> None:
     clock = 3.0 + np.arange(0.0, 2.0, 5e-3)
     command = 0.01 * np.sign(np.sin(4.0 * clock))

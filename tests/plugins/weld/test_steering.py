@@ -24,7 +24,10 @@ AHEAD, NORMAL = at(0.0), at(90.0)
         (55.0, 0.0, 1.0),  # cosine above a half: nothing is lost yet
         (np.degrees(np.arccos(0.25)), 0.0, 0.5),
         (89.0, 0.0, 0.1),  # it never stands
+        (90.0, 0.0, 0.1),
+        (90.0, 90.0, 0.1),
         (120.0, 0.0, 0.1),
+        (120.0, 90.0, 0.1),
         (0.0, 90.0, 0.2),  # 0.8 of 0.5 rad/s on 50 mm: 20 mm/s of 100
         (0.0, 30.0, 0.4),
         (55.0, 90.0, 0.2 * np.cos(np.radians(55.0))),
@@ -43,15 +46,15 @@ def test_a_tool_across_the_path_is_turned_back_before_it_is_trusted(
 ) -> None:
     assert STEERING.trust(cosine) == pytest.approx(trust)
     tool = at(-np.degrees(np.arccos(cosine)))
-    asked = STEERING.turn(0.01 * AHEAD, tool, NORMAL, 0.0)
+    asked = STEERING.turn(0.01 * AHEAD, tool, NORMAL, 0.0, 0.0)
     assert asked == pytest.approx((1 - trust) * 0.5)
 
 
 def test_an_error_is_taken_back_by_a_part_of_the_speed_and_the_rate_is_never_exceeded() -> None:
     for error, turn in ((1e-3, 0.02), (5e-3, 0.1), (1.0, 0.14), (-1.0, -0.14)):
-        assert STEERING.turn(0.01 * AHEAD, AHEAD, NORMAL, error) == pytest.approx(turn)
-    crooked = STEERING.turn(0.01 * AHEAD, at(45.0), NORMAL, 1e-3)
+        assert STEERING.turn(0.01 * AHEAD, AHEAD, NORMAL, error, 0.0) == pytest.approx(turn)
+    crooked = STEERING.turn(0.01 * AHEAD, at(45.0), NORMAL, 1e-3, 0.0)
     assert crooked == pytest.approx(0.02 * np.sqrt(2.0))  # a lever that is shorter by the cosine
-    assert STEERING.turn(AHEAD, AHEAD, NORMAL, 1.0) == 0.5
-    assert STEERING.turn(AHEAD, AHEAD, NORMAL, -1.0) == -0.5
+    assert STEERING.turn(AHEAD, AHEAD, NORMAL, 1.0, 0.0) == 0.5
+    assert STEERING.turn(AHEAD, AHEAD, NORMAL, -1.0, 0.0) == -0.5
     assert STEERING.turn(0.01 * AHEAD, AHEAD, NORMAL, 0.0, sway=1e-3) == pytest.approx(-0.02)
