@@ -133,6 +133,14 @@ def test_before_a_wrist_circle_stands_its_plate(height: float, flaw: float | Non
     assert (found.flaw, found.rank) == (said, 4 if flaw is None else 2)
 
 
+def test_what_stands_out_by_more_than_twice_the_plate_is_none() -> None:
+    thickness = WRIST.details.thickness
+    circle, plate = ring(0.87 * WRIST.rim, WRIST.rim), ring(0, 0.7 * WRIST.rim, height=thickness)
+    cable = ring(0, 0.7 * WRIST.rim, height=2.1 * thickness)
+    nearby = np.concatenate([circle, plate, cable, cable + [0, 0, 1e-4]])
+    assert compared(circle, nearby, WRIST).flaw is None
+
+
 def test_a_plate_that_is_not_seen_is_not_missed() -> None:
     circle = ring(0.87 * WRIST.rim, WRIST.rim)
     assert compared(circle, flange=WRIST).flaw is None

@@ -16,6 +16,8 @@ from flangeye_plugins.fit.sphere import SphereParams, fit_sphere
 from flangeye_plugins.plan.grid import GridParams, grid
 from flangeye_plugins.segment.grid import Grid
 from flangeye_plugins.segment.sphere import (
+    SIZE_STEP,
+    UNKNOWN_SIZES,
     Candidate,
     SegmentSphereParams,
     _apart,
@@ -221,6 +223,35 @@ def test_what_is_missing_of_a_ball_is_not_seen_and_what_sticks_out_speaks_agains
     spoilt = np.where(off[..., None], whole * (1 - 3e-3 / 0.6), whole)  # 3 mm before it
     seen = find_spheres(Grid(spoilt, ANGLE, None), SPHERE.radius, 1e-3)[0].seen
     assert seen == pytest.approx(0.5, abs=0.08)  # a quarter is not there, a quarter against it
+
+
+def test_what_stands_well_before_a_ball_hides_it_and_does_not_speak_against_it() -> None:
+    """A bar two radii before its middle, across a part of it."""
+    whole = ball().xyz
+    hidden = np.abs(whole[..., 0] / whole[..., 2] - AT[0] / AT[2]) < 5e-3
+    bar = whole * ((AT[2] - 2 * SPHERE.radius) / whole[..., 2:])
+    seen = find_spheres(
+        Grid(np.where(hidden[..., None], bar, whole), ANGLE, None), SPHERE.radius, 1e-3
+    )[0].seen
+    missing = find_spheres(
+        Grid(np.where(hidden[..., None], np.float32(np.nan), whole), ANGLE, None),
+        SPHERE.radius, 1e-3,
+    )[0].seen  # fmt: skip
+    assert seen == pytest.approx(missing, abs=0.02)
+    assert 0.6 < missing < 0.9
+
+
+def test_two_balls_that_touch_are_both_looked_at() -> None:
+    one, other = ball().xyz, ball(centre=AT + [2.05 * SPHERE.radius, 0.0, 0.0]).xyz
+    both = np.where(other[..., 2:] < one[..., 2:], other, one)
+    first, second, *_ = find_spheres(Grid(both, ANGLE, None), SPHERE.radius, 1e-3)
+    assert min(first.seen, second.seen) > 0.9
+
+
+def test_spheres_of_any_size_are_within_a_tenth_of_one_that_is_looked_for() -> None:
+    for radius in np.geomspace(8e-3, 75e-3, 200):
+        assert (np.abs(radius / UNKNOWN_SIZES - 1) < SIZE_STEP).any()
+    assert UNKNOWN_SIZES.min() == pytest.approx(8e-3)
 
 
 def test_spheres_that_overlap_are_one_the_better() -> None:
