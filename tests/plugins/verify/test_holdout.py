@@ -95,6 +95,7 @@ def test_errors_are_those_of_solutions_without_the_pose() -> None:
         np.sqrt(np.mean(np.square(list(result.errors.values()))))
     )
     assert result.figures["folds"] == 8
+    assert not [name for name in result.figures if name.startswith("corrected")]
 
 
 def test_the_figures_of_isotropic_noise() -> None:

@@ -1,5 +1,6 @@
 """verify.icp and error.icp: equation (11), on a flange whose shape and place are known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +29,22 @@ from flangeye.types import (
     FlangeCloud,
     HandEye,
     PointCloud,
+    PoseError,
     Transform,
     TransformEstimate,
     VerificationView,
     Views,
 )
 from flangeye_plugins.error.errors import error_holdout, error_icp
-from flangeye_plugins.verify.icp import CadCloud, IcpParams, IcpSettings, verify_icp
+from flangeye_plugins.verify.icp import (
+    CadCloud,
+    Comparison,
+    IcpParams,
+    IcpSettings,
+    _figures,
+    verify_icp,
+)
+from flangeye_plugins.verify.registration import Registration
 from flangeye_plugins.verify.surface import Surface, read_surface, surface_of
 
 MM = 1e-3
@@ -118,6 +128,17 @@ def test_the_camera_origin_shows_the_rotation_times_the_distance() -> None:
     np.testing.assert_allclose(
         [figures[f"camera_{k}"] for k in "xyz"], error.translation, atol=0.4 * MM
     )
+
+
+def test_a_turn_about_the_flanges_own_axis_is_clocking_and_no_tilt() -> None:
+    phi = np.array([3e-3, -4e-3, 7e-3])
+    fit = Registration(rigid(rotation_exp(phi), np.zeros(3)), 1e-5, 0.9, True)
+    error = PoseError(np.eye(4), np.zeros(3), np.eye(3))
+    figures = _figures(Comparison(error, fit))
+    assert figures["tilt"] == pytest.approx(5e-3)
+    assert figures["clocking"] == pytest.approx(7e-3)
+    assert (figures["rms"], figures["overlap"]) == (1e-5, 0.9)
+    assert "clocking" not in _figures(Comparison(error, replace(fit, roll_seen=False)))
 
 
 def test_translations_are_the_lengths_of_their_coordinates() -> None:

@@ -168,6 +168,21 @@ def test_touchs_figures_are_those_of_the_errors() -> None:
     )  # fmt: skip
 
 
+def test_the_limit_of_a_touch_is_within_it() -> None:
+    off = {"seen": ("0 m", "0 m", "1 m"), "position": ("0 m", "0 m", "1 m"), "rpy": ("0 deg",) * 3}
+    estimate = t.TransformEstimate(
+        t.Transform(t.BASE, t.CAMERA, np.eye(4)), 1e-12 * np.eye(6), np.zeros(3)
+    )
+    found = [
+        verify_touch(
+            t.HandEye(estimate, (), "test"),
+            TouchParams(tip=("0 m", "0.25 m", "0 m"), touches=(off,), max_error=limit),
+        )
+        for limit in ("0.25 m", "0.2499 m")
+    ]
+    assert [each.passed for each in found] == [True, False]
+
+
 @pytest.mark.parametrize(("sigmas", "explained"), [(2.79, 1.0), (2.80, 0.0)])
 def test_what_jogging_and_covariance_allow_is_explained(sigmas: float, explained: float) -> None:
     """The 95 % point of chi squared with three degrees of freedom is 2.795 squared."""

@@ -42,7 +42,7 @@ def test_a_place_that_one_view_alone_saw_has_no_spread() -> None:
 
 
 def test_the_picture_goes_from_blue_to_red_and_is_white_where_nothing_was_seen() -> None:
-    spread = np.array([[0.0, 1e-3], [0.5e-3, np.nan]])
+    spread = np.array([[0.0, 1e-3], [0.5e-3, np.nan], [2e-3, 1e-3]])
     pixels = _picture(spread, 1e-3).pixels[::6, ::6]
-    expected = [[[0, 76, 255], [255, 0, 0]], [[127, 38, 127], [255, 255, 255]]]
+    expected = [[[0, 76, 255], [255, 0, 0]], [[127, 38, 127], [255, 255, 255]], [[255, 0, 0]] * 2]
     assert pixels.tolist() == expected
