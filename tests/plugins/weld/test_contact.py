@@ -40,7 +40,7 @@ def test_contact_is_believed_at_60_percent_and_doubted_at_35_after_a_tenth_of_a_
     assert contact.state == "held"
     assert told(contact, 2.0, 0.351 * WANTED) is None
     assert told(contact, 2.0, 0.349 * WANTED) == pytest.approx(0.1, abs=0.011)
-    assert contact.state == "lost"
+    assert [contact.state] == ["lost"]
     assert told(contact, 2.0, 0.599 * WANTED) is None
     assert told(contact, 2.0, 0.601 * WANTED) == pytest.approx(0.1, abs=0.011)
 
