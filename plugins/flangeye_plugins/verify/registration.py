@@ -63,7 +63,7 @@ def register(
         reach: First limit: how far off the calibration may be [m].
         distance: Last limit: what noise and other objects set it to [m].
     """
-    source = measured[:: max(1, -(-len(measured) // MOST_POINTS))]
+    source = measured[:: 1 + len(measured) // MOST_POINTS]
     motion = np.eye(4)
     unknown = np.zeros((0, 6))
     for limit in _limits(reach, distance):

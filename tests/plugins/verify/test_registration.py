@@ -43,6 +43,19 @@ def test_a_corner_shows_every_motion() -> None:
     assert registered.roll_seen
 
 
+def test_six_points_are_enough_and_all_of_few_are_looked_at() -> None:
+    """Of a block's corner, two on each side and not in a line with the others."""
+    places = 1e-3 * np.array([[10.0, 40.0], [45.0, 20.0]])
+    sides = [np.insert(places, k, 0.0, axis=1) for k in range(3)]
+    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), 2, axis=0))
+    found = register(corner.points, corner, 1 * MM, 1 * MM)
+    assert isinstance(found, Registration)
+    assert (found.overlap, found.roll_seen) == (1.0, True)
+    assert register(corner.points[:5], corner, 1 * MM, 1 * MM) == (
+        "no points came within 1 mm of the flange's shape"
+    )
+
+
 def test_the_rms_is_that_of_what_matched_and_the_overlap_its_share() -> None:
     noise = 0.05 * MM * np.random.default_rng(0).standard_normal((len(SHAPE.points), 1))
     seen = SHAPE.points + noise * SHAPE.normals
