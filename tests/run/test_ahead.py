@@ -1,6 +1,7 @@
 """Captures that are there already are worked on ahead: in order, bounded, with equal results."""
 
 import json
+import os
 import threading
 import time
 from dataclasses import replace
@@ -67,10 +68,17 @@ def test_what_ends_the_items_is_raised_after_what_they_were() -> None:
 
 
 def test_threads_are_those_that_openmp_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    assert cores() == 1
+    mine = {0: range(3)}  # of this process
+    monkeypatch.setattr(os, "sched_getaffinity", mine.__getitem__, raising=False)
+    for told, threads in (("1", 1), ("2", 2), ("8", 3), ("0", 3), ("x", 3), ("", 3)):
+        monkeypatch.setenv("OMP_NUM_THREADS", told)
+        assert cores() == threads
     monkeypatch.delenv("OMP_NUM_THREADS")
-    assert cores() >= 1
+    assert cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    for count, threads in ((5, 5), (None, 1)):
+        monkeypatch.setattr(os, "cpu_count", lambda count=count: count)
+        assert cores() == threads
 
 
 def test_a_run_on_one_core_and_on_many_is_the_same(

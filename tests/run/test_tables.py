@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from flangeye import types as t
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.run.tables import _csv, _noise, _seen, _value, _works_on_scans
+from flangeye.run.tables import _csv, _noise, _recipe, _seen, _value, _works_on_scans
 
 POSE = t.Transform(t.BASE, t.FLANGE, rigid(rotation_exp([0, 0, np.pi / 2]), [1.0, -2.0, 0.5]))
 
@@ -66,3 +67,18 @@ def test_steps_that_work_on_scans_are_known_by_their_kind() -> None:
         {"verify.holdout": {}},
     ]
     assert [_works_on_scans(step) for step in steps] == [True, True, False, False]
+
+
+@pytest.mark.parametrize("scans", [{}, {"1-camera-target": "1.pcd"}])
+def test_steps_that_work_on_scans_go_where_there_are_none(scans: dict[str, str]) -> None:
+    text = """
+description: of a run
+robot: ur5e
+steps: [acquire.live, segment.flange, fit.rim, solve.cell]
+"""
+    cell: Any = SimpleNamespace(movers={"arm": object()})
+    recipe = yaml.safe_load(_recipe(text, cell, [circle(1, [1e-8] * 3)], scans))
+    acquire, *steps = recipe["steps"]
+    assert steps == (["segment.flange", "fit.rim", "solve.cell"] if scans else ["solve.cell"])
+    assert list(acquire) == ["acquire.archive" if scans else "acquire.centres"]
+    assert list(recipe) == ["robot", "steps"]

@@ -161,7 +161,7 @@ class Runner:
         self._captures = stream
         captures = self._ahead(stream) if self._may_work_ahead(stream) else iter(stream)
         while True:
-            before = self._watch.seconds.get(label, 0.0)
+            before = self._watch.seconds[label]
             with self._watch.timing(label):
                 capture = next(captures, None)
             if capture is None:
@@ -332,7 +332,7 @@ class Runner:
     def _call(
         self, step: Step, capture: str | None = None, given: Mapping[Any, Any] | None = None
     ) -> Any:
-        before = self._watch.seconds.get(step.label, 0.0)
+        before = self._watch.seconds[step.label]
         done = self._done().get(step.label) if capture is not None else None
         if done is not None:
             self._watch.add(step.label, done.seconds)

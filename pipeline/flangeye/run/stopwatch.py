@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,18 +18,18 @@ class Stopwatch:
     """
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self.calls: Counter[str] = Counter()
         self.idle: dict[str, float | None] = {}
         self._running: list[str] = []
-        self._since = 0.0
+        self._since: float  # when time was charged last
 
     @contextmanager
     def timing(self, label: str) -> Iterator[None]:
         """Charge the time inside to ``label``."""
         self._charge()
         self._running.append(label)
-        self.calls[label] = self.calls.get(label, 0) + 1
+        self.calls[label] += 1
         try:
             yield
         finally:
@@ -37,12 +38,11 @@ class Stopwatch:
 
     def add(self, label: str, seconds: float) -> None:
         """Charge what was done meanwhile, on another core, to ``label``."""
-        self.calls[label] = self.calls.get(label, 0) + 1
-        self.seconds[label] = self.seconds.get(label, 0.0) + seconds
+        self.calls[label] += 1
+        self.seconds[label] += seconds
 
     def _charge(self) -> None:
         now = time.perf_counter()
         if self._running:
-            label = self._running[-1]
-            self.seconds[label] = self.seconds.get(label, 0.0) + now - self._since
+            self.seconds[self._running[-1]] += now - self._since
         self._since = now
