@@ -172,10 +172,10 @@ def _axis(name: str, axis: Axis) -> dict[str, Any]:
 def _noise(seen: Sequence[Observation]) -> dict[str, str]:
     """Return how good the sightings are, as their covariances have it in the middle."""
     shift = np.median([_deviation(o.feature.centre_covariance) for o in seen])
-    of_pose = [o.feature.covariance[:3, :3] for o in seen if isinstance(o.feature, PoseFeature)]
-    if not of_pose:
+    turns = [o.feature.covariance for o in seen if isinstance(o.feature, PoseFeature)]
+    if not turns:
         return {"centre_noise": f"{shift * 1e3:.4g} mm"}
-    turn = np.median([_deviation(covariance) for covariance in of_pose])
+    turn = np.median([_deviation(covariance) for covariance in turns])
     return {
         "position_noise": f"{shift * 1e3:.4g} mm",
         "angle_noise": f"{np.degrees(turn):.4g} deg",
@@ -183,4 +183,4 @@ def _noise(seen: Sequence[Observation]) -> dict[str, str]:
 
 
 def _deviation(covariance: Any) -> float:
-    return float(np.sqrt(np.trace(covariance) / 3))
+    return float(np.sqrt(np.diag(covariance)[:3].mean()))
