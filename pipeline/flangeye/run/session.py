@@ -75,7 +75,7 @@ def record_run(
         if recorder:
             recorder.ended(str(error) or "stopped by Ctrl-C")
             recorder.close()
-        if recorder is None or not recorder.gathered:
+        if not (recorder and recorder.gathered):
             folder.discard()
         if isinstance(error, KeyboardInterrupt):
             raise RunStopped("stopped by Ctrl-C") from None

@@ -1,0 +1,48 @@
+"""What is left of a run that came to no result: its log once anything was gathered, else nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flangeye import StageError
+from flangeye import types as t
+from flangeye.errors import RunStopped
+from flangeye.log.read import read_run
+from flangeye.plugin.registry import Registry
+from flangeye.recipe.load import parse_recipe
+from flangeye.run.folder import RunFolder
+from flangeye.run.session import Start, record_run
+from tests import toy
+from tests.conftest import replaced
+
+
+@pytest.mark.parametrize(("ends", "raised"), [(StageError("no arm"), StageError),
+                                              (KeyboardInterrupt(), RunStopped)])  # fmt: skip
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_log_stays_once_a_capture_is_in_it(
+    toy_registry: Registry, toy_recipe: Path, tmp_path: Path,
+    count: int, ends: BaseException, raised: type[BaseException],
+) -> None:  # fmt: skip
+    plain = toy.acquire.function
+
+    def ending(seed: t.Seed, params: toy.AcquireParams) -> t.Captures:
+        every = plain(seed, params)
+        made = iter(every)
+
+        def some() -> Iterator[t.Capture | t.Rejection]:
+            for _ in range(count):
+                yield next(made)
+            raise ends
+
+        return t.Captures(some(), every.source, every.total)
+
+    recipe = parse_recipe(toy_recipe.read_text("utf-8"), "toy", toy_registry)
+    folder = RunFolder.create("toy", tmp_path / "out")
+    with replaced(toy.acquire, ending), pytest.raises(raised):
+        record_run(recipe, toy_registry, folder, Start(), report=False)
+    assert folder.path.exists() is bool(count)
+    if count:
+        assert len(read_run(folder.log).finished) == count
