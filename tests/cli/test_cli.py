@@ -208,6 +208,19 @@ def test_light_commands_import_nothing_heavy() -> None:
     assert told.stdout == "[]\n"
 
 
+@pytest.mark.parametrize(("told", "threads"), [(None, "1"), ("3", "3")])
+def test_matrices_keep_to_one_thread_unless_told_otherwise(told: str | None, threads: str) -> None:
+    code = (
+        "import os, sys; from flangeye import cli; assert 'numpy' not in sys.modules; "
+        "cli._command = lambda: print(os.environ['OPENBLAS_NUM_THREADS']); cli.main()"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    environment |= {"OPENBLAS_NUM_THREADS": told} if told else {}
+    command = [sys.executable, "-c", code]
+    run = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert run.stdout == f"{threads}\n"
+
+
 def test_ctrl_c_keeps_what_was_gathered(
     flangeye: Callable[..., Any], toy_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,13 +4,20 @@ Modules are imported inside the commands, so that ``--help`` answers at once; ``
 ``stages`` need no parser.
 """
 
+import os
 import sys
 
 from flangeye.cli.saying import end_in_words
 
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Captures are worked on side by side and matrices are small: more threads in one product only
+wait for each other, which costs a run twice its seconds. Read when numpy is imported."""
+
 
 def main() -> None:
     """Run the command line; every foreseen mistake is one line and an exit code."""
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     end_in_words(_command)
 
 
