@@ -15,6 +15,9 @@ from flangeye.handeye.loop import COLUMNS
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import ArmCorrection, Floats, Mask
 
+LEAST_KEPT = 1e-9
+"""Singular values below this share of the largest are left out."""
+
 FOLDS, LARGEST_FOLD = 5, 20
 """More folds where there are many poses, so that the cost stays linear in them."""
 HELPFUL = 0.9
@@ -197,8 +200,24 @@ def _without(fit: Fit, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
     own[np.arange(len(part)), :, np.arange(len(part))] = noise
     right = np.column_stack([fit.residuals[part].ravel(), own.reshape(size, size)])
     share = np.eye(size) - jacobian @ fit.covariance @ weighted.T
-    left = np.asarray(np.linalg.lstsq(share, right, rcond=1e-9)[0], dtype=np.float64)
+    left = _solved(share, right)
     return left[:, 0].reshape(-1, 6), left[:, 1:]
+
+
+def _solved(square: Floats, right: Floats) -> Floats:
+    """Return the least solution (n, k) of ``square @ x = right``, by the inverse if there is one.
+
+    Singular values are only asked for, at ten times the cost, where they may be too small to keep.
+    """
+    try:
+        inverse = np.linalg.inv(square)
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        # Of n rows, the ratio of the singular values is at most n times that of the sums.
+        if len(square) * np.linalg.norm(square, 1) * np.linalg.norm(inverse, 1) < 1 / LEAST_KEPT:
+            return np.asarray(inverse @ right)
+    return np.asarray(np.linalg.lstsq(square, right, rcond=LEAST_KEPT)[0], dtype=np.float64)
 
 
 def understated(found: Solution) -> float:
