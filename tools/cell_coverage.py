@@ -64,7 +64,8 @@ def table(
     arm: Annotated[
         list[str] | None, typer.Option(help="Arms as acquire.simulated_cell has them.")
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Sessions of each.")] = 8,
+    seeds: Annotated[int, typer.Option(help="Sessions of each.")] = 16,
+    first: Annotated[int, typer.Option(help="The first one's seed.")] = 100,
 ) -> None:
     """Print the table."""
     registry = load_registry()
@@ -75,7 +76,7 @@ def table(
     )
     for name in cell or CELLS:
         for bad in arm or ("quality: real", "zeros: 2 mrad"):
-            found = [answers(name, bad, seed, registry) for seed in range(seeds)]
+            found = [answers(name, bad, seed, registry) for seed in range(first, first + seeds)]
             for answer in ("as reported", "corrected"):
                 told = [each[answer] for each in found if answer in each]
                 if told:

@@ -10,7 +10,6 @@ import pytest
 from flangeye.files.bundled import bundled
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.cell import _notes, calibrate_cell, solve_cell
-from flangeye.handeye.cell_arms import size_of_zeros
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.cell import Cell
@@ -115,18 +114,8 @@ def test_the_covariance_holds_for_an_arm_far_worse_than_its_file_says() -> None:
     assert (considered < 12.6).mean() >= 0.8
 
 
-def test_the_size_of_zeros_is_the_one_that_made_the_errors() -> None:
-    rng = np.random.default_rng(0)
-    rows, zeros = rng.normal(size=(40, 6, 6)), rng.normal(size=(40, 6, 20))
-    noise, drawn = rng.normal(size=(40, 6)), rng.normal(size=20)
-    assert size_of_zeros(rows, zeros, noise, 240.0) == (1.0, 1.0)
-    size, share = size_of_zeros(rows, zeros, (noise + 8 * zeros @ drawn) / 2, 240.0)
-    assert 2.5 < size < 6  # four
-    assert 0.15 < share < 0.4  # a quarter
-
-
 def test_the_noise_of_what_moves_is_told_in_millimetres_and_degrees() -> None:
     found: Any = SimpleNamespace(movers=4.0)  # twice what is typical
-    _, note = _notes([], found, 1.0)
+    _, note = _notes([], found, None)
     shift, turn = 2e3 * TYPICAL_ARM.translation, 2.0 * np.degrees(TYPICAL_ARM.rotation)
     assert f"{shift:.3f} mm and {turn:.3f} deg per axis" in note

@@ -9,6 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
+from flangeye.handeye.arm_sizes import Sizes
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.cell_arms import (
     CorrectedArms,
@@ -65,11 +66,11 @@ def calibrate_cell(
     found = sighted.solved()
     _require_agreement(found, len(observations))
     branches = branches_of(sighted, cell)
-    known, size = considering_zeros(found, sighted, branches)
-    notes = _notes(observations, found, size)
+    known, sizes = considering_zeros(found, sighted, branches)
+    notes = _notes(observations, found, sizes)
     corrected = None
-    if branches and joint_offsets:
-        corrected, told = correcting_zeros(found, sighted, branches, size)
+    if sizes and joint_offsets:
+        corrected, told = correcting_zeros(found, sighted, branches, sizes)
         notes = (*notes, told)
     camera, *others = _estimates(known, observations, cell)
     return HandEye(
@@ -191,7 +192,9 @@ def _pairs(observations: Sequence[Observation], cell: Cell, found: Solved) -> tu
     return tuple(pairs)
 
 
-def _notes(observations: Sequence[Observation], found: Solved, zeros: float) -> tuple[str, ...]:
+def _notes(
+    observations: Sequence[Observation], found: Solved, sizes: Sizes | None
+) -> tuple[str, ...]:
     who = Counter((o.camera, o.target) for o in observations)
     sightings = ", ".join(f"{camera} saw {target} {n} times" for (camera, target), n in who.items())
     noise = np.sqrt(found.movers)
@@ -199,14 +202,16 @@ def _notes(observations: Sequence[Observation], found: Solved, zeros: float) -> 
         f"solved at once: {sightings}",
         f"noise of what moves: {noise * TYPICAL_ARM.translation * 1e3:.3f} mm and "
         f"{noise * np.degrees(TYPICAL_ARM.rotation):.3f} deg per axis, as the residuals show it",
-        *_note_of_zeros(zeros),
+        *_note_of_sizes(sizes),
     )
 
 
-def _note_of_zeros(size: float) -> tuple[str, ...]:
-    if size == 1.0:
+def _note_of_sizes(sizes: Sizes | None) -> tuple[str, ...]:
+    if sizes is None:
         return ()
+    zeros, within, between = sizes.expected
     return (
-        f"the joints' zeros are {size:.1f} times as far off as the robots' files say "
-        "(joint_accuracy), as the residuals show it; that is in the covariance",
+        f"the covariance counts joint zeros {zeros:.1f} times as large as the robots' files say "
+        f"(joint_accuracy), and what goes with them {within:.1f} (encoders, sag) and {between:.1f} "
+        "times (lengths, twists): all that is likely by the residuals",
     )

@@ -1,4 +1,4 @@
-"""The zeros of a cell's arms' joints: how large they are, and the answer for arms corrected.
+"""The errors of a cell's arms: what they add to the covariance, and the answer for corrected arms.
 
 They move neighbouring poses alike, so that the answer for the arms as reported follows them where
 independent noise would average out. ("Consider" covariance, Schmidt 1966.)
@@ -12,23 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.handeye.arm import MovedFlange
+from flangeye.handeye.arm_sizes import Sizes, likely_sizes
 from flangeye.handeye.candidates import Fit, by_folds, judged, rms
 from flangeye.handeye.graph import Sighting, Solved, information_of, linear_of, solve_graph
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import rotation_log
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import chi2_quantile, covariance_inflation
+from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import ArmCorrection, Floats, Mask
 
-RATIOS = np.logspace(-1, 2.5, 71)
-"""Sizes of joint zeros that are compared, in units of their files' and of the noise's scale."""
-CERTAIN = 0.999
-"""Probability with which zeros are not taken for larger than they are."""
 LENGTH, TWIST, WAVE, SAG = 0.1, 0.2, 0.4, 2.0
 """Of an arm whose zeros are off by 1 rad: how far its lengths [m], twists [rad] and encoders once a
 turn [rad], are, and by what a joint gives way for a metre of lever [rad]. Zeros, lengths and twists
-are as ``refine.arm`` expects them of each other."""
+are as ``refine.arm`` expects them of each other; each kind may be larger or smaller beside them."""
 UP = np.array([0.0, 0.0, 1.0])
 """Of an arm's base that is level."""
 DELTA = 1e-6
@@ -69,8 +66,8 @@ class Bent:
         return self.deviation * self.kinematics.jacobian(self.joints + self.offsets)[:, :, 1:]
 
     @property
-    def others(self) -> Floats:
-        """(N, 6, m) what all else does that is off where zeros are by one deviation."""
+    def others(self) -> tuple[Floats, Floats]:
+        """(N, 6, m) what is off where zeros are by one deviation: in the joints, and between."""
         joints = self.joints + self.offsets
         columns, n = self.kinematics.jacobian(joints), self.kinematics.n
         angles = (
@@ -81,7 +78,8 @@ class Bent:
         turned = [columns * each[:, None, :] for each in angles]
         steps = np.eye(3 * n).reshape(-1, n, 3) * [LENGTH, LENGTH, TWIST]
         longer = [self._by_lengths(step)[..., None] for step in steps]
-        return self.deviation * np.concatenate([*turned, *longer], axis=2)
+        within, between = (np.concatenate(each, axis=2) for each in (turned, longer))
+        return self.deviation * within, self.deviation * between
 
     def _by_lengths(self, step: Floats) -> Floats:
         """Return (N, 6) how a change (n, 3) of lengths and twists moves the flange, by its size."""
@@ -130,11 +128,14 @@ class Sighted:
         noise = {name: found.movers * covariance for name, covariance in self.noise.items()}
         graph = self.frames, self.sightings, found.places, noise
         residuals, jacobian, whiteners = linear_of(*graph)
-        zeros = others = np.zeros((*residuals.shape, 0))
+        kinds = [np.zeros((*residuals.shape, 0))] * 3
         for arm in arms:
             moves = linear_of(*graph, moved=[arm.name])[1]
-            zeros = np.concatenate([zeros, moves @ arm.twists], axis=2)
-            others = np.concatenate([others, moves @ arm.others], axis=2)
+            off = (arm.twists, *arm.others)
+            kinds = [
+                np.concatenate([k, moves @ x], axis=2) for k, x in zip(kinds, off, strict=True)
+            ]
+        zeros, *others = kinds
         kept = found.inliers
         freedom = sum(np.trace(s.projector) for s, k in zip(self.sightings, kept, strict=True) if k)
         return Linear(residuals, jacobian, zeros, others, whiteners, kept, float(freedom))
@@ -148,7 +149,7 @@ class Linear:
         residuals: (N, 6).
         jacobian: (N, 6, P) by the unknowns.
         zeros: (N, 6, k) by the joint zeros, in units of their deviations.
-        others: (N, 6, m) by all else that is off in an arm, in such units.
+        others: (N, 6, m) by all else that is off in an arm, in such units, each kind by itself.
         whiteners: (N, 6, 6).
         kept: (N,) which count.
         freedom: How many numbers those are.
@@ -157,7 +158,7 @@ class Linear:
     residuals: Floats
     jacobian: Floats
     zeros: Floats
-    others: Floats
+    others: Sequence[Floats]
     whiteners: Floats
     kept: Mask
     freedom: float
@@ -169,12 +170,18 @@ class Linear:
         errors = (w @ self.residuals[kept][..., None])[..., 0]
         return w @ self.jacobian[kept], w @ self.zeros[kept], errors
 
-    def follows(self, covariance: Floats, errors: Floats) -> Floats:
-        """Return (q, m) how the first q unknowns follow errors (N, 6, m) of unit size."""
+    def following(self, covariance: Floats, errors: Floats) -> Floats:
+        """Return (P, P) of the unknowns as they follow errors (N, 6, m) of unit size.
+
+        Args:
+            covariance: (q, q) of the first q of unknowns and zeros.
+            errors: The errors.
+        """
         rows, zeros, _ = self.whitened
         told = np.concatenate([rows, zeros], axis=2)[:, :, : len(covariance)]
         moved = self.whiteners[self.kept] @ errors[self.kept]
-        return np.asarray(covariance @ np.einsum("nij,nik->jk", told, moved))
+        followed = (covariance @ np.einsum("nij,nik->jk", told, moved))[: rows.shape[2]]
+        return np.asarray(followed @ followed.T)
 
     def information(self, size: float) -> Floats:
         """Return (P + k, P + k) of the unknowns and of zeros expected to be of a size."""
@@ -217,7 +224,7 @@ def branches_of(sighted: Sighted, cell: Cell) -> list[list[Bent]]:
 def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]) -> list[Bent]:
     """Return each arm on the branch whose zeros explain most."""
     chosen = [arms[0] for arms in branches]
-    size = _size(sighted.linear(found, chosen))[0]
+    size = float(_sizes(sighted.linear(found, chosen)).expected[0])
     for i, arms in enumerate(branches):
         tried = [[*chosen[:i], arm, *chosen[i + 1 :]] for arm in arms]
         chosen = max(tried, key=lambda arms: _explained(sighted.linear(found, arms), size))
@@ -226,22 +233,22 @@ def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]
 
 def considering_zeros(
     found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]
-) -> tuple[Solved, float]:
-    """Return the solution with what joint zeros may be off by in its covariance, and their size.
+) -> tuple[Solved, Sizes | None]:
+    """Return the solution with what its arms may be off by in its covariance, and how much it is.
 
-    The size is in units of what the robots' files say, as the sightings show it; at least one.
+    The sizes are in units of what the robots' files say: of joint zeros, of what else is off in
+    joints, and between them. None without an arm.
     """
     if not branches:
-        return found, 1.0
+        return found, None
     linear = sighted.linear(found, likeliest(found, sighted, branches))
-    size, share = _size(linear)
-    errors = np.concatenate([linear.zeros, linear.others], axis=2)
-    followed = size * linear.follows(found.joint, errors)
-    return _with_joint(found, share * found.joint + followed @ followed.T), size
+    sizes = _sizes(linear)
+    off = [linear.following(found.joint, kind) for kind in (linear.zeros, *linear.others)]
+    return _with_joint(found, sizes.mixed([found.joint, *off])), sizes
 
 
 def correcting_zeros(
-    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]], size: float
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]], sizes: Sizes
 ) -> tuple[CorrectedArms | None, str]:
     """Return the answer for corrected arms if it helps on sightings held out, and what to say.
 
@@ -249,8 +256,9 @@ def correcting_zeros(
         found: The answer for the arms as reported.
         sighted: What was sighted.
         branches: Of each arm, as its controller has it on every branch.
-        size: Expected of the zeros, in units of what the robots' files say.
+        sizes: Of the arms' errors, in units of what the robots' files say.
     """
+    size = float(sizes.expected[0])
     begun = likeliest(found, sighted, branches)
     corrected, linear, arms = _corrected(found, sighted, begun, size)
     # What noise is left without the zeros tells branches apart that looked alike before.
@@ -260,7 +268,7 @@ def correcting_zeros(
     bare, either = sighted.linear(found), found.inliers | corrected.inliers
     before, after = (rms(by_folds(each.fit(size))[0][either]) for each in (bare, linear))
     helps, told = judged(before, after, _told(arms))
-    return (CorrectedArms(_known(corrected, linear, size), arms) if helps else None), told
+    return (CorrectedArms(_known(corrected, linear, sizes), arms) if helps else None), told
 
 
 def _corrected(
@@ -306,15 +314,16 @@ def _stepped(linear: Linear, arms: Sequence[Bent], size: float) -> list[Bent]:
     return [arm.moved(x) for arm, x in zip(arms, np.split(step, ends[:-1]), strict=True)]
 
 
-def _known(found: Solved, linear: Linear, size: float) -> Solved:
+def _known(found: Solved, linear: Linear, sizes: Sizes) -> Solved:
     """Return the solution with the covariance that it has together with the zeros."""
-    p, covariance = linear.jacobian.shape[2], _inverse(linear.information(size))
+    size, p = float(sizes.expected[0]), linear.jacobian.shape[2]
+    covariance = _inverse(linear.information(size))
     taken = linear.zeros.shape[2] - np.trace(covariance[p:, p:]) / size**2
     left = max(linear.freedom - p - taken, 1.0)
     scale = max(float((linear.whitened[2] ** 2).sum()) / left, 1.0)
-    followed = size * linear.follows(covariance, linear.others)[:p]
-    joint = scale * covariance_inflation(left, 6) * covariance[:p, :p] + followed @ followed.T
-    return _with_joint(found, joint)
+    own = scale * covariance_inflation(left, 6) * covariance[:p, :p]
+    off = [linear.following(covariance, kind) for kind in linear.others]
+    return _with_joint(found, sizes.mixed([own, *off], np.ones(len(sizes.weights))))
 
 
 def _with_joint(found: Solved, joint: Floats) -> Solved:
@@ -344,41 +353,8 @@ def _told(arms: Sequence[Bent]) -> str:
     return f"the joints of {', of '.join(listed)}; the second answer is for them so corrected"
 
 
-def _size(linear: Linear) -> tuple[float, float]:
+def _sizes(linear: Linear) -> Sizes:
     rows, zeros, errors = linear.whitened
-    others = linear.whiteners[linear.kept] @ linear.others[linear.kept]
-    return size_of_zeros(rows, np.concatenate([zeros, others], axis=2), errors, linear.freedom)
-
-
-def size_of_zeros(
-    rows: Floats, zeros: Floats, errors: Floats, freedom: float
-) -> tuple[float, float]:
-    """Return by what factor joint zeros are larger than was said, and what that leaves of noise.
-
-    The restricted likelihood of all sightings (Patterson & Thompson 1971) over the factor, the
-    noise's own scale taken to be the likeliest; one and one where that says no more.
-
-    Args:
-        rows: (N, 6, P) what the sightings tell of the unknowns, whitened.
-        zeros: (N, 6, k) what zeros of one standard deviation, and all else, do to them.
-        errors: (N, 6) their residuals.
-        freedom: How many numbers those are.
-    """
-    p, k = rows.shape[2], zeros.shape[2]
-    both = np.concatenate([rows, zeros], axis=2)
-    information, told = information_of(both), np.einsum("nij,ni->j", both, errors)
-    total, left = float((errors**2).sum()), max(freedom - p, 1.0)
-
-    def likelihood(ratio: float) -> tuple[float, float]:
-        """Return twice the logarithm, and the noise's scale, by the zeros' size against it."""
-        known = information + np.diag(np.repeat([0.0, ratio**-2], [p, k]))
-        scale = max((total - told @ np.linalg.solve(known, told)) / left, 1e-12)
-        return -left * np.log(scale) - np.linalg.slogdet(known)[1] - 2 * k * np.log(ratio), scale
-
-    gains, scales = np.transpose([likelihood(float(ratio)) for ratio in RATIOS])
-    # Few zeros tell little of their size: its square is expected over all that are likely.
-    weights = np.exp((gains - gains.max()) / 2)
-    size = np.sqrt((weights * scales * RATIOS**2).sum() / weights.sum())
-    if size <= 1 or gains.max() - likelihood(1.0)[0] < chi2_quantile(CERTAIN, 1):
-        return 1.0, 1.0
-    return float(size), min(float(scales[gains.argmax()]), 1.0)
+    w, kept = linear.whiteners[linear.kept], linear.kept
+    others = [w @ each[kept] for each in linear.others]
+    return likely_sizes(rows, [zeros, *others], errors, linear.freedom)

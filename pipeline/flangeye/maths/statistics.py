@@ -47,6 +47,27 @@ def covariance_inflation(freedom: float, parameters: int = 6, probability: float
     return honest / chi2_quantile(probability, parameters)
 
 
+def mixture_inflation(
+    scales: Floats, weights: Floats, parameters: int = 6, probability: float = 0.95
+) -> float:
+    """Return the factor on a covariance that makes its region hold its share of a mixture.
+
+    Args:
+        scales: (G,) of the variance in each case, in units of that covariance.
+        weights: (G,) of the cases, one together.
+        parameters: Of the error.
+        probability: The region's.
+    """
+    from scipy.special import chdtr
+
+    edge, low, high = chi2_quantile(probability, parameters), 0.0, float(scales.max())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        inside = float(weights @ chdtr(parameters, edge * middle / np.maximum(scales, 1e-300)))
+        low, high = (middle, high) if inside < probability else (low, middle)
+    return high
+
+
 def excess_variance(errors: Floats, covariances: Floats) -> float:
     """Return the isotropic variance [m^2] that errors show beyond their own covariances, robustly.
 

@@ -1,0 +1,103 @@
+"""How large the errors of arms are, as residuals show it: sizes that are likely, by their weight.
+
+What is not told by the residuals stays open: every size that is likely counts, so that regions are
+as wide as what is not known makes them. (Restricted likelihood, Patterson & Thompson 1971, of a
+mixture of variances.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from flangeye.maths.statistics import mixture_inflation
+from flangeye.types import Floats
+
+RATIOS = np.logspace(-1, 2.5, 71)
+"""Sizes that are compared, in units of what was said and of the noise's scale."""
+BESIDE = (1 / 3, 1.0, 3.0)
+"""How large errors of one kind may be beside those of another, in what was said of both."""
+LIKELY = 1e-6
+"""What is less likely than this, beside the likeliest, does not count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Factors by which errors are larger than was said; G cases with their weights.
+
+    Attributes:
+        weights: (G,) of the cases, one together.
+        factors: (G, K) of each kind of error; the first at least one.
+        noise: (G,) what that leaves of the noise's variance, at most one.
+    """
+
+    weights: Floats
+    factors: Floats
+    noise: Floats
+
+    @property
+    def expected(self) -> Floats:
+        """(K,) roots of the factors' mean squares."""
+        return np.asarray(np.sqrt(self.weights @ self.factors**2))
+
+    def mixed(self, parts: Sequence[Floats], noise: Floats | None = None) -> Floats:
+        """Return the (m, m) covariance whose 95 % regions hold 95 %, whichever case is true.
+
+        Args:
+            parts: (m, m) covariances: of the noise, and of the last kinds of error as was said.
+            noise: (G,) factors on that of the noise; by default ``noise``.
+        """
+        kinds = self.factors[:, self.factors.shape[1] + 1 - len(parts) :] ** 2
+        squares = np.column_stack([self.noise if noise is None else noise, kinds])
+        mean = np.einsum("k,kij->ij", self.weights @ squares, np.array(parts))
+        shares = np.array([np.trace(np.linalg.solve(mean, part)) for part in parts]) / len(mean)
+        return np.asarray(mixture_inflation(squares @ shares, self.weights) * mean)
+
+
+def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom: float) -> Sizes:
+    """Return how large errors of some kinds are likely to be.
+
+    Args:
+        rows: (N, 6, P) what sightings tell of the unknowns, whitened.
+        kinds: (N, 6, k) what errors of each kind, as large as was said, do to them.
+        errors: (N, 6) their residuals.
+        freedom: How many numbers those are.
+    """
+    p, counts = rows.shape[2], [kind.shape[2] for kind in kinds]
+    known = np.linalg.qr(rows.reshape(-1, p))[0]
+    told = np.concatenate([*kinds, errors[..., None]], axis=2).reshape(-1, sum(counts) + 1)
+    told = told - known @ (known.T @ told)
+    gram, left = told.T @ told, max(freedom - p, 1.0)
+    cases = []
+    for beside in product(BESIDE, repeat=len(kinds) - 1):
+        scale = np.repeat([1.0, *beside], counts)
+        gains, noises = _likelihoods(gram, scale, left)
+        factors = np.outer(np.sqrt(noises) * RATIOS, [1.0, *beside])
+        cases.append(np.column_stack([gains, noises, factors]))
+    every = np.concatenate(cases)
+    every = every[every[:, 2] >= 1.0]
+    if not len(every):
+        return Sizes(np.ones(1), np.ones((1, len(kinds))), np.ones(1))
+    weights = np.exp((every[:, 0] - every[:, 0].max()) / 2)
+    some = weights > LIKELY
+    weights, every = weights[some] / weights[some].sum(), every[some]
+    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0))
+
+
+def _likelihoods(gram: Floats, scale: Floats, left: float) -> tuple[Floats, Floats]:
+    """Return twice the logarithm of the likelihood of each ratio, and the noise's variance there.
+
+    Args:
+        gram: (k + 1, k + 1) products of errors' effects, and last of the residuals.
+        scale: (k,) of the errors beside each other.
+        left: How many numbers the residuals are, less the unknowns.
+    """
+    values, axes = np.linalg.eigh(gram[:-1, :-1] * np.outer(scale, scale))
+    values, along = np.maximum(values, 0.0), axes.T @ (scale * gram[:-1, -1])
+    squares = RATIOS[:, None] ** 2
+    explained = (squares * along**2 / (1 + squares * values)).sum(axis=1)
+    noise = np.maximum((gram[-1, -1] - explained) / left, 1e-12)
+    return -left * np.log(noise) - np.log1p(squares * values).sum(axis=1), noise

@@ -1,0 +1,65 @@
+"""How large an arm's errors are: sizes that residuals tell, and what they leave open."""
+
+import numpy as np
+import pytest
+
+from flangeye.handeye.arm_sizes import Sizes, likely_sizes
+
+FREEDOM = 240.0
+
+
+def drawn(rng, size, beside, count=20):
+    """Return rows of six unknowns, two kinds of errors of those sizes, and what they leave."""
+    rows = rng.normal(size=(40, 6, 6))
+    kinds = [rng.normal(size=(40, 6, count)) for _ in range(2)]
+    off = size * (kinds[0] @ rng.normal(size=count) + beside * kinds[1] @ rng.normal(size=count))
+    return rows, kinds, rng.normal(size=(40, 6)) + off
+
+
+@pytest.mark.parametrize("beside", [1 / 3, 3.0])
+def test_each_size_is_the_one_that_made_the_errors(beside: float) -> None:
+    rng = np.random.default_rng(0)
+    told = []
+    for _ in range(6):
+        rows, kinds, errors = drawn(rng, 4.0, beside)
+        told.append(likely_sizes(rows, kinds, errors, FREEDOM).expected)
+    assert np.mean(told, axis=0) == pytest.approx([4.0, 4.0 * beside], rel=0.3)
+
+
+def test_what_the_errors_leave_of_the_noise_is_told() -> None:
+    rows, kinds, errors = drawn(np.random.default_rng(1), 8.0, 1.0)
+    sizes = likely_sizes(rows, kinds, errors / 2, FREEDOM)
+    assert sizes.weights @ sizes.noise == pytest.approx(0.25, rel=0.4)
+    assert sizes.expected[0] == pytest.approx(4.0, rel=0.4)
+
+
+def test_errors_are_no_smaller_than_was_said() -> None:
+    rows, kinds, errors = drawn(np.random.default_rng(2), 0.0, 1.0)
+    sizes = likely_sizes(rows, kinds, errors, FREEDOM)
+    assert (sizes.factors[:, 0] >= 1.0).all()
+    assert sizes.expected[0] < 1.2
+    huge = likely_sizes(rows, kinds, errors / 1e6, FREEDOM)
+    assert huge.expected == pytest.approx([1.0, 1.0])
+
+
+def test_sizes_that_nothing_tells_stay_open() -> None:
+    """One error among much noise: far larger ones are as likely, and count."""
+    rng = np.random.default_rng(3)
+    rows, kind = rng.normal(size=(40, 6, 6)), 0.02 * rng.normal(size=(40, 6, 1))
+    few = likely_sizes(rows, [kind], rng.normal(size=(40, 6)), FREEDOM)
+    assert few.expected[0] > 2
+    assert few.weights.sum() == pytest.approx(1.0)
+
+
+def test_a_region_holds_its_share_of_all_that_is_likely() -> None:
+    sizes = Sizes(np.array([0.7, 0.3]), np.array([[1.0], [5.0]]), np.ones(2))
+    parts = [np.eye(6), 4 * np.eye(6)]
+    covariance = sizes.mixed(parts)
+    rng = np.random.default_rng(4)
+    factor = np.where(rng.random(20000) < 0.7, 1.0, 5.0)
+    errors = np.sqrt(1 + 4 * factor**2)[:, None] * rng.standard_normal((20000, 6))
+    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors.T).T)
+    assert (squares < 12.59).mean() == pytest.approx(0.95, abs=0.01)
+    alone = Sizes(np.ones(1), np.array([[2.0]]), np.array([0.5]))
+    assert alone.mixed(parts) == pytest.approx(16.5 * np.eye(6), rel=1e-6)
+    assert alone.mixed(parts, np.ones(1)) == pytest.approx(17 * np.eye(6), rel=1e-6)
