@@ -183,7 +183,8 @@ def check_seam(seam: Seam, plan: Path, distance: float, settings: Following) -> 
         raise StageError(
             f"weld.tactile: the seam is too curved for a torch {distance * 1e3:.0f} mm behind "
             f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, allowed are "
-            f"{np.degrees(CROOKED):.0f}"
+            f"{np.degrees(CROOKED):.0f}; end the plan before the bend, or take a tool whose torch "
+            "is nearer to its tip"
         )
     fault = float(tube_radii(seam)[0])
     if fault > settings.reach:

@@ -5,8 +5,9 @@ the next. The finger goes ahead of the torch, straight beyond the end of its leg
 comes from behind the start of the next: for both there is room only where the upright plate of a
 fillet or lap joint ends at the corner.
 
-In a groove, which holds the tip between two walls, tip and torch may go round instead: the plan's
-corner becomes an arc, and what the tip feels says how far the seam is from that.
+Tip and torch may go round instead, to either side: the plan's corner becomes an arc, and what the
+tip feels says how far the seam is from that. The tip stays pressed against its wall, also where
+this ends at the corner and another begins, or turns into the way.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
             raise StageError(
                 f"weld.tactile: the seam has sharp corners ({_listed(corners)}), at which the "
                 f"torch has to stop: write a step weld.tactile for each leg, leg: 1 to "
-                f"{len(corners) + 1}; in a groove, corners: round leads it round them"
+                f"{len(corners) + 1}; or corners: round leads it round them"
             )
         return seam
     if params.leg > len(corners) + 1:
@@ -113,11 +114,6 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams) -> Se
     if params.leg is not None:
         raise StageError(
             "weld.tactile: corners: round leaves no legs; drop 'leg', or corners: stop"
-        )
-    if params.joint in ("fillet", "lap") and corners:
-        raise StageError(
-            f"weld.tactile: round the corner {_listed(corners[:1])} only a joint with two walls "
-            f"leads the tip, a {params.joint} joint has one: weld each leg, corners: stop"
         )
     points = seam.points_in_base
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -172,7 +168,8 @@ def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None
         raise StageError(
             f"weld.tactile: at the corner {_listed([corner])} the finger ahead of the torch would "
             "run into a wall: room is only round the outside of the upright plate of a fillet or "
-            "lap joint; press that plate ('side'), or end the plan before the corner"
+            "lap joint; press that plate ('side'), go round it with corners: round, or end the "
+            "plan before the corner"
         )
 
 

@@ -53,6 +53,10 @@ MOVED = 0.2e-3
 SWERVE = 0.3e-3
 """So far the arm may swerve from a curve while it does not know of it [m]."""
 
+CENTRE = 0.7
+"""Share of a curve's radius by which the arm may be off towards its centre: there all places of the
+curve are equally near."""
+
 SWERVE_AHEAD = 10e-3
 """So far before a curve the tip slows down [m]."""
 
@@ -438,10 +442,21 @@ class Follower:
             self._stop(f"no tag was seen for {settings.blind * 1e3:.0f} ms")
         elif self.phase == "bridging" and self.tip - self._bridge > settings.longest_gap:
             self._stop(f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam")
+        elif self.phase in ("following", "bridging") and self._aside(pose) > CENTRE:
+            self._stop(
+                f"the plan curves with a radius of {1e3 / abs(self._plan.bend(self.tip)):.1f} mm "
+                "and the arm is off towards its centre: how far along it the tip is cannot be "
+                "told; plan better, or raise 'corner_radius'"
+            )
         elif self._search.bent:
             self._stop("the tip is displaced though nothing should touch it")
         elif self.phase == "seeking" and self._astray(pose):
             self._stop(f"no groove within {settings.reach * 1e3:.0f} mm of the plan's start")
+
+    def _aside(self, pose: ToolPose) -> float:
+        """Return how far the arm is off to the inside of the plan's curve, in radii."""
+        off = float((pose.position[:2] - self._place.point) @ self._place.normal)
+        return off * self._plan.bend(self.tip)
 
     def _astray(self, pose: ToolPose) -> bool:
         below = self._place.height - float(pose.position[2])

@@ -57,11 +57,14 @@ class Path:
         self._rows = np.column_stack([self.points, self.tangents]).tolist()
 
     def _curvatures(self) -> Floats:
-        """Return the curvature (M,) by chords: a plan's scatter must not look like curves."""
+        """Return the curvature (M,) by chords, to the left positive.
+
+        By chords because a plan's scatter must not look like curves.
+        """
         span = max(1, min(round(CHORD / self.step), (len(self.points) - 1) // 2))
         chords = self.points[span:, :2] - self.points[:-span, :2]
         angles = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-        inner = np.abs(angles[span:] - angles[:-span]) / (span * self.step)
+        inner = (angles[span:] - angles[:-span]) / (span * self.step)
         return np.pad(inner, (span, len(self.points) - span - len(inner)), mode="edge")
 
     def at(self, s: float) -> Place:
@@ -101,7 +104,12 @@ class Path:
     def sharpest(self, start: float, end: float) -> float:
         """Return the largest curvature between two arc lengths [1/m]; none beyond the ends."""
         low, high = max(int(start / self.step), 0), max(int(end / self.step) + 1, 1)
-        return float(self._curvature[low:high].max(initial=0.0))
+        return float(np.abs(self._curvature[low:high]).max(initial=0.0))
+
+    def bend(self, s: float) -> float:
+        """Return the curvature at an arc length [1/m], to the left positive; none beyond."""
+        inside = 0.0 <= s <= self.length
+        return float(self._curvature[round(s / self.step)]) if inside else 0.0
 
     def advance(self, point: Floats, s: float, reach: float) -> float:
         """Return the arc length of the foot of ``point`` (2,), at most ``reach`` beyond ``s``.

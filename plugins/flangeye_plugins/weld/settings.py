@@ -187,8 +187,8 @@ class WeldTactileParams(Following):
     )  # fmt: skip
     corners: Literal["stop", "round"] = Field(
         "stop",
-        description="stop: the torch stops at a sharp corner, each leg is a step. round: in a "
-        "groove, tip and torch go round it without a stop.",
+        description="stop: the torch stops at a sharp corner, each leg is a step. round: tip and "
+        "torch go round it without a stop.",
     )
     corner_radius: Length = param(
         "5 mm", gt=0, description="Of the arc that a rounded corner of the plan becomes."

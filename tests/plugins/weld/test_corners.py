@@ -1,6 +1,6 @@
 """Plans with sharp corners: found, refused where the tool has no room, welded leg by leg."""
 
-from pathlib import Path
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.types import Seam
+from flangeye_emulators.weld_world.bench import built_for, known, start_at
+from flangeye_emulators.weld_world.conditions import LAP, Condition
+from flangeye_emulators.weld_world.groove import Tip
+from flangeye_emulators.weld_world.settings import WorldParams
+from flangeye_emulators.weld_world.trial import run_trial
+from flangeye_emulators.weld_world.world import Nominal
+from flangeye_plugins.weld.checks import check_seam
 from flangeye_plugins.weld.corners import ARC, corners_of, leg_of
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from tests.plugins.weld import bench, cell
 
@@ -71,6 +80,11 @@ def test_a_leg_is_what_lies_between_its_corners() -> None:
         ((90.0,), {"leg": 3}, r"leg 3 of a seam with 2; its sharp corners: \+90 deg"),
         ((), {"leg": 2}, "leg 2 of a seam with 1; its sharp corners: none"),
         ((-90.0,), {"leg": 1}, r"at the corner -90 deg at 60 mm the finger .* run into a wall"),
+        (
+            (-90.0,),
+            {"leg": 1},
+            "go round it with corners: round, or end the plan before the corner",
+        ),
         ((90.0,), {"leg": 2, "joint": "groove"}, "run into a wall: room is only round the outside"),
         ((60.0, -60.0), {"leg": 2}, "at the corner -60 deg at 120 mm the finger"),
     ],
@@ -101,7 +115,6 @@ def test_a_rounded_corner_is_an_arc_that_touches_both_legs(sampled) -> None:
     ("turns", "given", "message"),
     [
         ((90.0,), {"leg": 1}, "corners: round leaves no legs; drop 'leg'"),
-        ((90.0,), {"joint": "lap"}, r"\+90 deg at 60 mm only a joint .* a lap joint has one"),
         ((90.0, 90.0), {"corner_radius": 0.04}, "no room .* of 40 mm, at most 30 mm"),
     ],
 )
@@ -133,13 +146,50 @@ def test_tip_and_torch_go_round_a_corner_of_a_groove(turn: float) -> None:
     assert np.sqrt(np.mean(off**2)) < 0.1e-3
 
 
+def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
+    """Weld round a corner in a world of its own, the plan shifted [m]."""
+    asked = Following.model_validate({"joint": joint, "max_error": "1.5 mm", **given})
+    true = dense(polyline(turn, leg=0.06))
+    misplanned = seam_of(bench.misplaced(true, shift, plan_turn))
+    plan = Path(leg_of(misplanned, told(**{**ROUND, "joint": joint})).points_in_base)
+    body = built_for(asked)
+    section, belief = known(Condition(section=JOINTS[joint]), body, asked)
+    check_seam(misplanned, plan, belief.distance, asked)
+    seam = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
+    controller = controller_of(plan, belief, asked, "tactile")
+    return run_trial(controller, seam, WorldParams(), start_at(plan, belief, asked, 16e-3), 0)
+
+
+JOINTS = {"lap": LAP, "groove": None}
+
+
+@pytest.mark.parametrize("turn", [45.0, -45.0])
+def test_a_tip_pressed_against_one_wall_leads_the_torch_round_its_corners(turn: float) -> None:
+    """Round the outside of the plate, and into the corner where the next one stands."""
+    found = round_a_corner(turn, "lap", (1e-3, 1e-3, 0.0))
+    assert found.done, found.controller.reason
+    # A real ball stays off an inner corner by so much more: it touches both walls there.
+    mitre = Tip().radius * (1.0 / np.cos(np.radians(turn) / 2.0) - 1.0)
+    assert (found.errors + mitre <= found.column("bound")[found.beside]).all()
+    assert found.errors.max() < 0.5e-3
+    assert np.sqrt(np.mean(found.errors**2)) < 0.1e-3
+
+
+def test_an_arc_that_the_plan_is_off_by_as_much_as_its_radius_stops_the_weld() -> None:
+    """The arm is then near the arc's centre, from where all of its places are as near."""
+    found = round_a_corner(-58.5, "groove", (-0.6e-3, 3.2e-3, 0.0), -0.0175, side="right")
+    assert not found.done
+    assert "how far along it the tip is cannot be told" in found.controller.reason
+    assert (found.errors <= found.column("bound")[found.beside]).all()
+
+
 BENT = [[-40.0, -15.0, 14.0], [20.0, -15.0, 14.0], [20.0, 40.0, 14.0]]
 """An L round the corner of a plate that lies to its left [mm]."""
 
 
 @pytest.fixture
-def bent(tmp_path: Path) -> Path:
-    cad = Path("data/workpieces/v-straight.stl").absolute()
+def bent(tmp_path: FilePath) -> FilePath:
+    cad = FilePath("data/workpieces/v-straight.stl").absolute()
     (tmp_path / "bent.stl").write_bytes(cad.read_bytes())
     seam = {"name": "groove", "points": BENT, "opening": [0, 0, 1]}
     file = {"title": "L", "cad": "bent.stl", "unit": "mm", "seams": [seam], "source": "test"}
@@ -148,7 +198,7 @@ def bent(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("leg", [1, 2])
-def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: Path, leg: int) -> None:
+def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: int) -> None:
     line = np.array(BENT) * 1e-3 @ cell.HERE[:3, :3].T + cell.HERE[:3, 3]
     off = np.array([1e-3, -0.7e-3, 0.0])
     seam = seam_of(line + off)
