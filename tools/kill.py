@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,8 @@ MARK = "FLANGEYE_KILLED"
 """In the environment of a run and of all that it starts."""
 
 LINGER = 5.0
-"""Longest time until what a killed run started has ended by itself [s]."""
+"""Longest time until what a killed run started has ended by itself, its waits for a core aside [s]:
+what is still starting, as a batch's workers are, ends when it looks for who started it."""
 
 ENOUGH = 5
 """Observations from which a calibration can be solved again."""
@@ -142,7 +143,7 @@ class Trial:
     def _left(self, out: Path, shared: set[str]) -> Iterator[str]:
         """Yield what is left of a killed run besides its folder."""
         until = time.monotonic() + LINGER
-        while (left := _marked(str(out))) and time.monotonic() < until:
+        while (left := _marked(str(out))) and time.monotonic() < until + _queued(left):
             time.sleep(0.1)
         for pid, command in left.items():
             yield f"a process is left: {command}"
@@ -225,6 +226,16 @@ def _marked(out: str) -> dict[int, str]:
             words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
             found[int(process.name)] = words
     return found
+
+
+def _queued(processes: Iterable[int]) -> float:
+    """Return how long the process that had to wait most for a core has done so [s]."""
+    waited = [0.0]
+    for process in processes:
+        with suppress(OSError):
+            words = Path(f"/proc/{process}/schedstat").read_text("ascii").split()
+            waited.append(1e-9 * int(words[1]))
+    return max(waited)
 
 
 def _shared(out: str) -> set[str]:
