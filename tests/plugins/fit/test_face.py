@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.planes import Plane, robust_plane
-from flangeye_plugins.fit.face import disc_face, likeliest_plane
+from flangeye_plugins.fit.face import _planes_of_patches, disc_face, likeliest_plane
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 AT = np.array([0.0, 0.0, 0.6])
@@ -94,3 +94,15 @@ def test_the_normal_is_towards_the_scanner_however_it_was_given() -> None:
     points = face(np.random.default_rng(5))
     plane = disc_face(points, Plane(AT, -NORMAL, 0.0), (0.0, 0.04), 3e-3)
     assert plane is not None and plane.normal @ NORMAL > 0.999
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_planes_of_patches_have_unit_normals_on_the_side_of_the_rough_one(side: float) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.03, 0.03, (2000, 3)) * [1.0, 1.0, 1e-3] + [0.0, 0.0, 0.5]
+    rough = Plane(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, side]), 0.0)
+    patch = rng.integers(25, size=2000)
+    normals, levels = _planes_of_patches(points, patch, rough)
+    assert normals.shape == (26, 3) and levels.shape == (26,)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(26))
+    assert (normals @ rough.normal > 0.99).all()
