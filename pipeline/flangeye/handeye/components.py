@@ -146,12 +146,11 @@ class Residuals:
         """
         p, eye = self.projectors, np.eye(3)
         root = np.linalg.cholesky(p @ (own + FINEST**2 * eye) @ p + (eye - p))
-        whitened = np.linalg.solve(
-            root, np.concatenate([self.errors[..., None], p @ further @ p], 2)
-        )
-        added = np.linalg.solve(root, np.swapaxes(whitened[..., 1:], 1, 2))
+        whiten = np.linalg.inv(root)
+        onto = whiten @ p
+        added = onto @ further @ np.swapaxes(onto, 1, 2)
         shares, axes = np.linalg.eigh(0.5 * (added + np.swapaxes(added, 1, 2)))
-        errors = np.einsum("nij,ni->nj", axes, whitened[..., 0])
+        errors = (np.swapaxes(axes, 1, 2) @ (whiten @ self.errors[..., None]))[..., 0]
         return (errors**2).ravel(), np.maximum(shares, 0.0).ravel()
 
 
