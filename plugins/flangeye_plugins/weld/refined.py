@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -306,9 +307,7 @@ class RefinedPath:
         along, felt = self._along[some] / count, self._sum[some] / count
         waviness = max(_unexplained(rows, felt), SMALLEST**2)
         fields = [_Field(waviness, length, self._wander) for length in LENGTHS]
-        found = [_explained(field, along, rows, felt, self._noise(some)) for field in fields]
-        best = int(np.argmax([likelihood for *_, likelihood in found]))
-        shift, covariance, excess, _ = found[best]
+        best, shift, covariance, excess = _explained(fields, along, rows, felt, self._noise(some))
         # What was felt at few places only may be off by more than it seems there.
         few = (1.0 + SCANTY / len(used)) ** 2
         return _Motion(about, shift, few * covariance, fields[best], few * excess)
@@ -350,24 +349,32 @@ def _unexplained(rows: Floats, felt: Floats) -> float:
 
 
 def _explained(
-    field: _Field, along: Floats, rows: Floats, felt: Floats, noise: Floats
-) -> tuple[Floats, Floats, float, float]:
-    """Return the motion (3,) that explains offsets (K,) best, if a field leaves the rest.
+    fields: Sequence[_Field], along: Floats, rows: Floats, felt: Floats, noise: Floats
+) -> tuple[int, Floats, Floats, float]:
+    """Return which field leaves the rest best, and the motion (3,) that then explains offsets (K,).
 
-    With its covariance (3, 3), by how much the rest is larger than the field expects, and the
-    logarithm of the marginal likelihood (Rasmussen and Williams 2006, 2.45), the scale of field and
+    With its covariance (3, 3), and by how much the rest is larger than the field expects. The best
+    has the greatest marginal likelihood (Rasmussen and Williams 2006, 2.45), the scale of field and
     prior left free: a motion that hardly any plan is off by explains no waves.
     """
-    nugget = noise + 1e-6 * field.variance
-    root = np.linalg.cholesky(field.covariance(along, along) + np.diag(nugget))
-    white = np.linalg.solve(root, np.column_stack([rows, felt]))
-    white_rows, white_felt = white[:, :3], white[:, 3]
-    gram = white_rows.T @ white_rows + np.diag(PRIOR**-2)
-    inverse = np.linalg.inv(gram)
-    shift = inverse @ (white_rows.T @ white_felt)
+    among = [
+        field.covariance(along, along) + np.diag(noise + 1e-6 * field.variance) for field in fields
+    ]
+    # All fields at once: a call costs as much as its arithmetic.
+    roots = np.linalg.cholesky(np.array(among))
+    white = np.linalg.solve(roots, np.column_stack([rows, felt]))
+    turned = white[:, :, :3].transpose(0, 2, 1)
+    grams = turned @ white[:, :, :3] + np.diag(PRIOR**-2)
+    inverses = np.linalg.inv(grams)
+    shifts = (inverses @ (turned @ white[:, :, 3:]))[:, :, 0]
+    volumes = np.linalg.slogdet(grams)[1]
     freedom = max(len(felt) - 3, 1)
-    left = np.sum((white_felt - white_rows @ shift) ** 2) + np.sum((shift / PRIOR) ** 2)
-    scale = max(float(left) / freedom, 1e-9)
-    volume = 2.0 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(gram)[1])
-    excess = max(scale, 1.0)
-    return shift, excess * inverse, excess, -0.5 * (freedom * math.log(scale) + volume)
+    scales, likelihoods = [], []
+    for root, one, shift, volume in zip(roots, white, shifts, volumes.tolist(), strict=True):
+        left = np.sum((one[:, 3] - one[:, :3] @ shift) ** 2) + np.sum((shift / PRIOR) ** 2)
+        scales.append(max(float(left) / freedom, 1e-9))
+        volume += 2.0 * float(np.log(np.diag(root)).sum())
+        likelihoods.append(-0.5 * (freedom * math.log(scales[-1]) + volume))
+    best = int(np.argmax(likelihoods))
+    excess = max(scales[best], 1.0)
+    return best, shifts[best], excess * inverses[best], excess
