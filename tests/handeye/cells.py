@@ -90,10 +90,11 @@ ISSUE = Noise()
 def session(configuration, rng, n=15, tilt=TILT, noise=ISSUE, feature="pose", poses=None):
     """Draw a session whose target is some 0.6 m before the camera.
 
-    ``poses`` gives (n, 4, 4) motions of every arm in place of those drawn.
+    ``poses`` gives (n, 4, 4) motions of every arm in place of those drawn, or (2, n, 4, 4).
     """
     homes = [rigid(rotation(rng), np.array([0.4, 0.1, 0.4])) for _ in range(2)]
     drawn = [moves(rng, n, tilt) if poses is None else poses for _ in range(2)]
+    drawn = drawn[0] if np.ndim(drawn[0]) == 4 else drawn
     first, second = homes[0] @ drawn[0], homes[1] @ drawn[1]
     joints = None
     if configuration.name == "eye-on-arm":
@@ -192,16 +193,27 @@ def moving(times):
 def passing(configuration, rng, delay, n=40, **more):
     """Draw a session of a moving arm, seen by ``delay`` [s] later than the poses' times."""
     at = np.sort(rng.uniform(1.0, 25.0, n))
-    made = session(configuration, rng, n=n, poses=moving(at + delay), **more)
-    home = made.observations[0].base_T_flange.matrix @ invert(moving(at[:1] + delay)[0])
-    stream = np.arange(0.0, 26.0, 0.01)
-    poses = home @ moving(stream)
+    made = session(configuration, rng, n=n, poses=both(at + delay), **more)
+    stream, before, start = np.arange(0.0, 26.0, 0.01), made.observations[0].poses, both(at + delay)
+    moved = {
+        name: before[name].matrix @ invert(first[0]) @ motion
+        for name, first, motion in zip((FLANGE, FLANGE2), start, both(stream), strict=True)
+        if name in before
+    }
+    second = {FLANGE2: (stream, moved[FLANGE2])} if FLANGE2 in moved else None
     out = []
     for o, when in zip(made.observations, at, strict=True):
-        motion = passed(stream, poses, when)
-        pose = Transform(BASE, FLANGE, pose_at(motion, 0.0))
-        out.append(replace(o, poses={FLANGE: pose}, motion=motion))
+        motion = passed(stream, moved[FLANGE], when, second)
+        at_pose = {FLANGE: pose_at(motion, 0.0)}
+        at_pose |= {name: pose_at(motion, 0.0, name) for name in motion.others}
+        poses = {name: replace(o.poses[name], matrix=x) for name, x in at_pose.items()}
+        out.append(replace(o, poses=poses, motion=motion))
     return replace(made, observations=out)
+
+
+def both(times):
+    """Return the motions of two arms that never stand still."""
+    return moving(times), moving(1.3 * times + 5.0)
 
 
 def walking(made, rng, turn=5e-4, shift=2e-4):

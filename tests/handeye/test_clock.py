@@ -4,14 +4,17 @@ import re
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.maths.streams import later, pose_at
+from flangeye.maths.streams import later, pose_at, rates_of
+from flangeye.types import FLANGE2, Motion
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
 from tests.handeye.cells import CONFIGURATIONS, errors, passing
 
 TOLD = re.compile(r"([\d.]+) \+- ([\d.]+) ms (after|before)")
-CELLS = [("eye-on-base, marker", "pose"), ("eye-in-hand, base circle", "normal")]
+CELLS = [("eye-on-base, marker", "pose"), ("eye-in-hand, base circle", "normal"),
+         ("two arms, marker", "pose")]  # fmt: skip
 
 
 def solved(name, kind, delay, seed, n=24):
@@ -61,7 +64,21 @@ def test_a_motion_tells_other_moments_as_far_as_it_was_recorded() -> None:
     made = passing(cell, np.random.default_rng(0), 0.0, 4)
     motion = made.observations[0].motion
     assert later(motion, 0.21) is None
+    read = TypeAdapter(Motion).validate_json(TypeAdapter(Motion).dump_json(motion))
+    np.testing.assert_array_equal(read.poses, motion.poses)
     moved = later(motion, 0.1)
     assert moved is not None
     np.testing.assert_array_equal(pose_at(moved, 0.0), pose_at(motion, 0.1))
     assert moved.times[-1] == pytest.approx(0.1)
+
+
+def test_of_two_arms_the_motions_of_both_are_kept() -> None:
+    made = passing(CONFIGURATIONS["two arms, marker"], np.random.default_rng(0), 0.0, 4)
+    motion = made.observations[0].motion
+    read = TypeAdapter(Motion).validate_json(TypeAdapter(Motion).dump_json(motion))
+    np.testing.assert_array_equal(read.others[FLANGE2], motion.others[FLANGE2])
+    moved = later(motion, 0.1)
+    assert moved is not None
+    np.testing.assert_array_equal(pose_at(moved, 0.0, FLANGE2), pose_at(motion, 0.1, FLANGE2))
+    rates = rates_of([motion], FLANGE2)[0]
+    assert 0.05 < np.linalg.norm(rates[3:]) < 1

@@ -18,6 +18,7 @@ from flangeye.handeye.cell_arms import (
     considering_zeros,
     correcting_zeros,
 )
+from flangeye.handeye.cell_clock import on_one_clock
 from flangeye.handeye.estimates import estimate_at
 from flangeye.handeye.graph import Sighting, Solved
 from flangeye.handeye.measurements import measured
@@ -65,9 +66,11 @@ def calibrate_cell(
     sighted = sighted_of(observations, cell, limits)
     found = sighted.solved()
     _require_agreement(found, len(observations))
+    timed = on_one_clock(observations, cell, sighted, found)
+    observations, sighted, found = timed.observations, timed.sighted, timed.found
     branches = branches_of(sighted, cell)
     known, sizes = considering_zeros(found, sighted, branches)
-    notes = _notes(observations, found, sizes)
+    notes = (*_notes(observations, found, sizes), *timed.notes)
     corrected = None
     if sizes and joint_offsets:
         corrected, told = correcting_zeros(found, sighted, branches, sizes)

@@ -244,7 +244,7 @@ def considering_zeros(
     linear = sighted.linear(found, likeliest(found, sighted, branches))
     sizes = _sizes(linear)
     off = [linear.following(found.joint, kind) for kind in (linear.zeros, *linear.others)]
-    return _with_joint(found, sizes.mixed([found.joint, *off])), sizes
+    return found.with_joint(sizes.mixed([found.joint, *off])), sizes
 
 
 def correcting_zeros(
@@ -323,12 +323,7 @@ def _known(found: Solved, linear: Linear, sizes: Sizes) -> Solved:
     scale = max(float((linear.whitened[2] ** 2).sum()) / left, 1.0)
     own = scale * covariance_inflation(left, 6) * covariance[:p, :p]
     off = [linear.following(covariance, kind) for kind in linear.others]
-    return _with_joint(found, sizes.mixed([own, *off], np.ones(len(sizes.weights))))
-
-
-def _with_joint(found: Solved, joint: Floats) -> Solved:
-    blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(found.places)}
-    return replace(found, joint=joint, covariances=blocks)
+    return found.with_joint(sizes.mixed([own, *off], np.ones(len(sizes.weights))))
 
 
 def _inverse(information: Floats) -> Floats:

@@ -97,6 +97,11 @@ class Solved:
     inliers: Mask
     movers: float
 
+    def with_joint(self, joint: Floats) -> Solved:
+        """Return the same with another (6 K, 6 K) covariance."""
+        blocks = {n: joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i, n in enumerate(self.places)}
+        return replace(self, joint=joint, covariances=blocks)
+
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
@@ -172,7 +177,8 @@ def _solved(
     information = information_of(whiteners[kept] @ jacobian[kept])
     scale = np.tile(np.repeat(limits, 3), len(places))
     if weak_moves(information, scale):
-        seen = dict.fromkeys((pair.camera, pair.target) for pair in graph.pairs)
+        agreeing = [pair for pair in graph.pairs if kept[pair.rows].any()]
+        seen = dict.fromkeys((pair.camera, pair.target) for pair in agreeing)
         again = graph.seen_again(places, whiteners * kept[:, None, None])
         loops = Loops(graph.frames, list(seen), list(places), scale)
         raise CalibrationRefused(loops.told_unknown(information, again))

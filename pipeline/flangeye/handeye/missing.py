@@ -76,13 +76,16 @@ class Loops:
         moved = [end for end in ends if {*chain(self.frames, end)} & {*named}]
         still = [end for end in ends if end not in moved]
         if not moved:
-            return f"no sighting has {' or '.join(named)} in it: let one see the other"
+            return (
+                f"no sighting that agrees with others has {' or '.join(named)} in it: let a camera "
+                "see it, or it a target, and check what it saw"
+            )
         if not still or any(
             (camera in moved) != (target in moved) for camera, target in self.pairs
         ):
             return (
-                f"no motion shows where {' and '.join(named)} stand: say it of {named[0]} "
-                "(place: in the recipe)"
+                f"no motion shows where {' and '.join(named)} "
+                f"stand{'' if len(named) > 1 else 's'}: say it of {named[0]} (place: in the recipe)"
             )
         return (
             f"no sighting ties {' and '.join(moved)} to {' and '.join(still)}: let a camera of the "

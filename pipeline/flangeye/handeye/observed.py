@@ -10,13 +10,13 @@ import numpy as np
 
 from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.nuisance import Nuisance
-from flangeye.maths.geometry import rigid, rotation_log
+from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.streams import PASSED_STEP, later, pose_at
+from flangeye.maths.streams import later, pose_at, rates_of
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import BASE, FLANGE, Motion, Observation, PoseFeature
+from flangeye.types import BASE, FLANGE, FLANGE2, Motion, Observation, PoseFeature
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,34 +65,38 @@ class Cell:
     @property
     def motions(self) -> list[Motion] | None:
         """How the flange passed each capture; None where it stood still or nobody recorded it."""
-        motions = [o.motion for o in self.observations if o.motion is not None]
-        one_arm = {self.configuration.camera, self.configuration.target} == {BASE, FLANGE}
-        return motions if one_arm and len(motions) == len(self.observations) else None
+        carriers = {self.configuration.camera, self.configuration.target}
+        others = carriers - {BASE, FLANGE}
+        motions = [o.motion for o in self.observations if o.motion and others <= {*o.motion.others}]
+        told = FLANGE in carriers and len(motions) == len(self.observations)
+        return motions if told else None
 
     def delayed(self, delay: float) -> Cell | None:
-        """Return the cell with the flange where it was ``delay`` later [s]; None if not known."""
+        """Return the cell with its arms where they were ``delay`` later [s]; None if not known."""
         observations = []
         for o in self.observations:
             motion = o.motion and later(o.motion, delay)
             if motion is None:
                 return None
-            flange = replace(o.base_T_flange, matrix=pose_at(motion, 0.0))
-            poses = {**o.poses, FLANGE: flange}
+            moved = {FLANGE: pose_at(motion, 0.0)}
+            moved |= {name: pose_at(motion, 0.0, name) for name in motion.others}
+            poses = {name: replace(o.poses[name], matrix=x) for name, x in moved.items()}
+            poses = {**o.poses, **poses}
             observations.append(replace(o, poses=poses, joints=None, motion=motion))
         return replace(self, observations=observations, delay=(self.delay or 0.0) + delay)
 
     def unknown_delay(self) -> Nuisance | None:
-        """Return what a time [s] does by which the flange's poses are still too early."""
+        """Return what a time [s] does by which the arms' poses are still too early."""
         motions = self.motions
         if motions is None or self.flange is None:
             return None
-        before, after = (
-            np.array([pose_at(each, end) for each in motions])
-            for end in (-PASSED_STEP, PASSED_STEP)
-        )
-        turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
-        moved = np.concatenate([turned, after[:, :3, 3] - before[:, :3, 3]], axis=1)
-        return self.flange.nuisance(moved[..., None] / (2 * PASSED_STEP), np.inf)
+        delay = self.flange.nuisance(rates_of(motions)[..., None], np.inf)
+        if self.configuration.target != FLANGE2:
+            return delay
+        second = np.array([o.poses[FLANGE2].matrix for o in self.observations])
+        moves = rates_of(motions, FLANGE2)[..., None]
+        carried = MovedFlange(second, None, carries_camera=False).nuisance(moves, np.inf)
+        return replace(delay, target=delay.target + carried.target)
 
     def resized(self, factor: float) -> Cell:
         """Return the cell with all poses of the target so many times as far from the camera."""

@@ -5,6 +5,7 @@ Times are (N,) ascending [s], poses (N, 4, 4) [m]. Arrays only.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,23 +76,50 @@ def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
     return np.array([rigid(r, p) for r, p in zip(turned, moved, strict=True)])
 
 
-def passed(times: Floats, poses: Floats, at: float) -> Motion:
-    """Return how the stream's flange passed a moment ``at`` that lies in the stream."""
-    steps = PASSED_STEP * np.arange(-PASSED, PASSED + 1)
-    steps = steps[(steps == 0) | ((at + steps >= times[0]) & (at + steps <= times[-1]))]
-    return Motion(steps, interpolated(times, poses, at + steps))
+def passed(
+    times: Floats,
+    poses: Floats,
+    at: float,
+    others: Mapping[str, tuple[Floats, Floats]] | None = None,
+) -> Motion:
+    """Return how the stream's flange passed a moment ``at`` that lies in the stream.
+
+    Args:
+        times: The stream's.
+        poses: The stream's.
+        at: The moment [s].
+        others: Times and poses of what else moves, by frame.
+    """
+    steps = PASSED_STEP * np.arange(-PASSED, PASSED + 1, dtype=np.float64)
+    more = others or {}
+    for each in (times, *(stream for stream, _ in more.values())):
+        steps = steps[(steps == 0) | ((at + steps >= each[0]) & (at + steps <= each[-1]))]
+    beside = {name: interpolated(*stream, at + steps) for name, stream in more.items()}
+    return Motion(steps, interpolated(times, poses, at + steps), beside)
 
 
 def later(motion: Motion, delay: float) -> Motion | None:
     """Return how the flange passed the moment ``delay`` later [s]; None beyond what was kept."""
     if not motion.times[0] <= delay <= motion.times[-1]:
         return None
-    return Motion(motion.times - delay, motion.poses)
+    return Motion(motion.times - delay, motion.poses, motion.others)
 
 
-def pose_at(motion: Motion, time: float) -> Floats:
-    """Return the pose (4, 4) at a time of a motion [s]."""
-    return np.asarray(interpolated(motion.times, motion.poses, np.array([time]))[0])
+def pose_at(motion: Motion, time: float, of: str | None = None) -> Floats:
+    """Return the pose (4, 4) at a time of a motion [s]: the flange's, or that of another frame."""
+    poses = motion.poses if of is None else motion.others[of]
+    return np.asarray(interpolated(motion.times, poses, np.array([time]))[0])
+
+
+def rates_of(motions: Sequence[Motion], of: str | None = None) -> Floats:
+    """Return the (N, 6) twists per second at N moments, in the base at the frame's origin."""
+    before, after = (
+        np.array([pose_at(each, end, of) for each in motions])
+        for end in (-PASSED_STEP, PASSED_STEP)
+    )
+    turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
+    moved = np.concatenate([turned, after[:, :3, 3] - before[:, :3, 3]], axis=1)
+    return np.asarray(moved / (2 * PASSED_STEP))
 
 
 def mean_pose(poses: Floats) -> Floats:

@@ -22,9 +22,10 @@ from flangeye.maths.streams import (
     STILL_DISTANCE,
     interpolated,
     mean_pose,
+    passed,
     turning,
 )
-from flangeye.types import Floats
+from flangeye.types import Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     ColumnsParams,
@@ -290,10 +291,22 @@ def _by_time(
         _recording(
             seen, f"{i:04}", _mean([values[k] for k in p.events]),
             {each.name: p.pose if each is first else _at(each, p.time) for each in moved}, p.time,
+            _motion(first, moved, p),
         )
         for i, p in enumerate(still)
     ]  # fmt: skip
     return found, [f"{seen.text.file.name}: {note}" for note in notes]
+
+
+def _motion(first: Moved, moved: Sequence[Moved], found: Pair) -> Motion | None:
+    """Return how all arms passed; None where they stood still, or a rail or positioner moved."""
+    if found.motion is None or first.times is None:
+        return None
+    streams = {m.name: (np.asarray(m.times), m.values) for m in moved if m.values.ndim == 3}
+    motion = passed(first.times, first.values, found.time, streams)
+    around = found.time + motion.times
+    axes = [np.interp(around, np.asarray(m.times), m.values) for m in moved if m.values.ndim == 1]
+    return None if any(np.ptp(values) > STILL_DISTANCE for values in axes) else motion
 
 
 Signal = tuple[Floats, Floats]
@@ -332,7 +345,12 @@ def _mean(values: Sequence[Floats | Path | None]) -> Floats:
 
 
 def _recording(
-    seen: Seen, key: str, value: Floats | Path | None, at: Mapping[str, Floats], time: float = 0.0
+    seen: Seen,
+    key: str,
+    value: Floats | Path | None,
+    at: Mapping[str, Floats],
+    time: float = 0.0,
+    motion: Motion | None = None,
 ) -> Recording:
     given = seen.given
     found = Recording(
@@ -342,6 +360,7 @@ def _recording(
         axes={name: float(x) for name, x in at.items() if x.ndim == 0},
         seen_by=given.camera,
         saw=given.target,
+        motion=motion,
     )
     if value is None or isinstance(value, Path):
         return replace(found, cloud=value)

@@ -107,8 +107,13 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
     if target is not None and params.target_inverted:
         target = inverted(target[None])[0]
     motion = recording.motion
-    if motion is not None and params.arms != "second":
-        motion = replace(motion, poses=_corrected(motion.poses, params))
+    if motion is not None:
+        first = motion.poses if spared == FLANGE else _corrected(motion.poses, params)
+        others = {
+            name: poses if name == spared else _corrected(poses, params)
+            for name, poses in motion.others.items()
+        }
+        motion = replace(motion, poses=first, others=others)
     return replace(
         recording,
         motion=motion,

@@ -28,8 +28,8 @@ from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import recording_of, scans_in
 from flangeye.files.tables import Column, Table, files_at, number_of
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.streams import interpolated, mean_pose, turning
-from flangeye.types import FLANGE, FLANGE2, Floats
+from flangeye.maths.streams import interpolated, mean_pose, passed, turning
+from flangeye.types import FLANGE, FLANGE2, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     ColumnsParams,
@@ -250,11 +250,19 @@ def _joined(
     recordings = [
         replace(
             _recording(f"{i:04}", p.pose, _mean(values, p), _second_at(second, p), p.time),
-            motion=p.motion,
+            motion=_motion(arm, second, p),
         )
         for i, p in enumerate(pairs)
     ]
     return recordings, notes
+
+
+def _motion(arm: tuple[Floats, Floats], second: Readings | None, found: Pair) -> Motion | None:
+    """Return how the arms passed; None where they stood still."""
+    stream = None if second is None else _stream_of(second)
+    if found.motion is None or stream is None:
+        return found.motion
+    return passed(*arm, found.time, {FLANGE2: stream})
 
 
 def _mean(values: Sequence[Floats], found: Pair) -> Floats:
@@ -263,10 +271,16 @@ def _mean(values: Sequence[Floats], found: Pair) -> Floats:
 
 
 def _second_at(second: Readings | None, found: Pair) -> Floats | None:
-    if second is None or second.times is None:
+    stream = None if second is None else _stream_of(second)
+    return None if stream is None else interpolated(*stream, np.array([found.time]))[0]
+
+
+def _stream_of(readings: Readings) -> tuple[Floats, Floats] | None:
+    """Return the times and poses that were read; None where there are no times."""
+    if readings.times is None:
         return None
-    poses = np.array([value for value in second.values if value is not None])
-    return np.asarray(interpolated(second.times, poses, np.array([found.time]))[0])
+    known = [i for i, value in enumerate(readings.values) if value is not None]
+    return np.asarray(readings.times)[known], np.array([readings.values[i] for i in known])
 
 
 def _recording(

@@ -12,6 +12,7 @@ from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid
+from flangeye.maths.streams import pose_at
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run.folder import RunFolder
@@ -232,6 +233,36 @@ def test_streams_are_joined_by_time_where_everything_stands_still(tmp_path: Path
         assert recording.axes["rail"] == pytest.approx(0.1 * i, abs=1e-9)
         assert np.allclose(recording.centre_in_camera, [i, 0, 1])
         assert (recording.seen_by, recording.saw) == ("left", "ball")
+
+
+@pytest.mark.parametrize("slide", [0.0, 0.05])
+def test_arms_that_pass_are_told_with_how_they_passed_unless_a_rail_moves(
+    tmp_path: Path, slide: float
+) -> None:
+    times = np.arange(0, 12.0, 0.01)
+    for name, phase in (("one", 0.0), ("two", 1.0)):
+        poses = np.array([rigid(Rotation.from_rotvec([0.5 * np.sin(t + phase), 0, 0]).as_matrix(),
+                                [0.2 * np.sin(t + phase), 0.2 * np.cos(t), 0]) for t in times])  # fmt: skip
+        _written(tmp_path / f"{name}.csv", "t,x,y,z,qx,qy,qz,qw", times, _quaternions(poses))
+    _written(tmp_path / "rail.csv", "t,value", times, slide * times[:, None])
+    at = np.arange(1.0, 11.0, 0.5)
+    _written(tmp_path / "left.csv", "t,u,v,w", at, np.ones((len(at), 3)))
+    arm = {"time": "t", "rotation": "xyzw", "length": "m"}
+    params = CellParams.model_validate({
+        "arms": {name: {"file": f"{name}.csv", **arm} for name in ("one", "two")},
+        "axes": {"rail": {"file": "rail.csv", "time": "t", "column": "value", "unit": "m"}},
+        "sightings": [{"camera": "left", "target": "ball", "file": "left.csv", "time": "t",
+                       "rotation": "point", "length": "m"}],
+        "join": {"clock_offset": "0 ms"},
+    })  # fmt: skip
+    recordings = cell(tmp_path, params).recordings
+    assert len(recordings) > 10
+    for recording in recordings:
+        motion = recording.motion
+        assert (motion is None) == (slide > 0)
+        if motion is not None:
+            assert {*motion.others} == {"one", "two"}
+            assert np.allclose(pose_at(motion, 0.0, "two"), recording.poses["two"], atol=1e-6)
 
 
 def _quaternions(poses: Any) -> Any:
