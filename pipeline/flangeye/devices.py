@@ -307,7 +307,10 @@ class MotionAllowed:
     Attributes:
         allowed: Whether the arm may be moved.
         offline: Whether it is not even to be read (``--offline``).
+        plan_only: Whether nothing is wanted but the plan (``--json``); of a simulated arm as well,
+            which otherwise needs no permission.
     """
 
     allowed: bool = False
     offline: bool = False
+    plan_only: bool = False

@@ -14,7 +14,6 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye.types import Floats
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
@@ -42,15 +41,20 @@ class Planner:
 
     def __init__(self, project: Project, recipe: Recipe) -> None:
         self._project, self._recipe = project, recipe
+        self._words = ("run", project.recipe_path.name, "--json")
         with ui.row().classes("w-full gap-4"):
             with ui.column().classes("col-12 col-md-7"):
                 self._scene = new_scene(640, 460)
                 self._draw()
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()
-                ui.button("Check every pose and path", on_click=self._plan)
+                if recipe.plans:
+                    ui.button("Check every pose and path", on_click=self._plan)
+                else:
+                    ui.label("Its poses come from its recordings or its simulation: no plan.")
         self._checked = ui.column().classes("w-full")
-        command_line(project.command("run", project.recipe_path.name))
+        if recipe.plans:
+            command_line(project.command(*self._words))
 
     def _draw(self) -> None:
         robot, scanner = (self._recipe.context.get(m) for m in (RobotModel, ScannerModel))
@@ -60,36 +64,51 @@ class Planner:
         limits = self._recipe.header.robot and self._recipe.header.robot.limits
         if limits:
             draw_box(self._scene, np.array(limits.box.centre), np.array(limits.box.size), "#d68910")
-        view = self._view()
-        if view is not None and scanner is not None and robot is not None:
+        if scanner is not None and robot is not None:
             try:
-                self._scanner(scanner, view(Arm(robot), scanner))
+                self._scanner(robot, scanner)
             except StageError as error:
                 mistake(str(error))
-        self._scene.move_camera(1.5, -1.3, 1.1, 0.2, 0, 0.45)
+        self._scene.move_camera(1.35, -1.15, 1.0, 0.3, 0, 0.5)
 
-    def _view(self) -> Any:
-        return getattr(self._recipe.steps[0].params, "view", None)
-
-    def _scanner(self, scanner: ScannerModel, base_T_camera: Floats) -> None:
+    def _scanner(self, robot: RobotModel, scanner: ScannerModel) -> None:
+        """Draw what the scanner sees from where it is guessed to stand, or simulated."""
+        view = self._view()
+        if view is None and self._simulated is None:
+            return
+        base_T_camera = view(Arm(robot), scanner) if view else self._simulated.base_T_camera
         draw_frustum(self._scene, scanner, base_T_camera)
         with self._scene:
             ball = self._scene.sphere(0.05).move(*base_T_camera[:3, 3].tolist())
             ball.material("#3a7ebf").draggable()
         self._scene.on_drag_end(lambda e: self._dragged(e))
 
+    def _view(self) -> Any:
+        return getattr(self._recipe.steps[0].params, "view", None)
+
+    @property
+    def _simulated(self) -> Any:
+        """Where a simulated scanner stands, as its recipe says; None where nobody says."""
+        camera = getattr(self._recipe.steps[0].params, "camera", None)
+        return camera if hasattr(camera, "base_T_camera") else None
+
     def _dragged(self, event: events.SceneDragEventArguments) -> None:
         self._place([f"{1e3 * v:.0f} mm" for v in (event.x, event.y, event.z)])
 
     def _guess(self) -> None:
         """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
-        view = (_first(self._project.data()) or {}).get("view")
-        if self._view() is None or not isinstance(view, dict):
+        given = _first(self._project.data()) or {}
+        view = given.get("view")
+        guessed = self._view() is not None and isinstance(view, dict)
+        if not guessed and self._simulated is None:
             ui.label(
                 "This recipe has no first guess of the scanner's pose, so there is nothing to drag."
             )
             return
-        position = (view.get("guess") or {}).get("position") or ()
+        if guessed:
+            position = (view.get("guess") or {}).get("position") or ()
+        else:
+            position = [f"{1e3 * v:g} mm" for v in self._simulated.position]
         place = ui.input(
             "Where the scanner stands (x, y, z in the base)", value=", ".join(map(str, position))
         )
@@ -98,7 +117,8 @@ class Planner:
         ui.label("Drag the blue ball, or type: a tape measure is good enough.").classes(
             "text-caption"
         )
-        self._showing((view.get("shown") or {}).get("joints") or [])
+        if guessed:
+            self._showing((view.get("shown") or {}).get("joints") or [])
 
     def _showing(self, joints: list[list[Any]]) -> None:
         """Let the person show three poses that face the scanner, instead of guessing."""
@@ -114,14 +134,18 @@ class Planner:
 
     def _shown(self, text: str) -> None:
         rows = [[x.strip() for x in line.split(",")] for line in text.splitlines() if line.strip()]
-        self._set_view({"shown": {"joints": rows}})
+        self._write({"view": {"shown": {"joints": rows}}})
 
     def _place(self, position: list[str]) -> None:
-        view = (_first(self._project.data()) or {}).get("view") or {}
-        self._set_view({"guess": {**(view.get("guess") or {}), "position": position}})
+        given = _first(self._project.data()) or {}
+        if self._view() is None:
+            self._write({"camera": {**(given.get("camera") or {}), "position": position}})
+            return
+        guess = (given.get("view") or {}).get("guess") or {}
+        self._write({"view": {"guess": {**guess, "position": position}}})
 
-    def _set_view(self, view: dict[str, Any]) -> None:
-        self._project.write_step(self._recipe.steps[0].stage.name, {"view": view})
+    def _write(self, params: dict[str, Any]) -> None:
+        self._project.write_step(self._recipe.steps[0].stage.name, params)
         ui.navigate.reload()
 
     async def _plan(self) -> None:
@@ -129,11 +153,7 @@ class Planner:
         self._checked.clear()
         with self._checked:
             ui.spinner()
-        if self._recipe.steps[0].stage.name != "acquire.live":
-            text = "this recipe drives no arm: its poses come from its recordings or its simulation"
-        else:
-            words = ["run", self._project.recipe_path.name, "--json"]
-            text = await asyncio.to_thread(self._project.run_command, words)
+        text = await asyncio.to_thread(self._project.run_command, self._words)
         self._checked.clear()
         with self._checked:
             self._show(text)
@@ -146,7 +166,8 @@ class Planner:
         rows = plan.get("rows", [])
         if rows:
             stops = sum(row["id"] is not None for row in rows)
-            label = ui.label(f"{stops} poses, {plan['seconds']:.0f} s of motion")
+            motion = f", {plan['seconds']:.0f} s of motion" if plan["seconds"] else ""
+            label = ui.label(f"{stops} poses{motion}")
             label.classes("text-subtitle1").props('role="status"')
         ui.code(plan["text"], language="text").classes("w-full overflow-x-auto")
         for row in rows:

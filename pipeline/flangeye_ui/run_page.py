@@ -73,10 +73,12 @@ class Panel:
     def _pictures(self) -> None:
         self._scene = new_scene(600, 330, fps=5)
         self._scene.move_camera(0.0, -0.15, 0.25, 0, 0, 0.8, 0, -1, 0)
-        ui.label("Residual of each pose so far").classes("text-caption")
-        self._bars = ui.echart(residual_chart(None)).classes("w-full h-40")
-        ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")
-        self._map = ui.echart(place_chart({}, set())).classes("w-full h-48")
+        with ui.column().classes("w-full gap-1") as self._of_poses:
+            ui.label("Residual of each pose so far").classes("text-caption")
+            self._bars = ui.echart(residual_chart(None)).classes("w-full h-40")
+            ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")
+            self._map = ui.echart(place_chart({}, set())).classes("w-full h-48")
+        self._of_poses.set_visibility(False)
 
     def _words(self) -> list[str]:
         return [self._project.recipe_path.name, *(["--move"] if self._live else [])]
@@ -188,6 +190,7 @@ class Panel:
         self._pose.offer([*found.residuals, *found.set_aside, *sorted(run.set_aside)])
 
     def _draw(self, run: RunProcess) -> None:
+        self._of_poses.set_visibility(True)
         self._map.options.update(place_chart(run.places, run.set_aside))
         self._map.update()
         self._scene.clear()

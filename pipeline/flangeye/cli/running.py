@@ -76,7 +76,8 @@ Offline = Annotated[
     bool, typer.Option("--offline", help="Without --move: plan without connecting to the arm.")
 ]
 PlanAsJson = Annotated[
-    bool, typer.Option("--json", help="Without --move: print the plan of acquire.live as JSON.")
+    bool,
+    typer.Option("--json", help="Without --move: print the plan of the poses as JSON and stop."),
 ]
 Resume = Annotated[
     str | None,
@@ -122,10 +123,15 @@ def run(  # noqa: PLR0913  one for each option
     with ExitStack() as stack:
         earlier = stack.enter_context(archive_at(resume))
         checked, point = _recipe_of(recipe, (earlier, retake or ()), registry, overrides or ())
+        _refuse(
+            json_ and not checked.plans,
+            f"--json: {checked.steps[0].stage.name} plans no poses; acquire.live and "
+            "acquire.simulated do",
+        )
         point = point or _point(checked, source, at, leave_out or ())
         results = stack.enter_context(results_at(out))
         recordings = stack.enter_context(archive_at(archive))
-        start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline))
+        start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline, json_))
         folder = RunFolder.create(checked.name, results)
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, registry, folder, start)

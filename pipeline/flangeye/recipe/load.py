@@ -13,6 +13,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from flangeye import types as t
+from flangeye.devices import MotionAllowed
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
@@ -64,6 +65,11 @@ class Recipe:
         """What its first step reads; None where it simulates, or drives an arm."""
         path = getattr(self.steps[0].params, "path", None)
         return path if isinstance(path, Path) else None
+
+    @property
+    def plans(self) -> bool:
+        """Whether its first step plans poses of an arm, which can be shown without a run."""
+        return MotionAllowed in self.steps[0].stage.needs.values()
 
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""

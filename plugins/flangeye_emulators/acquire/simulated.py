@@ -12,12 +12,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
-from flangeye.errors import StageError
+from flangeye.devices import MotionAllowed
+from flangeye.errors import NothingMoved, StageError
 from flangeye.maths.geometry import invert
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange, Sphere, plate_of
-from flangeye.motion.planning import Plan, Site, poses_near
+from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
 from flangeye.motion.reach import Reach
 from flangeye.plugin.stage import BoundPart, Choose, stage
 from flangeye.types import (
@@ -46,6 +47,7 @@ from flangeye_emulators.world.raycast import Body, Image
 from flangeye_emulators.world.scanner import CameraPose, ScannerQuality, before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_emulators.world.time_of_flight import TimeOfFlight
+from flangeye_plugins.acquire.plan_rows import as_plan, left_out, row_at
 
 EPOCH_NS = 1_704_067_200_000_000_000
 """When simulated runs begin: 2024-01-01, 00:00 UTC."""
@@ -91,6 +93,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     scanner: ScannerModel,
     flange: Flange,
     seed: Seed,
+    motion: MotionAllowed,
     params: SimulatedParams,
     sphere: Sphere | None = None,
     stage_log: StageLog | None = None,
@@ -106,12 +109,14 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
         scanner: What looks at it.
         flange: What to look for; a robot that is asked for its wrist circle carries its own plate.
         seed: Decides poses, errors and noise.
+        motion: Whether only the plan is asked for.
         params: See :class:`SimulatedParams`.
         sphere: A calibration sphere on the flange, where the recipe's feature has one.
         stage_log: Hears what a plan that chooses its poses expects of the next one.
 
     Raises:
         StageError: Fewer than three poses are possible.
+        NothingMoved: Only the plan was asked for.
     """
     plate = flange if flange.bore else plate_of(robot)
     planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
@@ -122,10 +127,12 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     poses = list(plan.poses)
     _refuse_too_few(len(poses), plan.wanted, reach, robot, scanner)
     checks = _checks(plan, site, params.verification, _rng(checking))
+    if motion.plan_only:
+        raise _plan_alone(checks, poses, plan.wanted, reach, site)
     others = [] if params.arm.is_default else _unseen(plan, site, _rng(checking.spawn(1)[0]))
     of_arm, of_scanner = errors.spawn(2)
     arm = ImperfectArm(robot, params.robot_errors, _rng(of_arm), params.arm)
-    visited = np.array([*checks, *(pose.joints for pose in poses), *others])
+    visited = np.array([*(pose.joints for pose in [*checks, *poses]), *others])
     angles, count = arm.angles(visited), len(checks) + len(poses)
     session = _Session(
         Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera, arm,
@@ -174,15 +181,33 @@ def _refuse_too_few(
     )
 
 
-def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[Floats]:
-    """Return joints for the captures that verify, near the middle of the workspace."""
+def _plan_alone(
+    checks: Sequence[PlannedPose],
+    poses: Sequence[PlannedPose],
+    wanted: int,
+    reach: Reach,
+    site: Site,
+) -> NothingMoved:
+    """Return the plan that is shown instead of a session."""
+    roles = [*(["verification"] * len(checks)), *(["calibration"] * len(poses))]
+    stops = [*checks, *poses]
+    rows = [
+        row_at(f"{i:04d}", role, pose, site.eye)
+        for i, (role, pose) in enumerate(zip(roles, stops, strict=True))
+    ]
+    head = f"{len(stops)} stops of a simulated arm, {wanted} requested; paths are not simulated"
+    return NothingMoved(*as_plan(head, rows, left_out(reach.refusals, stops)))
+
+
+def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[PlannedPose]:
+    """Return poses for the captures that verify, near the middle of the workspace."""
     found = poses_near(plan.centre, count, site, rng)
     if len(found) < count:
         raise StageError(
             f"acquire.simulated: no pose for verification near the middle of the workspace "
             f"({in_mm(plan.centre)}); move the plan's centre, or set verification: 0"
         )
-    return [pose.joints for pose in found]
+    return found
 
 
 def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:

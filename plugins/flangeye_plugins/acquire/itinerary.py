@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import angle_between
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange
@@ -21,11 +18,10 @@ from flangeye.motion.route import Barred, Route, Router
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, Role
 from flangeye.units import in_mm
+from flangeye_plugins.acquire.plan_rows import PlanRow, as_plan, left_out, row_at, seconds_of
 
 FEWEST = 3
 """Poses without which no camera pose can be found."""
-LISTED = 12
-"""Places left out of a plan that are listed, at most."""
 
 
 class Stop(NamedTuple):
@@ -40,39 +36,6 @@ class Stop(NamedTuple):
     id: str
     role: Role
     pose: PlannedPose
-
-
-@dataclass(frozen=True)
-class PlanRow:
-    """A line of the plan that is shown without motion; fields as in its JSON.
-
-    Attributes:
-        id: Identifier of the capture; None where no pose is possible.
-        role: What it is for: verification, calibration, or ``left out``.
-        place: Of the flange in ``base`` [m].
-        tilt: Of the flange against the line of sight [rad].
-        path: ``direct`` or ``by home``; None where nobody knows, or there is none.
-        seconds: What the motion takes [s].
-        why_not: Why the arm cannot get there.
-    """
-
-    id: str | None
-    role: str
-    place: list[float]
-    tilt: float | None = None
-    path: str | None = None
-    seconds: float = 0.0
-    why_not: str | None = None
-
-    def line(self) -> str:
-        """Return it for people."""
-        place = _row_mm(self.place)
-        if self.id is None or self.tilt is None:
-            return f"{'-':4}  {self.role:12}  {place}           {self.why_not}"
-        way = f"barred: {self.why_not}" if self.why_not else "not known"
-        if self.path:
-            way = f"{self.path:8}  {self.seconds:4.1f} s"
-        return f"{self.id}  {self.role:12}  {place}  {np.degrees(self.tilt):3.0f} deg  {way}"
 
 
 class Itinerary:
@@ -162,32 +125,11 @@ class Itinerary:
             rows.append(self._row(stop, way))
             if not isinstance(way, Barred):
                 here = stop.pose.joints
-        seconds = sum(row.seconds for row in rows)
-        left_out = self._left_out(stops)
-        more = len(left_out) - LISTED
-        text = "\n".join([
-            f"{len(stops)} stops, {seconds:.0f} s of motion; {self._plan.wanted} were requested "
-            f"({self.why_not()} left out)",
-            "stop  for           flange at (mm, base)    tilt  path      time",
-            *(row.line() for row in rows + left_out[:LISTED]),
-            *([f"and {more} more places"] if more > 0 else []),
-        ])  # fmt: skip
-        return text, {"seconds": seconds, "rows": [asdict(row) for row in rows + left_out]}
-
-    def _left_out(self, stops: Sequence[Stop]) -> list[PlanRow]:
-        """Return a row for each place at which no pose is possible, a few of every reason first."""
-        reasons = defaultdict[tuple[float, ...], Counter[str]](Counter)
-        for refusal in self._reach.refusals:
-            reasons[_place(refusal.place)][refusal.reason] += 1
-        for stop in stops:
-            reasons.pop(_place(stop.pose.base_T_flange[:3, 3]), None)
-        rows, nth = [], Counter[str]()
-        for place, counts in reasons.items():
-            ((why, _),) = counts.most_common(1)
-            nth[why] += 1
-            rows.append((nth[why], PlanRow(None, "left out", list(place), why_not=why)))
-        rows.sort(key=lambda row: row[0])
-        return [row for _, row in rows]
+        head = (
+            f"{len(stops)} stops, {seconds_of(rows):.0f} s of motion; {self._plan.wanted} were "
+            f"requested ({self.why_not()} left out)"
+        )
+        return as_plan(head, rows, left_out(self._reach.refusals, (stop.pose for stop in stops)))
 
     def require_enough(self, found: int) -> None:
         """Refuse a plan of fewer than three poses.
@@ -203,12 +145,12 @@ class Itinerary:
             )
 
     def _row(self, stop: Stop, way: Route | Barred | None) -> PlanRow:
-        pose = stop.pose.base_T_flange
-        tilt = float(angle_between(pose[:3, 2], self._site.eye - pose[:3, 3]))
-        row = partial(PlanRow, stop.id, stop.role, list(_place(pose[:3, 3])), tilt)
+        row = row_at(stop.id, stop.role, stop.pose, self._site.eye)
         if isinstance(way, Barred):
-            return row(why_not=way.reason)
-        return row("by home" if way.via else "direct", way.seconds) if way else row()
+            return replace(row, why_not=way.reason)
+        if way is None:
+            return row
+        return replace(row, path="by home" if way.via else "direct", seconds=way.seconds)
 
     def _lost(self) -> set[int]:
         """Return the places in the plan of poses that told nothing."""
@@ -246,12 +188,3 @@ def itinerary_of(
             f"{in_mm(centre)} ({reasons}); correct the view, or widen robot.limits"
         )
     return Itinerary(reach, base_T_camera, scanner, Router(robot, margins.limits, reach.home))
-
-
-def _place(point: Floats) -> tuple[float, ...]:
-    """Return a point [m] to 0.1 mm, by which the plan tells places apart."""
-    return tuple(round(float(x), 4) + 0.0 for x in point)
-
-
-def _row_mm(place: Sequence[float]) -> str:
-    return " ".join(f"{1e3 * x:7.1f}" for x in place)
