@@ -8,7 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.handeye.drift import DriftTest, Information, blame, information_of, suspects, verdict
+from flangeye.handeye.drift import (
+    DriftTest,
+    Information,
+    Prior,
+    blame,
+    information_of,
+    suspects,
+    verdict,
+)
 from flangeye_emulators.world.year import (
     ABOUT,
     CORNERS,
@@ -78,7 +86,10 @@ def first_alarm(watched: Watched, begin: int) -> int | None:
     for n in range(begin + 1, len(told.matrix) + 1):
         if (
             verdict(
-                Information(told.matrix[:n], told.vector[:n]), watched.prior, CORNERS, TEST
+                Information(told.matrix[:n], told.vector[:n]),
+                Prior(Information.of_covariance(watched.prior)),
+                CORNERS,
+                TEST,
             ).state
             != "OK"
         ):
@@ -95,7 +106,10 @@ def false_alarms(years: int) -> tuple[int, int]:
         for n in range(1, len(told.matrix) + 1):
             ok = (
                 verdict(
-                    Information(told.matrix[:n], told.vector[:n]), watched.prior, CORNERS, TEST
+                    Information(told.matrix[:n], told.vector[:n]),
+                    Prior(Information.of_covariance(watched.prior)),
+                    CORNERS,
+                    TEST,
                 ).state
                 == "OK"
             )
@@ -122,7 +136,7 @@ def _blamed(watched: Watched, first: int) -> str:
     told = information_of(watched.sightings, TEST.daily)
     since = verdict(
         Information(told.matrix[: first + 1], told.vector[: first + 1]),
-        watched.prior,
+        Prior(Information.of_covariance(watched.prior)),
         CORNERS,
         TEST,
     ).since

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.handeye.drift import DriftTest, Information, allowance, information_of, verdict
+from flangeye.handeye.drift import DriftTest, Information, Prior, allowance, information_of, verdict
 from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
 from tools import drift_year
 
@@ -36,7 +36,12 @@ def test_a_cell_that_only_warms_and_cools_is_ok() -> None:
     told = information_of(watched.sightings, DriftTest().daily)
     for n in range(1, 91):
         seen = Information(told.matrix[:n], told.vector[:n])
-        assert verdict(seen, watched.prior, CORNERS, DriftTest()).state == "OK"
+        assert (
+            verdict(
+                seen, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest()
+            ).state
+            == "OK"
+        )
 
 
 def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
@@ -52,7 +57,7 @@ def test_a_joint_re_mastered_is_named() -> None:
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))
     watched = watch(Year(checks=46), Happening(joints=wrong), np.random.default_rng(3))
     told = information_of(watched.sightings, DriftTest().daily)
-    found = verdict(told, watched.prior, CORNERS, DriftTest())
+    found = verdict(told, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest())
     assert found.state == "MOVED" and found.since is not None
     before = Information.of_covariance(watched.prior).plus(told.summed(10, 40))
     parts = blame(before, watched.sightings.of(40, 46), ABOUT, watched.scanner, 3e-5)

@@ -5,14 +5,19 @@ carries to :math:`b` and the camera sees at :math:`c`, the residual
 :math:`r = T c - b = -J \xi + \varepsilon`. Each *check* is one to a few such sightings, reduced to
 an information matrix :math:`H` and a vector :math:`g = -\sum J^\top W r`. What the cell does with
 the hours of the day is one more unknown of each check, with a known variance, and marginalised.
+What the arm does wrong alike at every visit (:mod:`flangeye.handeye.pose_error`) is one unknown
+of all checks and of the calibration: its weights stand behind :math:`\xi` in one vector :math:`z`.
 
-**Steps.** The last :math:`w` checks are held against those before, which start from the
-calibration and its covariance. With :math:`\hat\xi` and :math:`C` from before,
-:math:`s = \sum g - \sum H \hat\xi` has covariance :math:`\sum H + \sum H C \sum H` while nothing
-moved, and :math:`s^\top \mathrm{cov}^{+} s` is the generalised likelihood ratio of a step
-(Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold is the quantile of an F
-distribution, for the scatter is learned from the checks before, at the false-alarm rate divided by
-the number of windows: by Bonferroni's inequality no more false alarms come a check.
+**Steps.** The last :math:`w` checks, with :math:`H` and :math:`g`, are held against those before,
+which start from the calibration's own sightings and tell :math:`z = m` with information
+:math:`B`. A motion of the camera between them has the information and the score
+
+.. math:: I = P^\top (H - H (H + B)^{-1} H) P, \quad s = P^\top (1 - H (H + B)^{-1}) (g - H m)
+
+where :math:`P` takes the motion's six, and :math:`s^\top I^{+} s` is the generalised likelihood
+ratio of a step (Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold is the
+quantile of an F distribution, for the scatter is learned from the checks before, at the false-alarm
+rate divided by the number of windows: by Bonferroni's inequality no more false alarms come a check.
 
 **Slow drift.** The mean of the last checks is held against the calibration with the first checks;
 what counts is how far it surely moves a point of the work.
@@ -35,6 +40,8 @@ from flangeye.types import Floats
 
 NO_NORMAL = 1.0
 """Variance [rad^2] of a tilt that was not measured: it tells nothing."""
+MISFIT = 1e-6
+"""How unlikely one sighting is that is a misfit, while nothing moved."""
 SURE = 1.64
 """Standard deviations: a drift counts when it is larger than its limit with 95 %."""
 LEVER = 0.5
@@ -47,8 +54,9 @@ class Sightings:
 
     Attributes:
         residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
-        effects: (N, 5, 6) their derivative by a motion of the camera about ``about``.
-        covariances: (N, 5, 5) with nothing moved, the scan's and the arm's.
+        effects: (N, 5, 6 + K) their derivative by a motion of the camera about ``about``, then by
+            K weights of the arm's error, which are the same at every check.
+        covariances: (N, 5, 5) with nothing moved, the scan's and the arm's beyond those weights.
         flanges: (N, 3, 3) base_R_flange.
         joints: (N, 5, n) their derivative by the arm's joints; None where those are not known.
         check: (N,) which check each belongs to, from 0, in order.
@@ -117,20 +125,27 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What checks tell of the camera's motion, in information form.
+    """What checks tell of the camera's motion and of the arm, in information form.
 
     Attributes:
-        matrix: (..., 6, 6).
-        vector: (..., 6).
+        matrix: (..., 6 + K, 6 + K).
+        vector: (..., 6 + K).
     """
 
     matrix: Floats
     vector: Floats
 
     @classmethod
-    def of_covariance(cls, covariance: Floats) -> Information:
-        """Return what a motion of zero, known with a (6, 6) covariance, tells."""
-        return cls(np.asarray(np.linalg.inv(covariance)), np.zeros(6))
+    def of_covariance(cls, covariance: Floats, mean: Floats | float = 0.0) -> Information:
+        """Return what a mean (D,) known with a (D, D) covariance tells."""
+        matrix = np.asarray(np.linalg.inv(covariance))
+        return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
+
+    def loosened(self, deviation: float) -> Information:
+        """Return the same after a motion of the camera by ``deviation`` [m]; see ``allowance``."""
+        covariance = self.covariance
+        covariance[:6, :6] += allowance(deviation)
+        return Information.of_covariance(covariance, self.mean)
 
     def summed(self, first: int, last: int) -> Information:
         """Return what the checks from ``first`` up to ``last`` tell together."""
@@ -142,12 +157,12 @@ class Information:
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6)."""
+        """(6 + K, 6 + K)."""
         return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
 
     @property
     def mean(self) -> Floats:
-        """(6,) the motion."""
+        """(6 + K,) the motion, and the weights."""
         return np.asarray(self.covariance @ self.vector)
 
 
@@ -156,30 +171,63 @@ def allowance(deviation: float) -> Floats:
     return np.diag([(deviation / LEVER) ** 2] * 3 + [deviation**2] * 3)
 
 
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the first check.
+
+    Attributes:
+        told: By the calibration, of the camera's motion since and of the arm's error.
+        freedom: Degrees of freedom from which the size of the arm's error is known.
+    """
+
+    told: Information
+    freedom: float = np.inf
+
+
 def information_of(sightings: Sightings, daily: float) -> Information:
     """Return what each check tells, its share of the day's motion marginalised."""
+    told = _unmarginalised(sightings)
+    motions = told.matrix[:, :, :6]
+    taken = motions @ np.linalg.inv(motions[:, :6] + np.linalg.inv(allowance(daily)))
+    matrix = told.matrix - taken @ told.matrix[:, :6]
+    return Information(matrix, told.vector - (taken @ told.vector[:, :6, None])[..., 0])
+
+
+def _unmarginalised(sightings: Sightings) -> Information:
     weights = np.linalg.inv(sightings.covariances)
     weighted = sightings.effects.transpose(0, 2, 1) @ weights
     matrices, vectors = weighted @ sightings.effects, -(weighted @ sightings.residuals[..., None])
     count = int(sightings.check.max()) + 1 if len(sightings.check) else 0
-    matrix, vector = np.zeros((count, 6, 6)), np.zeros((count, 6, 1))
+    matrix, vector = np.zeros((count, *matrices.shape[1:])), np.zeros((count, *vectors.shape[1:]))
     np.add.at(matrix, sightings.check, matrices)
     np.add.at(vector, sightings.check, vectors)
-    taken = matrix @ np.linalg.inv(matrix + np.linalg.inv(allowance(daily)))
-    return Information(matrix - taken @ matrix, (vector - taken @ vector)[..., 0])
+    return Information(matrix, vector[..., 0])
 
 
-def verdict(checks: Information, prior: Floats, corners: Floats, test: DriftTest) -> Verdict:
+def prior_of(sightings: Sightings, variances: Floats) -> Prior:
+    """Return what a calibration's own sightings tell, all of one check.
+
+    Args:
+        sightings: With the calibration's scans and the arm's noise in their covariances.
+        variances: (6 + K,) before them, of the camera's motion and of the arm's weights.
+    """
+    told = _unmarginalised(sightings).summed(0, 1)
+    start = Information.of_covariance(np.diag(variances))
+    tilts = np.count_nonzero(sightings.covariances[:, 3, 3] < NO_NORMAL)
+    return Prior(start.plus(told), max(3.0 * len(sightings.check) + 2.0 * tilts - 6.0, 1.0))
+
+
+def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest) -> Verdict:
     """Judge the last of the checks; every change found is its first.
 
     Args:
         checks: The n checks in order.
-        prior: (6, 6) covariance of the calibration about ``about``.
+        prior: What the calibration tells.
         corners: (8, 3) of the work, from ``about`` [m].
         test: How it is set.
     """
     n = len(checks.matrix)
-    start = Information.of_covariance(prior + allowance(test.seasonal))
+    start = Prior(prior.told.loosened(test.seasonal), prior.freedom)
     found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
     if found[0] > 1.0:
         return moved_since(checks, prior, corners, test, found[1], found[0])
@@ -192,14 +240,25 @@ def verdict(checks: Information, prior: Floats, corners: Floats, test: DriftTest
 
 
 def moved_since(
-    checks: Information, prior: Floats, corners: Floats, test: DriftTest, since: int, ratio: float
+    checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
 ) -> Verdict:
     """Return how far the camera is from where it was before check ``since``."""
-    start = Information.of_covariance(prior + allowance(test.seasonal))
+    start = prior.told.loosened(test.seasonal)
     before = start.plus(checks.summed(max(since - test.reference, 0), since))
-    after = checks.summed(since, len(checks.matrix))
-    motion, covariance = after.mean - before.mean, after.covariance + before.covariance
-    return Verdict("MOVED", motion, covariance, largest_shift(motion, corners), since, ratio)
+    change = _change(checks.summed(since, len(checks.matrix)), before)
+    shift = largest_shift(change.mean, corners)
+    return Verdict("MOVED", change.mean, change.covariance, shift, since, ratio)
+
+
+def misfits(sightings: Sightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
+    """Return which of N sightings (N,) cannot be, by themselves, while nothing moved."""
+    effects = sightings.effects
+    spread = effects @ before.covariance @ effects.transpose(0, 2, 1) + sightings.covariances
+    motions = effects[..., :6]
+    spread += motions @ allowance(test.daily) @ motions.transpose(0, 2, 1)
+    left = sightings.residuals + effects @ before.mean
+    squares = np.einsum("ni,ni->n", left, np.linalg.solve(spread, left[..., None])[..., 0])
+    return np.asarray(squares > chi2_quantile(1 - MISFIT, 5))
 
 
 def largest_shift(motion: Floats, corners: Floats) -> float:
@@ -221,53 +280,68 @@ def _windows(n: int, test: DriftTest) -> range:
     return range(1, min(test.window, n) + 1)
 
 
-def _step(
-    checks: Information, start: Information, first: int, test: DriftTest
-) -> tuple[float, int]:
+def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tuple[float, int]:
     """Return the likelihood ratio of a step at check ``first``, over its threshold; and it."""
     low = max(first - test.reference, 0)
-    before, after = start.plus(checks.summed(low, first)), checks.summed(first, len(checks.matrix))
-    statistic, rank = (x.item() for x in _surprise(after, before))
-    scale, freedom = _scatter(checks, low, first)
+    before = start.told.plus(checks.summed(low, first))
+    after = checks.summed(first, len(checks.matrix))
+    statistic, rank = (x.item() for x in _surprise(_change(after, before)))
+    scale, freedom = _scatter(checks, before, (low, first), start.freedom)
     rate = test.false_alarms / test.window
     limit = rank * scale * f_quantile(1 - rate, int(rank), freedom) if rank else np.inf
     return statistic / limit, first
 
 
-def _surprise(after: Information, before: Information) -> tuple[Floats, Floats]:
-    """Return the squared distances (...) of what came after from what was before, and ranks."""
+def _change(after: Information, before: Information) -> Information:
+    """Return what is told of a motion (..., 6) between what came before and what came after."""
+    taken = after.matrix @ np.linalg.inv(after.matrix + before.matrix)
     left = after.vector - after.matrix @ before.mean
-    values, axes = np.linalg.eigh(after.matrix + after.matrix @ before.covariance @ after.matrix)
+    score = left - (taken @ left[..., None])[..., 0]
+    told = after.matrix - taken @ after.matrix
+    return Information(told[..., :6, :6], score[..., :6])
+
+
+def _surprise(change: Information) -> tuple[Floats, Floats]:
+    """Return the squared distances (...) of a motion from none, and ranks."""
+    values, axes = np.linalg.eigh(change.matrix)
     seen = values > 1e-9 * values[..., -1:]
-    along = (np.swapaxes(axes, -1, -2) @ left[..., None])[..., 0]
+    along = (np.swapaxes(axes, -1, -2) @ change.vector[..., None])[..., 0]
     squares = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0)
     return squares.sum(-1), seen.sum(-1)
 
 
-def _scatter(checks: Information, low: int, high: int, fewest: int = 10) -> tuple[float, float]:
+def _scatter(
+    checks: Information,
+    before: Information,
+    span: tuple[int, int],
+    freedom: float,
+    fewest: int = 10,
+) -> tuple[float, float]:
     """Return by what factor checks scatter more than they say, and its degrees of freedom.
 
-    The median, so that one bad check does not hide the next; never below a quarter.
+    The median, so that one bad check does not hide the next; never below a quarter. Of few checks
+    nobody knows it, and the freedom is the calibration's.
     """
-    n = high - low
+    n = span[1] - span[0]
     if n < fewest:
-        return 1.0, np.inf
-    own = Information(checks.matrix[low:high], checks.vector[low:high])
-    squares, ranks = _surprise(own, checks.summed(low, high))
+        return 1.0, freedom
+    own = Information(checks.matrix[slice(*span)], checks.vector[slice(*span)])
+    squares, ranks = _surprise(_change(own, before))
     typical = [chi2_quantile(0.5, int(rank)) for rank in ranks]
     return max(float(np.median(squares / typical)), 0.25), 0.4 * float(ranks.mean()) * n
 
 
-def _slow(checks: Information, prior: Floats, test: DriftTest) -> tuple[Floats, Floats]:
+def _slow(checks: Information, prior: Prior, test: DriftTest) -> tuple[Floats, Floats]:
     """Return the motion from the calibration and the first checks to the last ones."""
     n = len(checks.matrix)
-    start = Information.of_covariance(prior)
-    first = start.plus(checks.summed(0, min(test.settled, max(n - test.settled, 0))))
-    last = start if n < test.settled else checks.summed(n - test.settled, n)
-    return last.mean - first.mean, last.covariance + first.covariance
+    if n < test.settled:
+        return np.zeros(6), prior.told.covariance[:6, :6]
+    first = prior.told.plus(checks.summed(0, min(test.settled, n - test.settled)))
+    change = _change(checks.summed(n - test.settled, n), first)
+    return change.mean, change.covariance
 
 
-def _began(checks: Information, corners: Floats, prior: Floats, test: DriftTest) -> int:
+def _began(checks: Information, corners: Floats, prior: Prior, test: DriftTest) -> int:
     """Return the check at which a slow drift had gone a quarter of its limit, for good."""
     shifts = []
     for n in range(test.settled, len(checks.matrix) + 1):
@@ -316,7 +390,7 @@ def suspects(parts: Mapping[str, float]) -> list[tuple[str, float]]:
 
 def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tuple[Floats, Floats]]:
     n = len(after.residuals)
-    at_scanner = -after.effects @ adjoint_shift(about - scanner)
+    at_scanner = -after.effects[..., :6] @ adjoint_shift(about - scanner)
     tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
     moved = at_scanner.reshape(5 * n, 6)
     found = {
@@ -338,10 +412,10 @@ def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tupl
 def _noise(before: Information, after: Sightings, daily: float) -> Floats:
     """Return the (5N, 5N) covariance of the residuals without a change."""
     n = len(after.residuals)
-    stacked = after.effects.reshape(5 * n, 6)
+    stacked = after.effects.reshape(5 * n, -1)
     out = stacked @ before.covariance @ stacked.T
     same = np.repeat(after.check, 5)[:, None] == np.repeat(after.check, 5)
-    out += same * (stacked @ allowance(daily) @ stacked.T)
+    out += same * (stacked[:, :6] @ allowance(daily) @ stacked[:, :6].T)
     for i, own in enumerate(after.covariances):
         out[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] += own
     return np.asarray(out)

@@ -17,7 +17,7 @@ STATIONS = [_pose(np.random.default_rng(k)) for k in (11, 12, 13)]
 def calibrate(folder: Path) -> Path:
     """Record a calibration and return its folder."""
     folder.mkdir()
-    scripted(Script(points=50, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
+    scripted(Script(points=400, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
     return folder
 
 

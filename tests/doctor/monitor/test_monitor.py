@@ -73,7 +73,7 @@ def test_a_slow_drift_is_degraded(cell: Path, tmp_path: Path) -> None:
     names = []
     for i in range(60):
         names.append(f"slow-{i}")
-        check(cell / names[-1], seed=200 + i, shift=(3.3e-6 * i, 0.0, 0.0))
+        check(cell / names[-1], seed=200 + i, shift=(2.7e-6 * i, 0.0, 0.0))
     options = ("--limit", "0.16 mm", "--false-alarms", "1e-9")
     done = monitor(cell, tmp_path / "h.parquet", *names, options=options)
     states = [json.loads(line)["state"] for line in done.stdout.splitlines()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.handeye.drift import Sightings, sightings_of
+from flangeye.handeye.drift import Prior, Sightings, prior_of, sightings_of
+from flangeye.handeye.pose_error import FREE, PoseError, pose_error_of
 from flangeye.log.read import RunLog, read_run
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import corners_of, excess_variance
+from flangeye.maths.statistics import corners_of
 from flangeye.models.loading import load_model
 from flangeye.models.workspace import workspace_of
 from flangeye.types import Floats
-
-FINEST_TILT = np.radians(0.01)
-"""No flange's normal is better known than this [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,35 +72,37 @@ class StoredCalibration:
         return corners_of(box.centre, box.size) - self.estimate.about
 
     @cached_property
-    def noise(self) -> tuple[float, float]:
-        """Variances of arm and surface beyond the scans' own: of a place [m^2], a tilt [rad^2]."""
-        used = [p for p in self.calibration.pairs if p.used]
-        turn = self.estimate.transform.rotation
-        own = np.array([turn @ p.observation.circle.covariance @ turn.T for p in used])
-        beyond = excess_variance(np.array([p.residual for p in used]), own)
-        measured = self.sightings(
-            [p.observation for p in used], np.zeros(len(used), dtype=np.intp), (0.0, 0.0)
-        )
-        tilts, known = measured.residuals[:, 3:], measured.covariances[:, 3:, 3:]
-        seen = known[:, 0, 0] < 0.5
-        spare = (
-            np.mean(tilts[seen] ** 2) - np.mean(known[seen][:, [0, 1], [0, 1]]) if seen.any() else 0
-        )
-        return beyond, max(float(spare), FINEST_TILT**2)
+    def _used(self) -> list[t.Observation]:
+        return [pair.observation for pair in self.calibration.pairs if pair.used]
 
-    def sightings(
-        self,
-        seen: Sequence[t.Observation],
-        check: NDArray[np.intp],
-        noise: tuple[float, float] | None = None,
-    ) -> Sightings:
+    @cached_property
+    def pose_error(self) -> PoseError:
+        """How wrong the arm's poses are, by this calibration's residuals."""
+        bare, circles = self._bare(self._used, _one_check(self._used))
+        return pose_error_of(bare.residuals, bare.effects, bare.covariances, circles)
+
+    @cached_property
+    def prior(self) -> Prior:
+        """What this calibration tells of later sightings; its own are held against it as well."""
+        variances = np.concatenate([FREE, self.pose_error.variances])
+        return prior_of(self.sightings(self._used, _one_check(self._used)), variances)
+
+    def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> Sightings:
         """Return sightings of the flange, held against this calibration.
 
         Args:
             seen: The N sightings.
             check: (N,) which check each belongs to.
-            noise: See :attr:`noise`; by default that.
         """
+        bare, circles = self._bare(seen, check)
+        effects = np.concatenate([bare.effects, self.pose_error.effects(circles)], axis=2)
+        covariances = bare.covariances + self.pose_error.beyond
+        return replace(bare, effects=effects, covariances=covariances)
+
+    def _bare(
+        self, seen: Sequence[t.Observation], check: NDArray[np.intp]
+    ) -> tuple[Sightings, Floats]:
+        """Return sightings with the scans' noise alone, and (N, 4, 4) expected circles."""
         correction = self.calibration.as_reported().correction
         expected = np.array(
             [corrected_flange(o.base_T_flange.matrix, o.joints, correction, self.arm) for o in seen]
@@ -113,12 +113,13 @@ class StoredCalibration:
         expected[:, :3, 3] += levers
         circles = [o.circle for o in seen]
         normals = [np.full(3, np.nan) if c.normal is None else c.normal for c in circles]
-        own = _covariances(self.estimate.transform.rotation, circles, expected, noise or self.noise)
-        return sightings_of(
+        bare = sightings_of(
             self.estimate.transform.matrix, self.estimate.about,
-            np.array([c.centre for c in circles]), np.array(normals), own, expected,
+            np.array([c.centre for c in circles]), np.array(normals),
+            _covariances(self.estimate.transform.rotation, circles, expected), expected,
             self._jacobians(seen, levers), check,
         )  # fmt: skip
+        return bare, expected
 
     def _jacobians(self, seen: Sequence[t.Observation], levers: Floats) -> Floats | None:
         """Return (N, 6, n) of the circles' centres, where every joint angle is known."""
@@ -148,16 +149,16 @@ def stored_calibration(path: Path) -> StoredCalibration:
     return StoredCalibration(log.path, log, calibration)
 
 
-def _covariances(
-    turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats, noise: tuple[float, float]
-) -> Floats:
-    """Return (N, 5, 5) of centres and tilts in the base, arm included."""
+def _covariances(turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats) -> Floats:
+    """Return (N, 5, 5) of centres and tilts in the base, the scans' own."""
     out = np.zeros((len(circles), 5, 5))
     for own, circle, frame in zip(out, circles, expected, strict=True):
-        own[:3, :3] = turn @ circle.covariance @ turn.T + (noise[0] + 1e-12) * np.eye(3)
+        own[:3, :3] = turn @ circle.covariance @ turn.T
         if circle.normal_covariance is not None:
             across = frame[:3, :2].T @ turn
-            own[3:, 3:] = across @ circle.normal_covariance @ across.T + (
-                noise[1] + 1e-12
-            ) * np.eye(2)
+            own[3:, 3:] = across @ circle.normal_covariance @ across.T
     return out
+
+
+def _one_check(seen: Sequence[t.Observation]) -> NDArray[np.intp]:
+    return np.zeros(len(seen), dtype=np.intp)

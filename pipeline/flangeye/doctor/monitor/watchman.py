@@ -31,7 +31,7 @@ def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Findi
     sightings = stored.sightings(*history.sightings())
     checks = information_of(sightings, test.daily)
     earlier = history.findings[-1] if history.findings else None
-    prior, corners = stored.estimate.covariance, stored.corners
+    prior, corners = stored.prior, stored.corners
     if earlier and earlier.state == "MOVED" and earlier.since is not None:
         found = moved_since(checks, prior, corners, test, earlier.since, earlier.statistic)
     else:
@@ -54,7 +54,7 @@ def _blamed(
     if found.since is None:
         return "", 0.0
     n = len(checks.matrix)
-    before = Information.of_covariance(stored.estimate.covariance).plus(
+    before = stored.prior.told.plus(
         checks.summed(max(found.since - test.reference, 0), found.since)
     )
     scanner = stored.estimate.transform.translation

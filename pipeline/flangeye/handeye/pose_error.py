@@ -1,0 +1,132 @@
+r"""How wrong an arm's poses are over its workspace, as one calibration tells it. Arrays only.
+
+An arm's joint zeros, lengths and encoders make errors that repeat: the same pose is wrong by the
+same, a pose nearby by nearly the same. So the error of a pose is a sum over few smooth functions of
+place and orientation, with weights :math:`w`, and independent noise beyond:
+
+.. math:: e(u) = \sum_k f_k(u) w_k + \varepsilon, \quad w_k \sim N(0, s^2), \quad
+    \varepsilon \sim N(0, n^2)
+
+with the features of :mod:`flangeye.maths.smooth_field`, to second order in place and first in
+orientation. The sizes :math:`s` and :math:`n`, of places and of tilts, are those that make the
+calibration's residuals likeliest while the camera is free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from flangeye.maths.geometry import hat, nearest_rotation, rotation_log
+from flangeye.maths.smooth_field import RADII, features
+from flangeye.types import Floats
+
+POWERS = tuple(
+    place + turn
+    for place in product(range(3), repeat=3)
+    for turn in product(range(2), repeat=3)
+    if sum(place) + 2 * sum(turn) <= 2
+)
+SHORTEST, NARROWEST = 0.05, 0.3
+"""An arm's error hardly changes over less: [m] and [rad]."""
+SMALLEST, LARGEST = 1e-6, 1e-2
+"""Sizes of errors that are tried: [m] and [rad]."""
+MOST_POSES = 60
+"""Poses from which the sizes are found; more tell them hardly better."""
+FREE = np.ones(6)
+"""Variances of a camera's motion that nothing is known of: [rad^2] and [m^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """The errors of an arm's poses, with their sizes.
+
+    Attributes:
+        middle: (4, 4) pose about which they are smooth.
+        lengths: (6,) over which they change: of place [m], then of orientation [rad].
+        smooth: Standard deviations of the weights, of a place [m] and of an orientation [rad].
+        noise: Standard deviations beyond, of a centre [m] and of a tilt [rad].
+    """
+
+    middle: Floats
+    lengths: Floats
+    smooth: tuple[float, float]
+    noise: tuple[float, float]
+
+    def effects(self, poses: Floats) -> Floats:
+        """Return (N, 5, K): how weights move the centre and tilt the normal of (N, 4, 4)."""
+        place = poses[:, :3, 3] - self.middle[:3, 3]
+        turn = rotation_log(poses[:, :3, :3] @ self.middle[:3, :3].T)
+        of_pose = features(np.concatenate([place, turn], axis=1) / self.lengths, POWERS)
+        spread = (of_pose[:, None, :, None] * np.eye(3)[:, None, :]).reshape(len(poses), 3, -1)
+        across = poses[:, :3, :2].transpose(0, 2, 1)
+        tilts = across @ -hat(poses[:, :3, 2]) @ spread
+        k = spread.shape[2]
+        out = np.zeros((len(poses), 5, 2 * k))
+        out[:, :3, :k], out[:, 3:, k:] = spread, tilts
+        return out
+
+    @property
+    def variances(self) -> Floats:
+        """(K,) of the weights."""
+        return np.repeat(np.square(self.smooth), 3 * len(POWERS))
+
+    @property
+    def beyond(self) -> Floats:
+        """(5, 5) covariance of the noise."""
+        return np.diag(np.repeat(np.square(self.noise), (3, 2)))
+
+
+def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats) -> PoseError:
+    """Return the error of an arm from a calibration's N residuals.
+
+    Args:
+        residuals: (N, 5) of centre [m] and tilt [rad].
+        effects: (N, 5, 6) their derivative by a motion of the camera, which is free.
+        own: (N, 5, 5) covariances of the scans alone.
+        poses: (N, 4, 4) of the circle in ``base``.
+    """
+    chosen = np.unique(np.linspace(0, len(poses) - 1, MOST_POSES).astype(int))
+    bare = _unsized(poses)
+    design = np.concatenate([effects, bare.effects(poses)], axis=2)[chosen]
+    seen = residuals[chosen], own[chosen]
+
+    def unlikelihood(logs: Floats) -> float:
+        return _unlikelihood(design, *seen, _sized(bare, logs))
+
+    from scipy.optimize import minimize
+
+    bounds = [(np.log(SMALLEST), np.log(LARGEST))] * 4
+    start = np.log([1e-4, 1e-4, 1e-4, 1e-4])
+    best = minimize(unlikelihood, start, method="L-BFGS-B", bounds=bounds)
+    return _sized(bare, best.x)
+
+
+def _unsized(poses: Floats) -> PoseError:
+    middle = np.eye(4)
+    middle[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    middle[:3, :3] = nearest_rotation(poses[:, :3, :3].mean(axis=0))
+    radius = np.linalg.norm(poses[:, :3, 3] - middle[:3, 3], axis=1).max()
+    angle = np.linalg.norm(rotation_log(poses[:, :3, :3] @ middle[:3, :3].T), axis=1).max()
+    lengths = RADII * np.array([max(radius, SHORTEST), max(angle, NARROWEST)])
+    return PoseError(middle, np.repeat(lengths, 3), (0.0, 0.0), (0.0, 0.0))
+
+
+def _sized(bare: PoseError, logs: Floats) -> PoseError:
+    smooth, tilt, noise, tilt_noise = np.exp(logs).tolist()
+    return PoseError(bare.middle, bare.lengths, (smooth, tilt), (noise, tilt_noise))
+
+
+def _unlikelihood(design: Floats, residuals: Floats, own: Floats, error: PoseError) -> float:
+    """Return minus twice the log of the marginal likelihood, but for a constant."""
+    noise = own + error.beyond
+    weighted = design.transpose(0, 2, 1) @ np.linalg.inv(noise)
+    variances = np.concatenate([FREE, error.variances])
+    information = (weighted @ design).sum(axis=0) * np.sqrt(variances[:, None] * variances)
+    vector = (weighted @ residuals[..., None]).sum(axis=0)[:, 0] * np.sqrt(variances)
+    inner = np.eye(len(variances)) + information
+    squares = np.einsum("ni,nij,nj->", residuals, np.linalg.inv(noise), residuals)
+    volume = np.linalg.slogdet(noise)[1].sum() + np.linalg.slogdet(inner)[1]
+    return float(squares - vector @ np.linalg.solve(inner, vector) + volume)
