@@ -39,3 +39,24 @@ def test_the_plan_as_json_is_the_one_for_people(
     left_out = [row for row in plan["rows"] if row["id"] is None]
     assert left_out and all(row["why_not"] in text for row in left_out)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_simulated_session_shows_its_plan_and_does_not_run(
+    command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = command(*shlex.split("run ur5_phoxi-m_simulated --json"))
+    plan = json.loads(out)
+    stops = [row for row in plan["rows"] if row["id"]]
+    assert code == 0 and plan["text"].startswith(f"{len(stops)} stops of a simulated arm")
+    assert [row["role"] for row in stops] == ["verification"] + ["calibration"] * (len(stops) - 1)
+    assert any(row["why_not"] == "out of the scanner's view" for row in plan["rows"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_archive_has_no_plan(command: Call) -> None:
+    code, _, err = command(*shlex.split("run ur5_phoxi-m_sample --json"))
+    assert (code, err.splitlines()[-1]) == (
+        2,
+        "error: --json: acquire.archive plans no poses; acquire.live and acquire.simulated do",
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,6 +71,7 @@ def monitor(  # noqa: PLR0913  one argument an option
         as_json,
         judge,
         stored_calibration,
+        without_misfits,
         write_chart,
     )
     from flangeye.errors import StageError
@@ -87,8 +89,9 @@ def monitor(  # noqa: PLR0913  one argument an option
     kept = History.read(history or stored.path.parent / "monitor.parquet", stored.key)
     registry = load_plugins()
     for check in _checks(stored, registry, archive, (scans, move), overrides or ()):
-        kept.add(check)
-        kept.findings.append(judge(stored, kept, test))
+        fine, misfits = without_misfits(stored, kept, check, test)
+        kept.add(fine)
+        kept.findings.append(replace(judge(stored, kept, test), set_aside=misfits))
         kept.write()
         say(as_json(kept, kept.findings[-1]))
     write_chart(kept, test, kept.path.with_suffix(".html"))

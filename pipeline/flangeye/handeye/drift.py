@@ -147,8 +147,8 @@ class Information:
         covariance[:6, :6] += allowance(deviation)
         return Information.of_covariance(covariance, self.mean)
 
-    def summed(self, first: int, last: int) -> Information:
-        """Return what the checks from ``first`` up to ``last`` tell together."""
+    def summed(self, first: int, last: int | None) -> Information:
+        """Return what the checks from ``first`` up to ``last``, or to the end, tell together."""
         return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
 
     def plus(self, other: Information) -> Information:

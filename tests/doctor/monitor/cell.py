@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,17 @@ STATIONS = [_pose(np.random.default_rng(k)) for k in (11, 12, 13)]
 def calibrate(folder: Path) -> Path:
     """Record a calibration and return its folder."""
     folder.mkdir()
-    scripted(Script(points=400, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
+    scripted(Script(points=50, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
     return folder
 
 
-def check(folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5) -> Path:
-    """Record a check: three scans, the scanner shifted by ``shift`` in base [m]."""
+def check(
+    folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5, misfit: float = 0.0
+) -> Path:
+    """Record a check: three scans, the scanner shifted by ``shift`` in base [m].
+
+    In the second one something else was found, by ``misfit`` aside [m].
+    """
     folder.mkdir()
     rng = np.random.default_rng(seed)
     recorder = Recorder(folder / "run.mcap", {"recipe.resolved.yaml": "title: x"}, False)
@@ -34,11 +40,11 @@ def check(folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5) -
         capture = t.Capture(
             name, cloud, t.by_frame(pose), time_ns=10**18 + seed * 8 * 3600 * 10**9 + i
         )
+        circle = _circle(camera.inverse() @ pose, rng, noise)
+        if i == 1:
+            circle = replace(circle, centre=circle.centre + [misfit, 0.0, 0.0])
         recorder.flangeye_captured(step="0.acquire.live", capture=capture, seconds=0.1)
-        recorder.flangeye_stage_finished(
-            step="2.fit.rim", value=_circle(camera.inverse() @ pose, rng, noise),
-            capture=name, seconds=0.0,
-        )  # fmt: skip
+        recorder.flangeye_stage_finished(step="2.fit.rim", value=circle, capture=name, seconds=0.0)
         recorder.flangeye_capture_finished(capture=name)
     recorder.close()
     return folder

@@ -73,12 +73,29 @@ def test_a_slow_drift_is_degraded(cell: Path, tmp_path: Path) -> None:
     names = []
     for i in range(60):
         names.append(f"slow-{i}")
-        check(cell / names[-1], seed=200 + i, shift=(2.7e-6 * i, 0.0, 0.0))
-    options = ("--limit", "0.16 mm", "--false-alarms", "1e-9")
+        check(cell / names[-1], seed=200 + i, shift=(6.5e-6 * i, 0.0, 0.0))
+    options = ("--false-alarms", "1e-9")
     done = monitor(cell, tmp_path / "h.parquet", *names, options=options)
     states = [json.loads(line)["state"] for line in done.stdout.splitlines()]
     assert states[0] == "OK" and set(states) == {"OK", "DEGRADED"}
     assert done.exit_code == ["OK", "DEGRADED"].index(states[-1])
+
+
+def test_one_scan_in_which_something_else_was_found_raises_no_alarm(
+    cell: Path, tmp_path: Path
+) -> None:
+    check(cell / "wrong", seed=300, misfit=0.02)
+    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "wrong", "ok-01")
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["state"] for line in lines] == ["OK"] * 3
+    assert [line["set_aside"] for line in lines] == [[], ["scan-1"], []]
+    assert [line["sightings"] for line in lines] == [3, 2, 3]
+
+
+def test_a_scanner_that_was_knocked_hard_is_no_misfit(cell: Path, tmp_path: Path) -> None:
+    check(cell / "knocked", seed=301, shift=(0.02, 0.0, 0.0))
+    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "knocked")
+    assert done.exit_code == 2 and json.loads(done.stdout.splitlines()[-1])["set_aside"] == []
 
 
 def test_the_same_scans_do_not_count_twice(cell: Path, tmp_path: Path) -> None:

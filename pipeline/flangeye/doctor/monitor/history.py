@@ -48,6 +48,7 @@ class Finding:
         statistic: The test's, over its threshold.
         part: What explains it best, in words; empty while nothing changed.
         probability: Probability of that part, among scanner, arm and flange.
+        set_aside: Ids of the scans in which something else than the flange was found.
     """
 
     check: int
@@ -58,6 +59,7 @@ class Finding:
     statistic: float
     part: str = ""
     probability: float = 0.0
+    set_aside: tuple[str, ...] = ()
 
 
 @dataclass
@@ -154,6 +156,7 @@ def as_json(history: History, finding: Finding) -> str:
             "time": _when(check),
             "source": check.source,
             "sightings": len(check.seen),
+            "set_aside": list(finding.set_aside),
             "state": finding.state,
             "shift_mm": round(finding.shift * 1e3, 4),
             "turn_deg": round(float(np.degrees(np.linalg.norm(finding.motion[:3]))), 5),
@@ -197,7 +200,8 @@ def _row(check: int, of: Check, seen: t.Observation) -> dict[str, Any]:
 
 
 def _finding(data: dict[str, Any]) -> Finding:
-    return Finding(**{**data, "motion": tuple(data["motion"])})
+    set_aside = tuple(data.get("set_aside", ()))
+    return Finding(**{**data, "motion": tuple(data["motion"]), "set_aside": set_aside})
 
 
 def _plain(values: Floats | None) -> list[float] | None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from flangeye.doctor.monitor.history import Finding, History
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye.doctor.monitor.history import Check, Finding, History
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.handeye.drift import (
     DriftTest,
@@ -11,6 +15,7 @@ from flangeye.handeye.drift import (
     Verdict,
     blame,
     information_of,
+    misfits,
     moved_since,
     suspects,
     verdict,
@@ -18,6 +23,32 @@ from flangeye.handeye.drift import (
 
 CODES = {"OK": 0, "DEGRADED": 1, "MOVED": 2}
 """Exit codes, for a script that stops a cell."""
+FEWEST = 3
+"""Scans of a check from which one that differs can be told, and the share of it that may."""
+
+
+def without_misfits(
+    stored: StoredCalibration, history: History, check: Check, test: DriftTest
+) -> tuple[Check, tuple[str, ...]]:
+    """Return a check without scans in which something else was found, and their ids.
+
+    Only while most of its scans are as if nothing had moved: what moves, all of them show.
+    """
+    if len(check.seen) < FEWEST:
+        return check, ()
+    seen, numbers = history.sightings()
+    before = stored.prior.told.loosened(test.seasonal)
+    if seen:
+        told = information_of(stored.sightings(seen, numbers), test.daily)
+        before = before.plus(told.summed(max(len(told.matrix) - test.reference, 0), None))
+    one = np.zeros(len(check.seen), dtype=np.intp)
+    wrong = misfits(stored.sightings(check.seen, one), before, test)
+    if wrong.sum() > len(wrong) / FEWEST:
+        return check, ()
+    fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
+    return replace(check, seen=fine), tuple(
+        o.id for o, bad in zip(check.seen, wrong, strict=True) if bad
+    )
 
 
 def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Finding:
