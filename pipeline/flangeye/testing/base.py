@@ -8,6 +8,7 @@ from types import NoneType
 from typing import Any, ClassVar, get_args
 
 from flangeye import types as t
+from flangeye.devices import MotionAllowed
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData, ScannerModel
@@ -96,6 +97,7 @@ class Conformance:
             ScannerModel: self.scanner,
             Flange: self.flange,
             t.Seed: t.Seed(0),
+            MotionAllowed: MotionAllowed(),
             t.Views: t.Views(),
             t.ArchivePath: t.ArchivePath(),
             t.StageLog: lambda name, value: None,

@@ -61,6 +61,9 @@ FEWEST = 3
 UNSEEN_TILT = 0.3
 """Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
 
+RUN = MotionAllowed()
+"""What is simulated needs no permission."""
+
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
 
@@ -93,10 +96,10 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     scanner: ScannerModel,
     flange: Flange,
     seed: Seed,
-    motion: MotionAllowed,
     params: SimulatedParams,
     sphere: Sphere | None = None,
     stage_log: StageLog | None = None,
+    motion: MotionAllowed = RUN,
 ) -> Captures:
     """Scan a simulated arm that moves its flange through the scanner's view.
 
@@ -109,10 +112,10 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
         scanner: What looks at it.
         flange: What to look for; a robot that is asked for its wrist circle carries its own plate.
         seed: Decides poses, errors and noise.
-        motion: Whether only the plan is asked for.
         params: See :class:`SimulatedParams`.
         sphere: A calibration sphere on the flange, where the recipe's feature has one.
         stage_log: Hears what a plan that chooses its poses expects of the next one.
+        motion: Whether only the plan is asked for.
 
     Raises:
         StageError: Fewer than three poses are possible.
