@@ -98,7 +98,7 @@ class Planner:
     def _guess(self) -> None:
         """Let the person say where the scanner stands: drag its ball, type it, or show poses."""
         given = _first(self._project.data()) or {}
-        view = given.get("view")
+        view: Any = given.get("view")
         guessed = self._view() is not None and isinstance(view, dict)
         if not guessed and self._simulated is None:
             ui.label(
