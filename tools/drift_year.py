@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from flangeye.handeye.blame import blame, suspects
 from flangeye.handeye.drift import (
     DriftTest,
     Information,
     Prior,
-    blame,
     information_of,
-    suspects,
     verdict,
 )
 from flangeye_emulators.world.year import (

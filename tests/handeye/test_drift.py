@@ -51,7 +51,7 @@ def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
 
 
 def test_a_joint_re_mastered_is_named() -> None:
-    from flangeye.handeye.drift import blame, suspects
+    from flangeye.handeye.blame import blame, suspects
     from flangeye_emulators.world.year import ABOUT, step_at
 
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))

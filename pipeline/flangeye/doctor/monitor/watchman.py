@@ -8,16 +8,15 @@ import numpy as np
 
 from flangeye.doctor.monitor.history import Check, Finding, History
 from flangeye.doctor.monitor.stored import StoredCalibration
+from flangeye.handeye.blame import blame, suspects
 from flangeye.handeye.drift import (
     DriftTest,
     Information,
     Sightings,
     Verdict,
-    blame,
     information_of,
     misfits,
     moved_since,
-    suspects,
     verdict,
 )
 
