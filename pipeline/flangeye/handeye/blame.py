@@ -10,12 +10,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flangeye.handeye.drift import Information, Sightings, allowance
+from flangeye.handeye.drift import MISFIT, Information, Sightings, allowance
 from flangeye.maths.geometry import adjoint_shift
+from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
 
 LARGEST = 1e-3
 """Standard deviation of what a part may do: [rad] or [m]."""
+FARTHEST = 0.1
+"""The same of what it may do at all."""
 
 
 def blame(
@@ -41,6 +44,25 @@ def blame(
     weights = {part: float(np.exp(score - best)) for part, score in scores.items()}
     total = sum(weights.values())
     return {part: w / total for part, w in sorted(weights.items(), key=lambda x: -x[1])}
+
+
+def explained(
+    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+) -> bool:
+    """Return whether the scanner, the flange or the arm alone can have moved as sightings say.
+
+    Args:
+        before: As in :func:`blame`.
+        after: The sightings.
+        about: As in :func:`blame`.
+        scanner: As in :func:`blame`.
+        daily: As in :func:`blame`.
+    """
+    residuals = (after.residuals + after.effects @ before.mean).ravel()
+    noise = _noise(before, after, daily)
+    limit = chi2_quantile(1 - MISFIT, len(residuals))
+    totals = (noise + FARTHEST**2 * d @ d.T for d, _ in _designs(after, about, scanner).values())
+    return any(residuals @ np.linalg.solve(total, residuals) < limit for total in totals)
 
 
 def suspects(parts: Mapping[str, float]) -> list[tuple[str, float]]:

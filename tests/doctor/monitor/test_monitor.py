@@ -98,6 +98,17 @@ def test_a_scanner_that_was_knocked_hard_is_no_misfit(cell: Path, tmp_path: Path
     assert done.exit_code == 2 and json.loads(done.stdout.splitlines()[-1])["set_aside"] == []
 
 
+def test_scans_that_contradict_each_other_check_nothing(cell: Path, tmp_path: Path) -> None:
+    check(cell / "torn", seed=302, misfit=0.05, shift=(0.02, 0.0, 0.0))
+    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "torn")
+    assert isinstance(done.exception, StageError)
+    assert str(done.exception).endswith(
+        "torn: nothing is checked: no one change of scanner, flange or arm explains its 3 scans; "
+        "look at them and scan again; where the scanner was moved far, calibrate"
+    )
+    assert len(done.stdout.splitlines()) == 1, "the check before is said and kept"
+
+
 def test_the_same_scans_do_not_count_twice(cell: Path, tmp_path: Path) -> None:
     history = tmp_path / "h.parquet"
     twice = monitor(cell, history, "ok-00", "ok-00")

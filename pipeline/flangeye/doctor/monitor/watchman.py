@@ -8,7 +8,8 @@ import numpy as np
 
 from flangeye.doctor.monitor.history import Check, Finding, History
 from flangeye.doctor.monitor.stored import StoredCalibration
-from flangeye.handeye.blame import blame, suspects
+from flangeye.errors import StageError
+from flangeye.handeye.blame import blame, explained, suspects
 from flangeye.handeye.drift import (
     DriftTest,
     Information,
@@ -32,22 +33,34 @@ def without_misfits(
     """Return a check without scans in which something else was found, and their ids.
 
     Only while most of its scans are as if nothing had moved: what moves, all of them show.
+
+    Raises:
+        StageError: No single change of the cell explains all scans of the check.
     """
-    if len(check.seen) < FEWEST:
-        return check, ()
-    seen, numbers = history.sightings()
-    before = stored.prior.told.loosened(test.seasonal)
-    if seen:
-        told = information_of(stored.sightings(seen, numbers), test.daily)
-        before = before.plus(told.summed(max(len(told.matrix) - test.reference, 0), None))
-    one = np.zeros(len(check.seen), dtype=np.intp)
-    wrong = misfits(stored.sightings(check.seen, one), before, test)
-    if wrong.sum() > len(wrong) / FEWEST:
-        return check, ()
-    fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
-    return replace(check, seen=fine), tuple(
-        o.id for o, bad in zip(check.seen, wrong, strict=True) if bad
-    )
+    before = _before(stored, history, test)
+    seen = stored.sightings(check.seen, np.zeros(len(check.seen), dtype=np.intp))
+    wrong = misfits(seen, before, test)
+    if 0 < FEWEST * wrong.sum() <= len(wrong):
+        fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
+        ids = tuple(o.id for o, bad in zip(check.seen, wrong, strict=True) if bad)
+        return replace(check, seen=fine), ids
+    scanner = stored.estimate.transform.translation
+    if wrong.any() and not explained(before, seen, stored.estimate.about, scanner, test.daily):
+        raise StageError(
+            f"{check.source}: nothing is checked: no one change of scanner, flange or arm explains "
+            f"its {len(wrong)} scans; look at them and scan again; where the scanner was moved "
+            "far, calibrate"
+        )
+    return check, ()
+
+
+def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Information:
+    """Return what the calibration and the last checks tell."""
+    known = stored.prior.told.loosened(test.seasonal)
+    if not history.checks:
+        return known
+    told = information_of(stored.sightings(*history.sightings()), test.daily)
+    return known.plus(told.summed(max(len(told.matrix) - test.reference, 0), None))
 
 
 def judge(stored: StoredCalibration, history: History, test: DriftTest) -> Finding:
