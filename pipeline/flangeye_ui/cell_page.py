@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, get_args
 
 import yaml
 from nicegui import ui
 
 from flangeye.files.bundled import bundled
+from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
 from flangeye_ui.layout import command_line, mistake, page
@@ -34,7 +36,8 @@ class Form:
         with ui.column().classes("col-12 col-md-5 gap-2"):
             self._start_from()
             self.fields()
-            ImportArm(project, self)
+            Import(project, self, "robot", ARM)
+            Import(project, self, "scanner", SCANNER)
         with ui.column().classes("col-12 col-md gap-2 md:sticky md:top-16"):
             ui.label("Recipe").classes("text-h6")
             self._yaml = ui.textarea(value=project.text, on_change=self._typed)
@@ -154,9 +157,9 @@ class Form:
         del data["steps"][index]
         self._write(data)
 
-    def choose_arm(self, model: str) -> None:
-        """Put an arm into the recipe."""
-        self._set(["robot", "model"], model)
+    def choose(self, section: str, model: str) -> None:
+        """Put a model into the recipe: of its robot or its scanner."""
+        self._set([section, "model"], model)
 
     def _write(self, data: dict[str, Any]) -> None:
         self._project.edit(data)
@@ -169,30 +172,30 @@ class Form:
         self.fields.refresh()
 
 
-class ImportArm:
-    """An arm that is not listed: from its URDF, or its table of joints, by ``new-robot``."""
+class Import:
+    """A model that is not listed: its file is made by the command that is shown."""
 
-    def __init__(self, project: Project, form: Form) -> None:
-        self._project, self._form = project, form
-        with ui.expansion("Import an arm").classes("w-full").props("dense"):
-            self._name = ui.input("Its name", value="my_arm", on_change=self._changed)
-            self._urdf = ui.input("Its URDF file, in this folder", on_change=self._changed)
-            self._joints = ui.textarea(
-                "Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", on_change=self._changed
-            )
-            plate = ui.select(_standards(), label="Plate", on_change=self._changed)
-            self._plate, boxes = plate, (self._name, self._urdf, self._joints, plate)
-            for box in boxes:
-                box.classes("w-full").props("dense")
+    def __init__(self, project: Project, form: Form, section: str, boxes: Boxes) -> None:
+        self._project, self._form, self._section = project, form, section
+        what = {"robot": "arm"}.get(section, section)
+        with ui.expansion(f"Import {'an' if what == 'arm' else 'a'} {what}") as self._box:
+            self._name = ui.input(f"Name of the {what}", value=f"my_{what}")
+            self._given = {option: box(label) for option, (label, box) in boxes.items()}
+            for each in (self._name, *self._given.values()):
+                each.classes("w-full").props("dense").on_value_change(self._changed)
             self._line = command_line(project.command(*self._words()))
-            ui.button("Import it", on_click=self._import).props("outline")
+            ui.button(f"Import the {what}", on_click=self._import).props("outline")
             self._told = ui.column().classes("w-full")
+        self._box.classes("w-full").props("dense")
 
     def _words(self) -> list[str]:
-        joints = [f"--joint={line}" for line in (self._joints.value or "").splitlines() if line]
-        given = [f"--urdf={self._urdf.value}"] if self._urdf.value else joints
-        plate = [f"--standard={self._plate.value}"] if self._plate.value else []
-        return ["new-robot", self._name.value or "my_arm", *given, *plate]
+        """Return the command's: each line of a box is an option, each part of it a word."""
+        words = [f"new-{self._section}", self._name.value or "my_model"]
+        for option, box in self._given.items():
+            for line in filter(None, (box.value or "").splitlines()):
+                parts = line.split(",") if option in PAIRS else [line]
+                words += [f"--{option}", *(part.strip() for part in parts)]
+        return words
 
     def _changed(self) -> None:
         self._line.content = self._project.command(*self._words())
@@ -205,7 +208,28 @@ class ImportArm:
                 mistake(said.removeprefix("error: "))
                 return
             ui.label(said).props('role="status"')
-        self._form.choose_arm(f"{self._words()[1]}.yaml")
+        self._form.choose(self._section, f"{self._words()[1]}.yaml")
+
+
+Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
+"""By option of a command: what its box is called, and what it is."""
+PAIRS = ("pixels", "field")
+"""Options of two values."""
+PRINCIPLES = get_args(ScannerModel.model_fields["principle"].annotation)
+ARM: Boxes = {
+    "urdf": ("Its URDF file, in this folder", ui.input),
+    "joint": ("Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", ui.textarea),
+    "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
+}
+SCANNER: Boxes = {
+    "near": ("Nearest that it measures, such as 300 mm", ui.input),
+    "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
+    "principle": ("Principle", lambda label: ui.select(list(PRINCIPLES), label=label)),
+    "pixels": ("Columns and rows, such as 1032, 772", ui.input),
+    "field": ("Field of view, such as 60 deg, 45 deg", ui.input),
+    "noise": ("Noise of a pixel in the middle, such as 0.1 mm", ui.input),
+    "error": ("Smooth distortion, such as 0.1 mm", ui.input),
+}
 
 
 def _within(mistake: Mistake, index: int, name: str, field: str) -> bool:

@@ -258,17 +258,44 @@ def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
     write_recipe(page, SMALL)
     page.get_by_text("The recipe is valid.").wait_for()
     page.get_by_text("Import an arm").click()
-    page.get_by_label("Its name").fill("kr6")
+    page.get_by_label("Name of the arm").fill("kr6")
     page.get_by_label("Its URDF file, in this folder").fill("nowhere.urdf")
-    page.get_by_text("flangeye new-robot kr6 --urdf=nowhere.urdf").wait_for()
-    page.get_by_role("button", name="Import it").click()
+    page.get_by_text("flangeye new-robot kr6 --urdf nowhere.urdf").wait_for()
+    page.get_by_role("button", name="Import the arm").click()
     page.get_by_role("alert").get_by_text("nowhere.urdf").wait_for()
     page.get_by_label("Its URDF file, in this folder").fill("kr6.urdf")
-    page.get_by_text("flangeye new-robot kr6 --urdf=kr6.urdf").wait_for()
-    page.get_by_role("button", name="Import it").click()
+    page.get_by_text("flangeye new-robot kr6 --urdf kr6.urdf").wait_for()
+    page.get_by_role("button", name="Import the arm").click()
     page.get_by_text("compare with the pendant").wait_for()
     recipe = yaml.safe_load((served.folder / "cell.yaml").read_text())
     assert recipe["robot"]["model"] == "kr6.yaml"
+
+
+def test_a_scanner_is_imported(browser: Any, served: Served) -> None:
+    page = opened(browser, served)
+    write_recipe(page, SMALL)
+    page.get_by_text("Import a scanner").click()
+    page.get_by_label("Name of the scanner").fill("eye7")
+    for label, value in (
+        ("Nearest that it measures", "400 mm"),
+        ("Farthest", "900 mm"),
+        ("Columns and rows", "640, 480"),
+        ("Field of view", "55 deg, 42 deg"),
+        ("Noise of a pixel", "0.1 mm"),
+        ("Smooth distortion", "0.1 mm"),
+    ):
+        page.get_by_label(label).fill(value)
+    page.get_by_role("button", name="Import the scanner").click()
+    page.get_by_role("alert").get_by_text("principle").wait_for()
+    page.get_by_label("Principle").click()
+    page.get_by_role("option", name="structured light").click()
+    page.get_by_text("--pixels 640 480 --field '55 deg' '42 deg'").wait_for()
+    page.get_by_role("button", name="Import the scanner").click()
+    text = page.get_by_label("Recipe in YAML").element_handle()
+    page.wait_for_function("box => box.value.includes('eye7.yaml')", arg=text)
+    page.get_by_text("The recipe is valid.").wait_for()
+    recipe = yaml.safe_load((served.folder / "cell.yaml").read_text())
+    assert recipe["scanner"]["model"] == "eye7.yaml"
 
 
 def test_the_archive_compares_runs_batches_and_checks(
