@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -69,7 +69,8 @@ class Recipe:
     @property
     def plans(self) -> bool:
         """Whether its first step plans poses of an arm, which can be shown without a run."""
-        return MotionAllowed in self.steps[0].stage.needs.values()
+        needs = self.steps[0].stage.needs.values()
+        return any(MotionAllowed in (need, *get_args(need)) for need in needs)
 
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""

@@ -61,9 +61,6 @@ FEWEST = 3
 UNSEEN_TILT = 0.3
 """Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
 
-RUN = MotionAllowed()
-"""What is simulated needs no permission."""
-
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
 
@@ -99,7 +96,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     params: SimulatedParams,
     sphere: Sphere | None = None,
     stage_log: StageLog | None = None,
-    motion: MotionAllowed = RUN,
+    motion: MotionAllowed | None = None,
 ) -> Captures:
     """Scan a simulated arm that moves its flange through the scanner's view.
 
@@ -130,7 +127,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     poses = list(plan.poses)
     _refuse_too_few(len(poses), plan.wanted, reach, robot, scanner)
     checks = _checks(plan, site, params.verification, _rng(checking))
-    if motion.plan_only:
+    if motion and motion.plan_only:
         raise _plan_alone(checks, poses, plan.wanted, reach, site)
     others = [] if params.arm.is_default else _unseen(plan, site, _rng(checking.spawn(1)[0]))
     of_arm, of_scanner = errors.spawn(2)
