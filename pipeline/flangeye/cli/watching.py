@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,9 +68,8 @@ def monitor(  # noqa: PLR0913  one argument an option
         CODES,
         History,
         as_json,
-        judge,
         stored_calibration,
-        without_misfits,
+        take,
         write_chart,
     )
     from flangeye.errors import StageError
@@ -89,11 +87,9 @@ def monitor(  # noqa: PLR0913  one argument an option
     kept = History.read(history or stored.path.parent / "monitor.parquet", stored.key)
     registry = load_plugins()
     for check in _checks(stored, registry, archive, (scans, move), overrides or ()):
-        fine, misfits = without_misfits(stored, kept, check, test)
-        kept.add(fine)
-        kept.findings.append(replace(judge(stored, kept, test), set_aside=misfits))
+        finding = take(stored, kept, check, test)
         kept.write()
-        say(as_json(kept, kept.findings[-1]))
+        say(as_json(kept, finding))
     write_chart(kept, test, kept.path.with_suffix(".html"))
     if opcua:
         _tell(opcua, kept.findings[-1])

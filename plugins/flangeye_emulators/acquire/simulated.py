@@ -138,17 +138,15 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
         Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera, arm,
         visited[:count], angles[:count], len(checks), params, of_scanner,
     )  # fmt: skip
+    unseen = _exactly(arm, visited[count:], angles[count:], base_T_camera)
     source = Source(
         fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
         notes=_notes(len(poses), plan.wanted, robot, scanner),
         workspace=Box(plan.centre, plan.size),
-        truth=Truth(
-            Transform(BASE, CAMERA, base_T_camera),
-            unseen=_exactly(arm, visited[count:], angles[count:], base_T_camera),
-        ),
+        truth=Truth(Transform(BASE, CAMERA, base_T_camera), unseen=unseen),
     )
     look = partial(session.look, rng=_rng(later))
-    whys = [*([""] * len(checks)), *(pose.why for pose in poses)]
+    whys = [pose.why for pose in [*checks, *poses]]
     captures = _explained(session.captures(noise), whys, stage_log)
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
     return Captures(captures, source, len(session.joints), look, recorded=not any(whys))

@@ -6,7 +6,7 @@ from flangeye.doctor.monitor.chart import write_chart
 from flangeye.doctor.monitor.history import Check, History, as_json
 from flangeye.doctor.monitor.sources import from_archive, from_arm
 from flangeye.doctor.monitor.stored import StoredCalibration, stored_calibration
-from flangeye.doctor.monitor.watchman import CODES, judge, without_misfits
+from flangeye.doctor.monitor.watchman import CODES, judge, take
 
 __all__ = [
     "CODES",
@@ -18,6 +18,6 @@ __all__ = [
     "from_arm",
     "judge",
     "stored_calibration",
-    "without_misfits",
+    "take",
     "write_chart",
 ]

@@ -27,7 +27,19 @@ FEWEST = 3
 """Scans of a check from which one that differs can be told, and the share of it that may."""
 
 
-def without_misfits(
+def take(stored: StoredCalibration, history: History, check: Check, test: DriftTest) -> Finding:
+    """Add a check to the history, without its misfits, and what it says; return that.
+
+    Raises:
+        StageError: Its scans are in the history, or no single change of the cell explains them.
+    """
+    fine, misfits = _without_misfits(stored, history, check, test)
+    history.add(fine)
+    history.findings.append(replace(judge(stored, history, test), set_aside=misfits))
+    return history.findings[-1]
+
+
+def _without_misfits(
     stored: StoredCalibration, history: History, check: Check, test: DriftTest
 ) -> tuple[Check, tuple[str, ...]]:
     """Return a check without scans in which something else was found, and their ids.
