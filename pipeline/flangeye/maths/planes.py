@@ -37,12 +37,12 @@ class Plane(NamedTuple):
     Attributes:
         point: (3,) centroid of the points it was fitted to [m].
         normal: (3,) unit normal.
-        sigma: Robust standard deviation of their distances [m].
+        sigma: Robust standard deviation of their distances; none of a rough plane [m].
     """
 
     point: Floats
     normal: Floats
-    sigma: float
+    sigma: float = 0.0
 
     def heights(self, points: Floats) -> Floats:
         """Return the (N,) signed distances of (N, 3) points, positive along the normal."""

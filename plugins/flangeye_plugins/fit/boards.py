@@ -246,7 +246,7 @@ def _ambiguity(poses: list[PlanarPose]) -> Rejected | None:
     """Say so when another pose explains the corners nearly as well."""
     if len(poses) < 2:
         return None
-    best, other = poses[:2]
+    best, other = poses
     ratio = (other.misfit - best.misfit) / (2 * best.noise**2)
     if ratio > CERTAIN:
         return None

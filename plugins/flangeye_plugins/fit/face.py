@@ -49,7 +49,7 @@ def likeliest_plane(points: Floats, rough: Plane) -> Plane:
     best = int(np.argmin(np.median(off, axis=1)))
     if best == 0:
         return rough
-    return Plane(rough.point + levels[best] * normals[best], normals[best], 0.0)
+    return Plane(rough.point + levels[best] * normals[best], normals[best])
 
 
 def _patches(flat: Floats) -> Indices:

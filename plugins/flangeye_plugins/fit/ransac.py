@@ -66,7 +66,7 @@ def fit_ransac_circle(
     as well: which of them wins is a matter of the seed.
     """
     points = cloud.cloud.xyz.astype(np.float64)
-    rough = Plane(cloud.centre, cloud.normal, 0.0)
+    rough = Plane(cloud.centre, cloud.normal)
     plane = disc_face(points, rough, (0.0, 1.5 * flange.outer), 3 * params.plane)
     if plane is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
@@ -113,7 +113,7 @@ def circles_through(triples: Floats) -> tuple[Floats, Floats]:
     normal = np.cross(a, b)
     squared = (normal**2).sum(axis=1)
     collinear = squared == 0
-    squared[collinear] = 1.0
+    squared[collinear] = np.inf
     longer = (a**2).sum(axis=1)[:, None] * b - (b**2).sum(axis=1)[:, None] * a
     offset = np.cross(longer, normal) / (2 * squared[:, None])
     radius = np.linalg.norm(offset, axis=1)

@@ -93,7 +93,7 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     thickness, to where the robot's flange frame has its origin.
     """
     points = cloud.cloud.xyz.astype(np.float64)
-    rough = Plane(cloud.centre, cloud.normal, 0.0)
+    rough = Plane(cloud.centre, cloud.normal)
     face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
     if face is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")

@@ -154,7 +154,7 @@ def _flattest(piece: Piece, rest: Indices) -> Iterator[Patch]:
         place = means[k] + middle
         normal = -normals[k] if normals[k] @ place > 0 else normals[k]
         members = order[starts[k] : starts[k] + sizes[k]]
-        yield Patch(piece, Plane(place, normal, 0.0), members, rest)
+        yield Patch(piece, Plane(place, normal), members, rest)
 
 
 def _principal(points: Floats, starts: Indices, sizes: Indices) -> tuple[Floats, Floats, Floats]:

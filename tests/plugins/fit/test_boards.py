@@ -9,9 +9,11 @@ from pydantic import ValidationError
 
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye.models.boards import Board, print_of
+from flangeye.models.corners import Corners
 from flangeye.types import CAMERA, Capture, Image, PointCloud, Rejected, Transform, by_frame
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board, scan_board
+from flangeye_plugins.fit import boards
 from flangeye_plugins.fit.boards import (
     CharucoParams,
     CheckerboardParams,
@@ -334,3 +336,83 @@ def test_two_poses_are_told_apart_if_one_is_a_thousand_times_likelier(
     told = ambiguity([pose_of(0.0, 0.0), pose_of(tilt, misfit)])
     assert (told and told.reason[: len(said or "")]) == said
     assert ambiguity([pose_of(0.0, 0.0)]) is None
+
+
+def test_a_thousand_times_likelier_is_not_yet_certain() -> None:
+    best = pose_of(0.0, 0.0)._replace(noise=1.0)
+    other = pose_of(0.2, 2 * boards.CERTAIN)
+    assert ambiguity([best, other]) is not None
+    assert ambiguity([best, other._replace(misfit=2.001 * boards.CERTAIN)]) is None
+
+
+POINTS = np.stack([*np.meshgrid(np.arange(6), np.arange(4)), np.zeros((4, 6))], -1).reshape(-1, 3)
+POINTS = 0.03 * (POINTS - POINTS.mean(axis=0))
+
+
+def project(points, pose):
+    seen = (points @ pose[:3, :3].T + pose[:3, 3]) @ CAMERA_MATRIX.T
+    return seen[:, :2] / seen[:, 2:]
+
+
+def known_corners(monkeypatch, pixels, pose, *, larger=1.0, rough=0.0):
+    """Return a capture in which such corners are found, on a sheet scanned by depth.
+
+    The scanner has it larger than it is, and so rough [m].
+    """
+    monkeypatch.setattr(boards, "find_corners", lambda board, image: Corners(pixels, POINTS))
+    v, u = np.indices((600, 800))
+    rays = np.stack([u, v, np.ones(u.shape)], -1) @ np.linalg.inv(CAMERA_MATRIX).T
+    depth = (pose[:3, 2] @ pose[:3, 3]) / (rays @ pose[:3, 2])
+    depth = larger * (depth + rough * np.random.default_rng(0).standard_normal(depth.shape))
+    image = Image(np.zeros((600, 800), np.uint8), CAMERA_MATRIX)
+    return Capture("0", PointCloud(CAMERA, rays * depth[..., None]), by_frame(POSE), image=image)
+
+
+def test_large_discs_seen_from_near_are_found_at_their_centres(monkeypatch: Any) -> None:
+    """The middles of their images lie up to half a pixel beside those of their centres."""
+    radius, angle = 0.013, np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    pose, middles = looking(0.6, distance=0.25), []
+    for point in POINTS:
+        x, y = project(point + rim, pose).T
+        area = x * np.roll(y, -1) - np.roll(x, -1) * y  # the centroid of a polygon
+        middles.append([((c + np.roll(c, -1)) * area).sum() / (3 * area.sum()) for c in (x, y)])
+    assert np.abs(middles - project(POINTS, pose)).max() > 0.5
+    seen = known_corners(monkeypatch, np.array(middles), pose)
+    params = OF_CIRCLES.model_copy(update={"diameter": 2 * radius, "depth": "off"})
+    assert np.abs(error(fit_circles(seen, params), pose)).max() < 2e-5
+
+
+@pytest.mark.parametrize(
+    ("depth", "pixels", "rough", "by_depth"),
+    [
+        ("auto", 0.5, 1e-5, 1), ("auto", 0.01, 3e-3, 0), ("off", 0.5, 1e-5, 0),
+        ("only", 0.01, 3e-3, 1),
+    ],
+)  # fmt: skip
+def test_depth_is_taken_where_it_is_better_never_or_always(
+    monkeypatch: Any, depth: str, pixels: float, rough: float, by_depth: float
+) -> None:
+    pose = looking()
+    noise = pixels * np.random.default_rng(1).standard_normal((len(POINTS), 2))
+    seen = known_corners(monkeypatch, project(POINTS, pose) + noise, pose, rough=rough)
+    update = {"depth": depth, "corner_noise": pixels, "scanner_error": 0.0}
+    found = fit_charuco(seen, OF_CHARUCO.model_copy(update=update))
+    assert found.figures["by_depth"] == by_depth
+    assert found.figures["corners"] == len(POINTS)
+
+
+@pytest.mark.parametrize(
+    ("larger", "rough", "refused"),
+    [
+        (1.0048, 0.0, False), (1.0052, 0.0, True), (0.9948, 0.0, True),
+        (1.006, 8e-3, False), (1.015, 8e-3, True),
+    ],
+)  # fmt: skip
+def test_a_size_is_wrong_by_more_than_half_a_percent_and_more_than_it_scatters(
+    monkeypatch: Any, larger: float, rough: float, refused: bool
+) -> None:
+    pose = looking()
+    seen = known_corners(monkeypatch, project(POINTS, pose), pose, larger=larger, rough=rough)
+    found = fit_charuco(seen, OF_CHARUCO.model_copy(update={"depth": "only"}))
+    assert isinstance(found, Rejected) == refused

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.planes import Plane, robust_plane
-from flangeye_plugins.fit.face import _planes_of_patches, disc_face, likeliest_plane
+from flangeye_plugins.fit.face import _patches, _planes_of_patches, disc_face, likeliest_plane
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 AT = np.array([0.0, 0.0, 0.6])
@@ -106,3 +106,9 @@ def test_planes_of_patches_have_unit_normals_on_the_side_of_the_rough_one(side: 
     assert normals.shape == (26, 3) and levels.shape == (26,)
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(26))
     assert (normals @ rough.normal > 0.99).all()
+
+
+def test_patches_are_five_by_five_to_the_last_point() -> None:
+    flat = np.stack(np.meshgrid(np.linspace(-2, 3, 21), np.linspace(0, 1, 21)), -1).reshape(-1, 2)
+    _, counts = np.unique(_patches(flat), return_counts=True)
+    assert sorted(counts) == [16] * 16 + [20] * 8 + [25]  # the last of a row has its border

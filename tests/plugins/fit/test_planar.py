@@ -128,7 +128,8 @@ def test_a_cameras_error_moves_the_pose_as_another_camera_would() -> None:
         step = 1e3 * between(best.matrix)
         nearest = min(np.abs(columns * sign - step[:, None]).max(axis=0).min() for sign in (1, -1))
         assert nearest < 0.01 * np.abs(step).max()
-    assert moved_by_camera(corners(), image(), POSE).shape == (6, 0)
+    for exact in (KNOWN, np.zeros((8, 8))):
+        assert moved_by_camera(corners(), image(covariance=exact), POSE).shape == (6, 0)
 
 
 def test_the_middle_of_a_discs_image_lies_beside_that_of_its_centre() -> None:

@@ -10,6 +10,7 @@ from flangeye.types import CircleFeature, Rejected, Seed
 from flangeye_plugins.fit.ransac import (
     CircleHypotheses,
     RansacCircleParams,
+    _coverage,
     circles_through,
     draw_circles,
     fit_ransac_circle,
@@ -140,3 +141,27 @@ def test_what_has_no_such_circle_is_set_aside(
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
     check_bound(RansacCircleParams, name, refused, taken)
+
+
+def test_a_direction_is_five_degrees_of_the_circle() -> None:
+    """Of what lies within e_d of it."""
+    angle = np.radians(np.arange(0, 180, 5) + 2.5)
+    half = 0.03 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert _coverage(half, 0.03, 1e-4) == 0.5
+    assert _coverage(half[:1], 0.0301, 1.01e-4) == 1 / 72
+    assert _coverage(half, 0.0302, 1e-4) == 0
+
+
+def test_what_is_farther_out_than_a_face_and_a_half_has_no_say() -> None:
+    """A slope behind the face, with more points than the face has."""
+    rng = np.random.default_rng(0)
+    points = face(UR5, pitch=0.8e-3)
+    angle, reach = rng.uniform(0, 2 * np.pi, 9000), UR5.outer * rng.uniform(1.6, 4, 9000)
+    x, y = reach * np.cos(angle), reach * np.sin(angle)
+    slope = np.stack([x, y, 0.05 * x - 1e-3], axis=1)
+    assert fitted(placed(np.concatenate([points, slope]))).normal @ NORMAL > 1 - 1e-6
+
+
+def test_a_point_just_as_far_off_as_it_may_be_is_not_counted() -> None:
+    points = np.array([[1.5, 0, 0], [-1.5, 0, 0], [0, 1.25, 0], [0, -1.25, 0]])
+    assert sphere_scores(points, np.zeros((1, 3)), np.ones(1), 0.5).tolist() == [2]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.fit.rings import find_rings
+from flangeye_plugins.fit.rings import _sectors_for, find_rings
 
 CENTRE = np.array([0.003, -0.002])
 NOMINAL = np.array([0.03, 0.016])
@@ -83,3 +83,8 @@ def test_a_sector_is_two_points_wide_at_its_ring(bore: float) -> None:
     radii = np.array([0.03, bore][: 1 + bool(bore)])
     found = find_rings(flat, radii, np.zeros(2), SCALE)
     assert found.bins == pytest.approx(np.pi * radii / 1e-3, abs=1.5)
+
+
+def test_a_ring_has_from_24_to_360_sectors() -> None:
+    assert _sectors_for(np.zeros((3, 2)), NOMINAL).tolist() == [24, 24]
+    assert _sectors_for(np.zeros((1_000_000, 2)), NOMINAL).tolist() == [360, 360]

@@ -173,6 +173,9 @@ def test_the_jacobian_is_the_derivative() -> None:
         distance = [np.linalg.norm(points - CENTRE - s * step, axis=1) for s in (1, -1)]
         assert exact[:, k] == pytest.approx((distance[0] - distance[1]) / 2e-7, abs=1e-6)
     assert (exact[:, 3] == -1).all()
+    near = CENTRE + 1e-5 * np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 0.0]])
+    expected = np.array([[0, -0.6, -0.8, -1], [0, 0, 0, -1]])
+    assert sphere_jacobian(near, CENTRE) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("radius", ["known", "free"])

@@ -181,6 +181,13 @@ def test_the_laser_has_to_pass_within_the_distances_asked_for(beside: float, tak
     assert isinstance(fit(xyz, min_coverage=0.05), CircleFeature) is taken
 
 
+def test_a_profile_almost_through_the_middle_can_be_asked_for() -> None:
+    """Its circle is almost as large as the sphere, and with noise larger."""
+    centre = np.array([0.012, 0.1 * SPHERE.radius, 0.25])
+    feature = found(profile(centre, noise=SI(0)), offset=(0.05, 0.97))
+    assert feature.centre == pytest.approx(centre, abs=2e-6)
+
+
 def test_points_off_the_circle_by_more_than_the_tolerance_are_left_out() -> None:
     """A wall that the sphere stands before, and a spatter that stands out of it."""
     xyz = profile(noise=SI(0))

@@ -59,10 +59,10 @@ def test_a_plane_is_known_as_well_as_its_patches_let_it() -> None:
 
 
 def test_three_rings_of_twenty_four_sectors_err_by_themselves() -> None:
-    """One point in each; what rings of a sector miss by cancels, and is there none the less."""
+    """Their sums count: what rings of a sector miss by cancels, and is there none the less."""
     angle = np.radians(np.arange(-180 + 7.5, 180, 15.0))
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    offsets = np.concatenate([radius * around for radius in (0.005, 0.015, 0.03)])
-    heights = np.repeat([1.0, -2.0, 1.0], 24)
+    offsets = np.concatenate([radius * around for radius in (0.005, 0.015, 0.029, 0.03)])
+    heights = np.repeat([1.0, -2.0, 0.4, 0.6], 24)
     found = plane_covariance(offsets, heights)
-    assert found[2, 2] == pytest.approx(72 / 69 * (heights**2).sum() / 72**2)
+    assert found[2, 2] == pytest.approx(72 / 69 * 24 * (1 + 4 + 1) / 96**2)
