@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
 from flangeye.models.boards import Board, print_of
 from flangeye.models.corners import Corners
-from flangeye.types import CAMERA, Capture, Image, PointCloud, Rejected, Transform, by_frame
+from flangeye.types import CAMERA, Capture, Floats, Image, PointCloud, Rejected, Transform, by_frame
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board, scan_board
 from flangeye_plugins.fit import boards
@@ -345,8 +345,8 @@ def test_a_thousand_times_likelier_is_not_yet_certain() -> None:
     assert ambiguity([best, other._replace(misfit=2.001 * boards.CERTAIN)]) is None
 
 
-POINTS = np.stack([*np.meshgrid(np.arange(6), np.arange(4)), np.zeros((4, 6))], -1).reshape(-1, 3)
-POINTS = 0.03 * (POINTS - POINTS.mean(axis=0))
+GRID = np.stack([*np.meshgrid(np.arange(6.0), np.arange(4.0)), np.zeros((4, 6))], -1)
+POINTS: Floats = 0.03 * (GRID.reshape(-1, 3) - GRID.mean(axis=(0, 1)))
 
 
 def project(points, pose):
