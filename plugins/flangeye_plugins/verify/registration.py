@@ -65,7 +65,6 @@ def register(
     """
     source = measured[:: 1 + len(measured) // MOST_POINTS]
     motion = np.eye(4)
-    unknown = np.zeros((0, 6))
     for limit in _limits(reach, distance):
         still = STILL if limit == distance else 20 * STILL
         converged = _converge(source, surface, motion, limit, still)

@@ -40,5 +40,6 @@ def test_a_cell_that_moved_is_refused(run: Path, shift: float, passed: bool) -> 
     assert found.passed is passed
     if not passed:
         assert found.figures["shift"] == pytest.approx(1e-3, rel=0.25)
-        assert "the cell has moved since" in found.reason
+        said = f", by {1e3 * found.figures['shift']:.2f} mm at the work's worst corner"
+        assert found.reason == f"the cell has moved since {run / 'run.mcap'}{said}"
         assert found.figures["turn"] < 4e-4, "it was shifted, not turned"

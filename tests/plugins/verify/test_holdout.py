@@ -29,6 +29,7 @@ from flangeye_plugins.verify.holdout import (
     HoldoutParams,
     _beyond_gate,
     _corrected_figures,
+    _judge,
     deal,
     deal_moments,
     verify_holdout,
@@ -260,6 +261,20 @@ def test_two_folds_are_enough_and_one_is_not() -> None:
     assert HoldoutParams(folds=2).folds == 2
     with pytest.raises(ValueError, match="greater than or equal to 2"):
         HoldoutParams(folds=1)
+
+
+def test_the_verdict_tells_the_error_over_all_poses_and_without_those_set_aside() -> None:
+    figures = {"poses": 20.0, "outliers": 0.0, "rms": 0.4e-3, "rms_inliers": 0.4e-3}
+    params = HoldoutParams.model_validate({"max_rms": "0.5 mm", "max_outliers": 0.1})
+    assert _judge(figures, params) == (
+        True, "held-out error 0.400 mm rms, within the limit of 0.5 mm",
+    )  # fmt: skip
+    some = figures | {"outliers": 2.0, "rms": 3e-3, "rms_inliers": 0.6e-3}
+    assert _judge(some, params) == (
+        False, "held-out error 3.000 mm rms over all 20 poses, 0.600 mm without 2 set aside, above "
+        "the limit of 0.5 mm",
+    )  # fmt: skip
+    assert _judge(some | {"outliers": 3.0}, params)[1].startswith("3 of 20 poses are outliers, ")
 
 
 def test_figures_of_a_corrected_arm_are_those_of_the_errors_lengths() -> None:

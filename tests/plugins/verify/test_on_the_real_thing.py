@@ -231,6 +231,26 @@ def test_spheres_figures_are_those_of_the_distances() -> None:
     assert series == pytest.approx(np.column_stack([np.full(4, 200.0), 1e3 * errors]))
 
 
+@pytest.mark.parametrize(("limit", "passed"), [("125 mm", True), ("124.999 mm", False)])
+def test_the_limit_of_a_distance_is_within_it(limit: str, passed: bool) -> None:
+    bar = {"first": ("0 m", "0 m", "1 m"), "second": ("0.5 m", "0 m", "1 m"), "length": "375 mm"}
+    params = SphereParams.model_validate({"bars": [bar], "max_error": limit})
+    assert verify_sphere(calibration(), params).passed is passed
+
+
+def test_distances_are_those_of_the_ball_and_not_of_the_flange() -> None:
+    exact, ball = calibration(), np.array([0.02, -0.05, 0.3])
+    pairs = []
+    for pair in exact.pairs:
+        pose = pair.observation.base_T_flange
+        seen = np.linalg.inv(TRUTH) @ pose.matrix @ np.append(ball, 1.0)
+        feature = replace(pair.observation.circle, centre=seen[:3], centre_in_flange=ball)
+        pairs.append(replace(pair, observation=replace(pair.observation, feature=feature)))
+    found = verify_sphere(replace(exact, pairs=tuple(pairs)), SphereParams())
+    assert found.figures["max"] < 1e-12
+    assert found.figures["pairs"] > 40
+
+
 def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
     places = np.array([np.linalg.inv(TRUTH) @ pose for pose in poses(12)])[:, :3, 3]
     gaps = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(12, 1)]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_log
+from flangeye_plugins.verify import registration
 from flangeye_plugins.verify.registration import Registration, _least_squares, _limits, register
 from flangeye_plugins.verify.surface import Surface, surface_of
 from tests.plugins.verify.test_icp import FLANGE_50, MM
@@ -23,6 +24,14 @@ def found(points: np.ndarray, shape: Surface = SHAPE, distance: float = 1 * MM) 
     return registered
 
 
+def block(moved: np.ndarray, count: int = 1500) -> tuple[np.ndarray, Surface]:
+    """Return the points of a block's corner before a motion, and the corner."""
+    rng = np.random.default_rng(0)
+    sides = [np.insert(rng.uniform(0, 0.05, (count, 2)), k, 0.0, axis=1) for k in range(3)]
+    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), count, axis=0))
+    return apply(np.linalg.inv(moved), corner.points), corner
+
+
 def test_a_shape_that_was_moved_is_taken_back() -> None:
     seen = apply(np.linalg.inv(MOVED), SHAPE.points[::2])
     registered = found(seen)
@@ -34,11 +43,8 @@ def test_a_shape_that_was_moved_is_taken_back() -> None:
 
 
 def test_a_corner_shows_every_motion() -> None:
-    rng, turn = np.random.default_rng(0), rotation_exp([0.02, -0.01, 0.03])
-    sides = [np.insert(rng.uniform(0, 0.05, (1500, 2)), k, 0.0, axis=1) for k in range(3)]
-    corner = Surface(np.concatenate(sides), np.repeat(np.eye(3), 1500, axis=0))
-    moved = rigid(turn, np.array([1.0, -0.5, 0.7]) * MM)
-    registered = found(apply(np.linalg.inv(moved), corner.points), corner)
+    moved = rigid(rotation_exp([0.02, -0.01, 0.03]), np.array([1.0, -0.5, 0.7]) * MM)
+    registered = found(*block(moved))
     assert registered.motion == pytest.approx(moved, abs=2e-5)
     assert registered.roll_seen
 
@@ -89,6 +95,43 @@ def test_a_turn_that_the_shape_does_not_show_stays_zero() -> None:
 )  # fmt: skip
 def test_what_cannot_be_registered_says_why(points: np.ndarray, why: str) -> None:
     assert register(points, SHAPE, 20 * MM, 1 * MM) == why
+
+
+def test_it_goes_on_until_neither_turn_nor_shift_moves_a_point() -> None:
+    """The first step of a turn is off by its square: 0.04 mm at 30 mm."""
+    for shift in (3.0, -3.0):
+        moved = rigid(rotation_exp([0.05, 0.0, 0.0]), np.array([shift, shift, shift]) * MM)
+        seen, corner = block(moved)
+        registered = register(seen, corner, 12 * MM, 12 * MM)
+        assert isinstance(registered, Registration)
+        assert registered.rms < 2e-6
+        assert registered.motion == pytest.approx(moved, abs=1e-5)
+
+
+def test_only_the_last_limit_is_settled_to_micrometres(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[float, float]] = []
+
+    def converge(source, surface, motion, limit, still):
+        asked.append((limit, still))
+        return motion, np.zeros((0, 6))
+
+    monkeypatch.setattr(registration, "_converge", converge)
+    register(SHAPE.points, SHAPE, 4 * MM, 1 * MM)
+    assert asked == [(4 * MM, 1e-4), (2 * MM, 1e-4), (1 * MM, 5e-6)]
+
+
+def test_a_cylinder_or_two_walls_do_not_tell_a_shift_along_them() -> None:
+    """Of the cylinder turn and shift are not told, of the walls one shift alone."""
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(-np.pi, np.pi, 1500), rng.uniform(-0.02, 0.02, 1500)
+    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    cylinder = Surface(0.03 * around + height[:, None] * [0, 0, 1], around)
+    _, corner = block(np.eye(4))
+    walls = Surface(corner.points[:3000], corner.normals[:3000])
+    for shape in (cylinder, walls):
+        assert register(shape.points, shape, 1 * MM, 1 * MM) == (
+            "the matched points are too flat to tell a shift along the face"
+        )
 
 
 def test_a_face_alone_does_not_tell_a_shift_along_it() -> None:

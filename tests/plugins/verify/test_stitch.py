@@ -21,6 +21,8 @@ def test_a_cell_has_the_mean_height_of_its_points_if_they_are_enough() -> None:
     across = (np.arange(CELLS) + 0.5) * 2 / CELLS - 1
     assert found == pytest.approx(across[None, :] + 10 * across[:, None])
     assert np.isnan(_heights(tilted, 1.0, 5)).all()
+    smaller = tilted * [0.25, 0.25, 1.0]  # the map is as wide as the flange
+    assert np.array_equal(_heights(smaller, 0.25, 4), found)
 
 
 @pytest.mark.parametrize("heights", [(0.0, 2e-3), (0.0, 1e-3, 5e-3), (1.0, 1.0, 1.0)])
