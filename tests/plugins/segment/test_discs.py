@@ -71,16 +71,24 @@ def test_the_incidence_is_the_angle_to_the_line_of_sight(turn: float) -> None:
     assert np.degrees(incidence(0.6 * sight, normal)) == pytest.approx(turn, abs=1e-6)
 
 
+def test_what_faces_the_scanner_has_no_incidence_whatever_is_rounded() -> None:
+    for centre in np.random.default_rng(0).uniform(0.1, 1.0, (300, 3)):
+        assert incidence(centre, -centre / np.linalg.norm(centre)) < 1e-7
+
+
 def test_a_part_is_of_the_flanges_size_or_its_width_is_its_flaw() -> None:
     whole = disc(ring(0, UR5.rim))
     assert whole.flaw is None and whole.rank == 0 and whole.seen == 0
     assert whole.across == pytest.approx(2 * UR5.rim, abs=PITCH)
     assert whole.centre == pytest.approx(AT, abs=PITCH)
-    largest, smallest = UR5.outer + 2 * PITCH, UR5.rim / 8
-    assert disc(ring(0, largest - PITCH / 2)).flaw is None
-    assert disc(ring(0, largest + PITCH)).flaw == "69 mm across"
-    assert disc(ring(0, smallest + PITCH / 2)).flaw is None
-    assert str(disc(ring(0, smallest - PITCH)).flaw).endswith(" mm across")
+    largest, smallest = 2 * UR5.outer + 4 * PITCH, UR5.rim / 4
+    along = basis_of_plane(FACING.normal)[0]
+    for wide, fits in (
+        (largest - 1e-4, True), (largest + 1e-4, False),
+        (smallest + 1e-4, True), (smallest - 1e-4, False),
+    ):  # fmt: skip
+        flaw = disc(AT + np.outer([-wide / 2, 0, wide / 2], along)).flaw
+        assert flaw == (None if fits else f"{1e3 * wide:.0f} mm across")
 
 
 @pytest.mark.parametrize(("arc", "share"), [(2 * np.pi, 1.0), (np.pi, 0.5)])
@@ -144,8 +152,10 @@ def test_what_stands_out_by_more_than_twice_the_plate_is_none() -> None:
 def test_a_plate_that_is_not_seen_is_not_missed() -> None:
     circle = ring(0.87 * WRIST.rim, WRIST.rim)
     assert compared(circle, flange=WRIST).flaw is None
-    few = ring(0.55 * WRIST.rim, 0.6 * WRIST.rim)[:9]
-    assert compared(circle, np.concatenate([circle, few]), WRIST).flaw is None
+    plate = ring(0.55 * WRIST.rim, 0.6 * WRIST.rim)  # of no height: there is none
+    for rim, middle, flaw in ((10, 10, True), (10, 9, False), (9, 10, False)):
+        found = compared(circle, np.concatenate([circle[:rim], plate[:middle]]), WRIST)
+        assert (found.flaw is not None) is flaw
 
 
 def scored(seen: float, x: float = 0.0) -> Disc:
@@ -191,11 +201,18 @@ def test_why_none_is_the_flange(discs: Any, said: str) -> None:
     assert choose(discs, lambda d: np.zeros((1, 3), np.float32), WRIST) == said
 
 
+def test_a_face_whose_holes_cannot_be_told_is_taken_for_want_of_another() -> None:
+    blank = disc(ring(0, UR5.rim))._replace(rank=4)
+    found = choose([blank], lambda d: np.zeros((0, 3), np.float32), UR5)
+    assert not isinstance(found, str) and found[0] is blank
+
+
 @pytest.mark.parametrize(
-    ("depth", "unit"), [(29.9, None), (30.1, "unit mm"), (0.0101, None), (0.0099, "unit m")]
+    ("depth", "unit"),
+    [(29.9, None), (30.1, "unit mm"), (0.01, None), (0.0101, None), (0.0099, "unit m")],
 )
 def test_a_depth_is_between_a_centimetre_and_thirty_metres(depth: float, unit: str | None) -> None:
-    xyz = np.full((500, 600, 3), np.nan, dtype=np.float32)
+    xyz = np.full((500, 600, 3), np.nan)
     xyz[::2] = [1e-4, 50.0, depth]
     if unit is None:
         check_scale(xyz, "a")

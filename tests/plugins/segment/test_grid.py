@@ -108,6 +108,14 @@ def test_points_that_are_all_at_one_place_are_seen_there() -> None:
         assert view is not None and view.xyz == pytest.approx(place[None])
 
 
+def test_the_one_point_before_the_scanner_is_seen_though_it_is_not_drawn() -> None:
+    place = np.array([[0.1, 0.2, 0.8]], dtype=np.float32)
+    points = np.concatenate([np.tile(-place, (200_000, 1)), place])
+    assert len(_drawn(place, _lots(place), 50_000 / len(points))) == 0
+    view = range_image(points, 4e-3)
+    assert view is not None and view.xyz == pytest.approx(place[None])
+
+
 @pytest.mark.parametrize("share", [0.1, 0.4, 0.6])
 def test_a_share_is_drawn_evenly_whatever_the_order(share: float) -> None:
     scan = image(256, 256)

@@ -1,5 +1,6 @@
 """segment.sphere: the sphere, not the arm, the table or a hole."""
 
+import re
 from functools import cache
 from typing import Any
 
@@ -21,6 +22,7 @@ from flangeye_plugins.segment.sphere import (
     Candidate,
     SegmentSphereParams,
     _apart,
+    _between,
     _with_neighbours,
     find_spheres,
     most_voted,
@@ -124,8 +126,21 @@ def test_two_of_them_are_told_apart_by_nobody() -> None:
     near = points[np.linalg.norm(points - centre, axis=1) < 1.1 * SPHERE.radius]
     found = segment(of(np.concatenate([near, near + [0.0, 0.15, 0.0]])))
     assert isinstance(found, Rejected)
-    assert found.reason.startswith("2 spheres 38.1 mm across: at (")
-    assert found.reason.endswith(" mm; hide one or narrow near and far")
+    told = re.fullmatch(
+        r"2 spheres 38.1 mm across: at \((.*)\) mm and \((.*)\) mm; hide one or narrow near and far",
+        found.reason,
+    )
+    assert told
+    places = sorted([float(c) for c in place.split(",")] for place in told.groups())
+    expected = sorted((1e3 * (centre + [0.0, y, 0.0])).tolist() for y in (0.0, 0.15))
+    assert np.array(places) == pytest.approx(np.array(expected), abs=2.0)
+
+
+def test_a_point_just_at_near_or_far_is_between_them() -> None:
+    depth = np.array([[0.4375, 0.5, 0.75, 1.0, 1.0625]], np.float32)
+    view = Grid(np.repeat(depth[..., None], 3, axis=2), 1e-3, None)
+    kept = np.isfinite(_between(view, 0.5, 1.0).xyz[0])
+    assert kept.tolist() == [[inside] * 3 for inside in (False, True, True, True, False)]
 
 
 def test_nothing_between_near_and_far_is_no_sphere() -> None:
