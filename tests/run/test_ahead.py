@@ -46,6 +46,27 @@ def test_no_more_is_pulled_than_workers_and_two() -> None:
     assert len(pulled) <= 5 + 2 and threading.active_count() < 10
 
 
+def test_as_many_are_begun_as_there_are_workers_and_one_waits() -> None:
+    pulled, may_end = [], threading.Event()
+
+    def items():
+        for k in range(10):
+            pulled.append(k)
+            yield k
+
+    ahead = worked_ahead(items(), lambda _: may_end.wait(10), 2)
+    next(ahead)
+    assert pulled == [0, 1, 2]
+    may_end.set()
+    ahead.close()
+
+
+def test_a_call_takes_the_time_from_its_begin_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([10.0, 12.5])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    assert Done.of(lambda: 7) == Done(7, None, 2.5)
+
+
 def test_what_was_raised_is_raised_when_it_is_asked_for() -> None:
     def fail():
         raise ValueError("no")

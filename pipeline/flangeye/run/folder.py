@@ -123,6 +123,7 @@ def _corrections(answer: AnswerResult) -> dict[str, Any]:
 
 def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
     matrix = np.array(estimate.matrix)
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
     parent, _, child = name.partition("_T_")
     open_directions = (
         {"unobservable_rotation_translation": estimate.unobservable}
@@ -132,9 +133,9 @@ def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
     return {
         "parent": parent,
         "child": child,
-        "translation_m": matrix[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_from_rotation(matrix[:3, :3]).tolist(),
-        "rpy_rad": rpy_from_rotation(matrix[:3, :3]).tolist(),
+        "translation_m": translation.tolist(),
+        "quaternion_xyzw": quaternion_from_rotation(rotation).tolist(),
+        "rpy_rad": rpy_from_rotation(rotation).tolist(),
         "matrix": matrix.tolist(),
         "covariance_rotation_translation": estimate.covariance,
         "covariance_about_m": estimate.about,

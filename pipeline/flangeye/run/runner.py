@@ -132,7 +132,7 @@ class Runner:
         """Log observations that came ready made: one by one, as if they had been fitted."""
         step = self._steps("acquire")[0]
         for observation in stream:
-            self._finished(step, observation.id, observation, 0.0)
+            self._finished(step, observation.id, observation)
             self._hooks.flangeye_capture_finished(capture=observation.id)
             yield observation
 
@@ -142,9 +142,9 @@ class Runner:
         for capture, flange, observation in self._start.gathered():
             self._hooks.flangeye_captured(step=acquire.label, capture=capture, seconds=0.0)
             if flange is not None:
-                self._finished(self._steps("segment")[0], capture.id, flange, 0.0)
+                self._finished(self._steps("segment")[0], capture.id, flange)
             if observation:
-                self._finished(self._steps("fit")[0], capture.id, observation.feature, 0.0)
+                self._finished(self._steps("fit")[0], capture.id, observation.feature)
             self._hooks.flangeye_capture_finished(capture=capture.id)
             if observation:
                 yield observation
@@ -231,7 +231,7 @@ class Runner:
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:
         if flange := self._start.segmented(capture.id):
-            self._finished(self._steps("segment")[0], capture.id, flange, 0.0)
+            self._finished(self._steps("segment")[0], capture.id, flange)
             return flange
         found: t.FlangeCloud | None = self._per_capture("segment", capture.id, {t.Capture: capture})
         return found
@@ -270,7 +270,7 @@ class Runner:
         if self._start.does(step):
             return self._call(step)
         value = self._start.given(step)
-        self._finished(step, None, value, 0.0)
+        self._finished(step, None, value)
         return value
 
     def _solve_subset(self, observations: Sequence[t.Observation]) -> t.HandEye:
@@ -359,7 +359,8 @@ class Runner:
     def _noted(self, step: str, name: str, value: Any) -> None:
         self._hooks.flangeye_noted(step=step, name=name, value=value)
 
-    def _finished(self, step: Step, capture: str | None, value: Any, seconds: float) -> None:
+    def _finished(self, step: Step, capture: str | None, value: Any, seconds: float = 0.0) -> None:
+        """Tell what a step gave; what is there already took no time."""
         self._hooks.flangeye_stage_finished(
             step=step.label, capture=capture, value=value, seconds=seconds
         )

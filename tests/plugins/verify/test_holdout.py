@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from flangeye import StageError
 from flangeye.maths.geometry import rotation_exp
+from flangeye.models.configuration import DEFAULT
 from flangeye.types import (
     BASE,
     FLANGE,
@@ -30,8 +31,10 @@ from flangeye_plugins.verify.holdout import (
     _beyond_gate,
     _corrected_figures,
     _judge,
+    _measure_loop,
     deal,
     deal_moments,
+    hold_out,
     verify_holdout,
 )
 
@@ -118,6 +121,17 @@ def test_the_figures_of_isotropic_noise() -> None:
 def test_tilt_is_the_angle_between_mapped_and_reported_normals() -> None:
     result = verify_holdout(svd(simulate(30, 1e-6, tilt=2e-3)), svd, HoldoutParams())
     assert result.figures["tilt_rms"] == pytest.approx(2e-3, rel=0.01)
+
+
+def test_a_loop_measures_a_camera_beside_an_arm_as_that_is_measured() -> None:
+    observations, every = simulate(12, tilt=0.02), np.arange(12)
+    calibration = svd(simulate(12, seed=1))
+    plain = hold_out(observations, [every], [calibration], (DEFAULT, None))
+    loop = HeldOut(np.zeros((12, 3)), np.zeros((12, 3, 3)), np.full(12, np.nan))
+    _measure_loop(calibration, observations, every, (DEFAULT, None), loop)
+    assert loop.errors == pytest.approx(plain.errors, abs=1e-12)
+    assert loop.tilts == pytest.approx(plain.tilts, abs=1e-9)
+    assert loop.tilts == pytest.approx(np.full(12, 0.02), abs=5e-3)
 
 
 def test_a_calibration_above_the_limit_does_not_pass() -> None:
