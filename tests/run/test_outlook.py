@@ -79,6 +79,8 @@ def test_it_names_the_motion_that_is_missing(run: Path) -> None:
     recipe = parse_recipe(RECIPE, "small", registry)
     few = outlook(recipe, registry, log.observations()[:2], t.Source(fingerprint=""))
     assert few.error is None
+    workspace = t.Box(np.array([0.5, 0.0, 0.4]), np.full(3, 0.3))
+    assert outlook(recipe, registry, [], t.Source("", workspace=workspace)).coverage is None
     assert few.missing.startswith("3 poses needed")
     assert f"missing: {few.missing}" in few.lines()
     still = [*log.observations()[:1]] * 5

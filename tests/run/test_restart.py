@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flangeye import Params, stage
+from flangeye import Params, hookimpl, stage
 from flangeye import types as t
 from flangeye.errors import RunStopped, StageError
 from flangeye.log.read import RunLog, read_run
@@ -90,6 +90,40 @@ def test_a_run_that_ended_early_goes_on_with_what_it_has_not(
     _, start = earlier_run(folder, registry, ["000"])
     assert start.first == 1
     assert start.resumed is not None and start.resumed.done == {"001", "002"}
+
+
+def test_what_was_gathered_is_logged_again_with_what_became_of_it(
+    registry: Registry, ended_early: Callable[..., Path]
+) -> None:
+    def pulls_and_fails(observations, params):
+        fails(list(observations))
+
+    with replaced(toy.solve, pulls_and_fails):
+        text = AGAIN.replace("count: 6", "count: 4, bad: 1, verification: 2")
+        folder = ended_early(text, "monday_cell")
+    recipe, start = earlier_run(folder, registry)
+    told: list[tuple[str, str | None]] = []
+
+    class Told:
+        @hookimpl
+        def flangeye_stage_finished(self, step: str, capture: str | None) -> None:
+            told.append((step, capture))
+
+        @hookimpl
+        def flangeye_capture_finished(self, capture: str) -> None:
+            told.append(("finished", capture))
+
+    registry.hooks.register(Told())
+    observed = Runner(recipe, registry, t.ArchivePath())
+    observed._observe(start)
+    assert [o.id for o in observed._values[t.Observations]] == ["002", "003"]
+    segmented = [("1.segment.toy", "001"), ("finished", "001")]
+    fitted = [
+        (step, capture)
+        for capture in ("002", "003")
+        for step in ("1.segment.toy", "2.fit.toy", "finished")
+    ]
+    assert told == [*segmented, *fitted]
 
 
 def test_a_folder_without_a_recipes_name_is_gone_on_with_too(

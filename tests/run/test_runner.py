@@ -194,6 +194,25 @@ def test_stopwatch_charges_each_step_its_own_time(execute: Callable[..., Any]) -
     assert all(spent.idle is None for spent in result.timing.values())
 
 
+def test_a_source_is_opened_once_and_again_only_to_scan_in_a_simulated_cell(
+    execute: Callable[..., Any],
+) -> None:
+    opened: list[t.Seed] = []
+    plain = toy.acquire.function
+
+    def counted(seed, params):
+        opened.append(seed)
+        return plain(seed, params)
+
+    with replaced(toy.acquire, counted):
+        _, log = execute(SEAM_RECIPE)
+        assert len(opened) == 1
+        execute(SEAM_RECIPE, "seam.toy", log)
+        assert len(opened) == 1
+        execute(SEAM_RECIPE, "scan.toy", log)
+        assert len(opened) == 2
+
+
 @pytest.mark.parametrize("recorded", [False, True])
 def test_the_log_charges_each_step_the_time_that_the_result_does(
     execute: Callable[..., Any], recorded: bool
