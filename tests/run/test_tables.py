@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,19 @@ import pytest
 import yaml
 
 from flangeye import types as t
+from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.run.tables import _csv, _noise, _recipe, _seen, _value, _works_on_scans
+from flangeye.models.cell import Cell
+from flangeye.run import tables
+from flangeye.run.tables import (
+    _csv,
+    _noise,
+    _recipe,
+    _seen,
+    _value,
+    _works_on_scans,
+    write_tables,
+)
 
 POSE = t.Transform(t.BASE, t.FLANGE, rigid(rotation_exp([0, 0, np.pi / 2]), [1.0, -2.0, 0.5]))
 
@@ -82,3 +94,66 @@ steps: [acquire.live, segment.flange, fit.rim, solve.cell]
     assert steps == (["segment.flange", "fit.rim", "solve.cell"] if scans else ["solve.cell"])
     assert list(acquire) == ["acquire.archive" if scans else "acquire.centres"]
     assert list(recipe) == ["robot", "steps"]
+
+
+def log_of(text: str | None, seen: list[t.Observation], clouds: bool = False) -> Any:
+    """Return what of a log is looked at."""
+    cloud = t.PointCloud(t.CAMERA, np.ones((4, 3), np.float32))
+    captures = [t.Capture(o.id, cloud, o.poses) for o in seen]
+    return SimpleNamespace(
+        path=Path("run.mcap"), text=lambda _: text, observations=lambda: seen,
+        has_full_clouds=clouds, captures=lambda: captures,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any recipe is that of a cell in which one arm moves."""
+    recipe = SimpleNamespace(context={Cell: SimpleNamespace(movers={"flange": None})})
+    monkeypatch.setattr(tables, "parse_recipe", lambda *_: recipe)
+
+
+UNUSED: Any = None
+TEXT = "title: a cell\nsteps: [acquire.simulated_cell, segment.flange, fit.rim, solve.cell]\n"
+
+
+@pytest.mark.usefixtures("of_a_cell")
+@pytest.mark.parametrize("clouds", [False, True])
+def test_a_table_of_the_arm_one_of_what_was_seen_and_a_recipe(tmp_path: Path, clouds: bool) -> None:
+    seen = [circle(k, [1e-8] * 3) for k in (10, 2)]
+    files = write_tables(log_of(TEXT, seen, clouds), tmp_path, UNUSED)
+    assert files == [tmp_path / n for n in ("flange.csv", "camera_target.csv", "recipe.yaml")]
+    arm, sightings, recipe = (file.read_text("utf-8") for file in files)
+    assert [row[0] for row in csv.reader(arm.splitlines())] == ["number", "2", "10"]
+    rows = list(csv.reader(sightings.splitlines()))
+    steps = yaml.safe_load(recipe)["steps"]
+    if clouds:
+        assert rows[1:] == [
+            ["10", "clouds/10-camera-target.pcd"],
+            ["2", "clouds/2-camera-target.pcd"],
+        ]
+        assert all((tmp_path / row[1]).stat().st_size > 0 for row in rows[1:])
+        assert steps[1:] == ["segment.flange", "fit.rim", "solve.cell"]
+    else:
+        assert rows[1:] == [["10", "10", "0.1", "0.2"], ["2", "2", "0.1", "0.2"]]
+        assert not (tmp_path / "clouds").exists()
+        assert steps[1:] == ["solve.cell"]
+    assert next(iter(steps[0])) == ("acquire.archive" if clouds else "acquire.centres")
+
+
+def test_what_is_no_run_of_a_cell_has_no_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = "run.mcap: is no run of a cell, and tables are written of cells alone"
+    with pytest.raises(StageError, match=said):
+        write_tables(log_of(None, []), tmp_path, UNUSED)
+    monkeypatch.setattr(tables, "parse_recipe", lambda *_: SimpleNamespace(context={}))
+    with pytest.raises(StageError, match=said):
+        write_tables(log_of(TEXT, [circle(1, [1e-8] * 3)]), tmp_path, UNUSED)
+
+
+@pytest.mark.usefixtures("of_a_cell")
+def test_where_nothing_was_seen_there_is_nothing_to_write(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"run.mcap: nothing was seen in this run"):
+        write_tables(log_of(TEXT, []), tmp_path, UNUSED)
+    assert not list(tmp_path.iterdir())
