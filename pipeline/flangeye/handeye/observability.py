@@ -400,7 +400,7 @@ def _fault_of(poses: Floats) -> str | None:
         return None
     axis = axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))])
     named = in_base(axis, 2)
-    if _about_one_line(poses, axis):
+    if _about_one_line(poses):
         return f"turned only its last joint, about {named}; tilt it about another axis too"
     return (
         f"turned about one axis only, {named}, so that translation along it does not show; tilt "
@@ -408,7 +408,7 @@ def _fault_of(poses: Floats) -> str | None:
     )
 
 
-def _about_one_line(poses: Floats, axis: Floats) -> bool:
+def _about_one_line(poses: Floats) -> bool:
     """Return whether all poses turn about one fixed line."""
     rotations = poses[:, :3, :3] @ poses[0, :3, :3].T
     shifts = poses[:, :3, 3] - (rotations @ poses[0, :3, 3])
