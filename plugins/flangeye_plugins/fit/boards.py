@@ -171,7 +171,7 @@ def fit_aruco(capture: Capture, params: MarkerParams) -> PoseFeature | Rejected:
     Four corners tell little: a board with many gives a pose several times better. Seen nearly
     frontally a marker has two poses that fit alike, and is set aside unless depth decides.
     """
-    board = Board("marker", 1, 1, params.size, 0.0, params.dictionary, params.id)
+    board = Board("marker", 1, 1, params.size, dictionary=params.dictionary, marker_id=params.id)
     return fit_board(capture, board, params)
 
 

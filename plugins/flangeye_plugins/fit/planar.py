@@ -166,11 +166,10 @@ def middles_beside_centres(corners: Corners, image: Image, pose: Floats, radius:
     in_plane = np.broadcast_to(radius * pose[:3, :2], (len(centres), 3, 2))
     m = np.concatenate([in_plane, centres[:, :, None]], axis=2)
     dual = m @ np.diag([1.0, 1.0, -1.0]) @ m.transpose(0, 2, 1)
-    middles = dual[:, :, 2] / dual[:, 2:, 2]
     none = np.zeros(3)
     at = [
         cv2.projectPoints(points, none, none, image.camera_matrix, image.distortion)[0]
-        for points in (middles, centres)
+        for points in (dual[:, :, 2], centres)  # however long: only their directions count
     ]
     return np.asarray((at[0] - at[1]).reshape(-1, 2), dtype=np.float64)
 

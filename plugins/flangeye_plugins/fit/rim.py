@@ -197,6 +197,6 @@ def _centre_covariance(rings: Rings, of_plane: Floats, params: RimParams) -> Flo
     """Return the (3, 3) covariance of the centre in the face's axes, the normal last [m^2]."""
     covariance = params.scanner_error**2 * np.eye(3)
     covariance[:2, :2] += params.edge_bias**2 * np.eye(2)
-    covariance[:2, :2] += rings.covariance(params.inlier / 2)[:2, :2]
+    covariance[:2, :2] += rings.covariance()[:2, :2]
     covariance[2, 2] += of_plane[2, 2]
     return covariance

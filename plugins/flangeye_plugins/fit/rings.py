@@ -38,12 +38,14 @@ class Rings(NamedTuple):
         points: (N, 2) edge points [m].
         ring: (N,) 0 for rim, 1 for bore.
         bins: (k,) number of sectors each ring was searched in.
+        scale: Distance at which an edge point's weight is a half [m].
     """
 
     circles: Circles
     points: Floats
     ring: Indices
     bins: Indices
+    scale: float
 
     @property
     def residuals(self) -> Floats:
@@ -55,11 +57,11 @@ class Rings(NamedTuple):
         on_circle = np.abs(self.residuals) <= inlier
         return np.bincount(self.ring[on_circle], minlength=len(self.bins)) / self.bins
 
-    def covariance(self, scale: float) -> Floats:
-        """Return the (2 + k, 2 + k) covariance of centre and radii [m^2], ``scale`` as fitted."""
+    def covariance(self) -> Floats:
+        """Return the (2 + k, 2 + k) covariance of centre and radii [m^2]."""
         jacobian = circle_jacobian(self.circles, self.points, self.ring)
         stretch = sectors(self.points - self.circles.centre, STRETCHES) + STRETCHES * self.ring
-        residuals = self.residuals
+        residuals, scale = self.residuals, self.scale
         weights, curvature = cauchy_weights(residuals, scale), cauchy_curvature(residuals, scale)
         return clustered_covariance(jacobian, residuals, weights, stretch, curvature)
 
@@ -98,7 +100,7 @@ def _settled(
         circles = fit_concentric(points, ring, circles, scale)
         if np.abs(circles.centre - before).max() < within:
             break
-    return Rings(circles, points, ring, bins)
+    return Rings(circles, points, ring, bins, scale)
 
 
 def _sectors_for(flat: Floats, nominal: Floats) -> Indices:

@@ -69,7 +69,7 @@ def test_the_stated_covariance_is_that_of_the_centres() -> None:
         arc = beyond(points + 5e-5 * rng.standard_normal((len(points), 1)) * out, -0.5)
         rings = find_rings(arc, NOMINAL, CENTRE, SCALE)
         found.append([*rings.circles.centre, *rings.circles.radii])
-        stated.append(rings.covariance(SCALE))
+        stated.append(rings.covariance())
     scatter, mean = np.std(found, axis=0), np.sqrt(np.diag(np.mean(stated, axis=0)))
     assert mean == pytest.approx(scatter, rel=0.35)
 
