@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.geometry import basis_of_plane, rotation_exp, rotation_log
 
 VECTORS = st.lists(st.floats(-7.0, 7.0), min_size=3, max_size=3).map(np.array)
 
@@ -30,3 +30,11 @@ def test_at_no_turn_a_small_one_and_half_a_turn(length: Any) -> None:
 @given(VECTORS.filter(lambda v: np.linalg.norm(v) < 3.1))
 def test_the_logarithm_undoes_it(vector: Any) -> None:
     np.testing.assert_allclose(rotation_log(rotation_exp(vector)), vector, atol=1e-12)
+
+
+@given(VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1))
+def test_the_axes_of_a_plane_are_a_rotation_about_its_normal(normal: Any) -> None:
+    axes = basis_of_plane(normal)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    np.testing.assert_allclose(axes[2] * np.linalg.norm(normal), normal, atol=1e-12)

@@ -178,11 +178,15 @@ def nearest_rotation(matrices: Floats) -> Floats:
 
 def basis_of_plane(normal: Floats) -> Floats:
     """Return (3, 3) whose rows are two in-plane axes and the unit normal, right-handed."""
-    n = np.asarray(normal, dtype=np.float64) / np.linalg.norm(normal)
-    helper = np.eye(3)[np.argmin(np.abs(n))]
-    u = hat(helper) @ n
-    u /= np.linalg.norm(u)
-    return np.stack([u, hat(n) @ u, n])
+    x, y, z = np.asarray(normal, dtype=np.float64).tolist()
+    length = math.hypot(x, y, z)
+    x, y, z = x / length, y / length, z / length
+    # The cross product of the normal and the axis it is farthest from, without arrays of three.
+    k = min(range(3), key=(abs(x), abs(y), abs(z)).__getitem__)
+    a, b, c = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))[k]
+    across = math.hypot(a, b, c)
+    a, b, c = a / across, b / across, c / across
+    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a], [x, y, z]])
 
 
 def kabsch(source: Floats, target: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.maths.statistics import SIGMA_OF_MAD
-from flangeye.types import Floats, Mask, Singles
+from flangeye.maths.statistics import SIGMA_OF_MAD, median
+from flangeye.types import Floats, Indices, Mask, Singles
 
 T = TypeVar("T", bound=np.generic)
 
@@ -29,6 +29,12 @@ ENOUGH = 2000
 
 THINNEST = 1e-6
 """Half thickness of a slab about points that lie on one plane exactly [m]."""
+
+PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Pairs of coordinates, whose mean products are the scatter about an origin."""
+
+SCATTER = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
+"""Where in a point's nine moments the entries of the scatter are."""
 
 
 class Plane(NamedTuple):
@@ -64,7 +70,7 @@ def fit_plane(points: Floats, towards: Floats) -> Plane:
     offsets = points - point
     normal = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]
     normal = normal if normal @ towards >= 0 else -normal
-    return Plane(point, normal, SIGMA_OF_MAD * float(np.median(np.abs(offsets @ normal))))
+    return Plane(point, normal, SIGMA_OF_MAD * float(median(np.abs(offsets @ normal))))
 
 
 def thinned(points: NDArray[T], enough: int = ENOUGH) -> NDArray[T]:
@@ -112,25 +118,28 @@ class _Rows(NamedTuple):
     """Groups of points side by side, the shorter ones filled up.
 
     Attributes:
-        xyz: (P, 3, K) offsets from the rough planes' points [m].
+        moments: (P, 9, K) offsets from the rough planes' points [m], and their products
+            ``PRODUCTS`` [m^2]: what a plane takes of its points is then one product of matrices.
         there: (P, K) which are points.
     """
 
-    xyz: Floats
+    moments: Floats
     there: Mask
 
     @classmethod
     def of(cls, groups: Sequence[Floats | Singles], rough: Sequence[Plane]) -> _Rows:
         sizes = np.array([len(points) for points in groups])
-        shape = (len(groups), 3, sizes.max(initial=1))
-        xyz = np.zeros(shape, dtype=np.result_type(np.float32, *groups))
-        for row, points, plane in zip(xyz, groups, rough, strict=True):
-            row[:, : len(points)] = points.T - plane.point[:, None]
-        return cls(xyz, np.arange(xyz.shape[2]) < sizes[:, None])
+        shape = (len(groups), 9, sizes.max(initial=1))
+        moments = np.zeros(shape, dtype=np.result_type(np.float32, *groups))
+        for row, points, plane in zip(moments, groups, rough, strict=True):
+            np.subtract(points.T, plane.point[:, None], out=row[:3, : len(points)])
+        for row, (i, j) in enumerate(PRODUCTS, 3):
+            np.multiply(moments[:, i], moments[:, j], out=moments[:, row])
+        return cls(moments, np.arange(shape[2]) < sizes[:, None])
 
     def some(self, which: Mask) -> _Rows:
         """Return the rows of some groups."""
-        return self if which.all() else _Rows(self.xyz[which], self.there[which])
+        return _Rows(self.moments[which], self.there[which])
 
 
 class _Slabs:
@@ -155,21 +164,20 @@ class _Slabs:
     def at(cls, rough: Sequence[Plane], gates: Floats) -> _Slabs:
         return cls(np.array([plane.normal for plane in rough]).reshape(-1, 3), gates)
 
-    def off(self, rows: _Rows, which: Mask) -> Floats:
+    def off(self, rows: _Rows, which: Indices) -> Floats:
         """Return (Q, K) the distances of points from some of the planes."""
-        level = (self.normals[which] * self.points[which]).sum(axis=1)
-        normals = self.normals[which][:, None].astype(rows.xyz.dtype)
-        heights = (normals @ rows.xyz)[:, 0]
+        normals = self.normals[which]
+        level = (normals * self.points[which]).sum(axis=1)
+        heights = (normals[:, None].astype(rows.moments.dtype) @ rows.moments[:, :3])[:, 0]
         heights -= level[:, None]
         return np.abs(heights, out=heights)
 
-    def fit(self, rows: _Rows, chosen: Mask, which: Mask) -> None:
-        """Turn some planes to the (Q, K) points chosen: total least squares."""
-        counts = chosen.sum(axis=1)[:, None]
-        weighted = rows.xyz * chosen[:, None]
-        means = weighted.sum(axis=2, dtype=np.float64) / counts
-        about_rough = weighted @ rows.xyz.transpose(0, 2, 1) / counts[..., None]
-        scatter = about_rough - means[:, :, None] * means[:, None]
+    def fit(self, rows: _Rows, chosen: Mask, counts: Indices, which: Indices) -> None:
+        """Turn some planes to the (Q, K) points chosen, ``counts`` (Q,): total least squares."""
+        sums = (rows.moments @ chosen[..., None].astype(rows.moments.dtype))[..., 0]
+        moments = sums / counts[:, None]
+        means = moments[:, :3]
+        scatter = moments[:, SCATTER] - means[:, :, None] * means[:, None]
         normals = np.linalg.eigh(scatter)[1][..., 0]
         away = (normals * self.towards[which]).sum(axis=1) < 0
         self.points[which] = means
@@ -189,53 +197,60 @@ def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
 
     Concentration steps of least trimmed squares (Rousseeuw and Van Driessen 1999).
     """
-    going, chosen = np.ones(len(slabs.gates), dtype=bool), np.zeros_like(rows.there)
+    going, chosen = np.arange(len(slabs.gates)), np.zeros_like(rows.there)
     for _ in range(ROUNDS):
-        some = rows.some(going)
-        off = slabs.off(some, going)
-        half = _medians(off, some.there & (off <= slabs.gates[going][:, None]))
-        slabs.halves[going] = np.where(np.isnan(half), slabs.gates[going], half)
-        nearest = some.there & (off <= slabs.halves[going][:, None])
-        enough = nearest.sum(axis=1) >= 3
-        changed = enough & _differ(nearest, chosen[going], restless)
-        going[going] = changed
+        off = slabs.off(rows, going)
+        gates = slabs.gates[going]
+        half = _medians(off, rows.there & (off <= gates[:, None]))
+        slabs.halves[going] = halves = np.where(np.isnan(half), gates, half)
+        nearest = rows.there & (off <= halves[:, None])
+        counts = nearest.sum(axis=1)
+        changed = (counts >= 3) & _differ(nearest, chosen, restless * counts)
         if not changed.any():
             break
-        chosen[going] = nearest[changed]
-        slabs.fit(some.some(changed), chosen[going], going)
+        if not changed.all():
+            rows, going = rows.some(changed), going[changed]
+            nearest, counts = nearest[changed], counts[changed]
+        chosen = nearest
+        slabs.fit(rows, chosen, counts, going)
 
 
 def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
     """Fit each plane to all points in its slab, and open the slab to their noise, until at rest."""
-    going, chosen = slabs.found.copy(), np.zeros_like(rows.there)
+    going = np.flatnonzero(slabs.found)
+    if len(going) < len(slabs.found):
+        rows = rows.some(slabs.found)
+    chosen, off = np.zeros_like(rows.there), slabs.off(rows, going)
     for _ in range(ROUNDS):
-        if not going.any():
+        near = rows.there & (off <= np.maximum(slabs.halves[going], THINNEST)[:, None])
+        counts = near.sum(axis=1)
+        slabs.found[going] = enough = counts >= 3
+        changed = enough & _differ(near, chosen, restless * counts)
+        if not changed.any():
             break
-        some = rows.some(going)
-        thickness = np.maximum(slabs.halves[going], THINNEST)[:, None]
-        near = some.there & (slabs.off(some, going) <= thickness)
-        slabs.found[going] = enough = near.sum(axis=1) >= 3
-        changed = enough & _differ(near, chosen[going], restless)
-        going[going] = changed
-        some, chosen[going] = some.some(changed), near[changed]
-        slabs.fit(some, chosen[going], going)
-        slabs.sigmas[going] = SIGMA_OF_MAD * _medians(slabs.off(some, going), chosen[going])
-        slabs.halves[going] = np.minimum(slabs.gates[going], sigmas * slabs.sigmas[going])
+        if not changed.all():
+            rows, going = rows.some(changed), going[changed]
+            near, counts = near[changed], counts[changed]
+        chosen = near
+        slabs.fit(rows, chosen, counts, going)
+        off = slabs.off(rows, going)
+        slabs.sigmas[going] = noise = SIGMA_OF_MAD * _medians(off, chosen, counts)
+        slabs.halves[going] = np.minimum(slabs.gates[going], sigmas * noise)
 
 
-def _differ(chosen: Mask, before: Mask, share: float) -> Mask:
-    """Return (P,) whether more than a share of the points that a plane has chosen are new."""
-    changed = (chosen != before).sum(axis=1)
-    return np.asarray(changed > share * chosen.sum(axis=1))
+def _differ(chosen: Mask, before: Mask, few: Floats) -> Mask:
+    """Return (P,) whether more than a few (P,) of the points that a plane has chosen are new."""
+    return np.asarray((chosen != before).sum(axis=1) > few)
 
 
-def _medians(values: Floats, which: Mask) -> Floats:
+def _medians(values: Floats, which: Mask, count: Indices | None = None) -> Floats:
     """Return the (P,) medians of the values chosen in each of P rows, NaN where none is."""
     if len(values) == 1:
-        return np.array([np.median(values[which]) if which.any() else np.nan])
+        return np.array([median(values[which]) if which.any() else np.nan])
     # What is not chosen sorts to the end.
-    ordered = np.sort(np.where(which, values, values.dtype.type(np.inf)), axis=1)
-    count = which.sum(axis=1)
+    ordered = np.where(which, values, values.dtype.type(np.inf))
+    ordered.sort(axis=1)
+    count = which.sum(axis=1) if count is None else count
     row = np.arange(len(values))
     middle = (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2]) / 2
     return np.where(count > 0, middle, np.nan)

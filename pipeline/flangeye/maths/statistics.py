@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flangeye.maths.geometry import hat
 from flangeye.types import Floats
+
+T = TypeVar("T", bound=np.floating)
 
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 
 SAMPLES = 4000
 """Draws of the pose: a 95 % quantile from this many varies by one percent."""
+
+
+def median(values: NDArray[T]) -> NDArray[T]:
+    """Return the medians (...) of (..., n) finite values, one at least, as ``np.median`` does.
+
+    It sorts out what it needs alone, five to ten times as fast.
+    """
+    half = values.shape[-1] // 2
+    parted = np.partition(values, half, axis=-1)
+    above = parted[..., half]
+    return above if values.shape[-1] % 2 else (parted[..., :half].max(axis=-1) + above) / 2
 
 
 def chi2_quantile(probability: float, freedom: int) -> float:

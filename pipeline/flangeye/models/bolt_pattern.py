@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flangeye.maths.circles import distances
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
 
@@ -81,7 +82,7 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     Returns:
         (TICKS,), or None when there are too few points to see a hole.
     """
-    radius = np.hypot(flat[:, 0], flat[:, 1])
+    radius = distances(flat)
     ring = flat[np.abs(radius - pitch) < half_width]
     turn = np.arctan2(ring[:, 1], ring[:, 0]) / (2 * np.pi) * TICKS
     count = np.bincount(np.floor(turn).astype(np.intp) % TICKS, minlength=TICKS).astype(float)

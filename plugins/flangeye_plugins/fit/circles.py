@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.maths.circles import distances
 from flangeye.types import Floats
 
 DAMPING = 1e-9
@@ -34,7 +35,7 @@ def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -
         ring: (N,) which circle each point belongs to.
     """
     offsets = points - circles.centre
-    return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]) - circles.radii[ring])
+    return np.asarray(distances(offsets) - circles.radii[ring])
 
 
 def fit_concentric(points: Floats, ring: NDArray[np.intp], start: Circles, scale: float) -> Circles:
@@ -94,6 +95,6 @@ def cauchy_curvature(residual: Floats, scale: float) -> Floats:
 def circle_jacobian(circles: Circles, points: Floats, ring: NDArray[np.intp]) -> Floats:
     """Return the (N, 2 + k) derivative of :func:`circle_residuals` to centre and radii."""
     offsets = points - circles.centre
-    radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-9)
+    radius = np.maximum(distances(offsets), 1e-9)
     of_radii = -(ring[:, None] == np.arange(len(circles.radii))).astype(np.float64)
     return np.hstack([-offsets / radius[:, None], of_radii])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from flangeye.maths.circles import distances
 from flangeye.maths.planes import Plane, robust_plane, thinned
+from flangeye.maths.statistics import median
 from flangeye.types import Floats, Indices
 
 ACROSS, FEWEST = 5, 20
@@ -23,7 +25,7 @@ def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: flo
     Returns:
         The plane, or None when fewer than three points lie near it.
     """
-    reach = np.hypot(*rough.flatten(points).T)
+    reach = distances(rough.flatten(points))
     candidates = points.compress((reach >= ring[0]) & (reach < ring[1]), axis=0)
     if len(candidates) < 3:
         return None
@@ -46,7 +48,7 @@ def likeliest_plane(points: Floats, rough: Plane) -> Plane:
     sample = thinned(points)
     normals, levels = _planes_of_patches(sample, _patches(rough.flatten(sample)), rough)
     off = np.abs(normals @ (sample - rough.point).T - levels[:, None])
-    best = int(np.argmin(np.median(off, axis=1)))
+    best = int(np.argmin(median(off)))
     if best == 0:
         return rough
     return Plane(rough.point + levels[best] * normals[best], normals[best])

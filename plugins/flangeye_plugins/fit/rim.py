@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import Params, stage
+from flangeye.maths.circles import distances
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane, fit_plane, thinned
 from flangeye.models.bolt_pattern import roll_angle
@@ -145,7 +146,7 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
     them backwards: with 0.2 mm of noise they hide in it and move the plane by 0.015 mm.
     """
     offsets = face.flatten(points) - rings.circles.centre
-    radius = np.hypot(offsets[:, 0], offsets[:, 1])
+    radius = distances(offsets)
     rim, *bore = rings.circles.radii
     inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
     inner = points.compress(inside, axis=0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.circles import edge_points, fringe, sectors, vote_centre
+from flangeye.maths.circles import distances, edge_points, fringe, sectors, vote_centre
 from flangeye.maths.planes import thinned
 from flangeye.types import Floats, Indices
 from flangeye_plugins.fit.circles import (
@@ -122,7 +122,7 @@ def _edges_near(
     With a depth, all points that are at most so far [m] behind them.
     """
     offsets = flat - centre
-    reach = np.hypot(offsets[:, 0], offsets[:, 1])
+    reach = distances(offsets)
     found = []
     for k, (low, high) in enumerate(SEARCHED[: len(nominal)]):
         inside = (reach > low * nominal[k]) & (reach < high * nominal[k])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.maths.circles import sectors
+from flangeye.maths.circles import distances, sectors
 from flangeye.types import Floats
 
 STRETCHES = 12
@@ -56,7 +56,7 @@ def plane_covariance(offsets: Floats, heights: Floats) -> Floats:
         offsets: (N, 2) points in the plane, about where the height is taken [m].
         heights: (N,) residuals [m].
     """
-    radius = np.hypot(offsets[:, 0], offsets[:, 1])
+    radius = distances(offsets)
     third = np.minimum((3 * radius / radius.max()).astype(np.intp), 2)
     cluster = 2 * STRETCHES * third + sectors(offsets, 2 * STRETCHES)
     jacobian = -np.stack([*offsets.T, np.ones(len(offsets))]).T

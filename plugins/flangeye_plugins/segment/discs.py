@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.maths.circles import edge_points, vote_centre
+from flangeye.maths.circles import distances, edge_points, vote_centre
 from flangeye.maths.planes import Plane, thinned
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
@@ -176,6 +176,6 @@ def ring_shares(
     shares = []
     for k, radius in enumerate(flange.radii.values()):
         edge = flat[edge_points(flat, centre, SECTORS, outer=k == 0)] - centre
-        off = np.abs(np.hypot(edge[:, 0], edge[:, 1]) - radius)
+        off = np.abs(distances(edge) - radius)
         shares.append(float((off < tolerance).sum() / SECTORS))
     return centre, shares

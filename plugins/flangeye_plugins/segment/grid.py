@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.maths.statistics import median
 from flangeye.types import Floats, Singles
 
 SAMPLE = 50_000
@@ -92,7 +93,7 @@ def range_image(points: Singles, pitch: float) -> Grid | None:
         share, few = 1.0, _before_scanner(points)
     if len(few) == 0:
         return None
-    wanted = pitch / float(np.median(few[:, 2]))
+    wanted = pitch / float(median(few[:, 2]))
     spacing = _typical_angle(few[:, 0] / few[:, 2], few[:, 1] / few[:, 2]) * np.sqrt(share)
     enough = min(1.0, ROOMY * (spacing / wanted) ** 2)
     angle = max(wanted, 1.6 * spacing / np.sqrt(enough))
@@ -136,7 +137,7 @@ def thin_out(image: Singles, pitch: float) -> Grid:
     rows, columns = image[:, :: _every(image.shape[1])], image[:: _every(image.shape[0])]
     down, across = _angle_between(rows, axis=0), _angle_between(columns, axis=1)
     depth = rows[..., 2][np.isfinite(rows[..., 2])]
-    wanted = pitch / float(np.median(depth)) if depth.size else 1.0
+    wanted = pitch / float(median(depth)) if depth.size else 1.0
     strides = (_stride(wanted, down), _stride(wanted, across))
     angle = float(np.sqrt(strides[0] * down * strides[1] * across))
     return Grid(np.ascontiguousarray(image[:: strides[0], :: strides[1]]), angle, strides)
@@ -153,7 +154,7 @@ def _angle_between(lines: Singles, axis: int) -> float:
         step = np.diff(lines[..., :2] / lines[..., 2:], axis=axis)
     distance = np.hypot(step[..., 0], step[..., 1])
     finite = distance[np.isfinite(distance)]
-    return float(np.median(finite)) if finite.size else np.nan
+    return float(median(finite)) if finite.size else np.nan
 
 
 def _stride(wanted: float, spacing: float) -> int:

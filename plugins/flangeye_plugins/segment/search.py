@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye.maths.planes import robust_planes, thinned
+from flangeye.maths.statistics import median
 from flangeye.models.targets import Flange
 from flangeye.types import Indices, Singles
 from flangeye_plugins.segment.crop import in_box
@@ -23,7 +24,7 @@ UNEVEN = 3e-4
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
     """Return every flat part of the scene as a disc, with what keeps it from being the flange."""
     smooth, noise = smooth_surface(view, limits.crease)
-    pitch = view.angle * float(np.median(view.xyz[smooth][::7, 2])) if smooth.any() else np.inf
+    pitch = view.angle * float(median(view.xyz[..., 2][smooth][::7])) if smooth.any() else np.inf
     fewest = max(25, int(0.02 * np.pi * flange.rim**2 / pitch**2))
     pieces = [_piece(view, index, flange) for index in connected_pieces(smooth, fewest)]
     parts = flat_parts(pieces, 2.5 * flange.outer, _scatter(flange, noise), fewest)
@@ -32,7 +33,7 @@ def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
 
 
 def _piece(view: Grid, index: Indices, flange: Flange) -> Piece:
-    points = view.xyz.reshape(-1, 3)[index]
+    points = view.xyz.reshape(-1, 3).take(index, axis=0)
     return Piece(
         points, index, _patches(index, view, 0.5 * flange.rim / (view.angle * points[0, 2]))
     )

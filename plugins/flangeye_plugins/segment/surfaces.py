@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from flangeye.maths.statistics import SIGMA_OF_MAD
+from flangeye.maths.statistics import SIGMA_OF_MAD, median
 from flangeye.types import Indices, Mask, Singles
 from flangeye_plugins.segment.grid import Grid
 
@@ -32,12 +32,14 @@ def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
     """
     depth = np.ascontiguousarray(grid.xyz[..., 2])
     # The second difference of independent values has six times their variance.
-    noise = max(_typical(_bending(depth, axis, 1)) for axis in (0, 1)) / np.sqrt(6)
+    bent = [_bending(depth, axis, 1) for axis in (0, 1)]
+    noise = max(_typical(near) for near in bent) / np.sqrt(6)
     if NOISE_GATE * np.sqrt(6) * noise > bend:
         depth = _averaged(depth)
+        bent = [_bending(depth, axis, 1) for axis in (0, 1)]
     smooth = np.isfinite(depth)
-    for axis in (0, 1):
-        near, wide = _bending(depth, axis, 1), _bending(depth, axis, 2)
+    for axis, near in enumerate(bent):
+        wide = _bending(depth, axis, 2)
         limit = max(bend, NOISE_GATE * _typical(wide))
         # A crease of little slope, or one softened by the scanner, shows over two points.
         smooth &= ~(np.abs(near) > limit) & ~(np.abs(wide) > limit)
@@ -69,7 +71,7 @@ def _step(depth: Singles, axis: int) -> Singles:
     """Return the larger step of depth to the neighbours along an axis; missing ones are none."""
     out = np.zeros_like(depth)
     target = np.moveaxis(out, axis, 0)
-    step = np.nan_to_num(np.abs(np.diff(np.moveaxis(depth, axis, 0), axis=0)), copy=False)
+    step = np.fmax(np.abs(np.diff(np.moveaxis(depth, axis, 0), axis=0)), np.float32(0))
     target[:-1] = step
     target[1:] = np.maximum(target[1:], step)
     return out
@@ -79,7 +81,7 @@ def _typical(values: Singles) -> float:
     """Return the robust standard deviation of second differences."""
     sample = np.abs(values.ravel()[:: 1 + values.size // SAMPLE])
     sample = sample[np.isfinite(sample)]
-    return SIGMA_OF_MAD * float(np.median(sample)) if sample.size else 0.0
+    return SIGMA_OF_MAD * float(median(sample)) if sample.size else 0.0
 
 
 def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
