@@ -1,0 +1,41 @@
+"""Which part has changed: the same whatever was thought before of where the scanner stands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye.handeye.blame import blame, explained, suspects
+from flangeye.handeye.drift import Information, Sightings
+from flangeye_emulators.world.year import ABOUT, Happening, Year, watch
+
+DAILY = 3e-5
+WATCHED = watch(Year(checks=3), Happening(), np.random.default_rng(0))
+SEEN, BEFORE = WATCHED.sightings.of(0, 3), Information.of_covariance(WATCHED.prior)
+THOUGHT = np.array([1e-4, -2e-4, 3e-4, 2e-4, -1e-4, 3e-4])
+
+
+def thought(sign: float = 1.0) -> tuple[Information, Sightings]:
+    """Return what is known and seen with the scanner thought to stand elsewhere [rad, m]."""
+    known = Information(BEFORE.matrix, BEFORE.vector + BEFORE.matrix @ (sign * THOUGHT))
+    return known, replace(SEEN, residuals=SEEN.residuals - SEEN.effects @ (sign * THOUGHT))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_who_is_blamed_does_not_depend_on_where_motions_are_taken_from(sign: float) -> None:
+    plain = blame(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
+    moved = blame(*thought(sign), ABOUT, WATCHED.scanner, DAILY)
+    assert sum(plain.values()) == pytest.approx(1.0)
+    assert moved == pytest.approx(plain, rel=1e-6)
+    assert [p for _, p in suspects(plain)] == sorted((p for _, p in suspects(plain)), reverse=True)
+    assert sum(p for _, p in suspects(plain)) == pytest.approx(1.0)
+
+
+def test_scatter_as_it_was_is_explained_and_a_centimetre_of_it_is_not() -> None:
+    assert explained(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
+    assert explained(*thought(), ABOUT, WATCHED.scanner, DAILY)
+    wild = 0.01 * np.random.default_rng(1).standard_normal(SEEN.residuals.shape)
+    spoilt = replace(SEEN, residuals=SEEN.residuals + wild)
+    assert not explained(BEFORE, spoilt, ABOUT, WATCHED.scanner, DAILY)
