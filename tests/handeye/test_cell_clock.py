@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from flangeye import CalibrationRefused
 from flangeye.handeye.cell import calibrate_cell
+from flangeye.handeye.cell_clock import _told
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import invert, rigid, rotation_exp
@@ -101,3 +103,11 @@ def test_a_camera_whose_sightings_all_disagree_is_named() -> None:
     told = "where right is: .*; no sighting that agrees with others has right in it"
     with pytest.raises(CalibrationRefused, match=told):
         solved({"left": 0.0, "right": 0.5})
+
+
+def test_how_late_the_arms_are_is_told_of_each_camera() -> None:
+    left: Any = SimpleNamespace(covariance=np.diag([1e-6, 4e-6]))
+    assert _told(CELL, np.array([12.34e-3, -4e-3]), left) == (
+        "the arms were at the poses 12.3 +- 1.0 ms after the times that left gives, "
+        "4.0 +- 2.0 ms before the times that right gives"
+    )

@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flangeye.handeye.drift import DriftTest, Information, Prior, allowance, information_of, verdict
+from flangeye.handeye.drift import (
+    DriftTest,
+    Information,
+    Prior,
+    _change,
+    _scatter,
+    _surprise,
+    allowance,
+    information_of,
+    verdict,
+)
 from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
 from tools import drift_year
 
@@ -13,15 +23,57 @@ from tools import drift_year
 def test_the_days_motion_is_marginalised_as_an_unknown_would_be() -> None:
     watched = watch(Year(checks=2), Happening(), np.random.default_rng(0))
     seen, daily = watched.sightings, 3e-5
-    told = information_of(seen, daily)
+    known = information_of(seen, daily)
     own = seen.of(1, 2)
     stacked = own.effects.reshape(-1, 6)
     noise = stacked @ allowance(daily) @ stacked.T
     for i, each in enumerate(own.covariances):
         noise[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] += each
     weighted = np.linalg.solve(noise, stacked)
-    np.testing.assert_allclose(told.matrix[1], stacked.T @ weighted, rtol=1e-6, atol=1e-3)
-    np.testing.assert_allclose(told.vector[1], -weighted.T @ own.residuals.ravel(), rtol=1e-5)
+    np.testing.assert_allclose(known.matrix[1], stacked.T @ weighted, rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(known.vector[1], -weighted.T @ own.residuals.ravel(), rtol=1e-5)
+
+
+def told(rng: np.random.Generator, *shape: int) -> Information:
+    """Return what a camera's six numbers are known to be: positive, no axis by itself."""
+    rows = rng.standard_normal((*shape, 9, 6))
+    return Information(np.swapaxes(rows, -1, -2) @ rows, rng.standard_normal((*shape, 6)))
+
+
+def test_a_change_is_what_came_after_less_what_came_before() -> None:
+    rng = np.random.default_rng(0)
+    after, before = told(rng, 4), told(rng)
+    change = _change(after, before)
+    for k in range(4):
+        inverse = np.linalg.inv(after.matrix[k]), np.linalg.inv(before.matrix)
+        assert np.linalg.inv(change.matrix[k]) == pytest.approx(sum(inverse), rel=1e-6)
+        mean = inverse[0] @ after.vector[k] - inverse[1] @ before.vector
+        assert np.linalg.solve(change.matrix[k], change.vector[k]) == pytest.approx(mean)
+
+
+def test_a_surprise_is_the_squared_distance_along_what_is_told() -> None:
+    change = told(np.random.default_rng(1))
+    mean = np.linalg.solve(change.matrix, change.vector)
+    squares, rank = _surprise(change)
+    assert squares == pytest.approx(mean @ change.matrix @ mean) and rank == 6
+    flat = Information(np.diag([4.0, 1.0, 0, 0, 0, 0]), np.array([2.0, 3.0, 0, 0, 0, 0]))
+    assert [float(x) for x in _surprise(flat)] == [2.0**2 / 4 + 3.0**2, 2.0]
+
+
+@pytest.mark.parametrize("factor", [1.0, 9.0])
+def test_checks_scatter_by_the_factor_that_their_middle_one_does(factor: float) -> None:
+    rng = np.random.default_rng(2)
+    vectors = np.sqrt(factor) * rng.standard_normal((260, 6))
+    vectors[50:70] *= 30.0  # some bad ones hide nothing
+    checks = Information(np.tile(np.eye(6), (260, 1, 1)), vectors)
+    before = Information(1e9 * np.eye(6), np.zeros(6))
+    found, freedom = _scatter(checks, before, (10, 250), np.inf)
+    assert found == pytest.approx(factor, rel=0.25)
+    assert freedom == pytest.approx(0.4 * 6 * 240)
+    assert _scatter(checks, before, (10, 19), 7.0) == (1.0, 7.0)
+    assert _scatter(checks, before, (10, 20), 7.0)[1] == pytest.approx(0.4 * 6 * 10)
+    still = Information(checks.matrix, 0.01 * vectors)
+    assert _scatter(still, before, (100, 250), np.inf)[0] == 0.25
 
 
 @pytest.mark.parametrize("name", drift_year.STEPS)
@@ -33,9 +85,9 @@ def test_a_step_is_found_within_three_checks(name: str) -> None:
 
 def test_a_cell_that_only_warms_and_cools_is_ok() -> None:
     watched = watch(Year(checks=90), Happening(), np.random.default_rng(5))
-    told = information_of(watched.sightings, DriftTest().daily)
+    known = information_of(watched.sightings, DriftTest().daily)
     for n in range(1, 91):
-        seen = Information(told.matrix[:n], told.vector[:n])
+        seen = Information(known.matrix[:n], known.vector[:n])
         assert (
             verdict(
                 seen, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest()
@@ -56,10 +108,10 @@ def test_a_joint_re_mastered_is_named() -> None:
 
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))
     watched = watch(Year(checks=46), Happening(joints=wrong), np.random.default_rng(3))
-    told = information_of(watched.sightings, DriftTest().daily)
-    found = verdict(told, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest())
+    known = information_of(watched.sightings, DriftTest().daily)
+    found = verdict(known, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest())
     assert found.state == "MOVED" and found.since is not None
-    before = Information.of_covariance(watched.prior).plus(told.summed(10, 40))
+    before = Information.of_covariance(watched.prior).plus(known.summed(10, 40))
     parts = blame(before, watched.sightings.of(40, 46), ABOUT, watched.scanner, 3e-5)
     assert suspects(parts)[0][0] == "arm"
     assert max(parts, key=lambda part: parts[part]) == "joint 3 re-mastered"

@@ -1,5 +1,7 @@
 """What poses can tell: centres in a mirror are told from centres with noise."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -167,6 +169,18 @@ def test_a_rotation_that_stays_unknown_is_named_with_what_would_show_it() -> Non
         assert told in str(weak.value) and f"{noise * 1e3:.1f} mm of noise per axis: {cure}" in str(
             weak.value
         )
+
+
+def test_of_two_rotations_that_are_weak_the_weaker_is_named() -> None:
+    """Levers of 100 mm about y and of 50 mm about x, of both about z."""
+    flat = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.05, 0], [0, -0.05, 0]])
+    with pytest.raises(CalibrationRefused) as weak:
+        rotation_known(flat, 4e-3, 1e-3)
+    named = re.match(r"rotation about base \((.*?)\) is known to ([\d.]+) deg", str(weak.value))
+    assert named is not None
+    axis = [float(x) for x in named[1].split(",")]
+    assert np.abs(axis).tolist() == [1.0, 0.0, 0.0]
+    assert float(named[2]) == pytest.approx(np.degrees(4e-3 / np.sqrt(2 * 0.05**2)), abs=0.05)
 
 
 @pytest.mark.parametrize(

@@ -217,7 +217,7 @@ def require_observable(
             f"within {spread.farthest * 1e3:.1f} mm{parallel}: rotation about that line is not "
             "observable; move the arm across it"
         )
-    axis = weak.moves[:, 0] / np.linalg.norm(weak.moves[:, 0])
+    axis = weak.moves[:, 0] / limit
     cure = (
         "spread the poses further, and check that each scan belongs to its robot pose"
         if noise < MISTAKE
