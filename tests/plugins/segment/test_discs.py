@@ -141,6 +141,16 @@ def test_before_a_wrist_circle_stands_its_plate(height: float, flaw: float | Non
     assert (found.flaw, found.rank) == (said, 4 if flaw is None else 2)
 
 
+def test_a_plate_stands_before_its_circle_wherever_the_disc_has_its_plane() -> None:
+    thickness = WRIST.details.thickness
+    circle = ring(0.87 * WRIST.rim, WRIST.rim)
+    nearby = np.concatenate([circle, ring(0, 0.7 * WRIST.rim, height=thickness)])
+    for behind in (-0.4, 0.4):
+        plane = FACING._replace(point=AT + [0, 0, behind * thickness])
+        found = disc(circle, plane, WRIST)
+        assert compare(found, circle, nearby, PITCH, WRIST, LIMITS).flaw is None
+
+
 def test_what_stands_out_by_more_than_twice_the_plate_is_none() -> None:
     thickness = WRIST.details.thickness
     circle, plate = ring(0.87 * WRIST.rim, WRIST.rim), ring(0, 0.7 * WRIST.rim, height=thickness)

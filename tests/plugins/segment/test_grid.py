@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.maths.planes import Plane
+from flangeye_plugins.segment import grid
 from flangeye_plugins.segment.crop import crop, in_box
 from flangeye_plugins.segment.discs import Disc
 from flangeye_plugins.segment.grid import Grid, _drawn, _lots, coarse_view, project, range_image
@@ -86,6 +87,22 @@ def test_loose_points_fill_cells_as_wide_as_wanted_or_as_they_can(
     inside = view.xyz[1:-1, 1:-1, 2]
     assert np.isfinite(inside).mean() > 0.95
     assert np.nanmax(np.abs(inside - 0.8)) < 1e-6
+
+
+def test_of_a_dense_scan_some_four_points_a_cell_are_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked_at: list[int] = []
+
+    def counted(points: np.ndarray, angle: float) -> Grid:
+        looked_at.append(len(points))
+        return project(points, angle)
+
+    monkeypatch.setattr(grid, "project", counted)
+    scan = image(300, 320).reshape(-1, 3)
+    for pitch, cells in ((16e-3, 16 * 15), (8e-3, 32 * 30)):
+        range_image(scan, pitch)
+        assert looked_at.pop() == pytest.approx(4 * cells, rel=0.35)
 
 
 def test_points_behind_the_scanner_and_missing_ones_are_not_seen() -> None:
