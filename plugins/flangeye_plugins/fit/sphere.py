@@ -185,7 +185,7 @@ def cap_coverage(fit: SphereFit, max_incidence: float) -> float:
 
 def _patch(fit: SphereFit, count: int, widest: float) -> Indices:
     """Return which patch each point lies in: sectors about the line of sight, in rings."""
-    flat = (fit.points - fit.centre) @ basis_of_plane(fit.centre)[:2].T
+    flat = fit.points @ basis_of_plane(fit.centre)[:2].T  # across the line to the centre
     share = (np.hypot(flat[:, 0], flat[:, 1]) / (widest * fit.radius)) ** 2
     ring = np.minimum((RINGS * share).astype(np.intp), RINGS - 1)
     return np.asarray(count * ring + sectors(flat, count))

@@ -35,10 +35,9 @@ def clustered_covariance(
         curvature: (N,) derivative of ``weights * residual``, where the weights follow the
             residuals; the weights if not given.
     """
-    groups = int(cluster.max()) + 1
     p = jacobian.shape[1]
     each = jacobian.T * (weights * residual)
-    scores = np.stack([np.bincount(cluster, column, groups) for column in each], axis=1)
+    scores = np.stack([np.bincount(cluster, column) for column in each], axis=1)
     occupied = np.count_nonzero(np.bincount(cluster))
     slope = weights if curvature is None else curvature
     bread = np.linalg.pinv((jacobian.T * slope) @ jacobian)

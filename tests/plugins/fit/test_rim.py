@@ -161,6 +161,12 @@ def test_the_normal_is_known_as_well_as_its_scatter_says() -> None:
     )
 
 
+def test_the_normal_is_known_as_well_whatever_lies_off_the_face() -> None:
+    clean, dirty = (fitted(placed(face(UR5, stray=stray)), flatness="0 mm") for stray in (0, 800))
+    assert clean.normal_covariance is not None and dirty.normal_covariance is not None
+    assert np.trace(dirty.normal_covariance) < 2 * np.trace(clean.normal_covariance)
+
+
 @pytest.mark.parametrize("arc", [2 * np.pi, np.pi])
 def test_edges_that_are_bent_back_do_not_move_the_plane(arc: float) -> None:
     points = face(UR5, arc=arc)
