@@ -38,3 +38,8 @@ def test_the_axes_of_a_plane_are_a_rotation_about_its_normal(normal: Any) -> Non
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
     np.testing.assert_allclose(axes[2] * np.linalg.norm(normal), normal, atol=1e-12)
+
+
+@pytest.mark.parametrize("normal", [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 0]])
+def test_a_plane_without_a_normal_has_no_axes(normal: list[float]) -> None:
+    assert np.isnan(basis_of_plane(np.array(normal))).all()

@@ -177,9 +177,14 @@ def nearest_rotation(matrices: Floats) -> Floats:
 
 
 def basis_of_plane(normal: Floats) -> Floats:
-    """Return (3, 3) whose rows are two in-plane axes and the unit normal, right-handed."""
+    """Return (3, 3) whose rows are two in-plane axes and the unit normal, right-handed.
+
+    NaN where the normal has no direction.
+    """
     x, y, z = np.asarray(normal, dtype=np.float64).tolist()
     length = math.hypot(x, y, z)
+    if not 0.0 < length < math.inf:
+        return np.full((3, 3), np.nan)
     x, y, z = x / length, y / length, z / length
     # The cross product of the normal and the axis it is farthest from, without arrays of three.
     k = min(range(3), key=(abs(x), abs(y), abs(z)).__getitem__)
