@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -36,8 +37,9 @@ LIKELY, SURE = 2.0, 5.0
 
 
 class _Sweep(NamedTuple):
-    """The sweep at the start: its middle along the seam, mean height, and that one's sigma [m]."""
+    """The sweep at the start: how many samples, their middle, mean height and its sigma [m]."""
 
+    samples: int
     at: float
     height: float
     sigma: float
@@ -96,8 +98,7 @@ class Seating:
         self._flat = flat
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=NEWEST)
         self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
-        self._swept: list[tuple[float, float]] = []
-        self._sweep = _Sweep(0.0, 0.0, 0.0)
+        self._sweep = _Sweep(0, 0.0, 0.0, 0.0)
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
@@ -105,13 +106,13 @@ class Seating:
         self._samples.clear()
         self._newest.clear()
 
-    def seated(self, s: float, offset: float, height: float) -> None:
-        """Take a sample of a tip that is known to be seated; see :meth:`judge`."""
-        self._seated.add(s, offset, height)
-        self._swept.append((s, height))
-        at, heights = np.array(self._swept).T
-        sigma = float(heights.std() / np.sqrt(len(heights)))
-        self._sweep = _Sweep(float(at.mean()), float(heights.mean()), sigma)
+    def seated(self, samples: Floats) -> None:
+        """Take samples (K, 3) of a tip that is known to be seated; see :meth:`judge`."""
+        for s, offset, height in samples.tolist():
+            self._seated.add(s, offset, height)
+        at, _, height = samples.mean(axis=0).tolist()
+        sigma = float(samples[:, 2].std()) / math.sqrt(len(samples))
+        self._sweep = _Sweep(len(samples), at, height, sigma)
 
     def judge(self, s: float, offset: float, height: float) -> str | None:
         """Take a sample; return what is wrong.
@@ -144,12 +145,14 @@ class Seating:
 
     def _risen(self, s: float) -> float:
         """Return how much higher than in the sweep the tip is for long; 0 if it may be [m]."""
-        if len(self._swept) < NEWEST or s - self._samples.rows[0, 0] < LASTING:
+        if self._sweep.samples < NEWEST or s - self._samples.rows[0, 0] < LASTING:
             return 0.0
         heights = self._samples.rows[s - self._samples.rows[:, 0] < LASTING, 2]
         tilted = TILTED * abs(s - LASTING / 2 - self._sweep.at)
         rise = float(np.median(heights)) - self._sweep.height - tilted
-        sigma = float(np.hypot(heights.std() / np.sqrt(len(heights)), self._sweep.sigma))
+        if rise <= UNEVEN:
+            return 0.0
+        sigma = math.hypot(float(heights.std()) / math.sqrt(len(heights)), self._sweep.sigma)
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
     def _doubt_newest(self, aside: tuple[float, float], lifted: tuple[float, float]) -> None:
@@ -174,17 +177,17 @@ def _newest_from(
         newest: (M, 3) the same.
         steepest: Largest slopes of the line against the plan, aside and up.
     """
-    middle = before.mean(axis=0)
+    middle = before.sum(axis=0) / len(before)
     from_middle = before - middle
     along = from_middle[:, 0]
     spread = max(float(along @ along), 1e-18)
     slopes = along @ from_middle[:, 1:] / spread
-    slopes = np.clip(slopes, -np.array(steepest), steepest)
+    slopes = np.maximum(np.minimum(slopes, steepest), -np.array(steepest))
     left = from_middle[:, 1:] - along[:, None] * slopes
-    newest_from = newest.mean(axis=0) - middle
+    newest_from = newest.sum(axis=0) / len(newest) - middle
     off = newest_from[1:] - newest_from[0] * slopes
-    scatter = np.sqrt(np.mean(left**2, axis=0))
-    slope_sigma = np.minimum(scatter / np.sqrt(spread), steepest)
-    mean = scatter * np.sqrt(1.0 / len(newest) + 1.0 / len(before))
+    scatter = np.sqrt(np.einsum("ki,ki->i", left, left) / len(left))
+    slope_sigma = np.minimum(scatter / math.sqrt(spread), steepest)
+    mean = scatter * math.sqrt(1.0 / len(newest) + 1.0 / len(before))
     sigma = np.hypot(mean, newest_from[0] * slope_sigma)
     return (float(off[0]), float(sigma[0])), (float(off[1]), float(sigma[1]))

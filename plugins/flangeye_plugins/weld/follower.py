@@ -16,7 +16,7 @@ from flangeye_plugins.weld.contact import Contact, Release
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
-from flangeye_plugins.weld.refined import RefinedPath
+from flangeye_plugins.weld.refined import BIN, RefinedPath
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.search import STEEPER, Search
 from flangeye_plugins.weld.settings import Following
@@ -127,6 +127,7 @@ class Follower:
         self._coming = self.torch
         self.wanted = 0.0
         self.refined = RefinedPath(plan, belief.distance + settings.ending, settings.wander)
+        self.refined.hurried = True
         self._before = before
         if before is not None:
             self.refined.recall(before.samples)
@@ -169,6 +170,7 @@ class Follower:
             self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
         self._track.add(pose)
+        self._renew()
         for touch in touches:
             if self._touching and touch.time > self._seen:
                 self._feel(Touch(touch.time, self._level @ touch.displacement))
@@ -184,6 +186,11 @@ class Follower:
         command = STILL if silent else command
         self._response.record(pose.time, command)
         return command
+
+    def _renew(self) -> None:
+        """Do a cycle's share of finding the seam again from what was felt up to the last cycle."""
+        here = (self.torch, self._coming, self.tip)
+        self.refined.renew((*here, *(s + BIN for s in here)))
 
     def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:
         """Return the command that leads the tip along the seam and the torch behind it.
@@ -424,9 +431,11 @@ class Follower:
         self._response.dead_time, self._response.lag = found.dead_time, found.lag
         self.refined.noise = self.learned.noise
         self._began = self._time or 0.0
+        seated = []
         for pose, touch in self._swept:
             s, self._felt, self.wanted = self._located(pose, touch)
-            self._seating.seated(s, self._felt.offset, self._felt.height)
+            seated.append((s, self._felt.offset, self._felt.height))
+        self._seating.seated(np.array(seated))
         self.contact.hold(self._seen, self.wanted)
         self._enter("following")
 

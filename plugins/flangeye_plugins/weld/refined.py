@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ BESIDE = 16
 """Filled bins to either side that have a say in what is left of the fit: across a gap too."""
 
 LENGTHS = (1.5e-3, 3e-3, 6e-3, 12e-3, 24e-3)
-"""Correlation lengths among which the field's is chosen [m]."""
+"""Correlation lengths among which the field's is chosen, each twice the one before [m]."""
 
 SLOW = 30e-3
 """Correlation length of what a plan's shape is off by in any case [m]."""
@@ -63,6 +63,9 @@ PRIOR = np.array([5e-3, 5e-3, 0.05])
 
 SAMPLE_SIGMA = 0.01e-3
 """Standard deviation of one sample, until it is known [m]."""
+
+CORNER = 1e60
+"""Larger than the square of anything that is whitened."""
 
 SPAN = 4
 """Bins to both sides of a place at which its fit is tabulated: the direction is taken there."""
@@ -102,6 +105,16 @@ class _Field(NamedTuple):
         return np.asarray(felt + self.wander * np.exp(squared * (-0.5 / SLOW**2)))
 
 
+def _covariances(along: Floats, variance: float, wander: float) -> Floats:
+    """Return :meth:`_Field.covariance` of places (K,) at each of the lengths (L, K, K) [m^2]."""
+    squared = (along[:, None] - along) ** 2
+    felt = np.empty((len(LENGTHS), *squared.shape))
+    felt[-1] = np.exp(squared * (-0.5 / LENGTHS[-1] ** 2))
+    for i in reversed(range(len(LENGTHS) - 1)):  # half as long is to the fourth power
+        felt[i] = (felt[i + 1] * felt[i + 1]) ** 2
+    return np.asarray(variance * felt + wander * np.exp(squared * (-0.5 / SLOW**2)))
+
+
 class _Motion(NamedTuple):
     """How the plan is shifted and turned onto what was felt in a zone of the seam.
 
@@ -125,6 +138,8 @@ class RefinedPath:
 
     Attributes:
         noise: Standard deviation of one sample [m].
+        hurried: Whether what was found before does until :meth:`renew` has come to it; otherwise
+            it is found again as soon as it is asked for.
     """
 
     def __init__(self, plan: Path, margin: float, wander: float = 0.3e-3) -> None:
@@ -145,7 +160,10 @@ class RefinedPath:
         self._points, self._normals = points[:, :2], _left(tangents)
         self._fits: dict[int, _Fit | None] = {}
         self._motions: dict[int, _Motion | None] = {}
-        self.noise, self._new = SAMPLE_SIGMA, 0
+        self._sound: set[int] = set()  # bins and zones in which nothing new has been felt since
+        self._sound_zones: set[int] = set()
+        self._used: list[int] = []
+        self.noise, self._new, self.hurried = SAMPLE_SIGMA, 0, False
         self._pending: deque[tuple[float, float, float, float, float]] = deque()
 
     @property
@@ -172,17 +190,42 @@ class RefinedPath:
                 self._doubt[index] = max(self._doubt[index], doubt)
                 self._new += not self._count[index]
                 self._count[index] += 1
-                self._forget_fits(index)
+                self._doubt_fits(index)
 
-    def _forget_fits(self, index: int) -> None:
+    def _doubt_fits(self, index: int) -> None:
         """Fit again around a bin that has a new sample; everywhere, when there are many."""
         if self._new >= CHOOSING or (self._new and len(np.flatnonzero(self._count)) < FEW):
             self._new = 0
-            self._fits.clear()
-            self._motions.clear()
+            self._sound.clear()
+            self._sound_zones.clear()
         near = BESIDE + SPAN
-        for other in [i for i in self._fits if abs(i - index) <= near]:
-            del self._fits[other]
+        self._sound.difference_update(range(index - near, index + near + 1))
+
+    def renew(self, places: Iterable[float]) -> None:
+        """Find one thing again, at the first of these arc lengths where that is due.
+
+        A control cycle has time for one; a few cycles later all are renewed. What is due at other
+        places is forgotten: it would be old when the torch comes there.
+        """
+        bins = [self._index(s) for s in places]
+        if bins != self._used:
+            self._used, used = bins, self._sound.union(bins)
+            self._fits = {i: fit for i, fit in self._fits.items() if i in used}
+            zones = self._sound_zones.union(index // ZONE for index in bins)
+            self._motions = {i: motion for i, motion in self._motions.items() if i in zones}
+        due = next((index for index in bins if index not in self._sound), None)
+        if due is not None:
+            self._find(due)
+
+    def _find(self, index: int) -> None:
+        """Find the motion of a bin's zone again where that is due, else the fit around the bin."""
+        zone = index // ZONE
+        if zone not in self._sound_zones:
+            self._motions[zone] = self._moved(zone)
+            self._sound_zones.add(zone)
+        else:
+            self._fits[index] = self._fitted(index)
+            self._sound.add(index)
 
     def forget_pending(self) -> None:
         """Drop what is not yet believed: contact is lost, and it may be wrong already."""
@@ -261,8 +304,11 @@ class RefinedPath:
     def _fit(self, s: float) -> _Fit | None:
         """Return how the seam lies about ``s``; kept until something new is believed there."""
         index = self._index(s)
-        if index not in self._fits:
-            self._fits[index] = self._fitted(index)
+        while not (index in self._sound or (self.hurried and index in self._fits)):
+            if self.hurried and index // ZONE in self._motions:
+                self._fits[index] = self._fitted(index)
+            else:
+                self._find(index)
         return self._fits[index]
 
     def _fitted(self, index: int) -> _Fit | None:
@@ -271,7 +317,7 @@ class RefinedPath:
         The variance is that of universal kriging: where the field is held by samples, an error of
         the motion does no harm (Rasmussen and Williams 2006, 2.42).
         """
-        motion = self._motion(index)
+        motion = self._motions[index // ZONE]
         if motion is None:
             return None
         near, rows, residual = self._residual(motion, index)
@@ -280,7 +326,7 @@ class RefinedPath:
         table = np.arange(index - SPAN, index + SPAN + 1)
         there = self._rows(motion, table)
         kernel = field.covariance(self._middles[table], felt)
-        weights = kernel @ np.linalg.inv(among)
+        weights = np.linalg.solve(among, kernel.T).T
         offsets = there @ motion.shift + weights @ residual
         free = there[SPAN] - weights[SPAN] @ rows
         held = float(weights[SPAN] @ kernel[SPAN])
@@ -289,16 +335,10 @@ class RefinedPath:
         nearest = int(near[np.abs(near - index).argmin()])
         return _Fit(offsets.tolist(), variance, float(self._angle[nearest]))
 
-    def _motion(self, index: int) -> _Motion | None:
-        """Return how the plan is moved in the zone of a bin; the same for all its bins."""
-        zone = index // ZONE
-        if zone not in self._motions:
-            middle = min(zone * ZONE + ZONE // 2, len(self._middles) - 1)
-            self._motions[zone] = self._moved(float(self._middles[middle]))
-        return self._motions[zone]
-
-    def _moved(self, s: float) -> _Motion | None:
-        used = self._nearest(self._index(s), SAYING)
+    def _moved(self, zone: int) -> _Motion | None:
+        """Return how the plan is moved in a zone; the same for all its bins."""
+        middle = min(zone * ZONE + ZONE // 2, len(self._middles) - 1)
+        used = self._nearest(middle, SAYING)
         if not len(used):
             return None
         some = used[:: -(-len(used) // THINNED)]
@@ -306,11 +346,13 @@ class RefinedPath:
         rows = _rigid_rows(self._points[some] - about, self._normals[some])
         along, felt = self._along[some] / count, self._sum[some] / count
         waviness = max(_unexplained(rows, felt), SMALLEST**2)
-        fields = [_Field(waviness, length, self._wander) for length in LENGTHS]
-        best, shift, covariance, excess = _explained(fields, along, rows, felt, self._noise(some))
+        among = _covariances(along, waviness, self._wander)
+        among += np.diag(self._noise(some) + 1e-6 * waviness)
+        best, shift, covariance, excess = _explained(among, rows, felt)
         # What was felt at few places only may be off by more than it seems there.
         few = (1.0 + SCANTY / len(used)) ** 2
-        return _Motion(about, shift, few * covariance, fields[best], few * excess)
+        field = _Field(waviness, LENGTHS[best], self._wander)
+        return _Motion(about, shift, few * covariance, field, few * excess)
 
     def _residual(self, motion: _Motion, index: int) -> tuple[NDArray[np.intp], Floats, Floats]:
         """Return the filled bins nearest to one, their rows, and what the motion leaves there."""
@@ -348,33 +390,44 @@ def _unexplained(rows: Floats, felt: Floats) -> float:
     return float(np.var(felt - rows @ np.linalg.lstsq(rows, felt, rcond=None)[0]))
 
 
-def _explained(
-    fields: Sequence[_Field], along: Floats, rows: Floats, felt: Floats, noise: Floats
-) -> tuple[int, Floats, Floats, float]:
+def _explained(among: Floats, rows: Floats, felt: Floats) -> tuple[int, Floats, Floats, float]:
     """Return which field leaves the rest best, and the motion (3,) that then explains offsets (K,).
 
     With its covariance (3, 3), and by how much the rest is larger than the field expects. The best
     has the greatest marginal likelihood (Rasmussen and Williams 2006, 2.45), the scale of field and
     prior left free: a motion that hardly any plan is off by explains no waves.
+
+    Args:
+        among: (L, K, K) covariances of the offsets, by each of the fields [m^2].
+        rows: (K, 3) how a motion moves the plan.
+        felt: (K,) offsets [m].
     """
-    among = [
-        field.covariance(along, along) + np.diag(noise + 1e-6 * field.variance) for field in fields
-    ]
-    # All fields at once: a call costs as much as its arithmetic.
-    roots = np.linalg.cholesky(np.array(among))
-    white = np.linalg.solve(roots, np.column_stack([rows, felt]))
+    roots, white = _whitened(among, np.column_stack([rows, felt]))
     turned = white[:, :, :3].transpose(0, 2, 1)
     grams = turned @ white[:, :, :3] + np.diag(PRIOR**-2)
     inverses = np.linalg.inv(grams)
-    shifts = (inverses @ (turned @ white[:, :, 3:]))[:, :, 0]
-    volumes = np.linalg.slogdet(grams)[1]
+    shifts = inverses @ (turned @ white[:, :, 3:])
+    left = np.sum((white[:, :, 3:] - white[:, :, :3] @ shifts) ** 2, axis=(1, 2))
+    shifts = shifts[:, :, 0]
+    left += np.sum((shifts / PRIOR) ** 2, axis=1)
     freedom = max(len(felt) - 3, 1)
-    scales, likelihoods = [], []
-    for root, one, shift, volume in zip(roots, white, shifts, volumes.tolist(), strict=True):
-        left = np.sum((one[:, 3] - one[:, :3] @ shift) ** 2) + np.sum((shift / PRIOR) ** 2)
-        scales.append(max(float(left) / freedom, 1e-9))
-        volume += 2.0 * float(np.log(np.diag(root)).sum())
-        likelihoods.append(-0.5 * (freedom * math.log(scales[-1]) + volume))
-    best = int(np.argmax(likelihoods))
-    excess = max(scales[best], 1.0)
+    scales = np.maximum(left / freedom, 1e-9)
+    volumes = np.linalg.slogdet(grams)[1] + 2.0 * np.log(roots).sum(axis=1)
+    best = int(np.argmin(freedom * np.log(scales) + volumes))
+    excess = max(float(scales[best]), 1.0)
     return best, shifts[best], excess * inverses[best], excess
+
+
+def _whitened(among: Floats, columns: Floats) -> tuple[Floats, Floats]:
+    """Return the diagonals (L, K) of Cholesky roots, and columns (L, K, M) solved by the roots.
+
+    One factorisation does both: that of a matrix bordered by columns holds them solved in its
+    border. The corner only has to be large enough for the whole to be positive definite.
+    """
+    size, count = columns.shape
+    whole = np.zeros((len(among), size + count, size + count))
+    whole[:, :size, :size], whole[:, size:, :size] = among, columns.T
+    whole[:, range(size, size + count), range(size, size + count)] = CORNER
+    root = np.linalg.cholesky(whole)
+    diagonals = np.diagonal(root, axis1=1, axis2=2)[:, :size]
+    return diagonals, root[:, size:, :size].transpose(0, 2, 1)

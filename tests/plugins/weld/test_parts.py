@@ -266,6 +266,26 @@ def test_waves_felt_in_two_short_pieces_are_not_taken_for_a_plan_turned_far() ->
         assert abs(refined.offset(s) - wave(s)) < 4 * np.sqrt(refined.variance(s))
 
 
+def test_a_hurried_path_finds_one_thing_again_at_a_time_and_is_the_same_in_the_end() -> None:
+    exact, hurried = (RefinedPath(Path(curved(0.1)), 0.05) for _ in range(2))
+    hurried.hurried = True
+    for refined in (exact, hurried):
+        for s in np.arange(0.0, 0.05, 2e-4).tolist():
+            refined.add(s, s, 1e-3 * np.cos(s / 10e-3), 0.0)
+        refined.confirm(0.02)
+    first = hurried.variance(0.03)
+    assert first == exact.variance(0.03)
+    for refined in (exact, hurried):
+        refined.confirm(1.0)
+    after = []
+    for _ in range(2):  # the plan's motion first, then the field about the place
+        after.append(hurried.variance(0.03))
+        hurried.renew((0.03, 0.05))
+    assert after == [first, first]
+    assert hurried.variance(0.03) == exact.variance(0.03) < first
+    np.testing.assert_array_equal(hurried.frame(0.03), exact.frame(0.03))
+
+
 def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
     few, many = RefinedPath(Path(straight()), 0.05), RefinedPath(Path(straight()), 0.05)
     for refined, end in ((few, 1e-3), (many, 40e-3)):
@@ -305,8 +325,7 @@ def test_a_piece_of_the_seam_is_suspected_after_it_was_felt() -> None:
 def risen(rise, first=0.03, last=1.0):
     """Judge a seam that leaves its plan to the other side; the tip rises from first on [m]."""
     seating, rng, most = Seating(1.0, 1.0), np.random.default_rng(0), 0.0
-    for _ in range(100):
-        seating.seated(5e-3, 0.0, 0.6e-3 * rng.standard_normal())
+    seating.seated(np.array([(5e-3, 0.0, 0.6e-3 * rng.standard_normal()) for _ in range(100)]))
     for s in np.arange(5e-3, 80e-3, 0.3e-3).tolist():
         height = rise * max(s - first, 0.0) * (s < last) + 0.6e-3 * rng.standard_normal()
         seating.judge(s, -0.2 * s, height)
