@@ -133,11 +133,19 @@ class Residuals:
         if np.isinf(self.freedom):
             return 0.0, 1.0
         freedom, unit = max(self.freedom, 1.0), max(float((self.errors**2).mean()), FINEST**2)
-        squares, shares = self._along(own, unit * np.eye(3))
+        squares, shares = self._beside(own, unit)
         explained = float(squares.sum())
         if explained <= freedom:
             return 0.0, max(explained / freedom, 1e-6)
         return unit * _factor(squares, shares, freedom), 1.0
+
+    def _beside(self, own: Floats, variance: float) -> tuple[Floats, Floats]:
+        """Return the same where a variance is to be added evenly: along the axes of ``own``."""
+        p, eye = self.projectors, np.eye(3)
+        variances, axes = np.linalg.eigh(p @ (own + FINEST**2 * eye) @ p + (eye - p))
+        errors = (self.errors[:, None] @ axes)[:, 0]
+        measured = (axes * (p @ axes)).sum(axis=1)  # 1, or 0 across what was not
+        return (errors**2 / variances).ravel(), (variance * measured / variances).ravel()
 
     def _along(self, own: Floats, further: Floats) -> tuple[Floats, Floats]:
         """Return squared errors (3 N,) in units of their noise, and what is to be added there.

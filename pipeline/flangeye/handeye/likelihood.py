@@ -163,7 +163,9 @@ def climb(
         shares: (N,) from 0 to 1.
         iterations: Steps at most.
     """
-    here = _weighed(problem, found.at, found.linear, noise, shares)
+    # While the noise is as before, so are the weights.
+    weights = found.weights if noise == found.noise else None
+    here = _weighed(problem, found.at, found.linear, noise, shares, weights)
     return _climb_on(problem, here, shares, iterations)
 
 
@@ -192,10 +194,16 @@ def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solut
 
 
 def _weighed(
-    problem: Problem, at: Unknowns, linear: Linear, noise: Noise, shares: Floats
+    problem: Problem,
+    at: Unknowns,
+    linear: Linear,
+    noise: Noise,
+    shares: Floats,
+    weights: Floats | None = None,
 ) -> Solution:
     s = problem.measurements
-    weights, basis = weights_of(s, linear, noise), free_columns(s, problem.loop, at, problem.tilt)
+    weights = weights_of(s, linear, noise) if weights is None else weights
+    basis = free_columns(s, problem.loop, at, problem.tilt)
     jacobian = linear.jacobian.reshape(len(s) * 6, -1) @ basis
     weighted = (weights @ jacobian.reshape(len(s), 6, -1)).reshape(len(s) * 6, -1)
     squares = (linear.residuals * (weights @ linear.residuals[..., None])[..., 0]).sum(axis=1)
