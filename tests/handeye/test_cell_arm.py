@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye.files.bundled import bundled
+from flangeye.handeye.arm_sizes import Sizes
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.cell import _notes, calibrate_cell, solve_cell
 from flangeye.handeye.graph import LIMITS
@@ -19,13 +20,14 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 
 REGISTRY = load_registry()
-TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
+TWO, THREE = "two-scanners", "two-arms-three-scanners"
 SEEDS = 5
 
 
-def seen_by(seed: int, arm: str) -> Any:
-    """Return what two scanners saw of an arm, the cell, and where everything truly is."""
-    recipe = load_recipe(TWO, REGISTRY, [f"seed={seed}", f"steps.0.arm={{{arm}}}"])
+def seen_by(seed: int, arm: str, cell: str = TWO) -> Any:
+    """Return what the scanners of a cell saw, the cell, and where everything truly is."""
+    path = bundled("recipes") / f"configurations/{cell}_marker_most-likely_simulated.yaml"
+    recipe = load_recipe(path, REGISTRY, [f"seed={seed}", f"steps.0.arm={{{arm}}}"])
     seen = Runner(recipe, REGISTRY, ArchivePath(None)).take(None)
     return seen, recipe.context[Cell], recipe.steps[0].params.places
 
@@ -51,10 +53,10 @@ def squares(seed: int, zeros: str = "0.2 mrad") -> Any:
         yield [off(each, places)[0] for each in (known, unaware)]
 
 
-def answers(seed: int, arm: str) -> Any:
+def answers(seed: int, arm: str, cell: str = TWO) -> Any:
     """Yield of both answers, where there are two, all (square, metres)."""
-    seen, cell, places = seen_by(seed, arm)
-    told = calibrate_cell(seen, cell, LIMITS, "solve.cell")
+    seen, known, places = seen_by(seed, arm, cell)
+    told = calibrate_cell(seen, known, LIMITS, "solve.cell")
     for answer in (told.as_reported(), told.as_corrected()):
         yield answer and [off(each, places) for each in answer.transforms.values()]
 
@@ -98,11 +100,31 @@ def test_both_answers_are_as_far_off_as_they_say(arm: str) -> None:
     assert np.mean(np.array(corrected)[..., 1]) < 0.6 * np.mean(np.array(reported)[..., 1])
 
 
+@pytest.mark.slow
+def test_both_answers_hold_for_two_arms_as_bad_as_real_ones() -> None:
+    found = [list(answers(seed, "quality: real", THREE)) for seed in range(16)]
+    for answer in ([each[i] for each in found if each[i]] for i in (0, 1)):
+        assert len(answer) >= 8
+        assert (np.array(answer)[..., 0] < 12.6).mean() > 0.88
+
+
+def test_the_size_of_every_kind_of_error_is_told() -> None:
+    found: Any = SimpleNamespace(movers=1.0)
+    sizes = Sizes(np.ones(1), np.array([[5.0, 1.0, 2.0, 3.0, 4.0, 6.0]]), np.ones(1))
+    told = _notes([], found, sizes)[-1]
+    assert "counts joint zeros 5.0 times as large as the robots' files say" in told
+    assert "encoders 1.0, sag 2.0, lengths 3.0, twists 4.0" in told
+    assert "what is smooth over the workspace 6.0 times" in told
+
+
 def test_what_joint_zeros_may_be_off_by_is_in_the_covariance() -> None:
-    """UR5s with zeros as large as their file says; a sound covariance has a mean square of six."""
+    """UR5s with zeros as large as their file says; a sound covariance has a mean square of six.
+
+    Theirs is less: what else is off in real arms stays possible, and these have none of it.
+    """
     considered, bare = np.array([s for seed in range(SEEDS) for s in squares(seed)]).T
     assert bare.mean() > 12
-    assert 3 < considered.mean() < 10
+    assert 2 < considered.mean() < 10
     assert (considered < 12.6).mean() >= 0.8  # the 95 % region
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, FlangeyeError, StageError
 from flangeye.handeye.arm_sizes import Sizes
+from flangeye.handeye.bent import KINDS
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.cell_arms import (
     CorrectedArms,
@@ -212,9 +213,10 @@ def _notes(
 def _note_of_sizes(sizes: Sizes | None) -> tuple[str, ...]:
     if sizes is None:
         return ()
-    zeros, within, between = sizes.expected
+    zeros, *others = sizes.expected
+    each = ", ".join(f"{kind} {size:.1f}" for kind, size in zip(KINDS, others, strict=True))
     return (
         f"the covariance counts joint zeros {zeros:.1f} times as large as the robots' files say "
-        f"(joint_accuracy), and what goes with them {within:.1f} (encoders, sag) and {between:.1f} "
-        "times (lengths, twists): all that is likely by the residuals",
+        f"(joint_accuracy), and what goes with them: {each} times: all that is likely by the "
+        "residuals",
     )

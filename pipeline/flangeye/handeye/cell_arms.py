@@ -8,90 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.arm_sizes import Sizes, likely_sizes
+from flangeye.handeye.bent import Bent
 from flangeye.handeye.candidates import Fit, by_folds, judged, rms
 from flangeye.handeye.graph import Sighting, Solved, information_of, linear_of, solve_graph
 from flangeye.maths.frame_graph import Frame
-from flangeye.maths.geometry import rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import ArmCorrection, Floats, Mask
 
-LENGTH, TWIST, WAVE, SAG = 0.1, 0.2, 0.4, 2.0
-"""Of an arm whose zeros are off by 1 rad: how far its lengths [m], twists [rad] and encoders once a
-turn [rad], are, and by what a joint gives way for a metre of lever [rad]. Zeros, lengths and twists
-are as ``refine.arm`` expects them of each other; each kind may be larger or smaller beside them."""
-UP = np.array([0.0, 0.0, 1.0])
-"""Of an arm's base that is level."""
-DELTA = 1e-6
-"""For differences of the flange's pose by a length [m] or a twist [rad]."""
 STEPS = 3
 """Of Gauss and Newton for joint zeros; each squares the error of the one before."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bent:
-    """An arm whose joints are not quite where its controller says.
-
-    Attributes:
-        name: Frame that it moves.
-        kinematics: As its controller believes.
-        joints: (N, n) by which it is where the controller has it [rad].
-        deviation: Standard deviation of a zero, by the robot's file [rad].
-        offsets: (n,) to add to the joints [rad].
-    """
-
-    name: str
-    kinematics: Arm
-    joints: Floats
-    deviation: float
-    offsets: Floats
-
-    @property
-    def poses(self) -> Floats:
-        """(N, 4, 4) of the flange in the arm's base, with the offsets."""
-        return self.kinematics.flange(self.joints + self.offsets)
-
-    @property
-    def twists(self) -> Floats:
-        """(N, 6, n - 1) what zeros of one deviation do to it, in its base.
-
-        The first joint's is right by definition: it fixes the base's x axis.
-        """
-        return self.deviation * self.kinematics.jacobian(self.joints + self.offsets)[:, :, 1:]
-
-    @property
-    def others(self) -> tuple[Floats, Floats]:
-        """(N, 6, m) what is off where zeros are by one deviation: in the joints, and between."""
-        joints = self.joints + self.offsets
-        columns, n = self.kinematics.jacobian(joints), self.kinematics.n
-        angles = (
-            WAVE * np.sin(joints),
-            WAVE * np.cos(joints),
-            SAG * _levers(self.kinematics, joints),
-        )
-        turned = [columns * each[:, None, :] for each in angles]
-        steps = np.eye(3 * n).reshape(-1, n, 3) * [LENGTH, LENGTH, TWIST]
-        longer = [self._by_lengths(step)[..., None] for step in steps]
-        within, between = (np.concatenate(each, axis=2) for each in (turned, longer))
-        return self.deviation * within, self.deviation * between
-
-    def _by_lengths(self, step: Floats) -> Floats:
-        """Return (N, 6) how a change (n, 3) of lengths and twists moves the flange, by its size."""
-        arm, joints = self.kinematics, self.joints + self.offsets
-        before, after = arm.flange(joints), arm.altered(DELTA * step).flange(joints)
-        turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
-        moved = after[:, :3, 3] - before[:, :3, 3]
-        return np.concatenate([turned, moved], axis=1) / DELTA
-
-    def moved(self, deviations: Floats) -> Bent:
-        """Return the arm with (n - 1,) more added to its offsets, in units of the deviation."""
-        return replace(self, offsets=self.offsets + self.deviation * np.pad(deviations, (1, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,17 +61,12 @@ class Sighted:
         noise = {name: found.movers * covariance for name, covariance in self.noise.items()}
         graph = self.frames, self.sightings, found.places, noise
         residuals, jacobian, whiteners = linear_of(*graph)
-        kinds = [np.zeros((*residuals.shape, 0))] * 3
-        for arm in arms:
-            moves = linear_of(*graph, moved=[arm.name])[1]
-            off = (arm.twists, *arm.others)
-            kinds = [
-                np.concatenate([k, moves @ x], axis=2) for k, x in zip(kinds, off, strict=True)
-            ]
-        zeros, *others = kinds
+        moves = [(arm, linear_of(*graph, moved=[arm.name])[1]) for arm in arms]
+        nothing = np.zeros((*residuals.shape, 0))
+        zeros = np.concatenate([nothing, *(by @ arm.twists for arm, by in moves)], axis=2)
         kept = found.inliers
         freedom = sum(np.trace(s.projector) for s, k in zip(self.sightings, kept, strict=True) if k)
-        return Linear(residuals, jacobian, zeros, others, whiteners, kept, float(freedom))
+        return Linear(residuals, jacobian, zeros, moves, whiteners, kept, float(freedom))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +77,7 @@ class Linear:
         residuals: (N, 6).
         jacobian: (N, 6, P) by the unknowns.
         zeros: (N, 6, k) by the joint zeros, in units of their deviations.
-        others: (N, 6, m) by all else that is off in an arm, in such units, each kind by itself.
+        moves: Of each arm, (N, 6, 6) by its flange's turns and shifts.
         whiteners: (N, 6, 6).
         kept: (N,) which count.
         freedom: How many numbers those are.
@@ -158,10 +86,16 @@ class Linear:
     residuals: Floats
     jacobian: Floats
     zeros: Floats
-    others: Sequence[Floats]
+    moves: Sequence[tuple[Bent, Floats]]
     whiteners: Floats
     kept: Mask
     freedom: float
+
+    @cached_property
+    def others(self) -> list[Floats]:
+        """(N, 6, m) by all else that is off in an arm, in such units, each kind by itself."""
+        off = [[by @ kind for kind in arm.others] for arm, by in self.moves]
+        return [np.concatenate(kind, axis=2) for kind in zip(*off, strict=True)]
 
     @property
     def whitened(self) -> tuple[Floats, Floats, Floats]:
@@ -224,7 +158,7 @@ def branches_of(sighted: Sighted, cell: Cell) -> list[list[Bent]]:
 def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]) -> list[Bent]:
     """Return each arm on the branch whose zeros explain most."""
     chosen = [arms[0] for arms in branches]
-    size = float(_sizes(sighted.linear(found, chosen)).expected[0])
+    size = float(_sizes(sighted.linear(found, chosen), zeros_alone=True).expected[0])
     for i, arms in enumerate(branches):
         tried = [[*chosen[:i], arm, *chosen[i + 1 :]] for arm in arms]
         chosen = max(tried, key=lambda arms: _explained(sighted.linear(found, arms), size))
@@ -236,8 +170,8 @@ def considering_zeros(
 ) -> tuple[Solved, Sizes | None]:
     """Return the solution with what its arms may be off by in its covariance, and how much it is.
 
-    The sizes are in units of what the robots' files say: of joint zeros, of what else is off in
-    joints, and between them. None without an arm.
+    The sizes are in units of what the robots' files say: of joint zeros, then of each of
+    :data:`flangeye.handeye.bent.KINDS`. None without an arm.
     """
     if not branches:
         return found, None
@@ -330,16 +264,6 @@ def _inverse(information: Floats) -> Floats:
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _levers(arm: Arm, joints: Floats) -> Floats:
-    """Return (N, n) the horizontal lever about each joint of what hangs on it [m].
-
-    Its weight is taken to be spread evenly over the links' origins beyond the joint.
-    """
-    origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
-    beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
-    return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ UP)
-
-
 def _told(arms: Sequence[Bent]) -> str:
     listed = (
         f"{arm.name} are off by ({', '.join(f'{x * 1e3:.2f}' for x in arm.offsets)}) mrad"
@@ -348,8 +272,8 @@ def _told(arms: Sequence[Bent]) -> str:
     return f"the joints of {', of '.join(listed)}; the second answer is for them so corrected"
 
 
-def _sizes(linear: Linear) -> Sizes:
+def _sizes(linear: Linear, zeros_alone: bool = False) -> Sizes:
     rows, zeros, errors = linear.whitened
     w, kept = linear.whiteners[linear.kept], linear.kept
-    others = [w @ each[kept] for each in linear.others]
+    others = [] if zeros_alone else [w @ each[kept] for each in linear.others]
     return likely_sizes(rows, [zeros, *others], errors, linear.freedom)
