@@ -56,7 +56,9 @@ def test_the_step_it_writes_says_what_it_said(
          "--seen '1 mm, 2 mm, 3': '3' has no unit: a length needs one (mm, m, um, for example "
          "'31.5 mm'); write '12 mm, -40 mm, 702 mm'"),
         (("--seen", "1 mm, 2 mm, 3 mm", "--tip", "0 mm, 0 mm, 1 mm"),
-         "run.mcap: its recipe names no robot.driver with robot.limits"),
+         "run.mcap: its recipe names no robot.driver with robot.limits, so no arm can be read; touch "
+         "with the calibration of a live recipe, or write the step verify.touch with poses from the "
+         "pendant ('flangeye stages verify.touch')"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_touched_is_one_line(

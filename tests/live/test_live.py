@@ -1,8 +1,10 @@
 """The online loop against the real client, a controller on loopback and a simulated scanner."""
 
+import json
 import signal
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +103,17 @@ def test_a_capture_is_taken_again_and_the_calibration_is_touched(cell: Any) -> N
     assert gone == pytest.approx(0.06 - 0.005, abs=1e-3)  # it stops 5 mm before the point
     assert "predicted is off by" in out
     assert (cell.folder / "touch.yaml").exists()
+
+    words = ("run", "--live", "--scans", "2", "--set", "scanner.driver.emulator.seed=2")
+    code, out, err = cell.run(*words, command="monitor")
+    assert code == 0 and out.endswith("dry run, nothing moved; add --move to execute\n"), err
+    assert not (cell.folder / "run/checks").exists()
+    code, out, err = cell.run(*words, "--move", command="monitor")
+    assert code == 0, err
+    said = json.loads(out)
+    assert (said["state"], said["sightings"]) == ("OK", 2)
+    assert said["time"].startswith(datetime.now(UTC).isoformat()[:10])
+    assert len(cell.captures(said["source"])) == 2
 
 
 def metres(point: np.ndarray) -> str:

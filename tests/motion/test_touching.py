@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.devices import RobotDriver
+from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
@@ -111,3 +111,19 @@ def test_the_arm_is_slow_beside_the_work_whatever_the_recipe_allows() -> None:
     assert (fast.speed, fast.joint_speed) == (0.02, 0.2)
     kept = Cell([]).toucher(slow)._slowly()
     assert (kept.speed, kept.joint_speed) == (0.01, 0.1)
+
+
+class Forgetful(Cell):
+    """An emulator that starts anew with each connection."""
+
+    @contextmanager
+    def _open(self) -> Iterator[SimulatedRobot]:
+        yield SimulatedRobot(UR5E, SimulatedParams())
+
+
+def test_an_arm_that_is_not_where_it_was_sent_is_not_touched_with() -> None:
+    cell = Forgetful([])
+    touching = cell.toucher().touch(points(cell), move=True)
+    with pytest.raises(DeviceError, match=r"sent to 5 mm before point 1 and its tip stands \d+ mm"):
+        next(touching)
+    assert cell.asked == ["point 1: the arm will go to 5 mm before it; keep clear"]

@@ -79,6 +79,7 @@ def touch(
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not wait for confirmation.")] = False,
     out: Annotated[Path, typer.Option(help="Recipe step to write.")] = Path("touch.yaml"),
+    overrides: Overrides = None,
 ) -> None:
     """Touch points the scanner measured and compare predicted and actual positions.
 
@@ -87,7 +88,8 @@ def touch(
     from flangeye.cli.touching import touch_points
 
     registry = load_plugins()
-    for line in touch_points(run, registry, (seen, tip), move, _asker(yes), out):
+    given, ask = (seen, tip), _asker(yes)
+    for line in touch_points(run, registry, given, move, ask, out, overrides or ()):
         say(line)
 
 

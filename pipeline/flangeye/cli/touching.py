@@ -30,6 +30,7 @@ def touch_points(
     move: bool,
     ask: Callable[[str], None],
     out: Path,
+    overrides: Sequence[str] = (),
 ) -> Iterator[str]:
     """Yield a line for each point that was touched, and write the step ``verify.touch``.
 
@@ -40,6 +41,7 @@ def touch_points(
         move: Let the arm go near each.
         ask: Shows a person a sentence and returns when it is done.
         out: File for the step.
+        overrides: Changes to the calibration's recipe: another address of the arm.
 
     Raises:
         StageError: There is no calibration, its recipe names no arm, or a point is no point.
@@ -53,7 +55,8 @@ def touch_points(
         predicted = calibration.base_T_camera.transform.apply(seen)
     except FrameMismatchError as error:
         raise StageError(f"{log.path}: {error}") from None
-    recipe = parse_recipe(log.text("recipe.resolved.yaml") or "", log.path.name, registry)
+    text = log.text("recipe.resolved.yaml") or ""
+    recipe = parse_recipe(text, log.path.name, registry, overrides)
     touched = []
     for each in _toucher(recipe, tip, ask).touch(predicted, move):
         touched.append(each)
@@ -67,7 +70,11 @@ def _toucher(recipe: Recipe, tip: Floats, ask: Callable[[str], None]) -> Toucher
     robot, driver = recipe.context.get(RobotModel), recipe.context.get(RobotDriver)
     section = recipe.context.get(LimitsSection)
     if robot is None or driver is None or section is None:
-        raise StageError(f"{recipe.name}: its recipe names no robot.driver with robot.limits")
+        raise StageError(
+            f"{recipe.name}: its recipe names no robot.driver with robot.limits, so no arm can be "
+            "read; touch with the calibration of a live recipe, or write the step verify.touch "
+            "with poses from the pendant ('flangeye stages verify.touch')"
+        )
     return Toucher(driver, robot, limits_of(section, robot), tip, ask)
 
 

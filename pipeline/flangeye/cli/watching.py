@@ -108,7 +108,7 @@ def _checks(
     for path in archives:
         yield from_archive(path, stored, registry, overrides)
     if not archives:
-        yield from_arm(stored, registry, *live)
+        yield from_arm(stored, registry, *live, overrides)
 
 
 def _tell(opcua: str, finding: Finding) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.devices import RobotDriver
+from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
@@ -74,14 +74,30 @@ class Toucher:
 
         Raises:
             StageError: There is no way to a point; says what bars it.
-            DeviceError: The arm cannot be read or moved.
+            DeviceError: The arm cannot be read or moved, or is not where it went to.
         """
         for number, point in enumerate(points, 1):
             if move:
                 self._approach(number, point)
+                self._require_near(number, point)
             self.ask(f"point {number}: jog the tip onto it, slowly")
             flange = read_state(self.driver)[1].base_T_flange.matrix
-            yield Touched(point, flange[:3, :3] @ self.tip + flange[:3, 3], flange)
+            yield Touched(point, self._tip_at(flange), flange)
+
+    def _tip_at(self, flange: Floats) -> Floats:
+        return np.asarray(flange[:3, :3] @ self.tip + flange[:3, 3])
+
+    def _require_near(self, number: int, point: Floats) -> None:
+        """Refuse an arm that does not stand where it was sent once it was let go of."""
+        tip = self._tip_at(read_state(self.driver)[1].base_T_flange.matrix)
+        away = float(np.linalg.norm(tip - point))
+        if away > 2 * SHORT:
+            raise DeviceError(
+                f"the arm was sent to {SHORT * 1e3:g} mm before point {number} and its tip stands "
+                f"{away * 1e3:.0f} mm from it: it moved since, or it is an emulator that starts "
+                "anew with each connection (start 'flangeye emulator' and name its address with "
+                "--set)"
+            )
 
     def _approach(self, number: int, point: Floats) -> None:
         """Drive to before a point, by a way that was checked as a whole."""

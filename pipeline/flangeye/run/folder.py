@@ -20,7 +20,10 @@ from flangeye.result.contract import AnswerResult
 
 EXPORTS = "exports"
 """Where in the folder the files for other programs are."""
-
+RUNS = Path("runs")
+"""Where folders go that nobody named."""
+CHECKS = "checks"
+"""Where beside a calibration the scans of its checks go."""
 
 HEADER = """\
 # Maps child coordinates to parent coordinates; metres and radians.
@@ -44,13 +47,13 @@ class RunFolder:
         self.path = path
 
     @classmethod
-    def create(cls, recipe: str, out: Path | None) -> RunFolder:
-        """Make ``out``, or ``runs/<time>_<recipe>``.
+    def create(cls, name: str, out: Path | None, under: Path = RUNS) -> RunFolder:
+        """Make ``out``, or a folder ``<time>_<name>`` under ``under``.
 
         Raises:
             FolderError: It cannot be made, or it already holds files.
         """
-        path = out or _unused(Path("runs") / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{recipe}")
+        path = out or _unused(under / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{name}")
         try:
             if path.is_dir() and any(path.iterdir()):
                 raise FolderError(f"{path}: already holds files; name a new or empty folder")
@@ -81,7 +84,7 @@ class RunFolder:
         """Remove the folder: the run never got as far as a result worth keeping."""
         shutil.rmtree(self.path, ignore_errors=True)
         parent = self.path.parent
-        if parent.name == "runs" and parent.is_dir() and not any(parent.iterdir()):
+        if parent.name in (RUNS.name, CHECKS) and parent.is_dir() and not any(parent.iterdir()):
             parent.rmdir()
 
     def _write(self, name: str, text: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,18 +61,39 @@ def record_run(
             recorded in it.
     """
     runner = Runner(recipe, registry, start.archive, start.motion)
-    resolved = recipe.resolved()
-    texts = {"recipe.yaml": recipe.text, "recipe.resolved.yaml": resolved}
-    recorder = None
-    try:
-        recorder = Recorder(folder.log, texts, recipe.header.log.clouds == "full")
-        registry.hooks.register(recorder)
+    with _logged(recipe, registry, folder):
         result = runner.run(start.point)
-        folder.write(result, resolved)
+        folder.write(result, recipe.resolved())
         if report:
             write_report(
                 read_run(folder.log), folder.path / "report.html", registry.exports(), library
             )
+    return result
+
+
+def record_scans(
+    recipe: Recipe, registry: Registry, folder: RunFolder, motion: MotionAllowed, count: int
+) -> None:
+    """Take the first ``count`` flanges that a recipe finds, with a log, and solve nothing.
+
+    Raises:
+        FlangeyeError: As :func:`record_run`.
+    """
+    runner = Runner(recipe, registry, ArchivePath(), motion)
+    with _logged(recipe, registry, folder) as recorder:
+        taken = runner.take(count)
+        recorder.ended(f"{len(taken)} scans were asked for, without a calibration")
+
+
+@contextmanager
+def _logged(recipe: Recipe, registry: Registry, folder: RunFolder) -> Iterator[Recorder]:
+    """Log what happens into a folder; remove it when nothing was gathered."""
+    texts = {"recipe.yaml": recipe.text, "recipe.resolved.yaml": recipe.resolved()}
+    recorder = None
+    try:
+        recorder = Recorder(folder.log, texts, recipe.header.log.clouds == "full")
+        registry.hooks.register(recorder)
+        yield recorder
     except (FlangeyeError, KeyboardInterrupt) as error:
         if recorder:
             recorder.ended(str(error) or "stopped by Ctrl-C")
@@ -84,4 +107,3 @@ def record_run(
         if recorder:
             recorder.close()
             registry.hooks.unregister(recorder)
-    return result

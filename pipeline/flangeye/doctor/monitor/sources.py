@@ -17,7 +17,9 @@ from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
+from flangeye.run.folder import CHECKS, RunFolder
 from flangeye.run.runner import Runner
+from flangeye.run.session import record_scans
 
 
 def from_archive(
@@ -45,8 +47,16 @@ def from_archive(
     return _checked(path, seen, path.stat().st_mtime_ns)
 
 
-def from_arm(stored: StoredCalibration, registry: Registry, scans: int, move: bool) -> Check:
+def from_arm(
+    stored: StoredCalibration,
+    registry: Registry,
+    scans: int,
+    move: bool,
+    overrides: Sequence[str] = (),
+) -> Check:
     """Take scans with the arm, as the calibration's own recipe drives it: one check.
+
+    They are kept in ``checks/<time>`` beside the calibration's log, as those of any run.
 
     Raises:
         NothingMoved: ``move`` is false; the plan.
@@ -58,9 +68,10 @@ def from_arm(stored: StoredCalibration, registry: Registry, scans: int, move: bo
             f"{stored.path}: was not calibrated live; take scans yourself and name them with "
             "--archive"
         )
-    recipe = parse_recipe(stored.recipe, stored.path.name, registry)
-    runner = Runner(recipe, registry, t.ArchivePath(), MotionAllowed(move))
-    return _checked(stored.path, runner.take(scans))
+    recipe = parse_recipe(stored.recipe, stored.path.name, registry, overrides)
+    folder = RunFolder.create("check", None, stored.path.parent / CHECKS)
+    record_scans(recipe, registry, folder, MotionAllowed(move), scans)
+    return _checked(folder.path, *_of_log(folder.log))
 
 
 def _of_log(path: Path) -> tuple[list[t.Observation], int]:
