@@ -21,8 +21,9 @@ from flangeye.log.read import RunLog, read_run, take
 from flangeye.log.watch.tail import Message, follow
 from flangeye.log.watch.view import View
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.load import Recipe
 from flangeye.run.outlook import Outlook, outlook
+from flangeye.run.recorded import recipe_of_log
 from flangeye.types import Floats
 
 POINTS = 20_000
@@ -132,8 +133,7 @@ class RunProcess:
                 return  # what the run itself says of its recipe stands on the page already
 
     def _recipe(self) -> Recipe:
-        text = read_run(self.log.path).text("recipe.resolved.yaml") or ""
-        return parse_recipe(text, self.path.name, self._registry)
+        return recipe_of_log(read_run(self.log.path), self._registry, name=self.path.name)
 
     def _show(self, message: Message) -> None:
         """Keep the newest scan and the flange in it, thin enough for a page."""

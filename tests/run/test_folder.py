@@ -67,7 +67,7 @@ def test_only_a_calibration_that_was_not_refused_is_there_for_other_programs(
 ) -> None:
     def written(name, **changes):
         folder = RunFolder.create("toy", tmp_path / name)
-        folder.write(result.model_copy(update=changes), "title: Toy\n")
+        folder.write(result.model_copy(update=changes), {"recipe.resolved.yaml": "title: Toy\n"})
         return {str(p.relative_to(folder.path)) for p in folder.path.rglob("*") if p.is_file()}
 
     always = {"recipe.resolved.yaml", "result.json"}

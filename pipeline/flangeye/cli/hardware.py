@@ -61,7 +61,7 @@ def _asker(yes: bool) -> Callable[[str], None]:
 
 
 @app.command()
-def touch(
+def touch(  # noqa: PLR0913  one for each option
     run: Annotated[Path, typer.Argument(help="The calibration's run: folder or run.mcap.")],
     seen: Annotated[
         list[str],

@@ -18,12 +18,13 @@ from flangeye.motion.limits import limits_of
 from flangeye.motion.touching import Touched, Toucher
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.header import LimitsSection
-from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.load import Recipe
+from flangeye.run.recorded import recipe_of_log
 from flangeye.types import Floats, FrameMismatchError
 from flangeye.units import parse_quantity
 
 
-def touch_points(
+def touch_points(  # noqa: PLR0913  one for each option
     run: Path,
     registry: Registry,
     given: tuple[Sequence[str], str],
@@ -55,8 +56,7 @@ def touch_points(
         predicted = calibration.base_T_camera.transform.apply(seen)
     except FrameMismatchError as error:
         raise StageError(f"{log.path}: {error}") from None
-    text = log.text("recipe.resolved.yaml") or ""
-    recipe = parse_recipe(text, log.path.name, registry, overrides)
+    recipe = recipe_of_log(log, registry, overrides)
     touched = []
     for each in _toucher(recipe, tip, ask).touch(predicted, move):
         touched.append(each)

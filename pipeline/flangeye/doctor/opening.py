@@ -26,8 +26,9 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart, Params
-from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step
+from flangeye.run.recorded import recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.types import Floats
 
@@ -67,9 +68,8 @@ def open_cell(
         StageError: The recordings cannot be read.
     """
     log = read_run(log_of(path)) if path.suffix == ".mcap" or is_log(log_of(path)) else None
-    text = log.text("recipe.yaml") if log else None
-    if recipe is None and text is not None:
-        recipe = parse_recipe(text, path.name, registry)
+    if recipe is None and log and log.has_recipe:
+        recipe = recipe_of_log(log, registry, name=path.name)
     cell = recipe.context.get(Cell) if recipe else None
     if recipe is None or cell is None:
         return None
@@ -82,12 +82,11 @@ def open_cell(
 
 def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSession:
     log = read_run(path)
-    text = log.text("recipe.yaml")
     if not log.gathered:
         log.require_sound()
         raise StageError(f"{path}: the run ended early; nothing was gathered yet")
-    if recipe is None and text is not None:
-        recipe = parse_recipe(text, path.name, registry)
+    if recipe is None and log.has_recipe:
+        recipe = recipe_of_log(log, registry, name=path.name)
     found = {o.id: o.feature for o in log.observations()}
     calibration = [meta for meta in log.poses.values() if meta["role"] == "calibration"]
     given = {o.id: o.base_T_flange.matrix for o in log.observations()}

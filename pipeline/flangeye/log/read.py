@@ -183,6 +183,16 @@ class RunLog:
         return None if raw is None else raw.decode()
 
     @property
+    def has_recipe(self) -> bool:
+        """Whether it says what was run."""
+        return not {"recipe.yaml", "recipe.resolved.yaml"}.isdisjoint(self.attachments)
+
+    @property
+    def models(self) -> dict[str, bytes]:
+        """The attached models of the recipe's own, by the name that it gives them."""
+        return {k: v for k, v in self.attachments.items() if k.startswith("models/")}
+
+    @property
     def result(self) -> dict[str, Any] | None:
         """The content of ``result.json``, when the run came to its end."""
         raw = self.attachments.get("result.json")

@@ -22,7 +22,7 @@ def load_model(kind: Literal["robots", "scanners"], name: str, near: Path | None
 
     Args:
         kind: Folder under ``data/``.
-        name: Model name, or a path ending in ``.yaml``; relative to ``near`` if not found here.
+        name: Model name, or a path ending in ``.yaml``: from ``near``, or else from here.
         near: Folder of the recipe.
 
     Raises:
@@ -43,7 +43,7 @@ def model_names(kind: str) -> list[str]:
 
 def _path(kind: str, name: str, near: Path | None) -> Path:
     if name.endswith((".yaml", ".yml")):
-        return Path(name) if Path(name).exists() or near is None else near / name
+        return near / name if near and (near / name).exists() else Path(name)
     known = model_names(kind)
     if name not in known:
         close = difflib.get_close_matches(name, known, n=2) or known

@@ -74,7 +74,7 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
         offer(Configuration, ("configuration",), lambda: _configuration(header, context))
     carries = context.get(RobotModel) or _carrier(context.get(Cell))
     if _plate_named(header, carries):
-        offer(Flange, ("feature",), lambda: _flange(header, carries, folder))
+        offer(Flange, ("feature",), lambda: _flange(header, carries, folder, context))
     _devices(header, context, complain)
     return context
 
@@ -134,12 +134,12 @@ def _plate(header: Header) -> str | None:
     return robot.flange if robot and not robot.urdf else None
 
 
-def _flange(header: Header, robot: RobotModel | None, folder: Path) -> Flange:
+def _flange(header: Header, robot: RobotModel | None, folder: Path, context: Context) -> Flange:
     feature = header.feature
     _refuse_two(feature)
     details = robot.flange if robot else FlangeDetails(standard=_plate(header))
     if not feature.wrist_circle:
-        return flange_of(details, _standard(str(feature.standard or details.standard), folder))
+        return flange_of(details, _standard(feature.standard or details.standard, folder, context))
     if robot is None:
         raise RecipeError(
             "wrist_circle: how far it lies behind the flange's face is in the robot's file "
@@ -155,10 +155,11 @@ def _refuse_two(feature: FeatureSection) -> None:
         raise RecipeError("give either a sphere or a wrist_circle, not both")
 
 
-def _standard(designation: str, folder: Path) -> FlangeStandard:
-    if designation.endswith((".yaml", ".yml")):
-        return read_model(folder / designation, FlangeStandard)
-    return load_standard(designation)
+def _standard(designation: str | None, folder: Path, context: Context) -> FlangeStandard:
+    if not str(designation).endswith((".yaml", ".yml")):
+        return load_standard(str(designation))
+    own = context[FlangeStandard] = read_model(folder / str(designation), FlangeStandard)
+    return own
 
 
 def _configuration(header: Header, context: Context) -> Configuration:

@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, get_args
 
 import yaml
@@ -23,6 +24,7 @@ from flangeye.plugin.stage import Params, Stage
 from flangeye.recipe.context import Context, context_of
 from flangeye.recipe.header import Header
 from flangeye.recipe.overrides import apply_override
+from flangeye.recipe.own_models import carried_files, sections, written_out
 from flangeye.recipe.steps import SECTIONS, Step, StepOrder
 
 PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
@@ -49,11 +51,15 @@ class Recipe:
 
     def resolved(self) -> str:
         """Return the recipe as YAML with every default and override written out."""
-        return self._resolved
+        return self.files["recipe.resolved.yaml"]
 
     @cached_property
-    def _resolved(self) -> str:
-        return yaml.safe_dump(self.data(), sort_keys=False, allow_unicode=True, width=100)
+    def files(self) -> dict[str, str]:
+        """Name -> text of what repeats it elsewhere: itself resolved, and models of its own."""
+        data, models = written_out(self.header, self.context)
+        data["steps"] = self._steps_as_data()
+        text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        return {"recipe.resolved.yaml": text, **models}
 
     def with_seed(self, seed: int) -> Recipe:
         """Return the recipe with another seed, as if it had been written so."""
@@ -74,14 +80,15 @@ class Recipe:
 
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""
-        data = self.header.model_dump(mode="json", exclude_none=True)
-        data["steps"] = [
+        return {**sections(self.header), "steps": self._steps_as_data()}
+
+    def _steps_as_data(self) -> list[Any]:
+        return [
             {step.stage.name: step.params.model_dump(mode="json", exclude_none=True)}
             if step.params
             else step.stage.name
             for step in self.steps
         ]
-        return data
 
 
 def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
@@ -101,16 +108,36 @@ def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -
     )
 
 
-def parse_recipe(text: str, name: str, registry: Registry, overrides: Sequence[str] = ()) -> Recipe:
-    """Check a recipe given as text, as a log holds it; see :func:`load_recipe`."""
-    return _Checker(parse_yaml(text, name), registry, Path()).check(name, text, overrides)
+def parse_recipe(
+    text: str,
+    name: str,
+    registry: Registry,
+    overrides: Sequence[str] = (),
+    models: Mapping[str, bytes] = MappingProxyType({}),
+) -> Recipe:
+    """Check a recipe given as text, as a log holds it; see :func:`load_recipe`.
+
+    Args:
+        text: The recipe.
+        name: What to call it.
+        registry: The plugins on offer.
+        overrides: As for :func:`load_recipe`.
+        models: Files of models that come with it, by the name it gives them.
+    """
+    with carried_files(models) as folder:
+        return _Checker(parse_yaml(text, name), registry, Path(), folder).check(
+            name, text, overrides
+        )
 
 
 class _Checker:
     """Collects every mistake of one recipe."""
 
-    def __init__(self, document: Document, registry: Registry, folder: Path) -> None:
+    def __init__(
+        self, document: Document, registry: Registry, folder: Path, models: Path | None = None
+    ) -> None:
         self._lookup = Lookup(registry, folder)
+        self._models = models or folder
         self._document = document
         self._overridden: list[tuple[Hashable, ...]] = []
         self._left_out: list[tuple[Hashable, ...]] = []
@@ -163,7 +190,7 @@ class _Checker:
             if not (len(keys) == 1 and keys[0] in broken):
                 self.complain(keys, message)
 
-        context = context_of(header, self._lookup.folder, complain)
+        context = context_of(header, self._models, complain)
         for offered, source in SECTIONS.items():
             if broken.intersection(source.sections):
                 context.setdefault(offered, None)

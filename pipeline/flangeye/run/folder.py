@@ -67,13 +67,18 @@ class RunFolder:
         """The MCAP log."""
         return self.path / "run.mcap"
 
-    def write(self, result: Result, resolved: str) -> None:
+    def write(self, result: Result, recipe: Mapping[str, str]) -> None:
         """Write everything but the log and the report.
+
+        Args:
+            result: The run's.
+            recipe: Name -> text of the resolved recipe and what it needs.
 
         Raises:
             FolderError: A file cannot be written.
         """
-        self._write("recipe.resolved.yaml", resolved)
+        for name, text in recipe.items():
+            self._write(name, text)
         self._write("result.json", dump_result(result.model_dump(mode="json")))
         if result.transforms and not result.refused:
             self._write("calibration.yaml", calibration_yaml(result))

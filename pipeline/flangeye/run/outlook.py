@@ -14,7 +14,8 @@ from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.coverage import Coverage, coverage_of
 from flangeye.models.workspace import work_of, workspace_of
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.load import Recipe
+from flangeye.run.recorded import recipe_of_log
 from flangeye.run.runner import Runner
 
 
@@ -55,8 +56,7 @@ class Outlook:
 
 def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
     """Return the outlook of a log by its own recipe; the run may be going on, killed or done."""
-    text = log.text("recipe.resolved.yaml") or log.text("recipe.yaml") or ""
-    recipe = parse_recipe(text, log.path.name, registry)
+    recipe = recipe_of_log(log, registry)
     return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
 
 

@@ -17,8 +17,9 @@ from flangeye.errors import StageError
 from flangeye.log.read import RunLog, read_notes, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import KINDS
-from flangeye.recipe.load import Recipe, parse_recipe
+from flangeye.recipe.load import Recipe
 from flangeye.recipe.steps import Step
+from flangeye.run.recorded import recipe_of_log
 
 _ORDER = list(KINDS)
 LEFT_OUT = "left out by --leave-out"
@@ -296,15 +297,12 @@ def earlier_run(
             f"{log.path}: this run is complete; there is nothing to resume "
             "(--retake ID takes a capture again)"
         )
-    text = log.text("recipe.resolved.yaml")
-    if text is None:
-        raise StageError(f"{log.path}: holds no recipe; it cannot be resumed")
     name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
-    recipe = parse_recipe(text, name, registry)
+    recipe = recipe_of_log(log, registry, name=name)
     weld = None if retaken else _begun_weld(log, recipe)
     if weld is not None:
         going_on = [f"steps.{weld.index}.resume={log.path.absolute()}"]
-        return parse_recipe(text, name, registry, going_on), restart_at(log, recipe, weld.label)
+        return recipe_of_log(log, registry, going_on, name), restart_at(log, recipe, weld.label)
     if not resumable(recipe):
         raise StageError(f"{log.path}: {recipe.steps[0].stage.name} begins anew each time")
     segments = any(step.stage.kind == "segment" for step in recipe.steps)

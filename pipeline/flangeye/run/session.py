@@ -63,7 +63,7 @@ def record_run(
     runner = Runner(recipe, registry, start.archive, start.motion)
     with _logged(recipe, registry, folder):
         result = runner.run(start.point)
-        folder.write(result, recipe.resolved())
+        folder.write(result, recipe.files)
         if report:
             write_report(
                 read_run(folder.log), folder.path / "report.html", registry.exports(), library
@@ -88,7 +88,7 @@ def record_scans(
 @contextmanager
 def _logged(recipe: Recipe, registry: Registry, folder: RunFolder) -> Iterator[Recorder]:
     """Log what happens into a folder; remove it when nothing was gathered."""
-    texts = {"recipe.yaml": recipe.text, "recipe.resolved.yaml": recipe.resolved()}
+    texts = {"recipe.yaml": recipe.text, **recipe.files}
     recorder = None
     try:
         recorder = Recorder(folder.log, texts, recipe.header.log.clouds == "full")

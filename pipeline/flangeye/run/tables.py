@@ -19,7 +19,8 @@ from flangeye.log.read import RunLog
 from flangeye.maths.geometry import quaternion_from_rotation, rotation_log
 from flangeye.models.cell import Axis, Cell
 from flangeye.plugin.registry import Registry
-from flangeye.recipe.load import parse_recipe
+from flangeye.recipe.load import Recipe
+from flangeye.run.recorded import recipe_of_log
 from flangeye.types import Observation, PoseFeature, Transform
 
 POSE = ("number", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -43,9 +44,8 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     Raises:
         StageError: The run is none of a cell, or nothing was seen in it.
     """
-    text = log.text("recipe.yaml")
-    recipe = None if text is None else parse_recipe(text, log.path.name, registry)
-    if text is None or recipe is None or Cell not in recipe.context:
+    recipe = recipe_of_log(log, registry) if log.has_recipe else None
+    if recipe is None or Cell not in recipe.context:
         raise StageError(f"{log.path}: is no run of a cell, and tables are written of cells alone")
     cell, seen = recipe.context[Cell], log.observations()
     if not seen:
@@ -59,8 +59,11 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     for name, rows in tables.items():
         files.append(folder / f"{name}.csv")
         write_whole(files[-1], _csv(rows))
+    for name, raw in log.models.items():
+        files.append(folder / name)
+        write_whole(files[-1], raw)
     files.append(folder / "recipe.yaml")
-    write_whole(files[-1], _recipe(text, cell, seen, scans))
+    write_whole(files[-1], _recipe(_text(log, recipe), cell, seen, scans))
     return files
 
 
@@ -126,6 +129,11 @@ def _csv(rows: Iterator[Sequence[Any]]) -> str:
     for row in rows:
         writer.writerow([x if isinstance(x, str) else f"{x:.12g}" for x in row])
     return text.getvalue()
+
+
+def _text(log: RunLog, recipe: Recipe) -> str:
+    """Return the recipe as it was written, unless it names models that the log carries."""
+    return recipe.text if log.models else log.text("recipe.yaml") or recipe.text
 
 
 def _recipe(text: str, cell: Cell, seen: Sequence[Observation], scans: Mapping[str, str]) -> str:

@@ -18,6 +18,7 @@ from flangeye.log.read import log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import CHECKS, RunFolder
+from flangeye.run.recorded import recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.run.session import record_scans
 
@@ -42,7 +43,9 @@ def from_archive(
         return _checked(path, *_of_log(log))
     if not path.exists():
         raise StageError(f"{path}: does not exist")
-    recipe = parse_recipe(_from_archive(stored), stored.path.name, registry, overrides)
+    recipe = parse_recipe(
+        _from_archive(stored), stored.path.name, registry, overrides, stored.log.models
+    )
     seen = Runner(recipe, registry, t.ArchivePath(path)).take(None)
     return _checked(path, seen, path.stat().st_mtime_ns)
 
@@ -68,7 +71,7 @@ def from_arm(
             f"{stored.path}: was not calibrated live; take scans yourself and name them with "
             "--archive"
         )
-    recipe = parse_recipe(stored.recipe, stored.path.name, registry, overrides)
+    recipe = recipe_of_log(stored.log, registry, overrides)
     folder = RunFolder.create("check", None, stored.path.parent / CHECKS)
     record_scans(recipe, registry, folder, MotionAllowed(move), scans)
     return _checked(folder.path, *_of_log(folder.log))

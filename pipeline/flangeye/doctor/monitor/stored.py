@@ -21,6 +21,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import corners_of
 from flangeye.models.loading import load_model
 from flangeye.models.workspace import workspace_of
+from flangeye.recipe.own_models import carried_files
 from flangeye.types import Floats
 
 
@@ -60,7 +61,8 @@ class StoredCalibration:
         """The arm's kinematics, where the recipe names a model that is known here."""
         header = parse_yaml(self.recipe, "recipe").data if self.recipe else {}
         model = (header.get("robot") or {}).get("model")
-        return Arm(load_model("robots", model)) if model else None
+        with carried_files(self.log.models) as folder:
+            return Arm(load_model("robots", model, folder)) if model else None
 
     @cached_property
     def corners(self) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
+from flangeye.recipe.own_models import carried_files
 from flangeye.report.account import provenance_of
 from flangeye.report.certificate.budget import Conditions, budget_of, shares_of, use_budget_of
 from flangeye.report.facts import Facts, facts_of
@@ -92,7 +94,7 @@ def render(facts: Facts, conditions: Conditions) -> str:
 def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
     result = facts.result
     header = parse_yaml(facts.recipe, "recipe").data if facts.recipe else {}
-    scanner = _scanner(header)
+    scanner = _scanner(header, facts.log.models)
     return {
         "result": result,
         "budget": budget_of(result),
@@ -132,9 +134,10 @@ def _serial(section: dict[str, Any]) -> str:
     return str(settings.get("serial", "")) if isinstance(settings, dict) else ""
 
 
-def _scanner(header: dict[str, Any]) -> ScannerModel | None:
+def _scanner(header: dict[str, Any], models: Mapping[str, bytes]) -> ScannerModel | None:
     model = (header.get("scanner") or {}).get("model")
     try:
-        return load_model("scanners", model) if model else None
+        with carried_files(models) as folder:
+            return load_model("scanners", model, folder) if model else None
     except FlangeyeError:  # the file of the run's machine need not be on this one
         return None

@@ -1,0 +1,96 @@
+"""Models of a recipe's own files, carried with a run: its log is read where they are not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import yaml
+
+from flangeye.models.cell import Cell
+from flangeye.models.model import Model
+from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.scanners import ScannerData
+from flangeye.models.standards import FlangeStandard
+from flangeye.recipe.context import Context
+from flangeye.recipe.header import Header
+
+CARRIED = re.compile(r"models/\w+\.yaml")
+"""Names of such files, beside the log and in it."""
+
+
+def sections(header: Header) -> dict[str, Any]:
+    """Return a recipe's sections as data; a cell says itself what stands where."""
+    data = header.model_dump(mode="json", exclude_none=True)
+    if header.cell:
+        del data["configuration"]
+    return data
+
+
+def written_out(header: Header, context: Context) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return a recipe's sections as data, and the files of the models that are not bundled.
+
+    A URDF and a factory calibration become a model's file as well: what was read of them.
+
+    Args:
+        header: The sections.
+        context: What they offered.
+    """
+    data = sections(header)
+    files = {}
+    for section, key, name, model in _own(data, context):
+        files[f"models/{name}.yaml"] = _text(model)
+        section[key] = f"models/{name}.yaml"
+    return data, files
+
+
+def _own(
+    data: dict[str, Any], context: Context
+) -> Iterator[tuple[dict[str, Any], str, str, Model]]:
+    """Yield each section that names a model of one's own: it, the key, a name, the model."""
+    robot = data.get("robot", {})
+    if robot.get("urdf") or robot.get("factory") or _is_file(robot.get("model")):
+        link = ("flange",) if "urdf" in robot else ()  # with a model, flange is its plate
+        for key in ("urdf", "base", "packages", "factory", *link):
+            robot.pop(key, None)
+        yield robot, "model", "robot", context[RobotModel]
+    if _is_file((second := data.get("second_robot", {})).get("model")):
+        yield second, "model", "second_robot", context[SecondRobot].model
+    for name, arm in data.get("cell", {}).get("arms", {}).items():
+        if _is_file(arm["model"]):
+            yield arm, "model", name, context[Cell].movers[name]
+    if _is_file((scanner := data.get("scanner", {})).get("model")):
+        yield scanner, "model", "scanner", context[ScannerData]
+    if FlangeStandard in context:
+        yield data["feature"], "standard", "standard", context[FlangeStandard]
+
+
+def _is_file(name: str | None) -> bool:
+    return name is not None and name.endswith((".yaml", ".yml"))
+
+
+def _text(model: Model) -> str:
+    data = model.model_dump(mode="json", exclude_unset=True)
+    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+
+
+@contextmanager
+def carried_files(models: Mapping[str, bytes]) -> Iterator[Path]:
+    """Give the folder that a recipe's models are in while it is read: the shell's without any.
+
+    Args:
+        models: Name -> content, as a log has them; other names are not written.
+    """
+    if not models:
+        yield Path()
+        return
+    with TemporaryDirectory() as name:
+        (Path(name) / "models").mkdir()
+        for file, raw in models.items():
+            if CARRIED.fullmatch(file):
+                (Path(name) / file).write_bytes(raw)
+        yield Path(name)
