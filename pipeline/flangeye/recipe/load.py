@@ -103,7 +103,7 @@ def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -
         RecipeError: Names every mistake found, not only the first.
     """
     document = read_yaml(path)
-    return _Checker(document, registry, path.parent).check(
+    return _Checker(document, registry, path.parent.absolute()).check(
         path.stem, read_text(path, MAX_BYTES, RecipeError), overrides
     )
 

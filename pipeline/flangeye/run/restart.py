@@ -298,6 +298,8 @@ def earlier_run(
             "(--retake ID takes a capture again)"
         )
     name = log.path.absolute().parent.name.partition("_")[2] or "resumed"
+    if not log.has_recipe:
+        raise StageError(f"{log.path}: holds no recipe; it cannot be resumed")
     recipe = recipe_of_log(log, registry, name=name)
     weld = None if retaken else _begun_weld(log, recipe)
     if weld is not None:
