@@ -68,7 +68,9 @@ def test_the_arms_of_a_cell_and_a_second_arm_are_carried(folder: Path) -> None:
     text = f"cell: {{arms: {arms}, cameras: {{eye: left}}, targets: {{marker: right}}}}\n"
     (folder / "cell.yaml").write_text(HEADER + text + CELL)
     here = load_recipe(folder / "cell.yaml", load_registry())
-    second = "robot: ur5\nsecond_robot: ur10e.yaml\nscanner: phoxi-m\nconfiguration: {name: two-arms}\n"
+    second = (
+        "robot: ur5\nsecond_robot: ur10e.yaml\nscanner: phoxi-m\nconfiguration: {name: two-arms}\n"
+    )
     (folder / "two.yaml").write_text(HEADER + second + STEPS)
     two = load_recipe(folder / "two.yaml", load_registry())
     shutil.rmtree(folder)

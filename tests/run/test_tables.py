@@ -102,7 +102,7 @@ def log_of(text: str | None, seen: list[t.Observation], clouds: bool = False) ->
     captures = [t.Capture(o.id, cloud, o.poses) for o in seen]
     return SimpleNamespace(
         path=Path("run.mcap"), text=lambda _: text, observations=lambda: seen,
-        has_full_clouds=clouds, captures=lambda: captures,
+        has_full_clouds=clouds, captures=lambda: captures, has_recipe=text is not None, models={},
     )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def log_of(text: str | None, seen: list[t.Observation], clouds: bool = False) ->
 def of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any recipe is that of a cell in which one arm moves."""
     recipe = SimpleNamespace(context={Cell: SimpleNamespace(movers={"flange": None})})
-    monkeypatch.setattr(tables, "parse_recipe", lambda *_: recipe)
+    monkeypatch.setattr(tables, "recipe_of_log", lambda *_: recipe)
 
 
 UNUSED: Any = None
@@ -147,7 +147,7 @@ def test_what_is_no_run_of_a_cell_has_no_tables(
     said = "run.mcap: is no run of a cell, and tables are written of cells alone"
     with pytest.raises(StageError, match=said):
         write_tables(log_of(None, []), tmp_path, UNUSED)
-    monkeypatch.setattr(tables, "parse_recipe", lambda *_: SimpleNamespace(context={}))
+    monkeypatch.setattr(tables, "recipe_of_log", lambda *_: SimpleNamespace(context={}))
     with pytest.raises(StageError, match=said):
         write_tables(log_of(TEXT, [circle(1, [1e-8] * 3)]), tmp_path, UNUSED)
 
