@@ -440,7 +440,9 @@ class Follower:
         self._enter("following")
 
     def _enter(self, phase: Phase) -> None:
-        self._release.loose = phase == "ending" and self.phase == "bridging"
+        # Where nothing was felt before, nothing says by how much a wall would deflect the tip.
+        unheld = self.phase == "bridging" or self.refined.empty
+        self._release.loose = phase == "ending" and unheld
         self.phase = phase
 
     def _refuse(self, pose: ToolPose, settings: Following) -> None:
