@@ -59,6 +59,8 @@ def rows(names: list[str], kept: dict[str, float]) -> tuple[Table, dict[str, flo
 def main(words: list[str]) -> None:
     """Run the cases named, or all, and print a row for each."""
     names = [word for word in words if word != "--keep"] or list(CASES)
+    if unknown := [name for name in names if name not in CASES]:
+        raise SystemExit(f"no case {', '.join(unknown)}; known: {', '.join(CASES)}; or --keep")
     kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     table, found = rows(names, kept)
     Console(width=160).print(table)
