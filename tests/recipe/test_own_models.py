@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -64,8 +65,9 @@ def test_a_log_carries_what_is_not_bundled(folder: Path, text: str, carried: lis
 
 
 def test_the_arms_of_a_cell_and_a_second_arm_are_carried(folder: Path) -> None:
-    arms = "{left: ur5.yaml, right: {model: ur10e.yaml, on: base, place: unknown}}"
-    text = f"cell: {{arms: {arms}, cameras: {{eye: left}}, targets: {{marker: right}}}}\n"
+    arms = "{scanner: ur5.yaml, right: {model: ur10e.yaml, on: base, place: unknown}}"
+    text = f"cell: {{arms: {arms}, cameras: {{eye: scanner}}, targets: {{marker: right}}}}\n"
+    text += "scanner: phoxi-m.yaml\n"
     (folder / "cell.yaml").write_text(HEADER + text + CELL)
     here = load_recipe(folder / "cell.yaml", load_registry())
     second = (
@@ -75,15 +77,18 @@ def test_the_arms_of_a_cell_and_a_second_arm_are_carried(folder: Path) -> None:
     two = load_recipe(folder / "two.yaml", load_registry())
     shutil.rmtree(folder)
     assert elsewhere(here).context[Cell].movers == here.context[Cell].movers
+    assert elsewhere(here).context[ScannerData] == here.context[ScannerData]
     assert elsewhere(two).context[SecondRobot] == two.context[SecondRobot]
 
 
 @pytest.mark.parametrize("kind", ["robots", "scanners"])
-def test_every_model_is_written_as_it_is_read(kind: str, tmp_path: Path) -> None:
+def test_every_model_is_written_as_it_is_read(
+    kind: Literal["robots", "scanners"], tmp_path: Path
+) -> None:
     for name in model_names(kind):
-        model = load_model(kind, name)  # type: ignore[arg-type]
+        model = load_model(kind, name)
         (tmp_path / f"{name}.yaml").write_text(_text(model))
-        again = load_model(kind, f"{name}.yaml", tmp_path)  # type: ignore[arg-type]
+        again = load_model(kind, f"{name}.yaml", tmp_path)
         assert again == model
         if isinstance(model, RobotModel):
             zero = np.zeros(len(model.joints))

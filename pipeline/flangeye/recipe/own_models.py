@@ -62,7 +62,7 @@ def _own(
         yield second, "model", "second_robot", context[SecondRobot].model
     for name, arm in data.get("cell", {}).get("arms", {}).items():
         if _is_file(arm["model"]):
-            yield arm, "model", name, context[Cell].movers[name]
+            yield arm, "model", f"arm_{name}", context[Cell].movers[name]  # one may be a "scanner"
     if _is_file((scanner := data.get("scanner", {})).get("model")):
         yield scanner, "model", "scanner", context[ScannerData]
     if FlangeStandard in context:
