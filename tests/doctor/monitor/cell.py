@@ -10,28 +10,30 @@ import numpy as np
 from flangeye import types as t
 from flangeye.log.record import Recorder
 from flangeye.maths.geometry import rigid, rotation_exp
-from tests.report.conftest import TRUTH, WORKSPACE, Script, _pose, scripted
+from tests.report.conftest import RECIPE, TRUTH, WORKSPACE, Script, _pose, scripted
 
 STATIONS = [_pose(np.random.default_rng(k)) for k in (11, 12, 13)]
 
 
-def calibrate(folder: Path) -> Path:
+def calibrate(folder: Path, recipe: str = RECIPE) -> Path:
     """Record a calibration and return its folder."""
     folder.mkdir()
-    scripted(Script(points=50, ids=tuple(f"{i:02}" for i in range(30))), folder / "run.mcap")
+    ids = tuple(f"{i:02}" for i in range(30))
+    scripted(Script(points=50, ids=ids, recipe=recipe), folder / "run.mcap")
     return folder
 
 
 def check(
-    folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5, misfit: float = 0.0
-) -> Path:
+    folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5, misfit: float = 0.0,
+    recipe: str = "title: x",
+) -> Path:  # fmt: skip
     """Record a check: three scans, the scanner shifted by ``shift`` in base [m].
 
     In the second one something else was found, by ``misfit`` aside [m].
     """
     folder.mkdir()
     rng = np.random.default_rng(seed)
-    recorder = Recorder(folder / "run.mcap", {"recipe.resolved.yaml": "title: x"}, False)
+    recorder = Recorder(folder / "run.mcap", {"recipe.resolved.yaml": recipe}, False)
     recorder.flangeye_run_started(source=t.Source("sha256:0"), total=3)
     camera = t.Transform(t.BASE, t.CAMERA, rigid(np.eye(3), np.array(shift)) @ TRUTH.matrix)
     for i, pose in enumerate(STATIONS):

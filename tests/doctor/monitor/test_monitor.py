@@ -163,6 +163,21 @@ def test_mistakes_are_one_line(
     assert message in str(refused.exception)
 
 
+@pytest.mark.parametrize("robot", ["ur10e", "kuka-iiwa14-r820"])  # as many joints, and one more
+def test_a_run_of_another_robot_checks_nothing(robot: str, tmp_path: Path) -> None:
+    of = "robot: {{model: {}}}".format
+    calibrate(tmp_path / "calibration", of("ur5e"))
+    check(tmp_path / "same", 400, recipe=of("ur5e"))
+    check(tmp_path / "other", 401, recipe=of(robot))
+    done = monitor(tmp_path, tmp_path / "h.parquet", "same", "other")
+    assert len(done.stdout.splitlines()) == 1
+    assert isinstance(done.exception, StageError)
+    assert str(done.exception).endswith(
+        "other/run.mcap: is a run of another robot than this calibration's; name runs of the same "
+        "cell"
+    )
+
+
 def test_a_run_without_a_calibration_cannot_be_watched(cell: Path) -> None:
     with pytest.raises(StageError, match="holds no calibration"):
         stored_calibration(cell / "ok-00")

@@ -14,7 +14,7 @@ from flangeye.doctor.monitor.history import Check
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.log.read import log_of, read_run
+from flangeye.log.read import RunLog, log_of, read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import CHECKS, RunFolder
@@ -36,11 +36,13 @@ def from_archive(
         overrides: Where the recordings are read in another way than the calibration's were.
 
     Raises:
-        StageError: It cannot be read, or the flange is in none of its scans.
+        StageError: It cannot be read, is of another robot, or shows the flange in no scan.
     """
     log = log_of(path)
     if log.suffix == ".mcap" and log.is_file():
-        return _checked(path, *_of_log(log))
+        run = read_run(log)
+        stored.refuse_another_arm(run)
+        return _checked(path, *_of_log(run))
     if not path.exists():
         raise StageError(f"{path}: does not exist")
     recipe = parse_recipe(
@@ -74,13 +76,12 @@ def from_arm(
     recipe = recipe_of_log(stored.log, registry, overrides)
     folder = RunFolder.create("check", None, stored.path.parent / CHECKS)
     record_scans(recipe, registry, folder, MotionAllowed(move), scans)
-    return _checked(folder.path, *_of_log(folder.log))
+    return _checked(folder.path, *_of_log(read_run(folder.log)))
 
 
-def _of_log(path: Path) -> tuple[list[t.Observation], int]:
-    log = read_run(path)
+def _of_log(log: RunLog) -> tuple[list[t.Observation], int]:
     times = [int(meta["time_ns"]) for meta in log.poses.values()]
-    return log.observations(), max(times, default=0) or path.stat().st_mtime_ns
+    return log.observations(), max(times, default=0) or log.path.stat().st_mtime_ns
 
 
 def _from_archive(stored: StoredCalibration) -> str:

@@ -24,6 +24,9 @@ from flangeye.models.workspace import workspace_of
 from flangeye.recipe.own_models import carried_files
 from flangeye.types import Floats
 
+SAME_MAKE = 0.03
+"""How far the flanges of two arms of one make may be apart, with all joints at zero [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class StoredCalibration:
@@ -59,10 +62,20 @@ class StoredCalibration:
     @cached_property
     def arm(self) -> Arm | None:
         """The arm's kinematics, where the recipe names a model that is known here."""
-        header = parse_yaml(self.recipe, "recipe").data if self.recipe else {}
-        model = (header.get("robot") or {}).get("model")
-        with carried_files(self.log.models) as folder:
-            return Arm(load_model("robots", model, folder)) if model else None
+        return _arm_of(self.log)
+
+    def refuse_another_arm(self, log: RunLog) -> None:
+        """Refuse a later run of an arm that is built otherwise.
+
+        Raises:
+            StageError: Its flange stands elsewhere with every joint at zero.
+        """
+        ours, theirs = self.arm, _arm_of(log)
+        if ours and theirs and not _alike(ours, theirs):
+            raise StageError(
+                f"{log.path}: is a run of another robot than this calibration's; name runs of the "
+                "same cell"
+            )
 
     @cached_property
     def corners(self) -> Floats:
@@ -149,6 +162,24 @@ def stored_calibration(path: Path) -> StoredCalibration:
             "beside the robot (base_T_camera) can be watched"
         )
     return StoredCalibration(log.path, log, calibration)
+
+
+def _arm_of(log: RunLog) -> Arm | None:
+    """Return the kinematics of a run's arm, where its recipe names a model that is known here."""
+    recipe = log.text("recipe.resolved.yaml")
+    header = parse_yaml(recipe, "recipe").data if recipe else {}
+    model = (header.get("robot") or {}).get("model")
+    with carried_files(log.models) as folder:
+        return Arm(load_model("robots", model, folder)) if model else None
+
+
+def _alike(one: Arm, other: Arm) -> bool:
+    """Tell whether two arms are of one make: corrected lengths and zeros move a flange less."""
+    if one.n != other.n:
+        return False
+    at_zero = np.zeros(one.n)
+    between = one.flange(at_zero)[:3, 3] - other.flange(at_zero)[:3, 3]
+    return bool(np.linalg.norm(between) < SAME_MAKE)
 
 
 def _covariances(turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats) -> Floats:
