@@ -19,8 +19,9 @@ from flangeye.maths.geometry import hat, rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, Mask
 
-STEPS = 6
-"""Of Gauss and Newton; each squares the error of the one before."""
+STEPS = 12
+"""Of Gauss and Newton; what scatters and the parameters are found in turn, and settle by a fifth
+each time."""
 DELTA = 1e-6
 """For differences of the flange's pose by a parameter [rad, m]."""
 KNOWN, LOOSE = 0.5, 100.0

@@ -75,11 +75,12 @@ def test_cells_without_points_are_missing_and_what_no_scanner_sees_is_left_out()
     assert none.shape == (1, 1, 3) and np.isnan(none).all()
 
 
+@pytest.mark.parametrize("rows", [300, 60])
 @pytest.mark.parametrize(("pitch", "dense"), [(4e-3, True), (5e-4, False)])
 def test_loose_points_fill_cells_as_wide_as_wanted_or_as_they_can(
-    pitch: float, dense: bool
+    pitch: float, dense: bool, rows: int
 ) -> None:
-    scan = image(300, 320).reshape(-1, 3)
+    scan = image(rows, 320).reshape(-1, 3)
     scan = np.random.default_rng(0).permutation(scan)
     view = range_image(scan, pitch)
     assert view is not None
@@ -123,6 +124,8 @@ def test_points_that_are_all_at_one_place_are_seen_there() -> None:
     for points in (np.concatenate([behind, place]), np.tile(place, (60_000, 1)), place):
         view = range_image(points, 4e-3)
         assert view is not None and view.xyz == pytest.approx(place[None])
+    organised = np.broadcast_to(place, (64, 80, 3))
+    assert thinned(organised, 4e-3).strides == (1, 1)
 
 
 def test_the_one_point_before_the_scanner_is_seen_though_it_is_not_drawn() -> None:

@@ -43,6 +43,13 @@ def test_a_few_points_off_its_plane_are_no_part_of_it() -> None:
     assert len(part.points) == (wall.points[:, 2] == np.float32(0.7)).sum()
 
 
+def test_what_stands_on_a_flat_piece_is_a_part_of_its_own_if_it_is_large_enough() -> None:
+    wall = piece(lambda x, y: np.where(x < 0.03, 0.005, 0.0))
+    for fewest, expected in ((50, {0.7, 0.695}), (1000, {0.7})):
+        parts = flat_parts([wall], 0.1, SCATTER, fewest)
+        assert {round(float(p.plane.point[2]), 4) for p in parts} == expected
+
+
 def test_a_bent_piece_has_a_part_for_each_side() -> None:
     parts = flat_parts([piece(roof)], 0.2, SCATTER, 50)
     found = sorted(part.plane.normal[0] for part in parts if len(part.points) > 1500)

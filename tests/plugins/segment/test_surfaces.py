@@ -56,6 +56,14 @@ def test_a_crease_ends_a_surface_where_depth_bends_by_more_than_is_allowed(
     assert smooth[:, :38].all() and smooth[:, 42:].all()
 
 
+def test_a_crease_beside_the_border_of_the_view_ends_a_surface() -> None:
+    depth = slope(across=0.0)
+    depth[:, 1:] += 0.9e-3 * np.arange(79)
+    smooth = smooth_surface(view(depth), BEND)[0]
+    assert not smooth[:, 1].any()
+    assert smooth[:, 4:].all()
+
+
 @pytest.mark.parametrize(("step", "ends"), [(5.3e-3, False), (5.8e-3, True)])
 def test_beside_a_missing_point_a_step_steeper_than_sixty_degrees_ends_a_surface(
     step: float, ends: bool
@@ -78,10 +86,11 @@ def test_noise_beyond_the_crease_is_averaged_first() -> None:
 
 def test_an_average_is_that_of_the_neighbours_that_are_there() -> None:
     depth = slope(9, 12).astype(np.float32)
-    depth[4, 5] = np.nan
+    depth[4, 5] = depth[:2, 9] = depth[2, 9:] = np.nan
+    depth[0, 10] = depth[1, 10:] = np.nan  # the last corner stands alone
     found = _averaged(depth)
-    assert np.isnan(found[4, 5]) and np.isfinite(found).sum() == depth.size - 1
-    for row, column in ((0, 0), (8, 11), (2, 2), (4, 6), (3, 5)):
+    assert np.array_equal(np.isnan(found), np.isnan(depth))
+    for row, column in ((0, 0), (8, 11), (2, 2), (4, 6), (3, 5), (0, 11)):
         near = depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
         assert found[row, column] == pytest.approx(np.nanmean(near), rel=1e-6)
 
