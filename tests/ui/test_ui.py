@@ -161,6 +161,7 @@ def test_a_pose_is_left_out_by_the_command_that_is_shown(browser: Any, served: S
     write_recipe(page, SMALL)
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Run")
+    page.get_by_role("status").filter(has_text=re.compile(r"\S")).wait_for()
     if not page.get_by_text("done (exit code 0)").count():
         page.get_by_role("button", name="Start", exact=True).click()
         page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
