@@ -8,6 +8,7 @@ import pytest
 
 from flangeye.handeye.calibration import _beyond
 from flangeye.handeye.components import Noise
+from flangeye.handeye.consensus import _first_noise
 
 
 @pytest.mark.parametrize(
@@ -31,3 +32,9 @@ def test_noise_beyond_the_features_own_is_the_arms_and_what_else_there_is(
     measurements = SimpleNamespace(are_poses=are_poses, has_normal=np.full(4, normals))
     problem: Any = SimpleNamespace(measurements=measurements, arms=None)
     assert _beyond(found, problem) == told
+
+
+def test_noise_that_is_stated_is_all_there_is_from_the_start() -> None:
+    stated: Any = SimpleNamespace(stated=True)
+    nowhere: Any = None
+    assert _first_noise(stated, nowhere) == Noise(pose=0.0, tilt=0.0)

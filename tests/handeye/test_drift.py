@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 
 from flangeye.handeye.drift import (
+    MISFIT,
     DriftTest,
     Information,
     Prior,
+    Sightings,
     _change,
     _scatter,
     _surprise,
     allowance,
     information_of,
+    misfits,
+    moved_since,
     verdict,
 )
+from flangeye.maths.statistics import chi2_quantile
 from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
 from tools import drift_year
 
@@ -74,6 +79,33 @@ def test_checks_scatter_by_the_factor_that_their_middle_one_does(factor: float) 
     assert _scatter(checks, before, (10, 20), 7.0)[1] == pytest.approx(0.4 * 6 * 10)
     still = Information(checks.matrix, 0.01 * vectors)
     assert _scatter(still, before, (100, 250), np.inf)[0] == 0.25
+
+
+def test_a_sighting_is_a_misfit_beyond_what_camera_day_and_scan_allow_together() -> None:
+    camera, scan, mean = 3e-4, 4e-4, 1e-3
+    covariance = np.diag([1e-12] * 3 + [camera**2] * 3)
+    before = Information.of_covariance(covariance, np.array([0, 0, 0, mean, 0, 0]))
+    limit = np.sqrt(chi2_quantile(1 - MISFIT, 5) * (camera**2 + scan**2 + DriftTest().daily ** 2))
+    off = np.array([0.99, 1.01, -0.99, -1.01]) * limit - mean
+    residuals, effects = np.zeros((4, 5)), np.zeros((4, 5, 6))
+    residuals[:, 0], effects[:, :3, 3:] = off, np.eye(3)
+    own = np.tile(np.diag([scan**2] * 3 + [1e-6] * 2), (4, 1, 1))
+    seen = Sightings(residuals, effects, own, np.tile(np.eye(3), (4, 1, 1)), None, np.arange(4))
+    assert misfits(seen, before, DriftTest()).tolist() == [False, True, False, True]
+
+
+def test_a_motion_is_held_against_the_checks_of_its_reference_alone() -> None:
+    test, weight = DriftTest(reference=8), 1e8
+    means = np.zeros((20, 6))
+    means[:4, 3], means[4:12, 3] = 9.0, 1e-3  # the first four are no longer held against it
+    means[12:, 3:] = [1e-3, 3e-3, 4e-3]
+    checks = Information(np.tile(weight * np.eye(6), (20, 1, 1)), weight * means)
+    unknown = Prior(Information.of_covariance(1e6 * np.eye(6)))
+    found = moved_since(checks, unknown, CORNERS, test, 12, 2.5)
+    assert (found.state, found.since, found.statistic) == ("MOVED", 12, 2.5)
+    assert found.motion == pytest.approx([0, 0, 0, 0, 3e-3, 4e-3], abs=1e-9)
+    assert found.shift == pytest.approx(5e-3)
+    assert found.covariance == pytest.approx((1 / 8 + 1 / 8) / weight * np.eye(6), abs=1e-13)
 
 
 @pytest.mark.parametrize("name", drift_year.STEPS)
