@@ -229,6 +229,7 @@ def test_scans_of_other_poses_are_refused() -> None:
     ]
     told = refusal(replace(made, observations=shuffled))
     assert "check that each scan belongs to its robot pose" in told
+    assert "(place: unknown, where nobody has measured where the target is mounted)" in told
 
 
 def test_two_arms_and_a_circle_of_unknown_place_are_refused() -> None:

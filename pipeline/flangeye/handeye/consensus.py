@@ -31,6 +31,11 @@ LARGEST_SHARE = 0.2
 """Of the poses' extent: scans that belong to other poses show noise as large as the extent."""
 LARGEST_TILT = np.radians(10.0)
 """Normals further than this from the target's axis, at the median, belong to another frame."""
+CONFIGURED = (
+    "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
+    "where the target is mounted)"
+)
+"""What to look at, where poses agree with no one answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,11 +313,10 @@ def _require_majority(problem: Problem, found: Solution) -> None:
     if agreeing < max(3, given / 2):
         raise CalibrationRefused(
             f"only {agreeing} of {given} poses agree with one answer: check that each scan belongs "
-            "to its robot pose, and that the recipe's configuration is the cell's"
+            "to its robot pose, and " + CONFIGURED
         )
     if not _plausible(problem, found):
         raise CalibrationRefused(
             f"the poses agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
-            "deg only: check that each scan belongs to its robot pose, and that the recipe's "
-            "configuration is the cell's"
+            "deg only: check that each scan belongs to its robot pose, and " + CONFIGURED
         )

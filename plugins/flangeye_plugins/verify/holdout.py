@@ -221,13 +221,13 @@ def _measure(
     calibration: HandEye, observation: Observation, expected: Floats, held: HeldOut, i: int
 ) -> None:
     estimate = calibration.base_T_camera
-    rotation, circle = estimate.transform.rotation, observation.circle
-    mapped = estimate.transform.apply(circle.centre)
-    held.errors[i] = mapped - (expected[:3, :3] @ circle.centre_in_flange + expected[:3, 3])
+    rotation, seen = estimate.transform.rotation, observation.feature
+    mapped = estimate.transform.apply(seen.centre)
+    held.errors[i] = mapped - (expected[:3, :3] @ observation.centre_in_mount + expected[:3, 3])
     of_pose = covariance_at(estimate.covariance, estimate.about, mapped[None])[0]
-    held.covariances[i] = rotation @ circle.covariance @ rotation.T + of_pose
-    if circle.normal is not None:
-        held.tilts[i] = angle_between(rotation @ circle.normal, expected[:3, 2])
+    held.covariances[i] = rotation @ seen.centre_covariance @ rotation.T + of_pose
+    if seen.normal is not None:
+        held.tilts[i] = angle_between(rotation @ seen.normal, expected[:3, 2])
 
 
 def _beyond_gate(held: HeldOut, probability: float) -> NDArray[np.bool_]:

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from flangeye import StageError
-from flangeye.maths.geometry import rotation_exp
+from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.configuration import DEFAULT
 from flangeye.types import (
     BASE,
@@ -19,6 +20,7 @@ from flangeye.types import (
     Observation,
     Observations,
     Pair,
+    PoseFeature,
     Seed,
     Source,
     Transform,
@@ -77,6 +79,13 @@ def displaced(observation: Observation, by: Sequence[float]) -> Observation:
     return Observation(observation.id, moved, by_frame(observation.base_T_flange))
 
 
+def marker_of(circle: CircleFeature) -> PoseFeature:
+    """A marker in a circle's place, its z along the circle's normal."""
+    rotation = Rotation.align_vectors([circle.normal], [[0, 0, 1]])[0].as_matrix()
+    covariance = np.diag([1e-6, 1e-6, 1e-6, *np.diag(circle.covariance)])
+    return PoseFeature(Transform("camera", "target", rigid(rotation, circle.centre)), covariance)
+
+
 def test_folds_hold_out_every_pose_once_and_do_not_depend_on_global_state() -> None:
     np.random.seed(1)
     first = deal(13, 5, 0)
@@ -132,6 +141,15 @@ def test_a_loop_measures_a_camera_beside_an_arm_as_that_is_measured() -> None:
     assert loop.errors == pytest.approx(plain.errors, abs=1e-12)
     assert loop.tilts == pytest.approx(plain.tilts, abs=1e-9)
     assert loop.tilts == pytest.approx(np.full(12, 0.02), abs=5e-3)
+
+
+def test_a_marker_on_the_flange_is_measured_beside_an_arm() -> None:
+    observations, calibration = simulate(12, tilt=0.02), svd(simulate(12, seed=1))
+    plain = hold_out(observations, [np.arange(12)], [calibration], (DEFAULT, None))
+    markers = [replace(o, feature=marker_of(o.circle)) for o in observations]
+    held = hold_out(markers, [np.arange(12)], [calibration], (DEFAULT, None))
+    assert held.errors == pytest.approx(plain.errors, abs=1e-12)
+    assert held.tilts == pytest.approx(plain.tilts, abs=1e-9)
 
 
 def test_a_calibration_above_the_limit_does_not_pass() -> None:
