@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 
 from flangeye.cli.commands import app
 from flangeye.doctor.monitor import History, from_arm, judge, stored_calibration
+from flangeye.doctor.monitor.chart import figure
 from flangeye.doctor.monitor.history import Finding
 from flangeye.doctor.monitor.opcua import write_state
 from flangeye.errors import FlangeyeError, StageError
@@ -60,6 +61,14 @@ def test_ok_then_moved_since_when_and_which_part(cell: Path, tmp_path: Path) -> 
         and "since check 16" in page
         and "https://" not in page.split("<script", 1)[0]
     )
+
+
+def test_the_chart_of_one_check_has_one_time(cell: Path, tmp_path: Path) -> None:
+    monitor(cell, tmp_path / "h.parquet", "ok-00")
+    history = History.read(tmp_path / "h.parquet", stored_calibration(cell / "calibration").key)
+    (at,) = figure(history, DriftTest()).layout.xaxis.tickvals
+    assert (at.year, at.microsecond) == (2001, 0)
+    assert "h.parquet: 1. A step" in (tmp_path / "h.html").read_text()
 
 
 def test_what_has_moved_stays_moved(cell: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: #1c2230; backg
 h1 {{ margin: 0; font-size: 1.5rem; color: {colour}; }}
 p {{ margin: .4rem 0; overflow-wrap: anywhere; }}
 </style></head><body><h1>{state}</h1><p>{sentence}</p>{figure}
-<p>{checks} checks of {path}. A step is reported at a false-alarm rate of at most {rate:g} a check.
+<p>Checks in {path}: {checks}. A step is reported at a false-alarm rate of at most {rate:g} a check.
 </p></body></html>"""
 
 
@@ -77,6 +77,8 @@ def figure(history: History, test: DriftTest) -> Any:
     chart.add_hline(y=1.0, line_color=COLOURS["MOVED"], line_dash="dot", row=2, col=1)
     chart.update_yaxes(title_text="shift of the work, mm", rangemode="tozero", row=1, col=1)
     chart.update_yaxes(title_text="step test / threshold", rangemode="tozero", row=2, col=1)
+    if len(at) == 1:  # nothing else fixes the axis, and it would show the milliseconds
+        chart.update_xaxes(tickvals=at)
     chart.update_layout(
         template="plotly_white", height=560, showlegend=False, margin={"t": 20, "r": 20}
     )
@@ -86,5 +88,5 @@ def figure(history: History, test: DriftTest) -> Any:
 def _axis(history: History) -> list[Any]:
     times = [c.time_ns for c in history.checks[: len(history.findings)]]
     if all(times) and len(set(times)) == len(times):
-        return [datetime.fromtimestamp(x / 1e9, UTC) for x in times]
+        return [datetime.fromtimestamp(x // 10**9, UTC) for x in times]
     return list(range(len(times)))
