@@ -29,9 +29,10 @@ DICTIONARIES = (
 
 def _known(name: str) -> str:
     name = name.removeprefix("DICT_")
-    if name not in DICTIONARIES:
+    by_name = {known.lower(): known for known in DICTIONARIES}
+    if name.lower() not in by_name:
         raise ValueError(f"no dictionary '{name}'; known: {', '.join(DICTIONARIES)}")
-    return name
+    return by_name[name.lower()]
 
 
 Dictionary = Annotated[str, AfterValidator(_known)]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.models.boards import Board, charuco_of, dictionary_of
+from flangeye.models.boards import DICTIONARIES, Board, charuco_of, dictionary_of
 from flangeye.models.square_edges import corners_of_square
 from flangeye.types import Floats, Image, Rejected
 
@@ -17,6 +18,9 @@ FEWEST_CHARUCO = 6
 """Corners of a ChArUco board below which too little of it is seen."""
 LEAST_CONTRAST = 0.3
 """Between a square and those beside it, over that between black and white."""
+
+WIDEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
+"""The families that no other contains: the first markers of 4X4_1000 are those of 4X4_50."""
 
 
 class Corners(NamedTuple):
@@ -57,10 +61,22 @@ def _charuco(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
         seen = 0 if markers is None else len(markers)
         return Rejected(
             f"{count} corners of the ChArUco board found, at least {FEWEST_CHARUCO} are needed "
-            f"({seen} of its markers were)"
+            f"({seen} of its markers were{'' if seen else _of_other_families(board, grey)})"
         )
     pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     return Corners(pixels, board.inner_corners()[np.asarray(ids).ravel()])
+
+
+def _of_other_families(board: Board, grey: Grey) -> str:
+    """Return what to write where the image shows markers, and none of the board's family."""
+    import cv2
+
+    for name in WIDEST:
+        family = cv2.aruco.ArucoDetector(dictionary_of(replace(board, dictionary=name)))
+        _, ids, _ = family.detectMarkers(grey)
+        if ids is not None:
+            return f"; {len(ids)} of {name} are seen: write dictionary: {name}"
+    return ""
 
 
 def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
@@ -72,7 +88,7 @@ def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
     corners, ids, _ = detector.detectMarkers(grey)
     found = [] if ids is None else [int(each) for each in np.asarray(ids).ravel()]
     if found.count(board.marker_id) != 1:
-        others = ", ".join(map(str, sorted(found))) or "none"
+        others = ", ".join(map(str, sorted(found))) or f"none{_of_other_families(board, grey)}"
         return Rejected(
             f"marker {board.marker_id} found {found.count(board.marker_id)} times, once is needed "
             f"(found: {others})"

@@ -353,9 +353,7 @@ def _look(message: Any) -> Floats:
     """Return a coarse look at a cloud's depths or an image's pixels."""
     if hasattr(message, "fields"):
         return np.asarray(np.nan_to_num(cloud_of(message)[..., 2].ravel()[::97]), dtype=float)
-    if hasattr(message, "encoding"):
-        return np.asarray(pixels_of(message)[::16, ::16], dtype=float)
-    return np.zeros(1)
+    return np.asarray(pixels_of(message)[::16, ::16], dtype=float)
 
 
 def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:

@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from flangeye import StageError
+from flangeye.files.images import decode_image
 from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
+from flangeye.files.tables import natural
 from flangeye.log.records import Channel, LogFile
 from flangeye.types import Singles
 
@@ -79,12 +81,13 @@ class Raw:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag: those of its folder, or the file itself.
+    """Return the files of a bag in the order of their numbers, or the file itself.
 
     Raises:
         NotThisLayout: There are none.
     """
-    candidates = [path] if path.is_file() else sorted(path.glob("*"))
+    folder = [path] if path.is_file() else path.glob("*")
+    candidates = sorted(folder, key=lambda p: natural(p.name))
     files = [p for p in candidates if p.suffix in (".mcap", ".db3")]
     if not files:
         raise NotThisLayout(f"{path}: holds no ROS 2 bag (.mcap or .db3)")
@@ -248,7 +251,16 @@ def save_image(path: Path, message: Any) -> Path:
 
 
 def pixels_of(message: Any) -> Any:
-    """Return the pixels of a ``sensor_msgs/Image`` as 8 bits, blue first where coloured."""
+    """Return the pixels of a ``sensor_msgs/Image`` as 8 bits, blue first where coloured.
+
+    Those of a ``CompressedImage`` are grey.
+
+    Raises:
+        StageError: Its encoding is not known.
+        ImageError: It is compressed, and damaged.
+    """
+    if hasattr(message, "format"):
+        return decode_image(bytes(message.data), 0)
     if message.encoding not in GREY:
         known = ", ".join(GREY)
         raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")

@@ -1,6 +1,7 @@
 """Printed targets in rendered images: perspective, lens, blur and noise, with known truth."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -194,6 +195,27 @@ def blank():
 def test_nothing_to_be_seen_is_said(kind: str, reason: str) -> None:
     _, fit, params = FITS[kind]
     assert fit(blank(), params).reason == reason
+
+
+@pytest.mark.parametrize(
+    ("kind", "family", "told"),
+    [
+        ("charuco", "5X5_100", "(0 of its markers were; 17 of 5X5_1000 are seen: write "
+         "dictionary: 5X5_1000)"),
+        ("marker", "6X6_50", "(found: none; 1 of 6X6_1000 are seen: write dictionary: 6X6_1000)"),
+    ],
+)  # fmt: skip
+def test_markers_of_another_family_are_named(kind: str, family: str, told: str) -> None:
+    board, fit, params = FITS[kind]
+    printed = capture(replace(board, dictionary=family), looking())
+    assert fit(printed, params).reason.endswith(told)
+    written = params.model_copy(update={"dictionary": told[-9:-1]})
+    assert not isinstance(fit(printed, written), Rejected)
+
+
+def test_a_family_may_be_written_in_small_letters() -> None:
+    assert MarkerParams(size=SI(0.02), dictionary="5x5_100").dictionary == "5X5_100"
+    assert MarkerParams(size=SI(0.02), dictionary="apriltag_36H11").dictionary == "APRILTAG_36h11"
 
 
 def test_a_capture_without_an_image_is_set_aside() -> None:

@@ -1,5 +1,6 @@
 """ROS 2 bags for tests, written by rosbags: an arm that stops, and what a camera saw there."""
 
+import cv2
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -80,6 +81,11 @@ def image(t, pixels):
     return T["sensor_msgs/msg/Image"](
         header(t, "camera"), *pixels.shape, "mono8", 0, pixels.shape[1], pixels.ravel()
     )
+
+
+def compressed(t, pixels):
+    png = cv2.imencode(".png", pixels)[1].ravel()
+    return T["sensor_msgs/msg/CompressedImage"](header(t, "camera"), "png", png)
 
 
 def camera_info(t, matrix, shape):

@@ -24,11 +24,12 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
-from flangeye_plugins.reader.ros2_messages import messages
+from flangeye_plugins.reader.ros2_messages import bag_files, messages
 from tests.plugins.reader.bags import (
     FIXED,
     START,
     camera_info,
+    compressed,
     image,
     joint_state,
     point_cloud,
@@ -96,7 +97,10 @@ def test_a_cameras_clock_that_is_off_is_moved_into_the_standstills(bag: Callable
     assert np.array_equal([read_cloud(r.cloud).xyz for r in found.recordings], CLOUDS)
 
 
-def test_an_offset_is_estimated_by_how_images_change(bag: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("message", [image, compressed])
+def test_an_offset_is_estimated_by_how_images_change(
+    bag: Callable[..., Any], message: Callable[..., Any]
+) -> None:
     """Images at 20 Hz of something that moves with the arm, their clock 0.35 s behind."""
     told, _ = robot_in_tf(POSES)
     times, moving, _ = stops(POSES)
@@ -104,7 +108,8 @@ def test_an_offset_is_estimated_by_how_images_change(bag: Callable[..., Any]) ->
     for t, pose in list(zip(times, moving, strict=True))[::2]:
         shift = 300 * np.linalg.norm(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
         row = 127 + 120 * np.sin((columns + shift) / 15)
-        told.append(("/image", t - 0.35, image(t - 0.35, np.tile(row, (96, 1)).astype(np.uint8))))
+        pixels = np.tile(row, (96, 1)).astype(np.uint8)
+        told.append(("/image", t - 0.35, message(t - 0.35, pixels)))
     told.append(("/camera_info", START, camera_info(START, np.diag([900.0, 901, 1]), (96, 128))))
     found = read(bag(told))
     offset = float(found.notes[1].split("clock offset ")[1].split(" ms")[0])
@@ -112,6 +117,12 @@ def test_an_offset_is_estimated_by_how_images_change(bag: Callable[..., Any]) ->
     assert len(found.recordings) == 5
     assert found.recordings[0].image.is_file()
     assert found.recordings[0].camera[0][1, 1] == 901
+
+
+def test_the_files_of_a_bag_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (0, 2, 10):
+        (tmp_path / f"bag_{number}.mcap").touch()
+    assert [p.stem for p in bag_files(tmp_path)] == ["bag_0", "bag_2", "bag_10"]
 
 
 def test_joint_angles_give_poses_by_the_arms_model(bag: Callable[..., Any]) -> None:
