@@ -352,6 +352,11 @@ def _considers_zeros(cell: Cell, options: Options) -> bool:
 def _note_of_zeros(cell: Cell, options: Options) -> tuple[str, ...]:
     """Say whether the covariance includes unknown joint zeros."""
     flange = cell.flange
+    if flange is not None and flange.kinematics is None and options.joint_zeros:
+        return (
+            "what the arm does wrong alike at all poses is not in the covariance, for its "
+            "kinematics are not known: name them in the recipe (robot: model, or urdf)",
+        )
     if flange is None or not _considers_zeros(cell, options):
         return ()
     each = f"unknown joint zeros ({flange.deviation * 1e3:g} mrad each)"

@@ -87,7 +87,9 @@ def simulate(
     return observations
 
 
-def solver(robot: RobotModel, **params: object) -> Callable[[Sequence[Observation]], HandEye]:
+def solver(
+    robot: RobotModel | None, **params: object
+) -> Callable[[Sequence[Observation]], HandEye]:
     return lambda observations: solve_poses(
         observations, RobustParams.model_validate(params), robot
     )
@@ -337,3 +339,11 @@ def test_joint_offsets_are_found_with_a_target_off_the_flange(ur5: RobotModel) -
     correction = corrected.correction
     assert correction.joint_offsets is not None
     np.testing.assert_allclose(correction.joint_offsets, offsets, atol=1e-3)
+
+
+def test_without_kinematics_the_arm_is_said_not_to_be_in_the_covariance(ur5: RobotModel) -> None:
+    notes = solver(None)(simulate(ur5, 15)).notes
+    assert (
+        "what the arm does wrong alike at all poses is not in the covariance, for its kinematics "
+        "are not known: name them in the recipe (robot: model, or urdf)"
+    ) in notes
