@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.handeye.arm_sizes import Sizes, likely_sizes
+from flangeye.handeye.arm_sizes import LIKELY, RATIOS, Sizes, likely_sizes
 
 FREEDOM = 240.0
 
@@ -63,3 +63,25 @@ def test_a_region_holds_its_share_of_all_that_is_likely() -> None:
     alone = Sizes(np.ones(1), np.array([[2.0]]), np.array([0.5]))
     assert alone.mixed(parts) == pytest.approx(16.5 * np.eye(6), rel=1e-6)
     assert alone.mixed(parts, np.ones(1)) == pytest.approx(17 * np.eye(6), rel=1e-6)
+
+
+def test_sizes_weigh_as_much_as_they_are_likely() -> None:
+    """Against the restricted likelihood of each, by the whole covariance of what is left."""
+    rng = np.random.default_rng(5)
+    rows, kind = rng.normal(size=(10, 6, 6)), rng.normal(size=(10, 6, 12))
+    errors = rng.normal(size=(10, 6)) + 20.0 * kind @ rng.normal(size=12)
+    sizes = likely_sizes(rows, [kind], errors, 60.0)
+    across = np.linalg.svd(rows.reshape(60, 6))[0][:, 6:]
+    left, effects = across.T @ errors.ravel(), across.T @ kind.reshape(60, 12)
+    logs, factors = [], []
+    for ratio in RATIOS:
+        shape = np.eye(54) + ratio**2 * effects @ effects.T
+        noise = left @ np.linalg.solve(shape, left) / 54
+        if ratio * np.sqrt(noise) >= 1.0:
+            logs.append(-0.5 * (54 * np.log(noise) + np.linalg.slogdet(shape)[1]))
+            factors.append(ratio * np.sqrt(noise))
+    weights = np.exp(np.array(logs) - max(logs))
+    kept = weights > LIKELY
+    assert 5 < kept.sum() < len(kept)
+    assert sizes.factors[:, 0] == pytest.approx(np.array(factors)[kept])
+    assert sizes.weights == pytest.approx(weights[kept] / weights[kept].sum())

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.handeye.blame import blame, explained, suspects
-from flangeye.handeye.drift import Information, Sightings
+from flangeye.handeye.blame import _noise, blame, explained, suspects
+from flangeye.handeye.drift import Information, Sightings, allowance
 from flangeye_emulators.world.year import ABOUT, Happening, Year, watch
 
 DAILY = 3e-5
@@ -39,3 +39,33 @@ def test_scatter_as_it_was_is_explained_and_a_centimetre_of_it_is_not() -> None:
     wild = 0.01 * np.random.default_rng(1).standard_normal(SEEN.residuals.shape)
     spoilt = replace(SEEN, residuals=SEEN.residuals + wild)
     assert not explained(BEFORE, spoilt, ABOUT, WATCHED.scanner, DAILY)
+
+
+def test_what_sightings_scatter_by_is_their_own_the_days_and_what_was_known() -> None:
+    """The arm's weights, beside the camera's six, are known as before and alike at every check."""
+    rng = np.random.default_rng(2)
+    n, weights = len(SEEN.residuals), 4
+    effects = np.concatenate([SEEN.effects, rng.normal(size=(n, 5, weights))], axis=2)
+    spread = rng.normal(size=(6 + weights, 6 + weights))
+    before = Information.of_covariance(spread @ spread.T + 0.1 * np.eye(6 + weights))
+    told = _noise(before, replace(SEEN, effects=effects), 0.5)
+    for i in range(n):
+        for j in range(n):
+            expected = effects[i] @ before.covariance @ effects[j].T
+            if SEEN.check[i] == SEEN.check[j]:
+                expected += effects[i][:, :6] @ allowance(0.5) @ effects[j][:, :6].T
+            if i == j:
+                expected += SEEN.covariances[i]
+            block = told[5 * i : 5 * i + 5, 5 * j : 5 * j + 5]
+            np.testing.assert_allclose(block, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_blame_is_the_same_with_weights_of_the_arm_that_do_nothing() -> None:
+    n = len(SEEN.residuals)
+    more = replace(SEEN, effects=np.concatenate([SEEN.effects, np.zeros((n, 5, 2))], axis=2))
+    wide = np.eye(8)
+    wide[:6, :6] = WATCHED.prior
+    plain = blame(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
+    weighed = blame(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
+    assert weighed == pytest.approx(plain, rel=1e-6)
+    assert explained(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)

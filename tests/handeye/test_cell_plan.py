@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.files.bundled import bundled
 from flangeye.handeye.cell import solve_cell
-from flangeye.handeye.cell_plan import errors_at_work, foreseen, is_foretold, most_telling
+from flangeye.handeye.cell_plan import _moved, errors_at_work, foreseen, is_foretold, most_telling
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.cell import Cell
@@ -17,7 +17,7 @@ from flangeye.recipe.load import load_recipe
 from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
 from flangeye.run.session import Start, record_run
-from flangeye.types import ArchivePath, Transform
+from flangeye.types import ArchivePath, CircleFeature, Transform
 
 REGISTRY = load_registry()
 TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
@@ -75,3 +75,17 @@ def test_a_run_ends_when_enough_was_seen(tmp_path: Any) -> None:
     assert 6 < len(result.observations) < 40
     assert result.truth.rms_over_workspace < 0.35e-3
     assert {o.camera for o in result.observations} == {"left", "right"}
+
+
+def test_a_circle_is_foreseen_with_its_normal_known_as_well_across_it() -> None:
+    pose = rigid(rotation_exp([0.4, -0.3, 0.2]), [0.1, -0.2, 0.7])
+    own, across = 1e-8 * np.eye(3), np.diag([3e-6, 3e-6, 0.0])
+    like = CircleFeature(np.zeros(3), np.array([0, 0, 1.0]), {"rim": 0.03}, own, across, 1.0)
+    moved: Any = _moved(like, pose)
+    assert moved.centre == pytest.approx(pose[:3, 3])
+    assert moved.normal == pytest.approx(pose[:3, 2])
+    turned = pose[:3, :3] @ across @ pose[:3, :3].T
+    assert moved.normal_covariance == pytest.approx(turned, abs=1e-18)
+    assert np.array_equal(moved.covariance, own) and moved.radii == {"rim": 0.03}
+    bare: Any = _moved(replace(like, normal=None, normal_covariance=None), pose)
+    assert bare.centre == pytest.approx(pose[:3, 3]) and bare.normal is None

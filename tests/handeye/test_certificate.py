@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from flangeye.handeye.certificate import NOT_SHOWN, Sightings, certify
+from flangeye.handeye import certificate
+from flangeye.handeye.certificate import NOT_SHOWN, Certificate, Sightings, certify
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
@@ -68,4 +69,21 @@ def test_what_cannot_be_shown_is_said_to_be_so() -> None:
     told = solve_poses(made.observations, RobustParams(certify=True), ROBOT, made.configuration)
     assert told.notes[-1] == (
         f"{NOT_SHOWN}: that can be done for whole poses and two unknown places alone"
+    )
+
+
+@pytest.mark.parametrize(
+    ("cost", "missing", "told"), [(8.0, 1.0, "12.5%"), (2.0, 5.0, "100.0%"), (0.0, 0.0, "0.0%")]
+)
+def test_how_much_better_another_answer_may_be_is_said(
+    cost: float, missing: float, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shown(sightings: Sightings, x: Floats, y: Floats) -> Certificate:
+        return Certificate(np.array([x[:3, :3], y[:3, :3]]), cost, missing, False)
+
+    monkeypatch.setattr(certificate, "certify", shown)
+    made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), n=15)
+    found = solve_poses(made.observations, RobustParams(certify=True), ROBOT, made.configuration)
+    assert found.notes[-1] == (
+        f"{NOT_SHOWN}: another answer may leave squared errors less by {told}"
     )

@@ -108,6 +108,67 @@ def test_a_motion_is_held_against_the_checks_of_its_reference_alone() -> None:
     assert found.covariance == pytest.approx((1 / 8 + 1 / 8) / weight * np.eye(6), abs=1e-13)
 
 
+def test_weights_of_the_arm_are_told_by_every_check_less_the_days_motion_of_each() -> None:
+    """Against one system of all that is unknown: the motion, two weights, each check's day."""
+    rng, daily = np.random.default_rng(4), 3e-5
+    effects, residuals = rng.normal(size=(9, 5, 8)), 1e-4 * rng.normal(size=(9, 5))
+    own, check = np.tile(1e-9 * np.eye(5), (9, 1, 1)), np.repeat(np.arange(3), 3)
+    seen = Sightings(residuals, effects, own, np.tile(np.eye(3), (9, 1, 1)), None, check)
+    found = information_of(seen, daily)
+    assert found.matrix.shape == (3, 8, 8)
+    rows = np.zeros((9, 5, 8 + 18))
+    rows[..., :8] = effects
+    for i, c in enumerate(check):
+        rows[i, :, 8 + 6 * c : 14 + 6 * c] = effects[i, :, :6]
+    normal = np.einsum("nij,nik->jk", rows, rows) / 1e-9
+    normal[8:, 8:] += np.kron(np.eye(3), np.linalg.inv(allowance(daily)))
+    right = -np.einsum("nij,ni->j", rows, residuals) / 1e-9
+    matrix, vector = found.matrix.sum(0), found.vector.sum(0)
+    assert np.linalg.inv(matrix) == pytest.approx(np.linalg.inv(normal)[:8, :8], rel=1e-4)
+    assert np.linalg.solve(matrix, vector) == pytest.approx(
+        np.linalg.solve(normal, right)[:8], rel=1e-4
+    )
+
+
+def drifted(to: float, since: int = 20, count: int = 60) -> Information:
+    """Return checks of a camera that goes evenly to a shift along x [m], from a check on."""
+    means = np.zeros((count, 6))
+    means[:, 3] = to * np.clip((np.arange(count) - since) / (count - 9 - since), 0.0, 1.0)
+    own = np.linalg.inv(allowance(2e-5))
+    return Information(np.tile(own, (count, 1, 1)), means @ own)
+
+
+@pytest.mark.parametrize(
+    ("to", "state"), [(0.15e-3, "OK"), (0.3e-3, "DEGRADED"), (0.55e-3, "MOVED")]
+)
+def test_a_slow_drift_counts_by_how_far_it_surely_went(to: float, state: str) -> None:
+    """Held against the first nine checks; it began where a quarter of the limit was gone."""
+    prior = Prior(Information.of_covariance(allowance(1e-3)))
+    unseen = DriftTest(false_alarms=1e-300)  # no step of it is one
+    found = verdict(drifted(to), prior, CORNERS, unseen)
+    assert found.state == state
+    assert found.shift == pytest.approx(to, rel=0.01)
+    assert found.motion[3] == pytest.approx(to, rel=0.01)
+    assert found.covariance[3, 3] == pytest.approx((2e-5) ** 2 * (1 / 9 + 1 / 9), rel=0.01)
+    if state == "OK":
+        assert found.since is None
+        return
+    # The mean of nine checks lags by four: 20 + 31 * 0.1 mm / to, and 4 more.
+    assert found.since == np.floor(24 + 31 * 1e-4 / to) + 1
+
+
+def test_of_fewer_checks_than_settle_nothing_drifted() -> None:
+    prior = Prior(Information.of_covariance(allowance(1e-3)))
+    for count, told in ((8, 0.0), (10, 1.0), (9, 1.0)):
+        means = np.zeros((count, 6))
+        means[:, 3] = 1e-3
+        own = np.linalg.inv(allowance(1e-6))
+        checks = Information(np.tile(own, (count, 1, 1)), means @ own)
+        found = verdict(checks, prior, CORNERS, DriftTest(false_alarms=1e-300, seasonal=1.0))
+        # Of nine, the calibration alone is what they are held against; of ten, one check more.
+        assert found.motion[3] == pytest.approx(told * (1e-3 if count == 9 else 0.0), abs=1e-8)
+
+
 @pytest.mark.parametrize("name", drift_year.STEPS)
 def test_a_step_is_found_within_three_checks(name: str) -> None:
     part, size = drift_year.STEPS[name]

@@ -1,10 +1,13 @@
 """Flat parts: of a piece that is flat, of one that is bent, and of none."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from flangeye.maths.planes import Plane
-from flangeye_plugins.segment.parts import Patch, Piece, _principal, flat_parts
+from flangeye_plugins.segment import parts as room
+from flangeye_plugins.segment.parts import Patch, Piece, _flattest, _principal, flat_parts
 
 PITCH = 2e-3
 SCATTER = 3e-4
@@ -93,3 +96,38 @@ def test_groups_have_the_means_variances_and_normals_of_their_points() -> None:
         assert means[k] == pytest.approx(group.mean(axis=0))
         assert variances[k] == pytest.approx(values[0])
         assert abs(normals[k] @ axes[:, 0]) == pytest.approx(1)
+
+
+def test_sixty_patches_are_tried_the_flattest_first() -> None:
+    """Of 100, each of which is rougher than the one before; a patch of a few points is none."""
+    rng = np.random.default_rng(0)
+    bumpy = piece(flat, rows=100, columns=100)
+    which = np.unique(bumpy.patch, return_inverse=True)[1]
+    rough = 1e-5 * (1 + np.argsort(rng.permutation(100)))
+    noise = np.where(np.indices((100, 100)).sum(axis=0).ravel() % 2, 1.0, -1.0)
+    points = bumpy.points.astype(np.float64)
+    points[:, 2] += noise * rough[which]
+    tried = list(_flattest(bumpy._replace(points=points.astype(np.float32)), np.arange(10000)))
+    first = [int(which[patch.members[0]]) for patch in tried]
+    assert first == np.argsort(rough)[:60].tolist()
+    for patch in tried:
+        assert len(patch.members) == 100 and len(set(which[patch.members])) == 1
+        assert patch.rough.normal @ patch.rough.point < 0
+    few = np.flatnonzero((which != which[0]) | (np.arange(10000) % 100 < 4))  # 40 of 100 are left
+    assert int(which[0]) not in {which[p.members[0]] for p in _flattest(bumpy, few)}
+
+
+def test_planes_are_settled_by_some_hundred_points_whatever_the_piece_holds(
+    monkeypatch: Any,
+) -> None:
+    asked: list[list[int]] = []
+
+    def planes(samples: Any, rough: Any, scatter: float) -> Any:
+        asked.append([len(sample) for sample in samples])
+        return [None] * len(samples)
+
+    monkeypatch.setattr(room, "_planes", planes)
+    assert not flat_parts([piece(flat, 120, 100), piece(flat, 20, 20)], 1.0, SCATTER, 50)
+    whole, around = asked
+    assert whole == [572, 400]  # every 21st point, and all
+    assert max(around) == 706  # every 17th: of fifty patches of 100 points some 300

@@ -23,6 +23,8 @@ from flangeye_plugins.segment.sphere import (
     SegmentSphereParams,
     _apart,
     _between,
+    _settled,
+    _share_seen,
     _with_neighbours,
     find_spheres,
     most_voted,
@@ -333,3 +335,40 @@ def test_only_what_lies_between_near_and_far_is_looked_at(
 )  # fmt: skip
 def test_a_parameter_has_its_bounds(name: str, refused: Any, taken: Any) -> None:
     check_bound(SegmentSphereParams, name, refused, taken)
+
+
+def points_on(count: int, radius: float) -> Any:
+    """Points on the side of a ball at ``AT`` that is turned to the scanner."""
+    rng = np.random.default_rng(0)
+    rays = rng.standard_normal((count, 3)) - 2.0 * AT / np.linalg.norm(AT)
+    rays[(rays @ AT) > 0] *= -1
+    return AT + radius * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def test_of_fewer_points_than_six_nothing_is_seen_of_a_sphere() -> None:
+    start = AT + [1e-3, 0, 0]
+    none = _settled(start, points_on(5, 0.02), ANGLE, 0.02, 1e-3, True)
+    assert none.seen == 0.0 and none.radius == 0.02 and (none.centre == start).all()
+    some = _settled(start, points_on(6, 0.02), ANGLE, 0.02, 1e-3, True)
+    assert some.seen > 0.0 and some.centre == pytest.approx(AT, abs=1e-6)
+
+
+def test_what_is_of_another_size_by_more_than_can_be_is_not_seen_at_all() -> None:
+    """A size is found within 15 % of what is looked for: others find it better."""
+    points = points_on(400, 0.02)
+    for share, found in ((0.86, True), (1.14, True), (0.80, False), (1.25, False)):
+        told = _settled(AT, points, ANGLE, 0.02 / share, 1e-3, False)
+        assert (told.seen > 0.0) is found
+        assert told.radius == pytest.approx(0.02 if found else 0.02 / share, abs=1e-6)
+        if not found:
+            assert told.seen == 0.0 and (told.centre == AT).all()
+
+
+def test_no_more_is_there_than_speaks_for_it() -> None:
+    """As many points against a sphere as for it: none of it is seen."""
+    middle = AT - 0.02 * AT / np.linalg.norm(AT)
+    on, off = np.tile(middle, (8, 1)), np.tile(AT - 0.5 * (AT - middle), (8, 1))
+    seen = [_share_seen(AT, np.vstack([on, off[:k]]), ANGLE, 0.02, 1e-3) for k in (0, 4, 8, 7)]
+    due = np.pi * (np.sin(np.radians(60)) * 0.02 / ANGLE) ** 2 / (AT @ AT)
+    assert seen == pytest.approx([8 / due, 4 / due, 0.0, 1 / due])
+    assert _share_seen(AT, off, ANGLE, 0.02, 1e-3) == 0.0

@@ -16,6 +16,7 @@ from flangeye.types import (
     FLANGE,
     Box,
     CircleFeature,
+    CorrectedArm,
     HandEye,
     Observation,
     Observations,
@@ -331,3 +332,24 @@ def test_what_cameras_saw_of_one_pose_is_held_out_together() -> None:
     for fold in folds:
         assert len(fold) == 4
         assert {i ^ 1 for i in fold} == set(fold.tolist())
+
+
+def test_outliers_are_told_by_the_arm_as_it_is_corrected() -> None:
+    """As reported all poses are 30 mm off, and the one that is off by 20 mm more is like them."""
+    observations = simulate(20)
+    observations[7] = displaced(observations[7], [0.02, 0, 0])
+
+    def both(some: Sequence[Observation]) -> HandEye:
+        sound = without_07(some)
+        pose = sound.camera.transform
+        off = rigid(pose.rotation, pose.translation + [0.03, 0, 0])
+        reported = replace(sound.camera, transform=replace(pose, matrix=off))
+        return replace(sound, camera=reported, corrected=CorrectedArm(sound.camera, None))
+
+    figures = verify_holdout(both(observations), both, HoldoutParams()).figures
+    assert figures["outliers"] == 1
+    assert figures["corrected_rms_inliers"] < 0.8 * MM
+    assert figures["rms_inliers"] == pytest.approx(0.03, rel=0.05)
+    plain = verify_holdout(without_07(observations), without_07, HoldoutParams()).figures
+    assert figures["corrected_rms"] == pytest.approx(plain["rms"])
+    assert figures["corrected_p95"] == pytest.approx(plain["p95"])
