@@ -15,9 +15,12 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
+from flangeye.errors import StageError
+from flangeye.maths.geometry import rigid
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.draft.arrays import PoseArrays
 from flangeye.recipe.load import load_recipe
+from tests.plugins.reader.bags import point_cloud, stops, tf, write_bag
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
 POSES = [(np.array([0.4, -0.1, 0.3]) + 0.05 * k * np.array([1, -1, (-1) ** k]),
@@ -469,6 +472,24 @@ def test_what_is_missing_is_one_line_with_what_to_add(
     assert str(done.exception).startswith(line)
     assert getattr(done.exception, "exit_code", None) == 2
     assert not (folder.parent / "recipe.yaml").exists()
+
+
+def test_a_bag_of_unknown_frames_is_answered_with_the_readers_line(folder: Path) -> None:
+    times, moving, middles = stops(np.array([rigid(r.as_matrix(), p) for p, r in POSES]))
+    told = [("/tf", t, tf(t, ("map", "end", pose))) for t, pose in zip(times, moving, strict=True)]
+    told += [("/scan", t, point_cloud(t, np.ones((9, 3)))) for t in middles]
+    write_bag(folder / "bag", "mcap", told)
+    (folder / "bag" / "metadata.yaml").unlink()
+    next((folder / "bag").glob("*.mcap")).rename(folder / "bag.mcap")
+    (folder / "bag").rmdir()
+    with pytest.raises(StageError) as refused:
+        init()
+    assert str(refused.value) == (
+        "rec: nothing tells where the flange is; write reader: {ros2_bag: {base: …, flange: "
+        "…}} (frames of tf: end, map); flangeye init takes such a line as --reader '{…}'"
+    )
+    answer = init("--reader", "{ros2_bag: {base: map, flange: end}}")
+    assert "5 poses (ROS 2 bag, rec), 5 with a cloud" in answer
 
 
 def test_a_recipe_is_not_written_over(folder: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,24 +27,28 @@ RecipePath = Annotated[
 """A path in a parameter; a relative one starts at the recipe's folder."""
 
 
-def bundled_file(kind: str, folder: str) -> Callable[[Any, ValidationInfo], Path]:
+def bundled_file(
+    kind: str, folder: str, own: Sequence[str] = (".yaml",)
+) -> Callable[[Any, ValidationInfo], Path]:
     """Return the check of a parameter that names a file of ``data/FOLDER`` or one's own.
 
     Args:
         kind: What it is, for people: ``workpiece``.
         folder: Where those that come with the project are: ``workpieces``.
+        own: How the names of one's own files end; ``.yml`` is taken too.
     """
+    allowed = f"a {' or '.join(own)} file"
 
     def found(value: Any, info: ValidationInfo) -> Path:
         if not isinstance(value, (str, Path)):
-            raise ValueError(f"a {kind} is a name or a path to a .yaml file")
-        if str(value).endswith((".yaml", ".yml")):
+            raise ValueError(f"a {kind} is a name or a path to {allowed}")
+        if str(value).endswith((*own, ".yml")):
             return _beside_recipe(value, info)
         path = bundled("data") / folder / f"{value}.yaml"
         if not path.is_file():
             known = sorted(p.stem for p in path.parent.glob("*.yaml"))
             near = difflib.get_close_matches(str(value), known, n=2) or known
-            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or a .yaml file")
+            raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or {allowed}")
         return path
 
     return found

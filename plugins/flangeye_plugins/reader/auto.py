@@ -34,7 +34,7 @@ def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
     untried = [name for name, reader in bound.items() if reader is None]
     if untried:
         missed.append(f"not tried, for a recipe must give their parameters: {', '.join(untried)}")
-    raise StageError(f"{path}: no reader knows this layout: {'; '.join(missed)}")
+    raise NotThisLayout(f"{path}: no reader knows this layout: {'; '.join(missed)}")
 
 
 def _bound(reader: Part) -> BoundPart | None:

@@ -13,17 +13,20 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from flangeye import Params, RecipeError, StageError, part
+from flangeye.files.paths import bundled_file
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning
-from flangeye.models.loading import load_model
+from flangeye.models.model import read_model
+from flangeye.models.robots import RobotModel
+from flangeye.models.urdf import robot_from_urdf
 from flangeye.types import FLANGE, Floats
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
@@ -51,6 +54,11 @@ UR_JOINTS = tuple(
     f"{name}_joint"
     for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 )
+ModelFile = Annotated[
+    Path,
+    BeforeValidator(bundled_file("robot", "robots", (".urdf", ".yaml"))),
+    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+]
 OFTEN = 3.0
 """From so many measurements a second on, their own change tells when something moved."""
 
@@ -66,9 +74,9 @@ class BagParams(Params):
     robot: str | None = Field(
         None, description="Topic of the arm, in place of tf: PoseStamped, or JointState with model."
     )
-    model: str | None = Field(
-        None, description="The arm's model, of data/robots or a file, to come from joint angles "
-        "to poses.",
+    model: ModelFile | None = Field(
+        None, description="The arm's model, to come from joint angles to poses: one that 'flangeye "
+        "robots' lists, a .urdf (base and flange name its links), or a .yaml file of your own.",
     )  # fmt: skip
     joints: tuple[str, ...] = Field(
         (), description="Names of the joints from base to flange, where JointState mixes them."
@@ -122,7 +130,10 @@ class Bag:
                 raise StageError(f"{self.path}: {what}: no topic '{given}'; of this type: {known}")
             return given
         if len(found) > 1:
-            raise StageError(f"{self.path}: {what}: name one of {', '.join(sorted(found))}")
+            raise StageError(
+                f"{self.path}: {what}: name one of {', '.join(sorted(found))}, for example "
+                f"reader: {{ros2_bag: {{{what}: {min(found)}}}}}"
+            )
         return found[0] if found else None
 
 
@@ -200,8 +211,8 @@ def _arm(bag: Bag, params: BagParams) -> tuple[Stream, str, Stream | None]:
     if params.model is not None:
         if joints is None:
             raise StageError(f"{bag.path}: model: there are no joint angles whose order is known")
-        poses = Arm(_model(params.model)).flange(joints[1])
-        return (joints[0], poses), f"the flange's poses by the model {params.model}", joints
+        poses = Arm(_model(params.model, params)).flange(joints[1])
+        return (joints[0], poses), f"the flange's poses by the model {params.model.stem}", joints
     base, flange = _frame(bag, params.base, BASES), _frame(bag, params.flange, FLANGES)
     if base and flange:
         told = f"the flange's poses from tf, {base} to {flange}"
@@ -209,11 +220,21 @@ def _arm(bag: Bag, params: BagParams) -> tuple[Stream, str, Stream | None]:
     others = [topic for topic in bag.poses if topic != params.target]
     if len(others) == 1:
         return in_order(*bag.poses[others[0]]), f"the flange's poses from {others[0]}", joints
-    frames = ", ".join(bag.frames.names) or "none"
-    raise StageError(
-        f"{bag.path}: nothing tells where the flange is; name base and flange (frames of tf: "
-        f"{frames}), robot (a PoseStamped topic), or model (of the arm, for joint angles)"
-    )
+    raise StageError(f"{bag.path}: nothing tells where the flange is; {_ways(bag)}")
+
+
+def _ways(bag: Bag) -> str:
+    """Say what to write so that the flange's poses are found in what the bag holds."""
+    ways = {
+        "base: …, flange: …": bag.frames.names and f"frames of tf: {', '.join(bag.frames.names)}",
+        "robot: …": bag.poses and f"PoseStamped topics: {', '.join(bag.poses)}",
+        "model: …": bag.joints and "of the arm whose joint angles these are: one that 'flangeye "
+        "robots' lists, or a .urdf or .yaml file",
+    }  # fmt: skip
+    found = [f"{{ros2_bag: {{{way}}}}} ({told})" for way, told in ways.items() if told]
+    if not found:
+        return "it has neither tf nor PoseStamped nor JointState"
+    return f"write reader: {' or '.join(found)}"
 
 
 def _frame(bag: Bag, given: str | None, usual: Sequence[str]) -> str | None:
@@ -222,9 +243,11 @@ def _frame(bag: Bag, given: str | None, usual: Sequence[str]) -> str | None:
     return next((name for name in usual if name in bag.frames.names), None)
 
 
-def _model(name: str) -> Any:
+def _model(path: Path, params: BagParams) -> RobotModel:
     try:
-        return load_model("robots", name)
+        if path.suffix == ".urdf":
+            return robot_from_urdf(path, params.base, params.flange)
+        return read_model(path, RobotModel)
     except RecipeError as error:
         raise StageError(f"model: {error}") from None
 

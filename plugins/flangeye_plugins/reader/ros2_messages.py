@@ -220,8 +220,10 @@ def cloud_of(message: Any) -> Singles:
             "itemsize": message.point_step,
         }
     )
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.row_step)
-    used = np.ascontiguousarray(rows[:, : message.width * message.point_step])
+    row = message.width * message.point_step  # some drivers leave row_step at 0
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    rows = data.reshape(message.height, message.row_step or row)
+    used = np.ascontiguousarray(rows[:, :row])
     points = used.reshape(-1).view(kind)
     xyz = np.stack([points[axis].astype(np.float32) for axis in "xyz"], axis=-1)
     return xyz.reshape(message.height, message.width, 3) if message.height > 1 else xyz

@@ -3,12 +3,15 @@
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
@@ -18,13 +21,14 @@ from flangeye.log import records
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
-from flangeye_plugins.reader.ros2_messages import bag_files, messages
+from flangeye_plugins.reader.ros2_messages import bag_files, cloud_of, messages
 from tests.plugins.reader.bags import (
     FIXED,
     START,
@@ -125,6 +129,12 @@ def test_the_files_of_a_bag_are_read_in_the_order_of_their_numbers(tmp_path: Pat
     assert [p.stem for p in bag_files(tmp_path)] == ["bag_0", "bag_2", "bag_10"]
 
 
+def test_a_cloud_whose_row_step_is_left_zero_is_read() -> None:
+    message = point_cloud(START, CLOUDS[0].reshape(-1, 3))
+    whole = replace(message, data=message.data[:-7], row_step=0)
+    assert np.array_equal(cloud_of(whole), CLOUDS[0].reshape(-1, 3))
+
+
 def test_joint_angles_give_poses_by_the_arms_model(bag: Callable[..., Any]) -> None:
     model = load_model("robots", "ur5e")
     angles = RNG.uniform(-1, 1, (5, 6))
@@ -137,6 +147,35 @@ def test_joint_angles_give_poses_by_the_arms_model(bag: Callable[..., Any]) -> N
     found = read(bag(told), model="ur5e")
     assert np.allclose([r.base_T_flange for r in found.recordings], poses, atol=1e-9)
     assert np.allclose([r.joints for r in found.recordings], angles, atol=1e-9)
+
+
+def test_the_arms_model_is_a_urdf_beside_the_recipe(tmp_path: Path) -> None:
+    """Its frames are named where the file leaves them open; a name that is none is told at once."""
+    turns = "".join(
+        f'<joint name="j{i}" type="revolute"><parent link="l{i - 1}"/><child link="l{i}"/>'
+        f'<origin xyz="0 0.1 0.2"/><axis xyz="{axis}"/><limit lower="-3" upper="3" velocity="1"/>'
+        "</joint>"
+        for i, axis in enumerate(["0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0"], 1)
+    )
+    links = "".join(f'<link name="l{i}"/>' for i in range(7))
+    (tmp_path / "own.urdf").write_text(f'<robot name="own">{links}{turns}</robot>')
+    times, _, middles = stops(POSES)
+    angles = RNG.uniform(-1, 1, (5, 6))
+    held = np.clip(((times - START) // 1.8).astype(int), 0, 4)
+    told = [("/joint_states", t, joint_state(t, angles[i]))
+            for t, i in zip(times, held, strict=True)]  # fmt: skip
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+    path = write_bag(tmp_path / "bag", "mcap", told)
+    given = {"model": "own.urdf", "base": "l0", "flange": "l6"}
+    context = SimpleNamespace(folder=tmp_path)
+    found = ros2_bag(path, BagParams.model_validate(given, context=context))
+    wanted = Arm(robot_from_urdf(tmp_path / "own.urdf", "l0", "l6")).flange(angles)
+    assert np.allclose([r.base_T_flange for r in found.recordings], wanted, atol=1e-9)
+    assert "by the model own" in found.notes[0]
+    with pytest.raises(StageError, match="model: .*own.urdf: .* 'l9'"):
+        read(path, model=str(tmp_path / "own.urdf"), base="l0", flange="l9")
+    with pytest.raises(ValidationError, match="known: ur5e.* or a .urdf or .yaml file"):
+        read(path, model="ur5ee")
 
 
 @pytest.mark.parametrize("way", ["topic", "frame"])
@@ -186,10 +225,14 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., A
     [
         ("tf", {}, "holds neither clouds nor images; name the target where somebody has measured it "
          "(a PoseStamped topic, or a frame of tf)"),
-        ("tf two", {}, "clouds: name one of /a, /b"),
+        ("tf two", {}, "clouds: name one of /a, /b, for example reader: {ros2_bag: {clouds: /a}}"),
         ("tf two", {"clouds": "/c"}, "clouds: no topic '/c'; of this type: /a, /b"),
-        ("two", {"clouds": "/a"}, "nothing tells where the flange is; name base and flange (frames "
-         "of tf: none), robot (a PoseStamped topic), or model (of the arm, for joint angles)"),
+        ("two", {"clouds": "/a"}, "nothing tells where the flange is; it has neither tf nor "
+         "PoseStamped nor JointState"),
+        ("two joints odd", {"clouds": "/a"}, "nothing tells where the flange is; write reader: "
+         "{ros2_bag: {base: …, flange: …}} (frames of tf: end, map) or {ros2_bag: {model: …}} (of "
+         "the arm whose joint angles these are: one that 'flangeye robots' lists, or a .urdf or "
+         ".yaml file)"),
         ("tf two", {"clouds": "/a", "model": "ur5e"},
          "model: there are no joint angles whose order is known"),
         ("tf two", {"target": "marker"}, "target: 'marker' is no PoseStamped topic; as a frame of "
@@ -204,6 +247,8 @@ def test_what_a_bag_does_not_tell_is_one_line(
 ) -> None:
     told = robot_in_tf(POSES)[0] if "tf" in topics else []
     told += [(f"/{name}", START, point_cloud(START, CLOUDS[0])) for name in "ab" if "two" in topics]
+    told += [("/joints", START, joint_state(START, np.zeros(6)))] if "joints" in topics else []
+    told += [("/tf", START, tf(START, ("map", "end", FIXED)))] if "odd" in topics else []
     late = START + 1000
     told += [("/a", late, point_cloud(late, CLOUDS[0]))] if "late" in topics else []
     path = write_bag(tmp_path / "bag", "mcap", told)

@@ -13,7 +13,7 @@ import yaml
 
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import read_cloud
-from flangeye.files.recording import Archive
+from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import Table
 from flangeye.files.yaml_lines import parse_value
@@ -96,7 +96,7 @@ def _reader(
     try:
         _bound("auto", registry)(survey.folder)
     except StageError as error:
-        reason = str(error)
+        reason = error
     else:
         return "auto"
     if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in survey.files):
@@ -132,8 +132,10 @@ def _maker(robot: Mapping[str, Any]) -> str | None:
     return load_model("robots", robot["model"]).maker if "model" in robot else None
 
 
-def _missing(survey: FolderSurvey, reason: str) -> str:
+def _missing(survey: FolderSurvey, reason: StageError) -> str:
     """Say what is missing, and the line that would bring it."""
+    if not isinstance(reason, NotThisLayout):
+        return f"{reason}; flangeye init takes such a line as --reader '{{…}}'"
     scans = survey.of(CLOUDS) or survey.of(IMAGES)
     if scans:
         return (
