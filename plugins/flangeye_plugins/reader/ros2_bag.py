@@ -390,9 +390,16 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
             f"{bag.path}: holds neither clouds nor images; name the target where somebody has "
             "measured it (a PoseStamped topic, or a frame of tf)"
         )
-    info = bag.only("camera_info", params.camera_info, INFO)
+    info = _info(bag, params, images) if images else None
     told = " and ".join(topic for topic in (clouds, images) if topic)
     return Scans(bag, clouds, images, bag.cameras.get(str(info))), told
+
+
+def _info(bag: Bag, params: BagParams, images: str) -> str | None:
+    """Return the CameraInfo as named, beside the images as drivers publish it, or the only one."""
+    beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+    given = params.camera_info or (beside if beside in bag.cameras else None)
+    return bag.only("camera_info", given, INFO)
 
 
 def _target(bag: Bag, params: BagParams) -> Target:

@@ -129,6 +129,21 @@ def test_the_files_of_a_bag_are_read_in_the_order_of_their_numbers(tmp_path: Pat
     assert [p.stem for p in bag_files(tmp_path)] == ["bag_0", "bag_2", "bag_10"]
 
 
+@pytest.mark.parametrize(
+    ("topic", "message"), [("/wrist/image_raw", image), ("/wrist/image_raw/compressed", compressed)]
+)
+def test_of_several_cameras_the_one_beside_the_images_is_taken(
+    tmp_path: Path, topic: str, message: Callable[..., Any]
+) -> None:
+    told, middles = robot_in_tf(POSES)
+    told += [(topic, t, message(t, np.zeros((4, 6), np.uint8))) for t in middles]
+    for name, focal in (("bench", 700.0), ("wrist", 900.0)):
+        info = camera_info(START, np.diag([focal, focal, 1]), (4, 6))
+        told.append((f"/{name}/camera_info", START, info))
+    path = write_bag(tmp_path / "bag", "mcap", told)
+    assert read(path, images=topic).recordings[0].camera[0][0, 0] == 900
+
+
 def test_a_cloud_whose_row_step_is_left_zero_is_read() -> None:
     message = point_cloud(START, CLOUDS[0].reshape(-1, 3))
     whole = replace(message, data=message.data[:-7], row_step=0)
