@@ -1,10 +1,18 @@
 """Smooth pieces of surface: what ends them, and what does not."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from flangeye_plugins.segment import surfaces
 from flangeye_plugins.segment.grid import Grid
-from flangeye_plugins.segment.surfaces import _averaged, connected_pieces, smooth_surface
+from flangeye_plugins.segment.surfaces import (
+    NOISE_GATE,
+    _averaged,
+    connected_pieces,
+    smooth_surface,
+)
 
 ANGLE = 4e-3
 BEND = 0.8e-3
@@ -112,3 +120,21 @@ def test_pieces_share_a_side_and_come_largest_first() -> None:
         for top, left, height, width in at
     ]
     assert [len(piece) for piece in connected_pieces(mask, 3)] == [6, 4, 4, 3]
+
+
+@pytest.mark.parametrize(("share", "averages"), [(0.98, False), (1.02, True)])
+def test_depth_is_averaged_where_noise_bends_it_as_a_crease_would(
+    share: float, averages: bool, monkeypatch: Any
+) -> None:
+    """A second difference has six times the variance of what it is taken of."""
+    depth = slope() + 1e-4 * np.random.default_rng(0).standard_normal((60, 80))
+    noise = smooth_surface(view(depth), 1.0)[1]
+    asked: list[Any] = []
+
+    def averaged(of: Any) -> Any:
+        asked.append(of)
+        return of
+
+    monkeypatch.setattr(surfaces, "_averaged", averaged)
+    smooth_surface(view(depth), NOISE_GATE * np.sqrt(6) * noise / share)
+    assert bool(asked) is averages
