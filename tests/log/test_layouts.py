@@ -14,10 +14,11 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from flangeye import types as t
 from flangeye.log.foxglove import points_of
-from flangeye.log.layouts import CLOUDS, foxglove_layout
+from flangeye.log.layouts import APPLICATION, CLOUDS, foxglove_layout
 from flangeye.log.record import Recorder
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import parse_recipe
+from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
 from tests import toy
 from tests.conftest import TOY_RECIPE
@@ -101,6 +102,11 @@ def test_a_rerun_blueprint_is_written(flangeye: Any, tmp_path: Path) -> None:
     home = os.environ | {"HOME": str(tmp_path), "RERUN_ANALYTICS": "0"}
     read = subprocess.run(words, capture_output=True, text=True, env=home)
     assert (read.returncode, "1 file verified without error" in read.stderr) == (0, True)
+
+
+def test_a_rerun_blueprint_is_that_of_the_logs_name(tmp_path: Path) -> None:
+    """Rerun takes a log's file name for its application, and a layout of another is not used."""
+    assert RunFolder(tmp_path).log.stem == APPLICATION
 
 
 def test_another_viewer_is_not_known(flangeye: Any) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 from flangeye.errors import StageError
 
 CLOUDS = ("/capture/cloud", "/circle", "/base/flanges")
-APPLICATION = "flangeye"
-"""Rerun keeps one layout for each application; ``rerun run.mcap layout.rbl`` takes this one."""
+APPLICATION = "run"
+"""Rerun keeps one layout for each application; that of a log is its file's name, ``run.mcap``."""
 
 
 def foxglove_layout() -> str:
