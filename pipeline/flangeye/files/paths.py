@@ -19,11 +19,9 @@ def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     return path if info.context is None else info.context.folder / path
 
 
-RecipePath = Annotated[
-    Path,
-    BeforeValidator(_beside_recipe),
-    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
-]
+WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json")
+"""How a path is written into a resolved recipe: it is the same from any folder."""
+RecipePath = Annotated[Path, BeforeValidator(_beside_recipe), WHOLE]
 """A path in a parameter; a relative one starts at the recipe's folder."""
 
 

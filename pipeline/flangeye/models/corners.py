@@ -19,8 +19,10 @@ FEWEST_CHARUCO = 6
 LEAST_CONTRAST = 0.3
 """Between a square and those beside it, over that between black and white."""
 
-WIDEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
-"""The families that no other contains: the first markers of 4X4_1000 are those of 4X4_50."""
+FAMILIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_1000")))
+"""One of each kind: the first markers of 4X4_250 are those of 4X4_50, and few prints need more."""
+WIDTH = 640
+"""Of an image in which other families are looked for [px]: each tries every square in it."""
 
 
 class Corners(NamedTuple):
@@ -71,9 +73,11 @@ def _of_other_families(board: Board, grey: Grey) -> str:
     """Return what to write where the image shows markers, and none of the board's family."""
     import cv2
 
-    for name in WIDEST:
+    by = min(1.0, WIDTH / grey.shape[1])
+    small = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
+    for name in FAMILIES:
         family = cv2.aruco.ArucoDetector(dictionary_of(replace(board, dictionary=name)))
-        _, ids, _ = family.detectMarkers(grey)
+        _, ids, _ = family.detectMarkers(small)
         if ids is not None:
             return f"; {len(ids)} of {name} are seen: write dictionary: {name}"
     return ""

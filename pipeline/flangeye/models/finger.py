@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field
 
-from flangeye.files.paths import bundled_file
+from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.models.model import Model
 from flangeye.types import Floats
 from flangeye.units import Angle, Length, Stiffness, param
@@ -110,6 +110,6 @@ class Finger(Model):
 FingerPath = Annotated[
     Path,
     BeforeValidator(bundled_file("finger", "fingers")),
-    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+    WHOLE,
 ]
 """A parameter that names a finger: a bundled one, or a file beside the recipe."""

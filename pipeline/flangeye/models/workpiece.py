@@ -24,11 +24,11 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import PER_METRE, LengthUnit
-from flangeye.files.paths import bundled_file
+from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.files.regular import read_regular
 from flangeye.models.model import Model, read_model
 from flangeye.types import Floats
@@ -109,7 +109,7 @@ class Workpiece:
 WorkpiecePath = Annotated[
     Path,
     BeforeValidator(bundled_file("workpiece", "workpieces")),
-    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+    WHOLE,
 ]
 """A parameter that names a workpiece: a bundled one, or a file beside the recipe."""
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field
 
 from flangeye import Params, RecipeError, StageError, part
-from flangeye.files.paths import bundled_file
+from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
@@ -57,7 +57,7 @@ UR_JOINTS = tuple(
 ModelFile = Annotated[
     Path,
     BeforeValidator(bundled_file("robot", "robots", (".urdf", ".yaml"))),
-    PlainSerializer(lambda path: str(path.absolute()), return_type=str, when_used="json"),
+    WHOLE,
 ]
 OFTEN = 3.0
 """From so many measurements a second on, their own change tells when something moved."""

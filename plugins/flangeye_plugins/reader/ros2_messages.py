@@ -261,8 +261,10 @@ def pixels_of(message: Any) -> Any:
         StageError: Its encoding is not known.
         ImageError: It is compressed, and damaged.
     """
+    import cv2
+
     if hasattr(message, "format"):
-        return decode_image(bytes(message.data), 0)
+        return decode_image(bytes(message.data), cv2.IMREAD_GRAYSCALE)
     if message.encoding not in GREY:
         known = ", ".join(GREY)
         raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")

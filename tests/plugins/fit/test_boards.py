@@ -200,16 +200,16 @@ def test_nothing_to_be_seen_is_said(kind: str, reason: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "family", "told"),
     [
-        ("charuco", "5X5_100", "(0 of its markers were; 17 of 5X5_1000 are seen: write "
-         "dictionary: 5X5_1000)"),
-        ("marker", "6X6_50", "(found: none; 1 of 6X6_1000 are seen: write dictionary: 6X6_1000)"),
+        ("charuco", "5X5_100", "(0 of its markers were; 17 of 5X5_250 are seen: write "
+         "dictionary: 5X5_250)"),
+        ("marker", "6X6_50", "(found: none; 1 of 6X6_250 are seen: write dictionary: 6X6_250)"),
     ],
 )  # fmt: skip
 def test_markers_of_another_family_are_named(kind: str, family: str, told: str) -> None:
     board, fit, params = FITS[kind]
     printed = capture(replace(board, dictionary=family), looking())
     assert fit(printed, params).reason.endswith(told)
-    written = params.model_copy(update={"dictionary": told[-9:-1]})
+    written = params.model_copy(update={"dictionary": told[-8:-1]})
     assert not isinstance(fit(printed, written), Rejected)
 
 

@@ -24,8 +24,8 @@ from flangeye.models.workspace import workspace_of
 from flangeye.recipe.own_models import carried_files
 from flangeye.types import Floats
 
-SAME_MAKE = 0.03
-"""How far the flanges of two arms of one make may be apart, with all joints at zero [m]."""
+SAME_MODEL = 0.03
+"""How far the flanges of two arms of one model may be apart, with all joints at zero [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,12 +174,12 @@ def _arm_of(log: RunLog) -> Arm | None:
 
 
 def _alike(one: Arm, other: Arm) -> bool:
-    """Tell whether two arms are of one make: corrected lengths and zeros move a flange less."""
+    """Tell whether two arms are of one model: corrected lengths and zeros move a flange less."""
     if one.n != other.n:
         return False
     at_zero = np.zeros(one.n)
     between = one.flange(at_zero)[:3, 3] - other.flange(at_zero)[:3, 3]
-    return bool(np.linalg.norm(between) < SAME_MAKE)
+    return bool(np.linalg.norm(between) < SAME_MODEL)
 
 
 def _covariances(turn: Floats, circles: Sequence[t.CircleFeature], expected: Floats) -> Floats:
