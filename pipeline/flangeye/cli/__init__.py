@@ -24,7 +24,8 @@ def main() -> None:
 def _command() -> None:
     from flangeye.cli.unparsed import answered
 
-    if not answered(sys.argv[1:]):
-        from flangeye.cli.commands import app
+    words = sys.argv[1:]
+    if not answered(words):
+        from flangeye.cli.commands import app, named_in
 
-        app()
+        (named_in(words) if words else app)()  # a shell that completes a line gives no words

@@ -9,7 +9,6 @@ import typer
 
 from flangeye.cli.app import LogFile, app, load_plugins
 from flangeye.cli.saying import say
-from flangeye.files.written import write_whole
 
 if TYPE_CHECKING:
     from flangeye.types import ExportedFile
@@ -40,6 +39,8 @@ def export(
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
+    from flangeye.files.written import write_whole
+
     name = f"export.{to.removeprefix('export.')}"
     file = _exported(run, name, values or [], anyway, camera)
     if out == Path("-"):
