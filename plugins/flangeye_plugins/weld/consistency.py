@@ -165,8 +165,8 @@ class Seating:
 
 
 def _newest_from(
-    before: Floats, newest: Floats, steepest: tuple[float, float] = (np.inf, np.inf)
-) -> tuple[tuple[float, float], ...]:
+    before: Floats, newest: Floats, steepest: tuple[float, float] = (math.inf, math.inf)
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return how far aside and up the newest are from a line, each with its sigma [m].
 
     The line is known as well as the samples have it: at its middle by their number, beyond by
@@ -177,17 +177,21 @@ def _newest_from(
         newest: (M, 3) the same.
         steepest: Largest slopes of the line against the plan, aside and up.
     """
-    middle = before.sum(axis=0) / len(before)
-    from_middle = before - middle
-    along = from_middle[:, 0]
-    spread = max(float(along @ along), 1e-18)
-    slopes = along @ from_middle[:, 1:] / spread
-    slopes = np.maximum(np.minimum(slopes, steepest), -np.array(steepest))
-    left = from_middle[:, 1:] - along[:, None] * slopes
-    newest_from = newest.sum(axis=0) / len(newest) - middle
-    off = newest_from[1:] - newest_from[0] * slopes
-    scatter = np.sqrt(np.einsum("ki,ki->i", left, left) / len(left))
-    slope_sigma = np.minimum(scatter / math.sqrt(spread), steepest)
-    mean = scatter * math.sqrt(1.0 / len(newest) + 1.0 / len(before))
-    sigma = np.hypot(mean, newest_from[0] * slope_sigma)
-    return (float(off[0]), float(sigma[0])), (float(off[1]), float(sigma[1]))
+    from_newest = before - newest.sum(axis=0) / len(newest)
+    middle = from_newest.sum(axis=0) / len(before)
+    # Moments, then plain floats: a control cycle waits for this.
+    moments = (from_newest.T @ from_newest / len(before) - middle[:, None] * middle).tolist()
+    ahead, *off = (-middle).tolist()
+    spread = max(moments[0][0], 1e-18 / len(before))
+    number = 1.0 / len(newest) + 1.0 / len(before)
+
+    def predicted(axis: int) -> tuple[float, float]:
+        most = steepest[axis - 1]
+        slope = min(max(moments[0][axis] / spread, -most), most)
+        left = moments[axis][axis] - 2.0 * slope * moments[0][axis] + slope**2 * moments[0][0]
+        scatter = math.sqrt(max(left, 0.0))
+        slope_sigma = min(scatter / math.sqrt(spread * len(before)), most)
+        sigma = math.hypot(scatter * math.sqrt(number), ahead * slope_sigma)
+        return off[axis - 1] - ahead * slope, sigma
+
+    return predicted(1), predicted(2)

@@ -157,6 +157,7 @@ class Follower:
         self._response = Response()
         self._elapsed = self._began = 0.0
         self._swept: list[tuple[ToolPose, Touch]] = []
+        self._put_off = False
 
     def kept(self) -> ResumePoint | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
@@ -170,7 +171,7 @@ class Follower:
             self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
         self._track.add(pose)
-        self._renew()
+        self._renew(bool(touches))
         for touch in touches:
             if self._touching and touch.time > self._seen:
                 self._feel(Touch(touch.time, self._level @ touch.displacement))
@@ -187,8 +188,14 @@ class Follower:
         self._response.record(pose.time, command)
         return command
 
-    def _renew(self) -> None:
-        """Do a cycle's share of finding the seam again from what was felt up to the last cycle."""
+    def _renew(self, touched: bool) -> None:
+        """Do a cycle's share of finding the seam again from what was felt up to the last cycle.
+
+        A cycle that has a touch to take in leaves it to the next one.
+        """
+        self._put_off = touched and not self._put_off
+        if self._put_off:
+            return
         here = (self.torch, self._coming, self.tip)
         self.refined.renew((*here, *(s + BIN for s in here)))
 

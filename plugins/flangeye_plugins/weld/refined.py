@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -105,14 +105,20 @@ class _Field(NamedTuple):
         return np.asarray(felt + self.wander * np.exp(squared * (-0.5 / SLOW**2)))
 
 
-def _covariances(along: Floats, variance: float, wander: float) -> Floats:
-    """Return :meth:`_Field.covariance` of places (K,) at each of the lengths (L, K, K) [m^2]."""
-    squared = (along[:, None] - along) ** 2
-    felt = np.empty((len(LENGTHS), *squared.shape))
-    felt[-1] = np.exp(squared * (-0.5 / LENGTHS[-1] ** 2))
-    for i in reversed(range(len(LENGTHS) - 1)):  # half as long is to the fourth power
-        felt[i] = (felt[i + 1] * felt[i + 1]) ** 2
-    return np.asarray(variance * felt + wander * np.exp(squared * (-0.5 / SLOW**2)))
+class _Explained(NamedTuple):
+    """A motion of the plan that explains offsets, beside a field of some length.
+
+    Attributes:
+        unlikely: Twice the negative logarithm of the marginal likelihood, but for a constant.
+        shift: (3,) along x and y [m], and turn [rad].
+        covariance: (3, 3) of it.
+        excess: See :class:`_Motion`.
+    """
+
+    unlikely: float
+    shift: Floats
+    covariance: Floats
+    excess: float
 
 
 class _Motion(NamedTuple):
@@ -163,6 +169,7 @@ class RefinedPath:
         self._sound: set[int] = set()  # bins and zones in which nothing new has been felt since
         self._sound_zones: set[int] = set()
         self._used: list[int] = []
+        self._moving: tuple[int, Generator[None, None, _Motion | None]] | None = None
         self.noise, self._new, self.hurried = SAMPLE_SIGMA, 0, False
         self._pending: deque[tuple[float, float, float, float, float]] = deque()
 
@@ -195,7 +202,7 @@ class RefinedPath:
     def _doubt_fits(self, index: int) -> None:
         """Fit again around a bin that has a new sample; everywhere, when there are many."""
         if self._new >= CHOOSING or (self._new and len(np.flatnonzero(self._count)) < FEW):
-            self._new = 0
+            self._new, self._moving = 0, None
             self._sound.clear()
             self._sound_zones.clear()
         near = BESIDE + SPAN
@@ -204,8 +211,9 @@ class RefinedPath:
     def renew(self, places: Iterable[float]) -> None:
         """Find one thing again, at the first of these arc lengths where that is due.
 
-        A control cycle has time for one; a few cycles later all are renewed. What is due at other
-        places is forgotten: it would be old when the torch comes there.
+        A control cycle has time for one, or for one length of the field in a zone's motion; a few
+        cycles later all are renewed. What is due at other places is forgotten: it would be old
+        when the torch comes there.
         """
         bins = [self._index(s) for s in places]
         if bins != self._used:
@@ -218,14 +226,19 @@ class RefinedPath:
             self._find(due)
 
     def _find(self, index: int) -> None:
-        """Find the motion of a bin's zone again where that is due, else the fit around the bin."""
+        """Find the fit around a bin again; a piece of its zone's motion, where that is due."""
         zone = index // ZONE
-        if zone not in self._sound_zones:
-            self._motions[zone] = self._moved(zone)
-            self._sound_zones.add(zone)
-        else:
+        if zone in self._sound_zones:
             self._fits[index] = self._fitted(index)
             self._sound.add(index)
+            return
+        if self._moving is None or self._moving[0] != zone:
+            self._moving = zone, self._moved(zone)
+        try:
+            next(self._moving[1])
+        except StopIteration as found:
+            self._motions[zone], self._moving = found.value, None
+            self._sound_zones.add(zone)
 
     def forget_pending(self) -> None:
         """Drop what is not yet believed: contact is lost, and it may be wrong already."""
@@ -335,8 +348,11 @@ class RefinedPath:
         nearest = int(near[np.abs(near - index).argmin()])
         return _Fit(offsets.tolist(), variance, float(self._angle[nearest]))
 
-    def _moved(self, zone: int) -> _Motion | None:
-        """Return how the plan is moved in a zone; the same for all its bins."""
+    def _moved(self, zone: int) -> Generator[None, None, _Motion | None]:
+        """Find how the plan is moved in a zone, the same for all its bins; a piece at a time.
+
+        The field's length is that of the greatest marginal likelihood.
+        """
         middle = min(zone * ZONE + ZONE // 2, len(self._middles) - 1)
         used = self._nearest(middle, SAYING)
         if not len(used):
@@ -346,12 +362,20 @@ class RefinedPath:
         rows = _rigid_rows(self._points[some] - about, self._normals[some])
         along, felt = self._along[some] / count, self._sum[some] / count
         waviness = max(_unexplained(rows, felt), SMALLEST**2)
-        among = _covariances(along, waviness, self._wander)
-        among += np.diag(self._noise(some) + 1e-6 * waviness)
-        best, shift, covariance, excess = _explained(among, rows, felt)
+        squared = (along[:, None] - along) ** 2
+        rest = self._wander * np.exp(squared * (-0.5 / SLOW**2))
+        rest += np.diag(self._noise(some) + 1e-6 * waviness)
+        correlation = np.exp(squared * (-0.5 / LENGTHS[-1] ** 2))
+        explained: dict[float, _Explained] = {}
+        for length in reversed(LENGTHS):
+            yield
+            explained[length] = _explained(waviness * correlation + rest, rows, felt)
+            correlation = (correlation * correlation) ** 2  # half as long: to the fourth power
+        length = min(explained, key=lambda length: explained[length].unlikely)
+        _, shift, covariance, excess = explained[length]
         # What was felt at few places only may be off by more than it seems there.
         few = (1.0 + SCANTY / len(used)) ** 2
-        field = _Field(waviness, LENGTHS[best], self._wander)
+        field = _Field(waviness, length, self._wander)
         return _Motion(about, shift, few * covariance, field, few * excess)
 
     def _residual(self, motion: _Motion, index: int) -> tuple[NDArray[np.intp], Floats, Floats]:
@@ -390,44 +414,37 @@ def _unexplained(rows: Floats, felt: Floats) -> float:
     return float(np.var(felt - rows @ np.linalg.lstsq(rows, felt, rcond=None)[0]))
 
 
-def _explained(among: Floats, rows: Floats, felt: Floats) -> tuple[int, Floats, Floats, float]:
-    """Return which field leaves the rest best, and the motion (3,) that then explains offsets (K,).
+def _explained(among: Floats, rows: Floats, felt: Floats) -> _Explained:
+    """Return the motion that explains offsets (K,) best beside a field.
 
-    With its covariance (3, 3), and by how much the rest is larger than the field expects. The best
-    has the greatest marginal likelihood (Rasmussen and Williams 2006, 2.45), the scale of field and
-    prior left free: a motion that hardly any plan is off by explains no waves.
+    The marginal likelihood (Rasmussen and Williams 2006, 2.45) has the scale of field and prior
+    left free: a motion that hardly any plan is off by explains no waves.
 
     Args:
-        among: (L, K, K) covariances of the offsets, by each of the fields [m^2].
+        among: (K, K) covariance of the offsets [m^2].
         rows: (K, 3) how a motion moves the plan.
         felt: (K,) offsets [m].
     """
-    roots, white = _whitened(among, np.column_stack([rows, felt]))
-    turned = white[:, :, :3].transpose(0, 2, 1)
-    grams = turned @ white[:, :, :3] + np.diag(PRIOR**-2)
-    inverses = np.linalg.inv(grams)
-    shifts = inverses @ (turned @ white[:, :, 3:])
-    left = np.sum((white[:, :, 3:] - white[:, :, :3] @ shifts) ** 2, axis=(1, 2))
-    shifts = shifts[:, :, 0]
-    left += np.sum((shifts / PRIOR) ** 2, axis=1)
+    diagonal, white = _whitened(among, np.column_stack([rows, felt]))
+    gram = white[:, :3].T @ white[:, :3] + np.diag(PRIOR**-2)
+    inverse: Floats = np.asarray(np.linalg.inv(gram), dtype=np.float64)
+    shift = inverse @ (white[:, :3].T @ white[:, 3])
+    left = white[:, 3] - white[:, :3] @ shift
     freedom = max(len(felt) - 3, 1)
-    scales = np.maximum(left / freedom, 1e-9)
-    volumes = np.linalg.slogdet(grams)[1] + 2.0 * np.log(roots).sum(axis=1)
-    best = int(np.argmin(freedom * np.log(scales) + volumes))
-    excess = max(float(scales[best]), 1.0)
-    return best, shifts[best], excess * inverses[best], excess
+    scale = max(float(left @ left + np.sum((shift / PRIOR) ** 2)) / freedom, 1e-9)
+    volume = float(np.linalg.slogdet(gram)[1] + 2.0 * np.log(diagonal).sum())
+    excess = max(scale, 1.0)
+    return _Explained(freedom * math.log(scale) + volume, shift, excess * inverse, excess)
 
 
 def _whitened(among: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """Return the diagonals (L, K) of Cholesky roots, and columns (L, K, M) solved by the roots.
+    """Return the diagonal (K,) of a Cholesky root, and columns (K, M) solved by the root.
 
     One factorisation does both: that of a matrix bordered by columns holds them solved in its
     border. The corner only has to be large enough for the whole to be positive definite.
     """
     size, count = columns.shape
-    whole = np.zeros((len(among), size + count, size + count))
-    whole[:, :size, :size], whole[:, size:, :size] = among, columns.T
-    whole[:, range(size, size + count), range(size, size + count)] = CORNER
-    root = np.linalg.cholesky(whole)
-    diagonals = np.diagonal(root, axis1=1, axis2=2)[:, :size]
-    return diagonals, root[:, size:, :size].transpose(0, 2, 1)
+    whole = CORNER * np.eye(size + count)
+    whole[:size, :size], whole[size:, :size] = among, columns.T
+    root: Floats = np.asarray(np.linalg.cholesky(whole), dtype=np.float64)
+    return np.diagonal(root)[:size], root[size:, :size].T
