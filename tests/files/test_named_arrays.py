@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -68,3 +69,30 @@ def test_opencvs_yaml(tmp_path: Path) -> None:
     assert np.array_equal(arrays_of(file)["T_0"], [[1, 2], [3, 4]])
     file.write_text(YAML.format("3."))
     assert refusal(file) == "cannot be read: cannot reshape array of size 3 into shape (2,2)"
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+def test_opencvs_matrices_of_several_channels(tmp_path: Path, suffix: str) -> None:
+    """A stack of poses, or of vectors, is a matrix of several channels to OpenCV."""
+    stacks = {
+        "robot": np.arange(80.0).reshape(5, 4, 4),
+        "rvecs": np.arange(15.0).reshape(5, 1, 3),
+        "T_0": np.eye(4),
+    }
+    storage = cv2.FileStorage(str(tmp_path / f"data{suffix}"), cv2.FILE_STORAGE_WRITE)
+    for name, stack in stacks.items():
+        storage.write(name, stack)
+    storage.release()
+    found = arrays_of(tmp_path / f"data{suffix}")
+    assert found.keys() == stacks.keys()
+    assert all(np.array_equal(found[name], stack) for name, stack in stacks.items())
+
+
+@pytest.mark.parametrize("head", [b"MATLAB 7.3 MAT-file, Platform: GLNXA64", b"\x89HDF\r\n\x1a\n"])
+def test_a_mat_file_of_matlab_7_3_says_what_to_do(tmp_path: Path, head: bytes) -> None:
+    file = tmp_path / "poses.mat"
+    file.write_bytes(head.ljust(512, b" ") + b"\x89HDF\r\n\x1a\n" + bytes(100))
+    assert refusal(file) == (
+        "is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
+        "load('poses.mat'); save('poses.mat', '-v7')"
+    )

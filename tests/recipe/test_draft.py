@@ -20,7 +20,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.draft.arrays import PoseArrays
 from flangeye.recipe.load import load_recipe
-from tests.plugins.reader.bags import point_cloud, stops, tf, write_bag
+from tests.plugins.reader.bags import joint_state, point_cloud, stops, tf, write_bag
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
 POSES = [(np.array([0.4, -0.1, 0.3]) + 0.05 * k * np.array([1, -1, (-1) ** k]),
@@ -461,7 +461,7 @@ def two_poses_of_nobody(folder):
         (sample, ["--reader", "table"], "--reader table.rotation: is missing\n--reader table.length: "),
         (odd_heading, ["--table", "a.csv"],
          "--table a.csv: is no table of poses; known: log.csv"),
-        (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "no robot 'ur55'"),
+        (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "--robot model: no robot 'ur55'"),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_one_line_with_what_to_add(
@@ -486,10 +486,23 @@ def test_a_bag_of_unknown_frames_is_answered_with_the_readers_line(folder: Path)
         init()
     assert str(refused.value) == (
         "rec: nothing tells where the flange is; write reader: {ros2_bag: {base: …, flange: "
-        "…}} (frames of tf: end, map); flangeye init takes such a line as --reader '{…}'"
+        "…}} (frames of tf: end, map); flangeye init takes such lines as --reader '{…}' and "
+        "--robot NAME"
     )
     answer = init("--reader", "{ros2_bag: {base: map, flange: end}}")
     assert "5 poses (ROS 2 bag, rec), 5 with a cloud" in answer
+
+
+def test_a_bag_of_joint_angles_is_read_by_the_arm_that_is_named(folder: Path) -> None:
+    angles = np.linspace([0, -1, 1, 0, 1, 0], [1, -0.5, 0.5, 1, 0.5, 2], 5)
+    times, _, middles = stops(np.array([rigid(r.as_matrix(), p) for p, r in POSES]))
+    held = np.clip(((times - times[0]) // 1.8).astype(int), 0, 4)
+    told = [("/joint_states", t, joint_state(t, angles[i]))
+            for t, i in zip(times, held, strict=True)]  # fmt: skip
+    told += [("/scan", t, point_cloud(t, np.ones((9, 3)))) for t in middles]
+    write_bag(folder / "bag", "mcap", told)
+    next((folder / "bag").glob("*.mcap")).rename(folder / "bag.mcap")
+    assert "5 poses (ROS 2 bag, rec), 5 with a cloud" in init("--robot", "ur5e")
 
 
 def test_a_recipe_is_not_written_over(folder: Path) -> None:

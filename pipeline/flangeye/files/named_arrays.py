@@ -24,16 +24,18 @@ from flangeye.types import Floats
 
 MAX_MATLAB = 1_000_000
 """Longest .mat file [bytes]."""
+HDF5 = b"\x89HDF\r\n"
 MATRICES = ((4, 4), (3, 3), (3, 4))
 """Shapes of a pose, of its rotation, and of a pose without its last row."""
 _IN_YAML = re.compile(
     r"^ *(?P<name>[\w-]+): !!opencv-matrix\s+rows: (?P<rows>\d{1,9})\s+cols: (?P<cols>\d{1,9})\s+"
-    r"dt: [a-z]\s+data: \[(?P<data>[^\]]*)\]",
+    r"dt: \"?(?P<channels>\d{0,3})[a-z]\"?\s+data: \[(?P<data>[^\]]*)\]",
     re.MULTILINE,
 )
 _IN_XML = re.compile(
     r"<(?P<name>[\w-]+) type_id=\"opencv-matrix\">\s*<rows>(?P<rows>\d{1,9})</rows>\s*"
-    r"<cols>(?P<cols>\d{1,9})</cols>\s*<dt>[a-z]</dt>\s*<data>(?P<data>[^<]*)</data>"
+    r"<cols>(?P<cols>\d{1,9})</cols>\s*<dt>\"?(?P<channels>\d{0,3})[a-z]\"?</dt>\s*"
+    r"<data>(?P<data>[^<]*)</data>"
 )
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
@@ -128,6 +130,11 @@ def _matlab(file: Path) -> dict[str, Floats]:
     """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
     command = python_command(matlab_parser.__file__)
     content = read_regular(file, MAX_MATLAB)
+    if content.startswith(b"MATLAB 7.3") or content.startswith(HDF5):
+        raise StageError(
+            f"{file}: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
+            f"load('{file.name}'); save('{file.name}', '-v7')"
+        )
     try:
         done = subprocess.run(
             command, input=content, capture_output=True, timeout=matlab_parser.SECONDS, check=False
@@ -150,7 +157,7 @@ def _opencv(file: Path) -> dict[str, Floats]:
     matrices = _IN_XML if file.suffix.lower() == ".xml" else _IN_YAML
     return {
         found["name"]: np.array(found["data"].replace(",", " ").split(), float).reshape(
-            int(found["rows"]), int(found["cols"])
+            int(found["rows"]), int(found["cols"]), *map(int, filter(None, [found["channels"]]))
         )
         for found in matrices.finditer(text)
     }

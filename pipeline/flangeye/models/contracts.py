@@ -1,7 +1,8 @@
 """How the parts that know models are called, and what they give: one Protocol a kind of part.
 
 ``@part`` holds every part against the Protocol of its kind; the table is
-:data:`flangeye.plugin.stage.PARTS`. A part may ask for ``params`` and ``siblings`` besides.
+:data:`flangeye.plugin.stage.PARTS`. A part may ask for ``params``, ``siblings`` and
+``kinematics`` besides.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import pluggy
 
 from flangeye.errors import FlangeyeError
+from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
 from flangeye.plugin.installed import installed_plugins
 from flangeye.plugin.stage import Part, Plugin, Siblings, Stage
@@ -232,10 +233,11 @@ class Registry:
 
 @dataclass(frozen=True)
 class Lookup:
-    """The context in which parameters are validated: the parts on offer, and paths' folder."""
+    """The context in which parameters are validated: parts on offer, paths' folder, the arm."""
 
     registry: Registry
     folder: Path = Path()
+    robot: RobotModel | None = None
 
     def part(self, name: str) -> Part:
         """Return the part ``name``; raises as :meth:`Registry.part` does."""

@@ -30,6 +30,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
 from flangeye.models.configuration import CELL, EVERY
+from flangeye.models.robots import RobotModel
 
 
 class Params(BaseModel):
@@ -253,7 +254,7 @@ class BoundPart:
     Attributes:
         part: The part.
         params: Its parameters, or None when it takes none.
-        offered: The parts a recipe may choose from, for a part that asks for Siblings.
+        offered: What a recipe offers a part that asks for ``siblings`` or ``kinematics``.
     """
 
     part: Part
@@ -265,6 +266,8 @@ class BoundPart:
         extra: dict[str, Any] = {} if self.params is None else {"params": self.params}
         if self.offered is not None and "siblings" in self.part.needs:
             extra["siblings"] = self.offered.siblings(self.part)
+        if self.offered is not None and "kinematics" in self.part.needs:
+            extra["kinematics"] = self.offered.robot
         return self.part.function(*args, **kwargs, **extra)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -278,9 +281,10 @@ class BoundPart:
 
 
 class PartLookup(Protocol):
-    """What the validation of a recipe passes as context: the parts on offer, and the folder."""
+    """What the validation of a recipe passes as context: parts on offer, the folder, the arm."""
 
     folder: Path
+    robot: RobotModel | None
 
     def part(self, name: str) -> Part:
         """Return the part ``kind.name``, or raise LookupError naming the nearest."""
@@ -492,9 +496,10 @@ def _check_call(declared: Part, kind: PartKind) -> None:
         )
 
 
-_GIVEN = ("params", "siblings", "reads_only")
-"""Arguments that any part may have: its parameters, the other parts of its kind, and, for a robot,
-whether the arm is opened to be read and for nothing else."""
+_GIVEN = ("params", "siblings", "kinematics", "reads_only")
+"""Arguments that any part may have: its parameters, the other parts of its kind, the model of the
+recipe's ``robot`` (None without one) and, for a robot, whether the arm is opened to be read and for
+nothing else."""
 
 
 def _fits(got: Any, wanted: Any) -> bool:

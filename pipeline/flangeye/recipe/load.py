@@ -19,6 +19,7 @@ from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
 from flangeye.files.yaml_lines import MAX_BYTES, Document, parse_yaml, read_yaml
+from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Lookup, PluginNotFoundError, Registry
 from flangeye.plugin.stage import Params, Stage
 from flangeye.recipe.context import Context, context_of
@@ -198,6 +199,7 @@ class _Checker:
 
     def _steps(self, entries: list[Any], context: Context) -> list[Step]:
         order = StepOrder(self.complain, context)
+        self._lookup = replace(self._lookup, robot=context.get(RobotModel))
         steps = []
         for index, entry in enumerate(entries):
             named = self._named(index, entry)

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout
+from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import BoundPart, Part, Siblings
 from flangeye_plugins.reader.ancorasir import ancorasir
 from flangeye_plugins.reader.folder import folder
@@ -18,10 +19,13 @@ BUILT_IN: Siblings = {"ancorasir": ancorasir, "folder": folder}
 
 
 @part("reader.auto")
-def auto(path: Path, siblings: Siblings = BUILT_IN) -> Archive:
+def auto(
+    path: Path, siblings: Siblings = BUILT_IN, kinematics: RobotModel | None = None
+) -> Archive:
     """Detect the layout: try every installed reader and report the one that fits."""
     bound = {name: _bound(reader) for name, reader in siblings.items()}
-    found, missed = _tried({name: reader for name, reader in bound.items() if reader}, path)
+    readers = {name: reader for name, reader in bound.items() if reader}
+    found, missed = _tried(readers, path, kinematics)
     if len(found) == 1:
         ((name, archive),) = found.items()
         note = f"reader: {name}, chosen by what {archive.root} holds"
@@ -45,13 +49,16 @@ def _bound(reader: Part) -> BoundPart | None:
         return None
 
 
-def _tried(readers: Mapping[str, BoundPart], path: Path) -> tuple[dict[str, Archive], list[str]]:
+def _tried(
+    readers: Mapping[str, BoundPart], path: Path, kinematics: RobotModel | None
+) -> tuple[dict[str, Archive], list[str]]:
     """Return what each reader gave that knows the path, and the others' reasons."""
     found: dict[str, Archive] = {}
     missed: list[str] = []
     for name, reader in readers.items():
+        arm = {"kinematics": kinematics} if "kinematics" in reader.part.needs else {}
         try:
-            found[name] = reader(path)
+            found[name] = reader(path, **arm)
         except NotThisLayout as error:
             missed.append(f"{name} ({str(error).removeprefix(f'{path}: ')})")
     return found, missed

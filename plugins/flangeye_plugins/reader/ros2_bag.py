@@ -1,32 +1,29 @@
 """ROS 2 bags, MCAP or SQLite, read without ROS.
 
 What the arm did comes from ``tf`` (``base`` and ``flange``), a ``PoseStamped`` topic, or joint
-angles with the arm's model; what the camera saw from ``PointCloud2``, ``Image`` with
+angles with the recipe's ``robot``; what the camera saw from ``PointCloud2``, ``Image`` with
 ``CameraInfo``, a ``PoseStamped`` of the target, or ``tf`` of the target's frame. The standstills
 are found in the arm's motion, and clouds and poses are paired by time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from flangeye import Params, RecipeError, StageError, part
-from flangeye.files.paths import WHOLE, bundled_file
+from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning
-from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
-from flangeye.models.urdf import robot_from_urdf
 from flangeye.types import FLANGE, Floats
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
@@ -43,6 +40,7 @@ from flangeye_plugins.reader.ros2_messages import (
     topics_of,
 )
 
+T = TypeVar("T")
 CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
@@ -54,11 +52,8 @@ UR_JOINTS = tuple(
     f"{name}_joint"
     for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 )
-ModelFile = Annotated[
-    Path,
-    BeforeValidator(bundled_file("robot", "robots", (".urdf", ".yaml"))),
-    WHOLE,
-]
+ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
+"""How a recipe names its arm."""
 OFTEN = 3.0
 """From so many measurements a second on, their own change tells when something moved."""
 
@@ -72,11 +67,8 @@ class BagParams(Params):
     base: str | None = Field(None, description="Frame of the arm's base, in which its poses are.")
     flange: str | None = Field(None, description="Frame of the flange, origin in its face.")
     robot: str | None = Field(
-        None, description="Topic of the arm, in place of tf: PoseStamped, or JointState with model."
-    )
-    model: ModelFile | None = Field(
-        None, description="The arm's model, to come from joint angles to poses: one that 'flangeye "
-        "robots' lists, a .urdf (base and flange name its links), or a .yaml file of your own.",
+        None, description="Topic of the arm, in place of tf: PoseStamped, or JointState, whose "
+        "angles become poses by the kinematics of the recipe's robot.",
     )  # fmt: skip
     joints: tuple[str, ...] = Field(
         (), description="Names of the joints from base to flange, where JointState mixes them."
@@ -101,6 +93,7 @@ class Bag:
         poses: Topic -> times and poses, of PoseStamped.
         joints: Topic -> times and, each, name -> angle.
         stamps: Topic -> times of clouds and images.
+        seen_from: Topic -> frame, of images and their cameras.
         cameras: Topic -> camera matrix (3, 3) [px] and distortion.
     """
 
@@ -111,6 +104,7 @@ class Bag:
     poses: dict[str, tuple[list[float], list[Floats]]] = field(default_factory=dict)
     joints: dict[str, tuple[list[float], list[dict[str, float]]]] = field(default_factory=dict)
     stamps: dict[str, list[float]] = field(default_factory=dict)
+    seen_from: dict[str, str] = field(default_factory=dict)
     cameras: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
 
     def of_type(self, *types: str) -> list[str]:
@@ -138,17 +132,17 @@ class Bag:
 
 
 @part("reader.ros2_bag")
-def ros2_bag(path: Path, params: BagParams) -> Archive:
+def ros2_bag(path: Path, params: BagParams, kinematics: RobotModel | None = None) -> Archive:
     """Read a ROS 2 bag, MCAP or .db3, without ROS: standstills with their clouds or images."""
     bag = _first_look(path)
-    arm, arm_told, joints = _arm(bag, params)
+    arm, arm_told, joints = _arm(bag, params, kinematics)
     seen, seen_told = _seen(bag, params)
     try:
         pairs, paired = pair(arm, seen.times, seen.signals(arm), params.join)
     except StageError as error:
         raise StageError(f"{path}: {error}") from None
     recordings = seen.recordings(pairs, joints)
-    notes = [f"ROS 2 bag: {arm_told}; {seen_told}", *paired]
+    notes = [f"ROS 2 bag: {arm_told}; {seen_told}", *paired, *seen.notes]
     return Archive(f"ROS 2 bag, {path.name}", path, recordings, bag.files, "m", notes)
 
 
@@ -169,7 +163,9 @@ def _first_look(path: Path) -> Bag:
             _append(bag.joints, raw, raw.read(_joint_angles))
         elif kind == INFO:
             bag.cameras[raw.topic] = raw.read(_intrinsics)
+            bag.seen_from[raw.topic] = raw.frame
         else:
+            bag.seen_from.setdefault(raw.topic, raw.frame)
             bag.stamps.setdefault(raw.topic, []).append(raw.stamp)
     return replace(bag, topics={t: kind for t, kind in bag.topics.items() if t in heard})
 
@@ -198,21 +194,20 @@ def _intrinsics(message: Any) -> tuple[Floats, Floats]:
 # --- the arm
 
 
-def _arm(bag: Bag, params: BagParams) -> tuple[Stream, str, Stream | None]:
+def _arm(
+    bag: Bag, params: BagParams, robot: RobotModel | None
+) -> tuple[Stream, str, Stream | None]:
     """Return the flange's poses, how they were found, and the joints, if their order is known.
 
     Raises:
         StageError: Nothing in the bag tells where the flange is, or several things do.
     """
     joints = _joints(bag, params)
-    if params.robot is not None and params.robot not in bag.of_type(JOINTS):
+    if params.robot in bag.of_type(JOINTS):
+        return *_by_kinematics(bag, joints, robot), joints
+    if params.robot is not None:
         topic = bag.only("robot", params.robot, POSE)
         return in_order(*bag.poses[str(topic)]), f"the flange's poses from {topic}", joints
-    if params.model is not None:
-        if joints is None:
-            raise StageError(f"{bag.path}: model: there are no joint angles whose order is known")
-        poses = Arm(_model(params.model, params)).flange(joints[1])
-        return (joints[0], poses), f"the flange's poses by the model {params.model.stem}", joints
     base, flange = _frame(bag, params.base, BASES), _frame(bag, params.flange, FLANGES)
     if base and flange:
         told = f"the flange's poses from tf, {base} to {flange}"
@@ -220,7 +215,32 @@ def _arm(bag: Bag, params: BagParams) -> tuple[Stream, str, Stream | None]:
     others = [topic for topic in bag.poses if topic != params.target]
     if len(others) == 1:
         return in_order(*bag.poses[others[0]]), f"the flange's poses from {others[0]}", joints
+    if robot is not None and bag.joints:
+        return *_by_kinematics(bag, joints, robot), joints
     raise StageError(f"{bag.path}: nothing tells where the flange is; {_ways(bag)}")
+
+
+def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) -> tuple[Stream, str]:
+    """Return the flange's poses at the recorded joint angles, and how they were found."""
+    if robot is None:
+        raise StageError(
+            f"{bag.path}: joint angles become poses by the arm's kinematics; write {ARM}"
+        )
+    if joints is None or joints[1].shape[1] != len(robot.joints):
+        raise StageError(
+            f"{bag.path}: which joint angles are the {len(robot.joints)} of {robot.model} is not "
+            "known; write reader: {ros2_bag: {robot: TOPIC, joints: [NAME, …]}}, from base to "
+            f"flange; there are {'; '.join(f'{t}: {_names(bag, t)}' for t in bag.joints)}"
+        )
+    return (
+        joints[0],
+        Arm(robot).flange(joints[1]),
+    ), f"the flange's poses by the joints of {robot.model}"
+
+
+def _names(bag: Bag, topic: str) -> str:
+    """Return the joints that a topic tells of."""
+    return ", ".join(bag.joints[topic][1][0])
 
 
 def _ways(bag: Bag) -> str:
@@ -228,28 +248,19 @@ def _ways(bag: Bag) -> str:
     ways = {
         "base: …, flange: …": bag.frames.names and f"frames of tf: {', '.join(bag.frames.names)}",
         "robot: …": bag.poses and f"PoseStamped topics: {', '.join(bag.poses)}",
-        "model: …": bag.joints and "of the arm whose joint angles these are: one that 'flangeye "
-        "robots' lists, or a .urdf or .yaml file",
-    }  # fmt: skip
-    found = [f"{{ros2_bag: {{{way}}}}} ({told})" for way, told in ways.items() if told]
+    }
+    found = [f"reader: {{ros2_bag: {{{way}}}}} ({told})" for way, told in ways.items() if told]
+    if bag.joints:
+        found.append(f"{ARM} (for the angles of {', '.join(bag.joints)})")
     if not found:
         return "it has neither tf nor PoseStamped nor JointState"
-    return f"write reader: {' or '.join(found)}"
+    return f"write {' or '.join(found)}"
 
 
 def _frame(bag: Bag, given: str | None, usual: Sequence[str]) -> str | None:
     if given is not None:
         return given
     return next((name for name in usual if name in bag.frames.names), None)
-
-
-def _model(path: Path, params: BagParams) -> RobotModel:
-    try:
-        if path.suffix == ".urdf":
-            return robot_from_urdf(path, params.base, params.flange)
-        return read_model(path, RobotModel)
-    except RecipeError as error:
-        raise StageError(f"model: {error}") from None
 
 
 def _joints(bag: Bag, params: BagParams) -> Stream | None:
@@ -283,6 +294,7 @@ class Target:
 
     times: Floats
     poses: Floats
+    notes: tuple[str, ...] = ()
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
         """Both turn as fast, in whatever frame."""
@@ -312,6 +324,16 @@ class Scans:
     clouds: str | None
     images: str | None
     camera: tuple[Floats, Floats] | None
+    damaged: dict[str, dict[int, StageError]] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was set aside: for each topic how many messages are damaged, and the first."""
+        return tuple(
+            f"set aside {len(errors)} of {len(self.bag.stamps[topic])} messages of {topic}, the "
+            f"first of them number {min(errors)}: {errors[min(errors)]}"
+            for topic, errors in self.damaged.items()
+        )
 
     @property
     def first(self) -> str:
@@ -327,15 +349,35 @@ class Scans:
         """How much each differs from the one before, where they come often enough to tell."""
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / OFTEN:
             return None
-        looks = [raw.read(_look) for raw in messages(self.bag.files, [self.first])]
-        alike = all(look.shape == looks[0].shape for look in looks)
-        changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks)]
-        between = (self.times[1:] + self.times[:-1]) / 2
-        return (turning(*arm), (between, np.array(changes))) if alike else None
+        looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))
+        if len({look.shape for look in looks.values()}) != 1:
+            return None
+        changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks.values())]
+        times = self.times[list(looks)]
+        return turning(*arm), ((times[1:] + times[:-1]) / 2, np.array(changes))
+
+    def _sound(
+        self, topic: str, wanted: Container[int], use: Callable[[int, Any], T]
+    ) -> dict[int, T]:
+        """Return what a function makes of some messages, by number; damaged ones are set aside.
+
+        Raises:
+            StageError: All of them are damaged.
+        """
+        found = {}
+        for number, raw in enumerate(messages(self.bag.files, [topic])):
+            if number in wanted:
+                try:
+                    found[number] = raw.read(partial(use, number))
+                except StageError as error:
+                    self.damaged.setdefault(topic, {})[number] = error
+        if not found and topic in self.damaged:
+            raise next(iter(self.damaged[topic].values()))
+        return found
 
     def recordings(self, pairs: Sequence[Pair], joints: Stream | None) -> list[Recording]:
         """Return a recording a pair, its cloud and image written as files."""
-        chosen = [found.events[len(found.events) // 2] for found in pairs]
+        chosen = [self._middle(found.events) for found in pairs]
         files = self._files(self.first, chosen)
         images = files if self.clouds is None else self._beside(chosen)
         return [
@@ -350,7 +392,14 @@ class Scans:
                 camera=self.camera,
             )
             for i, (found, event) in enumerate(zip(pairs, chosen, strict=True))
+            if event in files
         ]
+
+    def _middle(self, events: Sequence[int]) -> int:
+        """Return the middle one of a standstill's messages, of those not known to be damaged."""
+        damaged = self.damaged.get(self.first, {})
+        sound = [event for event in events if event not in damaged] or events
+        return sound[len(sound) // 2]
 
     def _beside(self, chosen: Sequence[int]) -> dict[int, Path]:
         """Return the image taken nearest to each chosen cloud."""
@@ -359,17 +408,13 @@ class Scans:
         taken = np.array(self.bag.stamps[self.images])
         nearest = {event: int(np.argmin(np.abs(taken - self.times[event]))) for event in chosen}
         files = self._files(self.images, list(nearest.values()))
-        return {event: files[image] for event, image in nearest.items()}
+        return {event: files[image] for event, image in nearest.items() if image in files}
 
     def _files(self, topic: str, wanted: Sequence[int]) -> dict[int, Path]:
         """Write some messages of a topic as files; return them by the message's number."""
-        folder, files = scratch(self.bag.path), {}
         save = save_cloud if self.bag.topics[topic] == CLOUD else save_image
-        for number, raw in enumerate(messages(self.bag.files, [topic])):
-            if number in wanted:
-                name = f"{topic.strip('/').replace('/', '_')}-{number:05}"
-                files[number] = raw.read(partial(save, folder / name))
-        return files
+        name = scratch(self.bag.path) / topic.strip("/").replace("/", "_")
+        return self._sound(topic, wanted, lambda i, told: save(Path(f"{name}-{i:05}"), told))
 
 
 def _look(message: Any) -> Floats:
@@ -396,9 +441,12 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
 
 
 def _info(bag: Bag, params: BagParams, images: str) -> str | None:
-    """Return the CameraInfo as named, beside the images as drivers publish it, or the only one."""
+    """Return the CameraInfo as named, beside the images, in their frame, or the only one."""
     beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-    given = params.camera_info or (beside if beside in bag.cameras else None)
+    frame = bag.seen_from[images]
+    same = [topic for topic in bag.cameras if frame and bag.seen_from[topic] == frame]
+    found = [beside] if beside in bag.cameras else same
+    given = params.camera_info or (found[0] if len(found) == 1 else None)
     return bag.only("camera_info", given, INFO)
 
 

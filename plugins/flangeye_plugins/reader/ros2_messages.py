@@ -79,6 +79,16 @@ class Raw:
         seconds, nanoseconds = struct.unpack_from(f"{order}iI", self.data, 4)
         return seconds + nanoseconds * 1e-9 if seconds or nanoseconds else self.received
 
+    @property
+    def frame(self) -> str:
+        """``header.frame_id`` of a message that begins with a header."""
+        if len(self.data) < SHORTEST + 4:
+            return ""
+        order = "<" if self.data[1] & 1 else ">"
+        (length,) = struct.unpack_from(f"{order}I", self.data, SHORTEST)
+        text = self.data[SHORTEST + 4 : SHORTEST + 4 + length]
+        return text.rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
 
 def bag_files(path: Path) -> list[Path]:
     """Return the files of a bag in the order of their numbers, or the file itself.
@@ -241,10 +251,12 @@ def save_image(path: Path, message: Any) -> Path:
 
     Raises:
         StageError: Its encoding is not known.
+        ImageError: It is compressed, and damaged.
     """
     import cv2
 
     if hasattr(message, "format"):
+        pixels_of(message)  # a damaged one is found here, where it can still be set aside
         suffix = ".png" if "png" in message.format else ".jpg"
         path.with_suffix(suffix).write_bytes(bytes(message.data))
         return path.with_suffix(suffix)

@@ -88,10 +88,10 @@ def compressed(t, pixels):
     return T["sensor_msgs/msg/CompressedImage"](header(t, "camera"), "png", png)
 
 
-def camera_info(t, matrix, shape):
+def camera_info(t, matrix, shape, frame=""):
     region = T["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     return T["sensor_msgs/msg/CameraInfo"](
-        header(t), *shape, "plumb_bob", np.zeros(5), matrix.ravel(), np.eye(3).ravel(),
+        header(t, frame), *shape, "plumb_bob", np.zeros(5), matrix.ravel(), np.eye(3).ravel(),
         np.zeros(12), 0, 0, region,
     )  # fmt: skip
 

@@ -1,17 +1,16 @@
 """A ROS 2 bag, read without ROS, gives what was recorded."""
 
+import json
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
@@ -23,7 +22,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import parse_recipe
+from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.reader.folder import FolderParams, folder
@@ -144,28 +143,105 @@ def test_of_several_cameras_the_one_beside_the_images_is_taken(
     assert read(path, images=topic).recordings[0].camera[0][0, 0] == 900
 
 
+def test_of_several_cameras_the_one_in_the_frame_of_the_images_is_taken(tmp_path: Path) -> None:
+    told, middles = robot_in_tf(POSES)
+    told += [("/pictures", t, image(t, np.zeros((4, 6), np.uint8))) for t in middles]
+    for frame, focal in (("bench", 700.0), ("camera", 900.0), ("other", 800.0)):
+        info = camera_info(START, np.diag([focal, focal, 1]), (4, 6), frame)
+        told.append((f"/info/{frame}", START, info))
+    path = write_bag(tmp_path / "bag", "mcap", told)
+    assert read(path).recordings[0].camera[0][0, 0] == 900
+
+
+def damage(file, topic, number):
+    """Cut a message of a bag short, by its number on its topic."""
+    with closing(sqlite3.connect(file)) as database, database:
+        rows = database.execute(
+            "SELECT messages.id, data FROM messages JOIN topics ON topic_id = topics.id "
+            "WHERE topics.name = ? ORDER BY timestamp",
+            (topic,),
+        ).fetchall()
+        one, data = rows[number]
+        cut = data[:40] + bytes(len(data) - 40)
+        database.execute("UPDATE messages SET data = ? WHERE id = ?", (cut, one))
+
+
+def test_a_damaged_cloud_is_set_aside_with_its_pose(tmp_path: Path) -> None:
+    told, middles = robot_in_tf(POSES)
+    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+    file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
+    damage(file, "/scan", 1)
+    found = read(file)
+    assert np.allclose([r.base_T_flange for r in found.recordings], POSES[[0, 2, 3, 4]], atol=1e-9)
+    clouds = [read_cloud(r.cloud).xyz for r in found.recordings]
+    assert np.array_equal(clouds, CLOUDS[[0, 2, 3, 4]])
+    assert found.notes[-1].startswith(
+        "set aside 1 of 5 messages of /scan, the first of them number 1: "
+    )
+    for number in (0, 2, 3, 4):
+        damage(file, "/scan", number)
+    with pytest.raises(StageError, match=r"\.db3: a message of /scan is damaged: "):
+        read(file)
+
+
+def test_a_damaged_image_is_set_aside_where_the_clocks_are_compared(tmp_path: Path) -> None:
+    """Of a standstill's other images one is taken."""
+    told, _ = robot_in_tf(POSES)
+    times, _, middles = stops(POSES)
+    noise = [RNG.integers(0, 255, (32, 32)).astype(np.uint8) for _ in times[::4]]
+    told += [("/image", t, compressed(t, n)) for t, n in zip(times[::4], noise, strict=True)]
+    told.append(("/camera_info", START, camera_info(START, np.diag([900.0, 900, 1]), (32, 32))))
+    file = next(write_bag(tmp_path / "bag", "db3", told).glob("*.db3"))
+    middle = int(np.argmin(np.abs(times[::4] - middles[2])))
+    damage(file, "/image", middle)
+    found = read(file, join={"clock_offset": "0 s"})
+    assert len(found.recordings) == 5
+    assert found.notes[-1].startswith(
+        f"set aside 1 of {len(noise)} messages of /image, the first of them number {middle}: "
+    )
+
+
 def test_a_cloud_whose_row_step_is_left_zero_is_read() -> None:
     message = point_cloud(START, CLOUDS[0].reshape(-1, 3))
     whole = replace(message, data=message.data[:-7], row_step=0)
     assert np.array_equal(cloud_of(whole), CLOUDS[0].reshape(-1, 3))
 
 
-def test_joint_angles_give_poses_by_the_arms_model(bag: Callable[..., Any]) -> None:
-    model = load_model("robots", "ur5e")
-    angles = RNG.uniform(-1, 1, (5, 6))
-    poses = Arm(model).flange(angles)
-    times, _, middles = stops(poses)
+def driven(angles):
+    """Joint angles of an arm that stops at each of them, and a cloud at each stop."""
+    times, _, middles = stops(POSES)
     held = np.clip(((times - START) // 1.8).astype(int), 0, 4)
     told = [("/joint_states", t, joint_state(t, angles[i]))
             for t, i in zip(times, held, strict=True)]  # fmt: skip
-    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
-    found = read(bag(told), model="ur5e")
+    return told + [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
+
+
+def reader_of(folder, robot, reader="auto"):
+    """The reader of a recipe with this arm, as the recipe's stage calls it."""
+    file = folder / "recipe.yaml"
+    steps = [{"acquire.archive": {"reader": reader}}, "segment.flange", "fit.rim", "solve.svd"]
+    plate = {"standard": "ISO 9409-1-50-4-M6"}
+    data = {"title": "A bag", "scanner": "phoxi-m", "robot": robot, "feature": plate}
+    file.write_text(json.dumps(data | {"steps": steps}))
+    return load_recipe(file, load_registry()).steps[0].params.reader
+
+
+@pytest.mark.parametrize("reader", ["auto", {"ros2_bag": {"robot": "/joint_states"}}])
+def test_joint_angles_give_poses_by_the_recipes_robot(
+    bag: Callable[..., Any], tmp_path: Path, reader: Any
+) -> None:
+    angles = RNG.uniform(-1, 1, (5, 6))
+    found = reader_of(tmp_path, "ur5e", reader)(bag(driven(angles)))
+    poses = Arm(load_model("robots", "ur5e")).flange(angles)
     assert np.allclose([r.base_T_flange for r in found.recordings], poses, atol=1e-9)
     assert np.allclose([r.joints for r in found.recordings], angles, atol=1e-9)
+    assert any("the flange's poses by the joints of ur5e" in note for note in found.notes)
 
 
-def test_the_arms_model_is_a_urdf_beside_the_recipe(tmp_path: Path) -> None:
-    """Its frames are named where the file leaves them open; a name that is none is told at once."""
+OWN = {"urdf": "own.urdf", "base": "l0", "flange": "l6"}
+
+
+def write_urdf(file):
     turns = "".join(
         f'<joint name="j{i}" type="revolute"><parent link="l{i - 1}"/><child link="l{i}"/>'
         f'<origin xyz="0 0.1 0.2"/><axis xyz="{axis}"/><limit lower="-3" upper="3" velocity="1"/>'
@@ -173,24 +249,56 @@ def test_the_arms_model_is_a_urdf_beside_the_recipe(tmp_path: Path) -> None:
         for i, axis in enumerate(["0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0"], 1)
     )
     links = "".join(f'<link name="l{i}"/>' for i in range(7))
-    (tmp_path / "own.urdf").write_text(f'<robot name="own">{links}{turns}</robot>')
-    times, _, middles = stops(POSES)
+    file.write_text(f'<robot name="own">{links}{turns}</robot>')
+
+
+def test_the_robot_whose_joints_were_recorded_is_a_urdf_beside_the_recipe(tmp_path: Path) -> None:
+    write_urdf(tmp_path / "own.urdf")
     angles = RNG.uniform(-1, 1, (5, 6))
-    held = np.clip(((times - START) // 1.8).astype(int), 0, 4)
-    told = [("/joint_states", t, joint_state(t, angles[i]))
-            for t, i in zip(times, held, strict=True)]  # fmt: skip
-    told += [("/scan", t, point_cloud(t, c)) for t, c in zip(middles, CLOUDS, strict=True)]
-    path = write_bag(tmp_path / "bag", "mcap", told)
-    given = {"model": "own.urdf", "base": "l0", "flange": "l6"}
-    context = SimpleNamespace(folder=tmp_path)
-    found = ros2_bag(path, BagParams.model_validate(given, context=context))
+    path = write_bag(tmp_path / "bag", "mcap", driven(angles))
+    found = reader_of(tmp_path, OWN)(path)
     wanted = Arm(robot_from_urdf(tmp_path / "own.urdf", "l0", "l6")).flange(angles)
     assert np.allclose([r.base_T_flange for r in found.recordings], wanted, atol=1e-9)
-    assert "by the model own" in found.notes[0]
-    with pytest.raises(StageError, match="model: .*own.urdf: .* 'l9'"):
-        read(path, model=str(tmp_path / "own.urdf"), base="l0", flange="l9")
-    with pytest.raises(ValidationError, match="known: ur5e.* or a .urdf or .yaml file"):
-        read(path, model="ur5ee")
+
+
+def test_a_run_of_joint_angles_by_a_urdf_is_read_where_that_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The arm of a bag is the recipe's, so its log carries it."""
+    (tmp_path / "here").mkdir()
+    write_urdf(tmp_path / "here" / "own.urdf")
+    reader = reader_of(tmp_path / "here", OWN, {"ros2_bag": {"robot": "/joint_states"}})
+    recipe = load_recipe(tmp_path / "here" / "recipe.yaml", load_registry())
+    files = recipe.files
+    carried = {name: text.encode() for name, text in files.items() if name.startswith("models/")}
+    (tmp_path / "here" / "own.urdf").unlink()
+    monkeypatch.chdir(tmp_path)
+    again = parse_recipe(files["recipe.resolved.yaml"], "log", load_registry(), models=carried)
+    path = write_bag(tmp_path / "bag", "mcap", driven(RNG.uniform(-1, 1, (5, 6))))
+    first, second = (r(path).recordings for r in (reader, again.steps[0].params.reader))
+    for one, other in zip(first, second, strict=True):
+        assert np.allclose(one.base_T_flange, other.base_T_flange, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("robot", "params", "message"),
+    [
+        (None, {"robot": "/joint_states"}, "joint angles become poses by the arm's kinematics; write "
+         "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"),
+        ("kuka-iiwa14-r820", {}, "which joint angles are the 7 of kuka-iiwa14-r820 is not known; write "
+         "reader: {ros2_bag: {robot: TOPIC, joints: [NAME, …]}}, from base to flange; there are "
+         "/joint_states: elbow_joint, shoulder_lift_joint, shoulder_pan_joint, wrist_1_joint, "
+         "wrist_2_joint, wrist_3_joint"),
+    ],
+)  # fmt: skip
+def test_joint_angles_of_no_known_arm_are_one_line(
+    tmp_path: Path, robot: str | None, params: dict[str, Any], message: str
+) -> None:
+    path = write_bag(tmp_path / "bag", "mcap", driven(RNG.uniform(-1, 1, (5, 6))))
+    model = load_model("robots", robot) if robot else None
+    with pytest.raises(StageError) as error:
+        ros2_bag(path, BagParams.model_validate(params), model)
+    assert str(error.value) == f"{path}: {message}"
 
 
 @pytest.mark.parametrize("way", ["topic", "frame"])
@@ -245,11 +353,9 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., A
         ("two", {"clouds": "/a"}, "nothing tells where the flange is; it has neither tf nor "
          "PoseStamped nor JointState"),
         ("two joints odd", {"clouds": "/a"}, "nothing tells where the flange is; write reader: "
-         "{ros2_bag: {base: …, flange: …}} (frames of tf: end, map) or {ros2_bag: {model: …}} (of "
-         "the arm whose joint angles these are: one that 'flangeye robots' lists, or a .urdf or "
-         ".yaml file)"),
-        ("tf two", {"clouds": "/a", "model": "ur5e"},
-         "model: there are no joint angles whose order is known"),
+         "{ros2_bag: {base: …, flange: …}} (frames of tf: end, map) or robot: NAME ('flangeye "
+         "robots' lists them) or robot: {urdf: arm.urdf} in the recipe (for the angles of "
+         "/joints)"),
         ("tf two", {"target": "marker"}, "target: 'marker' is no PoseStamped topic; as a frame of "
          "tf it needs the camera's frame, camera: NAME"),
         ("tf late", {}, "the arm's poses are from 1700000000.000 to 1700000008.200 s, the "

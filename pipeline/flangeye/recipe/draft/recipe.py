@@ -67,7 +67,7 @@ def draft_recipe(
     """
     robot = _robot(questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", NONE))
     reader = _reader(survey, questions, registry, robot)
-    archive = _bound(reader, registry)(survey.folder)
+    archive = _bound(reader, registry, robot)(survey.folder)
     stage, target = _what(archive, questions)
     head = _head(survey.folder, robot, target, questions)
     first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
@@ -94,7 +94,7 @@ def _reader(
     if given is not None:
         return parse_value(given, "--reader")
     try:
-        _bound("auto", registry)(survey.folder)
+        _bound("auto", registry, robot)(survey.folder)
     except StageError as error:
         reason = error
     else:
@@ -115,14 +115,17 @@ def _is_whole(table: Table, scans: bool) -> bool:
     return heads.arm is not None and (heads.target is not None or (scans and bool(heads.scan)))
 
 
-def _bound(reader: Any, registry: Registry) -> BoundPart:
+def _bound(reader: Any, registry: Registry, robot: Mapping[str, Any]) -> BoundPart:
     """Return a reader with its parameters, checked as a recipe's are."""
-    probe = {"title": "draft", "steps": [{"acquire.centres": {"reader": reader}}, "solve.svd"]}
+    section = {"robot": robot} if robot else {}
+    steps = [{"acquire.centres": {"reader": reader}}, "solve.svd"]
+    probe = {"title": "draft", **section, "steps": steps}
     try:
         params: Any = parse_recipe(json.dumps(probe), "probe", registry).steps[0].params
     except RecipeError as error:
         # Of the probe's file nobody knows.
         told = str(error).replace("probe:1: steps.0.acquire.centres.reader", "--reader")
+        told = told.replace("probe:1: robot.", "--robot ")
         raise RecipeError(told.replace("--reader.", "--reader ")) from None
     bound: BoundPart = params.reader
     return bound
@@ -135,7 +138,7 @@ def _maker(robot: Mapping[str, Any]) -> str | None:
 def _missing(survey: FolderSurvey, reason: StageError) -> str:
     """Say what is missing, and the line that would bring it."""
     if not isinstance(reason, NotThisLayout):
-        return f"{reason}; flangeye init takes such a line as --reader '{{…}}'"
+        return f"{reason}; flangeye init takes such lines as --reader '{{…}}' and --robot NAME"
     scans = survey.of(CLOUDS) or survey.of(IMAGES)
     if scans:
         return (
