@@ -1,10 +1,28 @@
 """Whether an answer is the best of all: shown where it is, not shown where it is not."""
 
+from dataclasses import astuple, replace
+
 import numpy as np
 import pytest
 
 from flangeye.handeye import certificate
-from flangeye.handeye.certificate import NOT_SHOWN, Certificate, Sightings, certify
+from flangeye.handeye.certificate import (
+    NOT_SHOWN,
+    Certificate,
+    Sightings,
+    _constraints,
+    _descend,
+    _missing,
+    _quadratic,
+    _unchanging,
+    _vector,
+    certify,
+)
+from flangeye.handeye.components import Noise
+from flangeye.handeye.likelihood import Problem, settle
+from flangeye.handeye.loop import ArmNoise
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.starts import start_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
@@ -87,3 +105,160 @@ def test_how_much_better_another_answer_may_be_is_said(
     assert found.notes[-1] == (
         f"{NOT_SHOWN}: another answer may leave squared errors less by {told}"
     )
+
+
+def errors_of(s: Sightings, x: Floats, y: Floats) -> float:
+    """Return the weighed squares of A X M - B Y D, half of the rotation matrices'."""
+    off = s.a @ x @ s.m - s.b @ y @ s.d
+    turned, shifted = (off[:, :3, :3] ** 2).sum(axis=(1, 2)), (off[:, :3, 3] ** 2).sum(axis=1)
+    return float(s.turning @ turned / 2 + s.shifting @ shifted)
+
+
+def any_sightings(seed: int) -> Sightings:
+    """Return sightings in which nothing rests, of different weights."""
+    rng = np.random.default_rng(seed)
+    a, m, b, d = (np.array([anywhere(rng) for _ in range(6)]) for _ in range(4))
+    return Sightings(a, m, b, d, rng.uniform(1, 3, 6), rng.uniform(1, 3, 6))
+
+
+def test_the_quadratic_is_the_least_error_that_translations_leave_to_rotations() -> None:
+    s, rng = any_sightings(1), np.random.default_rng(2)
+    quadratic = _quadratic(s)
+    for _ in range(3):
+        x, y = anywhere(rng), anywhere(rng)
+        here = (
+            _vector(np.array([x[:3, :3], y[:3, :3]]))
+            @ quadratic
+            @ _vector(np.array([x[:3, :3], y[:3, :3]]))
+        )
+
+        def moved(shift: Floats, x: Floats = x, y: Floats = y) -> float:
+            return errors_of(s, rigid(x[:3, :3], shift[:3]), rigid(y[:3, :3], shift[3:]))
+
+        # A quadratic in the translations: its gradient and Hessian are differences, exactly.
+        eye, zero = np.eye(6), moved(np.zeros(6))
+        hessian = np.array([[moved(a + b) - moved(a) - moved(b) + zero for a in eye] for b in eye])
+        gradient = np.array([moved(a) - zero for a in eye]) - np.diag(hessian) / 2
+        least = moved(-np.linalg.solve(hessian, gradient))
+        assert here == pytest.approx(least, rel=1e-9)
+
+
+def test_constraints_hold_for_rotations_alone() -> None:
+    """Of one rotation 20 are independent: 11 of its lines' products, 9 of their crosses."""
+    constraints, rng = np.array(list(_constraints())), np.random.default_rng(3)
+    np.testing.assert_array_equal(constraints, constraints.transpose(0, 2, 1))
+    pair = np.array([anywhere(rng)[:3, :3], anywhere(rng)[:3, :3]])
+    at = _vector(pair)
+    assert np.abs(constraints @ at @ at).max() < 1e-12
+    assert np.linalg.matrix_rank(constraints.reshape(60, -1)) == 40
+    for spoilt in (
+        pair * [[[-1.0]], [[1.0]]],
+        pair * [[[1.0]], [[1.1]]],
+        pair @ np.diag([1, 1, -1]),
+    ):
+        assert np.abs(constraints @ _vector(spoilt) @ _vector(spoilt)).max() > 0.2
+
+
+def test_what_leaves_the_answer_as_it_is_is_orthonormal_and_complete() -> None:
+    constraints = np.array(list(_constraints()))
+    at = _vector(np.array([anywhere(np.random.default_rng(5))[:3, :3]] * 2))
+    effects = np.einsum("kij,j->ik", constraints, at)
+    free = _unchanging(constraints, effects)
+    # L r has no part along r nor along the six turns: of 40 the 12 others are taken.
+    assert free.shape == (40 - 12, 19, 19)
+    assert free.reshape(28, -1) @ free.reshape(28, -1).T == pytest.approx(np.eye(28), abs=1e-9)
+    assert np.abs(free @ at).max() < 1e-9
+
+
+def test_the_bottom_of_the_valley_is_reached_from_its_slope() -> None:
+    sightings, x, y = sighted((5e-3, 1e-3), 0)
+    quadratic = _quadratic(sightings)
+    bottom = _descend(quadratic, np.array([x[:3, :3], y[:3, :3]]))
+    aside = rotation_exp(np.array([[0.2, -0.1, 0.1], [0.1, 0.2, -0.2]]))
+    assert _descend(quadratic, aside @ bottom) == pytest.approx(bottom, abs=1e-10)
+    least = _vector(bottom) @ quadratic @ _vector(bottom)
+    assert certify(sightings, x, y).cost == pytest.approx(least)
+    for turn in 1e-4 * np.concatenate([np.eye(6), -np.eye(6)]):
+        there = _vector(rotation_exp(turn.reshape(2, 3)) @ bottom)
+        assert there @ quadratic @ there > least
+
+
+def test_what_may_be_missing_is_seven_times_the_most_negative_eigenvalue(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of rotations and a one the squares are seven: a quadratic of -1 in all is -7."""
+    at = _vector(np.array([np.eye(3)] * 2))
+    assert _missing(3.0 * np.eye(19), at, 21.0, 1e-9) == pytest.approx(0.0, abs=1e-9)
+    # Where no constraint explains it, and it moves the answer, that counts against it as well.
+    monkeypatch.setattr(certificate, "_constraints", lambda: [np.zeros((19, 19))])
+    alone = np.zeros((19, 19))
+    alone[0, 0] = -0.5
+    assert _missing(alone, at, 0.0, 0.0) == pytest.approx(7 * 0.5 + 2 * 0.5 * np.sqrt(7))
+
+
+def test_an_answer_is_the_best_where_next_to_nothing_is_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A thousandth of the cost; where there is none, what rounding leaves."""
+    sightings, x, y = sighted((5e-3, 1e-3), 0)
+    cost = certify(sightings, x, y).cost
+    exact = replace(sightings, m=invert(sightings.a @ x) @ y)
+    size = 1e-9 * np.trace(_quadratic(exact))
+    for which, limit in ((sightings, 1e-3 * cost), (exact, size)):
+        for share in (0.99, 1.01):
+            monkeypatch.setattr(certificate, "_missing", lambda *_, m=share * limit: m)
+            assert certify(which, x, y).optimal == (share < 1)
+    assert certify(exact, x, y).cost < 1e-6
+
+
+@pytest.mark.parametrize("name", ["eye-in-hand, marker", "two arms, flange"])
+def test_what_is_certified_are_the_poses_that_agree_in_their_loop(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[Sightings, Floats, Floats]] = []
+
+    def shown(sightings: Sightings, x: Floats, y: Floats) -> Certificate:
+        seen.append((sightings, x, y))
+        return certify(sightings, x, y)
+
+    monkeypatch.setattr(certificate, "certify", shown)
+    made = session(CONFIGURATIONS[name], np.random.default_rng(3), n=15, feature="pose")
+    solve_poses(made.observations, RobustParams(certify=True), ROBOT, made.configuration)
+    ((s, x, y),) = seen
+    assert all(len(each) == 15 for each in astuple(s))
+    off = s.a @ x @ s.m - s.b @ y @ s.d
+    assert np.abs(off).max() < 5e-3
+    # Of 90 numbers 12 were found; the weights are those of the noise that they show.
+    assert 40 < errors_of(s, x, y) < 140
+    assert errors_of(replace(s, turning=0 * s.turning), x, y) > 10
+    assert errors_of(replace(s, shifting=0 * s.shifting), x, y) > 10
+
+
+@pytest.mark.parametrize(
+    ("off", "told"), [(0.9, OPTIMAL), (1.1, f"{NOT_SHOWN}: with errors alike")]
+)
+def test_a_best_answer_further_away_than_five_sigma_is_named(
+    off: float, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Along any axis: by the largest standard deviation of the camera's rotation."""
+    made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), n=15)
+    measured = measurements_of(made.observations, made.configuration, None)
+    problem = Problem(
+        measured, loop_of(made.configuration), ArmNoise(2e-4, 5e-5), None, stated=True
+    )
+    start = start_of(measured, problem.loop, np.random.default_rng(0))
+    found = settle(problem, start, Noise(0.0, 0.0))
+    values, axes = np.linalg.eigh(found.covariance[:3, :3])
+    away = rotation_exp(off * 5.0 * np.sqrt(values[-1]) * axes[:, 0])
+
+    def shown(sightings: Sightings, x: Floats, y: Floats) -> Certificate:
+        for told, at in ((sightings.turning, slice(0, 3)), (sightings.shifting, slice(3, 6))):
+            assert told == pytest.approx([np.trace(w[at, at]) / 3 for w in found.weights])
+        return Certificate(np.array([away @ x[:3, :3], y[:3, :3]]), 1.0, 0.0, True)
+
+    monkeypatch.setattr(certificate, "certify", shown)
+    said = certificate.certificate_note(problem, found)
+    assert said.startswith(told)
+    if off > 1:
+        far = np.degrees(off * 5.0 * np.sqrt(values[-1]))
+        assert said.endswith(f"the best answer is {far:.2g} deg from it")

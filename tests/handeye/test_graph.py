@@ -2,15 +2,28 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.handeye.graph import Sighting, solve_graph
+from flangeye.handeye import graph as room
+from flangeye.handeye.graph import (
+    GATE,
+    SIZES,
+    Sighting,
+    _first_below,
+    _Graph,
+    information_of,
+    linear_of,
+    rows_of,
+    solve_graph,
+)
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import chi2_quantile, covariance_inflation
 from flangeye.models.loading import load_model
 
 UR5 = Arm(load_model("robots", "ur5"))
@@ -315,3 +328,152 @@ def test_circles_on_the_flange_itself_tie_two_scanners() -> None:
         off = error(found.places[each], frames[each].place)
         assert off @ np.linalg.solve(found.covariances[each], off) < 22.5
         assert np.linalg.norm(off[3:]) < 1e-3
+
+
+def circled(sightings):
+    """Every other one as a circle is seen: spun about its normal, which it does not tell."""
+    out = []
+    for i, s in enumerate(sightings):
+        if i % 2:
+            projector = np.eye(6)
+            projector[:3, :3] -= np.outer(s.pose[:3, 2], s.pose[:3, 2])
+            s = replace(s, pose=s.pose @ pose(0, 0, 2.0, 0, 0, 0), projector=projector)
+        out.append(s)
+    return out
+
+
+def moved(frames, name, step):
+    """The frames with one turned about its own origin, in its parent, and shifted."""
+    place = np.array(frames[name].place)
+    place[..., :3, :3] = rotation_exp(step[:3]) @ place[..., :3, :3]
+    place[..., :3, 3] += step[3:]
+    return {**frames, name: replace(frames[name], place=place)}
+
+
+CELL: Any = CELLS["two arms with a scanner each and one between"]
+WORLD, SEEN = CELL[0], CELL[2]
+
+
+def test_what_is_predicted_moves_with_every_frame_as_differences_say() -> None:
+    """Of those that are to be found, and of arms; a circle's turn about its normal is none."""
+    sightings = circled(seen(WORLD, SEEN, np.random.default_rng(2)))
+    for s in sightings[1::2]:
+        assert np.trace(s.projector) == pytest.approx(5.0)
+    names, step = list(WORLD), 1e-6
+    residuals, jacobian, _ = linear_of(WORLD, sightings, {}, {}, moved=names)
+    assert np.abs(residuals).max() < 4 * TURN
+    for k in range(6 * len(names)):
+        by = step * np.eye(6)[k % 6]
+        after = linear_of(moved(WORLD, names[k // 6], by), sightings, {}, {}, moved=[])[0]
+        assert (after - residuals) / step == pytest.approx(jacobian[:, :, k], abs=2e-3)
+
+
+def test_what_carries_both_ends_adds_to_the_sightings_covariance() -> None:
+    sightings = circled(seen(WORLD, SEEN, np.random.default_rng(2)))
+    noise = {"flange": np.diag([1e-4**2] * 3 + [5e-5**2] * 3), "flange2": 4 * COVARIANCE}
+    places = {name: WORLD[name].place for name in ("hand", "plate2")}
+    residuals, jacobian, whiteners = linear_of(WORLD, sightings, places, noise)
+    effects = linear_of(WORLD, sightings, {}, {}, moved=list(noise))[1]
+    assert jacobian.shape == (len(sightings), 6, 12)
+    for s, effect, whitener in zip(sightings, effects, whiteners, strict=True):
+        spread = s.projector @ COVARIANCE @ s.projector
+        for covariance, moves in zip(noise.values(), np.split(effect, 2, axis=1), strict=True):
+            spread = spread + moves @ covariance @ moves.T
+        assert whitener @ spread @ whitener.T == pytest.approx(s.projector, abs=1e-9)
+    rows, errors = rows_of(WORLD, sightings, places, noise)
+    assert rows == pytest.approx(whiteners @ jacobian)
+    assert errors == pytest.approx((whiteners @ residuals[..., None])[..., 0])
+    assert information_of(rows) == pytest.approx(rows.reshape(-1, 12).T @ rows.reshape(-1, 12))
+
+
+def test_a_solution_is_the_least_of_its_errors_with_the_covariance_of_that() -> None:
+    name = "a scanner in the hand and one on the wall that never see the same thing"
+    cell: Any = CELLS[name]
+    frames, unknown, pairs = cell
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    sightings = seen(frames, pairs, np.random.default_rng(4))
+    found = solve_graph(given, sightings)
+    rows, errors = rows_of(given, sightings, found.places, {})
+    information = information_of(rows)
+    slope = np.einsum("nij,ni->j", rows, errors)
+    assert slope @ np.linalg.solve(information, slope) < 1e-9
+    wider = covariance_inflation(6 * len(sightings) - 24, 6)
+    assert found.joint == pytest.approx(np.linalg.inv(information) * wider, rel=1e-6)
+    for k, each in enumerate(unknown):
+        block = found.joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        np.testing.assert_array_equal(found.covariances[each], block)
+        np.testing.assert_array_equal(
+            found.with_joint(2 * found.joint).covariances[each], 2 * block
+        )
+    assert found.squares == pytest.approx((errors**2).sum(axis=1))
+    assert found.inliers.all() and found.movers == 1.0
+    begun = solve_graph(given, sightings, start={n: frames[n].place for n in unknown})
+    for each in unknown:
+        assert begun.places[each] == pytest.approx(found.places[each], abs=1e-8)
+
+
+def test_the_size_of_noise_is_where_half_of_each_pair_then_all_within_the_gate_are_explained() -> (
+    None
+):
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    sightings = [replace(s, covariance=1e-6 * COVARIANCE)
+                 for s in seen(frames, pairs, np.random.default_rng(4))]  # fmt: skip
+    graph = _Graph.of(given, sightings)
+    rng, carried = np.random.default_rng(1), np.tile(COVARIANCE, (2 * N, 1, 1))
+    residuals = 3 * rng.normal(size=(2 * N, 6)) * np.repeat([TURN, SHIFT], 3)
+    residuals[[3, 8]] *= 20
+    size, kept, whiteners = room._weighed(graph, residuals, carried)
+    assert np.flatnonzero(~kept).tolist() == [3, 8]
+    squares = (residuals**2 / np.diag(COVARIANCE)).sum(axis=1)
+    exact = squares[kept].sum() / (6 * kept.sum() - 18)
+    assert exact < size < exact * SIZES[1] / SIZES[0]
+    assert whiteners == pytest.approx(
+        np.tile(np.diag(1 / np.sqrt(np.diag((size + 1e-6) * COVARIANCE))), (2 * N, 1, 1))
+    )
+    edge = np.sqrt(chi2_quantile(GATE, 6) * size) * SHIFT
+    for off, inside in ((0.97, True), (1.03, False)):
+        residuals[5] = [0, 0, 0, off * edge, 0, 0]
+        assert room._weighed(graph, residuals, carried)[1][5] == inside
+    squares[5] = 1e6
+    middles = room._middles(graph, squares)
+    assert middles[[0, 1]] == pytest.approx([np.median(squares[::2]), np.median(squares[1::2])])
+
+
+def test_the_first_of_the_sizes_below_a_level_is_taken() -> None:
+    assert _first_below(lambda size: 1.0 / size, 1.0 / SIZES[60]) == SIZES[60]
+    assert _first_below(lambda size: 1.0 / size, 0.999 / SIZES[60]) == SIZES[61]
+    assert _first_below(lambda size: 0.0, 1.0) == SIZES[0] == pytest.approx(1e-3)
+    assert _first_below(lambda size: 2.0, 1.0) == SIZES[-1] == pytest.approx(1e4)
+
+
+def test_what_would_be_seen_again_is_what_is_told_with_it_moved_either_way() -> None:
+    """By 20 deg, or by 0.1 m; errors alike in all directions turn with what is seen."""
+    names = ["base2", "hand", "hand2", "between", "plate", "plate2"]
+    even = np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
+    sightings = [
+        replace(s, covariance=even) for s in seen(WORLD, SEEN, np.random.default_rng(0), 0.0)
+    ]
+    given = {n: Frame(f.parent) if n in names else f for n, f in WORLD.items()}
+    graph, places = _Graph.of(given, sightings), {n: WORLD[n].place for n in names}
+    told = graph.seen_again(places, linear_of(given, sightings, places, {})[2])
+    assert len(told) == 12
+    for name, twist in (("flange", np.eye(6)[1]), ("flange2", np.eye(6)[3])):
+        wanted = np.zeros((36, 36))
+        for sign in (1.0, -1.0):
+            step = sign * twist * np.repeat([np.radians(20), 0.1], 3)
+            rows, _ = rows_of(moved(given, name, step), sightings, places, {})
+            wanted = wanted + information_of(rows)
+        assert told[name, tuple(twist)] == pytest.approx(wanted, rel=1e-6, abs=1.0)
+    circles = circled(seen(WORLD, SEEN, np.random.default_rng(0), 0.0))
+    graph = _Graph.of(given, circles)
+    told = graph.seen_again(places, linear_of(given, circles, places, {})[2])
+    step = np.array([0, np.radians(20), 0, 0, 0, 0])
+    wanted = np.zeros((36, 36))
+    for sign in (1.0, -1.0):
+        frames = moved(WORLD, "flange", sign * step)
+        again = circled(seen(frames, SEEN, np.random.default_rng(0), 0.0))
+        wanted = wanted + information_of(
+            rows_of(moved(given, "flange", sign * step), again, places, {})[0]
+        )
+    assert told["flange", (0, 1, 0, 0, 0, 0)] == pytest.approx(wanted, rel=1e-6, abs=1.0)

@@ -99,7 +99,7 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
     from scipy.optimize import minimize
 
     bounds = [(np.log(SMALLEST), np.log(LARGEST))] * 4
-    start = np.log([1e-4, 1e-4, 1e-4, 1e-4])
+    start = np.full(4, np.log(1e-4))
     best = minimize(unlikelihood, start, method="L-BFGS-B", bounds=bounds)
     return _sized(bare, best.x)
 
