@@ -26,8 +26,7 @@ def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> 
         bins: Number of equal sectors about the centre; those without points give none.
         outer: Farthest if true, nearest otherwise.
     """
-    at_edge = fringe(flat, centre, bins, 0.0, outer)
-    sector = sectors(flat[at_edge] - centre, bins)
+    at_edge, sector = _fringe(flat, centre, bins, 0.0, outer)
     return at_edge[np.unique(sector, return_index=True)[1]]
 
 
@@ -36,12 +35,20 @@ def fringe(flat: Floats, centre: Floats, bins: int, depth: float, outer: bool = 
 
     Arguments as for :func:`edge_points`.
     """
+    return _fringe(flat, centre, bins, depth, outer)[0]
+
+
+def _fringe(
+    flat: Floats, centre: Floats, bins: int, depth: float, outer: bool
+) -> tuple[Indices, Indices]:
+    """Return what :func:`fringe` does, and the sectors of those points."""
     offsets = flat - centre
     reach = distances(offsets) * (1 if outer else -1)
     sector = sectors(offsets, bins)
     best = np.full(bins, -np.inf)
     np.maximum.at(best, sector, reach)
-    return np.flatnonzero(reach >= best[sector] - depth)
+    near = np.flatnonzero(reach >= best[sector] - depth)
+    return near, sector[near]
 
 
 def sectors(offsets: Floats, bins: int) -> Indices:

@@ -82,9 +82,8 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     Returns:
         (TICKS,), or None when there are too few points to see a hole.
     """
-    radius = distances(flat)
-    ring = flat[np.abs(radius - pitch) < half_width]
-    turn = np.arctan2(ring[:, 1], ring[:, 0]) / (2 * np.pi) * TICKS
+    x, y = flat.T.compress(np.abs(distances(flat) - pitch) < half_width, axis=1)
+    turn = np.arctan2(y, x) / (2 * np.pi) * TICKS
     count = np.bincount(np.floor(turn).astype(np.intp) % TICKS, minlength=TICKS).astype(float)
     # As narrow a window as the points allow, half a hole wide at most.
     for reach in range(2, max(3, int(half_width / pitch * TICKS / (2 * np.pi)) + 1)):

@@ -95,6 +95,7 @@ def cauchy_curvature(residual: Floats, scale: float) -> Floats:
 def circle_jacobian(circles: Circles, points: Floats, ring: NDArray[np.intp]) -> Floats:
     """Return the (N, 2 + k) derivative of :func:`circle_residuals` to centre and radii."""
     offsets = points - circles.centre
-    radius = np.maximum(distances(offsets), 1e-9)
-    of_radii = -(ring[:, None] == np.arange(len(circles.radii))).astype(np.float64)
-    return np.hstack([-offsets / radius[:, None], of_radii])
+    rows = np.zeros((2 + len(circles.radii), len(points)))
+    np.divide(-offsets.T, np.maximum(distances(offsets), 1e-9), out=rows[:2])
+    rows[2 + ring, np.arange(len(points))] = -1.0
+    return rows.T

@@ -169,7 +169,7 @@ def _feature(
     axes = basis_of_plane(plane.normal)
     heights = plane.heights(points)
     near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
-    about_centre = (points.compress(near, axis=0) - centre) @ axes[:2].T
+    about_centre = Plane(centre, plane.normal).flatten(points.compress(near, axis=0))
     of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
     to_flange = flange.details.thickness if flange.bore is None else 0.0
     return CircleFeature(

@@ -126,7 +126,7 @@ def _edges_near(
     found = []
     for k, (low, high) in enumerate(SEARCHED[: len(nominal)]):
         inside = (reach > low * nominal[k]) & (reach < high * nominal[k])
-        near, outer, count = flat.compress(inside, axis=0), k == 0, int(bins[k])
+        near, outer, count = flat.T.compress(inside, axis=1).T, k == 0, int(bins[k])
         found.append(
             near[fringe(near, centre, count, depth, outer)]
             if depth
