@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from flangeye.batch.dataset import Dataset
 from flangeye.batch.regress import read_manifests
 from flangeye.cli.commands import app
 from flangeye.files.bundled import bundled
@@ -81,6 +82,19 @@ def test_each_manifest_is_compared_and_a_second_start_runs_nothing(folder: Path)
     again = regress()
     assert again.exit_code == 0, again.output
     assert len(list(Path("regressions").glob("*/result.json"))) == 1
+
+
+def test_a_folder_that_another_batch_writes_to_is_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest(folder)
+    monkeypatch.setattr(Dataset, "rows", lambda *_: [])  # as if the other had settled its own
+    error = regress().exception
+    assert getattr(error, "exit_code", None) == 2
+    assert str(error).startswith("regressions: holds no outcome of points_rec_")
+    assert str(error).endswith(
+        "; another batch writes to this folder: wait for its end, or give --out"
+    )
 
 
 @pytest.mark.parametrize(

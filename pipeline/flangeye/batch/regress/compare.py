@@ -62,7 +62,8 @@ def compare(
         console: Where progress is shown.
 
     Raises:
-        FlangeyeError: The batch cannot start, or a manifest's recipe is wrong.
+        FlangeyeError: The batch cannot start, another one uses its folder, or a manifest's recipe
+            is wrong.
     """
     there = {file: m for file, m in manifests.items() if _recording(file, m).exists()}
     sessions = {file: _session(file, m, registry) for file, m in there.items()}
@@ -108,7 +109,14 @@ def _run(
     run_sessions(request, out, once, {}, software_of(registry), console)
     rows = Dataset(place_at(out), columns_of({})).rows(Ledger(once))
     fields = SessionOutcome.__dataclass_fields__
-    return {row["session"]: SessionOutcome(**{name: row[name] for name in fields}) for row in rows}
+    found = {row["session"]: SessionOutcome(**{name: row[name] for name in fields}) for row in rows}
+    lost = [session.id for session in once if session.id not in found]
+    if lost:
+        raise FlangeyeError(
+            f"{out}: holds no outcome of {lost[0]}; another batch writes to this folder: wait for "
+            "its end, or give --out"
+        )
+    return found
 
 
 def _compared(
