@@ -1,13 +1,14 @@
-"""The simplest layout, for recordings of one's own: a folder of clouds and a file of poses.
+"""The simplest layout, for recordings of one's own: a folder of scans and a file of poses.
 
-``poses.csv`` has a heading and a row for each cloud::
+``poses.csv`` has a heading and a row for each cloud or image::
 
     cloud,x_mm,y_mm,z_mm,qx,qy,qz,qw
     scan_001.pcd,412.5,-120.0,310.2,0.0,1.0,0.0,0.0
 
-The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` (a file name);
+The pose is ``base_T_flange`` as the controller shows it. Columns: ``cloud`` or
+``image`` (a file name; both, where they differ in more than their ending);
 ``x_m, y_m, z_m`` or ``x_mm, y_mm, z_mm``; ``qx, qy, qz, qw`` or a rotation vector
-``rx_rad, ry_rad, rz_rad``; and if wanted ``id`` (the cloud's name without its ending), ``role``
+``rx_rad, ry_rad, rz_rad``; and if wanted ``id`` (the scan's name without its ending), ``role``
 (``calibration`` or ``verification``), ``time_ns`` and joint angles ``j1_rad, j2_rad, …``. The
 flange of a second arm, in that arm's own base, has the same columns with ``second_`` before their
 names (``second_x_mm, …, second_qw``).
@@ -36,6 +37,7 @@ from pydantic import Field
 from flangeye import Params, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit, write_cloud
 from flangeye.files.recording import Archive, NotThisLayout, Recording
+from flangeye.files.scans import IMAGES, with_companion
 from flangeye.maths.geometry import quaternion_from_rotation
 from flangeye.types import FLANGE, FLANGE2, Capture, Floats, Transform
 from flangeye_plugins.reader.folder_poses import SECOND, ArmPose, PoseRow, read_poses
@@ -56,7 +58,7 @@ class FolderParams(Params):
 
 @part("reader.folder")
 def folder(path: Path, params: FolderParams) -> Archive:
-    """Read a folder of clouds with poses.csv, poses.yaml or poses.json beside them."""
+    """Read a folder of clouds or images with poses.csv, poses.yaml or poses.json beside them."""
     file = _poses_file(path)
     poses, lines = read_poses(file)
     unit = _unit(file, poses.unit, params.unit)
@@ -131,13 +133,18 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
 
 
 def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
-    name = row.id or Path(row.cloud).stem
+    cloud, image = (None if name is None else root / name for name in (row.cloud, row.image))
+    if cloud and cloud.suffix.lower() in IMAGES:
+        cloud, image = None, image or cloud
+    name = row.id or (cloud or image or root).stem
     joints = None if row.joints_rad is None else np.array(row.joints_rad)
     called = f"{where}: pose '{name}'"
     poses = {FLANGE: _pose(called, row, unit)}
     if row.second is not None:
         poses[FLANGE2] = _pose(f"{called}, second", row.second, unit)
-    return Recording(name, poses, root / row.cloud, None, joints, row.role, row.time_ns)
+    return Recording(
+        name, poses, cloud, joints=joints, role=row.role, time_ns=row.time_ns, image=image
+    )
 
 
 def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
@@ -148,7 +155,7 @@ def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
 
 
 def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
-    known = {recording.cloud for recording in recordings}
+    known = {with_companion(recording).cloud for recording in recordings}
     for path in sorted(file.parent.iterdir()):
         if path.suffix.lower() in UNPAIRED_SUFFIXES and path not in known:
             raise StageError(

@@ -38,12 +38,19 @@ class ArmPose(BaseModel):
 class PoseRow(ArmPose):
     """One pose, as ``poses.yaml`` has it; ``second`` is that of a second arm, in its own base."""
 
-    cloud: str = Field(min_length=1)
+    cloud: str | None = Field(None, min_length=1)
+    image: str | None = Field(None, min_length=1)
     id: str | None = None
     second: ArmPose | None = None
     role: Role = "calibration"
     time_ns: int = Field(0, ge=0)
     joints_rad: tuple[float, ...] | None = None
+
+    @model_validator(mode="after")
+    def _one_scan(self) -> Self:
+        if self.cloud is None and self.image is None:
+            raise ValueError("names no scan; it needs 'cloud' or 'image', a file beside this one")
+        return self
 
 
 class PosesFile(BaseModel):
@@ -63,7 +70,7 @@ _POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
 }
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _VECTOR = ("rx_rad", "ry_rad", "rz_rad")
-_OTHERS = ("cloud", "id", "role", "time_ns")
+_OTHERS = ("cloud", "image", "id", "role", "time_ns")
 SECOND = "second_"
 """What the columns of a second arm's pose begin with."""
 _JOINT = re.compile(r"j[1-9]\d?_rad")

@@ -91,7 +91,7 @@ def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
         (HEADING.replace("z_mm,", "") + ROW,
          ":1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing"),
         (HEADING.replace("qw", "w") + ROW,
-         ":1: column 'w' is not known; known: cloud, id, role, time_ns, x_m, y_m, z_m, x_mm, y_mm, "
+         ":1: column 'w' is not known; known: cloud, image, id, role, time_ns, x_m, y_m, z_m, x_mm, y_mm, "
          "z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, second_x_m, …"),
         (HEADING.replace("qw", "qx") + ROW, ":1: column 'qx' comes twice"),
         (HEADING.replace("cloud", "cloud,j1_rad,j2_rad") + ROW.replace(".pcd,", ".pcd,1,,"),
@@ -104,7 +104,8 @@ def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
          "number"),
         (HEADING + ROW.replace("412.5", "nan"),
          ":2: poses.0.position.0: Input should be a finite number"),
-        (HEADING + ROW.replace("a.pcd", ""), ":2: poses.0.cloud: Field required"),
+        (HEADING + ROW.replace("a.pcd", ""), ":2: poses.0: names no scan; it needs 'cloud' or 'image', "
+         "a file beside this one"),
         (HEADING.replace("qx,qy,qz,qw", "id") + "a.pcd,1,2,3,x\n",
          ":2: poses.0: needs a quaternion or a rotation vector, one of the two"),
         (HEADING + ROW.replace("0,1,0,0", "0,1,0.5,0"),
@@ -139,6 +140,19 @@ def test_a_heading_alone_is_an_archive_without_poses(tmp_path: Path) -> None:
     with pytest.raises(StageError) as error:
         check_ids(archive)
     assert str(error.value) == f"{tmp_path}: holds no poses"
+
+
+@pytest.mark.parametrize("column", ["cloud", "image", "cloud,image"])
+def test_images_may_stand_in_place_of_clouds(tmp_path: Path, column: str) -> None:
+    """A cloud of an image's name is its companion, not one that somebody forgot."""
+    (tmp_path / "a.png").touch()
+    (tmp_path / "a.ply").touch()
+    cells = {"cloud,image": "a.ply,a.png"}.get(column, "a.png")
+    text = HEADING.replace("cloud", column) + ROW.replace("a.pcd", cells)
+    (tmp_path / "poses.csv").write_text(text)
+    (recording,) = folder(tmp_path, FolderParams()).recordings
+    assert (recording.id, recording.image) == ("a", tmp_path / "a.png")
+    assert recording.cloud in (None, tmp_path / "a.ply")
 
 
 def test_a_cloud_without_a_pose_is_refused(tmp_path: Path) -> None:
