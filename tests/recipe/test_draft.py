@@ -458,6 +458,8 @@ def two_poses_of_nobody(folder):
         (sample, ["--target", "cube"],
          "--target cube: is none of flange, sphere, charuco, checkerboard, circles, aruco, with "
          "parameters"),
+        (sample, ["--target", "charuco: {columns: 8}"],
+         "--target charuco.rows: is missing\n--target charuco.square: is missing\n"),
         (sample, ["--reader", "table"], "--reader table.rotation: is missing\n--reader table.length: "),
         (odd_heading, ["--table", "a.csv"],
          "--table a.csv: is no table of poses; known: log.csv"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,8 @@ from flangeye.cli.app import app, load_plugins
 from flangeye.cli.saying import say
 from flangeye.errors import RecipeError
 
+TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)
+"""Where mistakes in a target are, in a recipe that was drafted."""
 Answer = str | None
 """To a question that a person is asked otherwise."""
 
@@ -105,9 +108,10 @@ def init(  # noqa: PLR0913  one for each option
     out.write_text(draft.text, "utf-8")
     try:
         checked = load_recipe(out, registry)
-    except RecipeError:
+    except RecipeError as error:
         out.unlink()
-        raise
+        # Of the recipe that is not kept nobody knows: its target is what was asked for.
+        raise RecipeError(TARGETS.sub("--target ", str(error))) from None
     for line in (*draft.told, *(f"assumed: {line}" for line in questions.assumed)):
         say(line)
     say(f"{out}: ok, {len(checked.steps)} steps; next: flangeye run {out}")

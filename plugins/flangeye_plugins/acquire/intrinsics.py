@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from flangeye import Params, StageError
 from flangeye.models.boards import Board, Dictionary, Kind
 from flangeye.models.corners import Corners, find_corners
-from flangeye.types import Floats, Image
+from flangeye.types import Floats, Image, Rejected
 from flangeye.units import Length, param
 
 FEWEST_VIEWS = 6
@@ -112,15 +112,16 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     if len(sizes) > 1:
         raise StageError(f"images of {len(sizes)} sizes are not one camera's")
     (size,) = sizes
-    seen = {name: corners for name, pixels in images.items() if (corners := _seen(board, pixels))}
-    _require_views(len(seen), len(images))
+    looked = {n: find_corners(board, Image(pixels, np.eye(3))) for n, pixels in images.items()}
+    seen = {name: found for name, found in looked.items() if isinstance(found, Corners)}
+    _require_views(len(seen), looked)
     _require_tilted(seen)
     lens = camera_of(seen, size, start)
     kept = {
         n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if not _outlies(e, lens[1])
     }
     if len(kept) < len(seen):
-        _require_views(len(kept), len(images))
+        _require_views(len(kept), looked)
         lens = camera_of(kept, size, start)
     left_out = tuple(name for name in images if name not in kept)
     found = lens[0]._replace(left_out=left_out)
@@ -128,16 +129,13 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     return found
 
 
-def _seen(board: Board, pixels: Grey) -> Corners | None:
-    corners = find_corners(board, Image(pixels, np.eye(3)))
-    return corners if isinstance(corners, Corners) else None
-
-
-def _require_views(seen: int, count: int) -> None:
+def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
     if seen < FEWEST_VIEWS:
+        missed = {n: found.reason for n, found in looked.items() if isinstance(found, Rejected)}
+        why = next((f"; {name}: {reason}" for name, reason in missed.items()), "")
         raise StageError(
-            f"{seen} of {count} images show the board, {FEWEST_VIEWS} are needed to tell the "
-            "camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]"
+            f"{seen} of {len(looked)} images show the board, {FEWEST_VIEWS} are needed to tell the "
+            f"camera; take more, or write focal_length: [fx, fy] and principal_point: [cx, cy]{why}"
         )
 
 

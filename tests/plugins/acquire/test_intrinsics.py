@@ -1,5 +1,6 @@
 """A camera nobody calibrated: found by the views of the board, or refined, with how well."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,9 @@ def test_too_few_or_too_equal_views_are_refused(views: Any) -> None:
     few = {name: views[name] for name in "0123"}
     with pytest.raises(StageError, match="^4 of 4 images show the board, 6 are needed to tell the"):
         lens_of(few, BOARD)
+    other = replace(BOARD, dictionary="6X6_250")
+    with pytest.raises(StageError, match=r"^0 of 4 .*; 0: 0 corners of .*: write dictionary: "):
+        lens_of(few, other)
     with pytest.raises(StageError, match="tilt the board by 20 deg and more to both sides"):
         lens_of(images(BOARD, 7, tilt=0.02), BOARD)
     with pytest.raises(StageError, match="^images of 2 sizes are not one camera's"):
