@@ -71,6 +71,8 @@ def test_a_whole_scanner_can_be_simulated(tmp_path: Path) -> None:
          "error: r.txt: a model's file ends in .yaml"),
         (["new-scanner", "acme", "--near", "3", "--far", "900 mm"],
          "error: acme.yaml:2: near: '3' has no unit: a length needs one"),
+        (["new-scanner", "acme", "--near", "900 mm", "--far", "300 mm"],
+         "error: acme.yaml:1: near, the least distance it sees at, is not below far"),
         (["new-robot", "mine", "--urdf", "nowhere.urdf"], "error: nowhere.urdf: "),
     ],
 )  # fmt: skip
@@ -84,6 +86,15 @@ def test_a_wrong_value_is_one_line_and_leaves_no_file(
     assert told.stderr.startswith(line)
     assert len(told.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["new-robot", "new-scanner"])
+def test_a_file_that_is_there_is_told_before_anything_is_asked(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "mine.yaml"
+    out.touch()
+    done = CliRunner().invoke(app, [kind, "mine", "--out", str(out)])
+    assert str(done.exception) == f"{out}: is there already; take another name with --out"
+    assert not done.output
 
 
 def test_a_kind_lists_its_stages() -> None:

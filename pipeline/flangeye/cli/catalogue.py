@@ -31,7 +31,7 @@ def scanners() -> None:
         s = load_model("scanners", name)
         see = f"{1e3 * s.near:.0f} to {1e3 * s.far:.0f} mm"
         say(
-            f"{name:15}  {s.maker:10}  {s.principle:16}  {see:15}  {s.columns} x {s.rows}  "
+            f"{name:17}  {s.maker:10}  {s.principle:16}  {see:15}  {s.columns} x {s.rows}  "
             f"noise {1e3 * s.temporal_noise:g} mm"
         )
 
@@ -76,10 +76,11 @@ def new_robot(  # noqa: PLR0913  one for each option
     out: Out = None,
 ) -> None:
     """Create a robot model from a URDF, or from its joints, given or asked for."""
-    from flangeye.models.new_model import robot_of_joints, write_robot
+    from flangeye.models.new_model import require_new, robot_of_joints, write_robot
     from flangeye.models.urdf import robot_from_urdf
 
     path = out or Path(f"{name}.yaml")
+    require_new(path)
     if urdf is not None:
         found = robot_from_urdf(urdf, base, flange, standard)
         robot = found.model_copy(update={"model": name, "maker": maker})
@@ -125,8 +126,10 @@ def new_scanner(  # noqa: PLR0913  one for each option
     out: Out = None,
 ) -> None:
     """Create a scanner model; archives need only the range, simulation all options."""
-    from flangeye.models.new_model import write_scanner
+    from flangeye.models.new_model import require_new, write_scanner
 
+    path = out or Path(f"{name}.yaml")
+    require_new(path)
     columns, rows = pixels or (None, None)
     values = {
         "model": name,
@@ -138,4 +141,4 @@ def new_scanner(  # noqa: PLR0913  one for each option
     }  # fmt: skip
     if principle or pixels or field or noise or error:
         values |= {"maker": "", "source": "stated when the file was made"}
-    say(write_scanner(out or Path(f"{name}.yaml"), values))
+    say(write_scanner(path, values))

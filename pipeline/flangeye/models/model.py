@@ -36,8 +36,8 @@ def read_model(path: Path, cls: type[M]) -> M:
         return cls.model_validate(document.data)
     except ValidationError as error:
         problems = [
-            f"{path}:{document.line(e['loc'])}: {'.'.join(map(str, e['loc']))}: "
-            f"{sentence(e, cls, e['input'])}"
+            ": ".join([f"{path}:{document.line(e['loc'])}", *place, sentence(e, cls, e["input"])])
             for e in error.errors()
+            for place in [[".".join(map(str, e["loc"]))] if e["loc"] else []]
         ]
         raise RecipeError("\n".join(problems)) from None

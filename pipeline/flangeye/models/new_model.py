@@ -81,8 +81,17 @@ def write_scanner(path: Path, values: Mapping[str, Any]) -> str:
 
 
 def _write(path: Path, data: Mapping[str, Any]) -> None:
+    require_new(path)
+    path.write_text(yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True), "utf-8")
+
+
+def require_new(path: Path) -> None:
+    """Refuse to write a model's file there, before anything is asked for it.
+
+    Raises:
+        RecipeError: The file exists, or does not end as a model's file does.
+    """
     if path.suffix not in (".yaml", ".yml"):
         raise RecipeError(f"{path}: a model's file ends in .yaml")
     if path.exists():
         raise RecipeError(f"{path}: is there already; take another name with --out")
-    path.write_text(yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True), "utf-8")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flangeye.models.model import Model
 from flangeye.types import Floats
@@ -21,6 +21,12 @@ class ScannerData(Model):
     model: str
     near: Length | None = None
     far: Length | None = None
+
+    @model_validator(mode="after")
+    def _near_before_far(self) -> Self:
+        if self.near is not None and self.far is not None and not 0 <= self.near < self.far:
+            raise ValueError("near, the least distance it sees at, is not below far")
+        return self
 
     @property
     def range(self) -> tuple[float, float]:
