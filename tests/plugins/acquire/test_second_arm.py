@@ -93,8 +93,8 @@ ROW = "a.pcd,1,2,3,0,1,0,0"
         ("second_x_mm,second_y_mm,second_z_mm", "1,2,3",
          "poses.csv:2: poses.0.second: needs a quaternion or a rotation vector, one of the two"),
         ("second_id", "7",
-         "poses.csv:1: column 'second_id' is not known; known: cloud, id, role, time_ns, x_m, y_m, "
-         "z_m, x_mm, y_mm, z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, "
+         "poses.csv:1: column 'second_id' is not known; known: cloud, image, id, role, time_ns, x_m, "
+         "y_m, z_m, x_mm, y_mm, z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, "
          "second_x_m, …"),
     ],
 )  # fmt: skip
