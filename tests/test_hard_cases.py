@@ -481,7 +481,7 @@ def test_a_folder_in_which_anything_was_recorded_is_kept(
     assert code == 2
     assert len(read_run(tmp_path / "kept" / "run.mcap").poses) == 6
     assert "what was gathered is in kept/run.mcap" in err
-    assert "flangeye run toy --from kept/run.mcap --at segment.toy --set PATH=VALUE" in err
+    assert "flangeye run toy.yaml --from kept/run.mcap --at segment.toy --set PATH=VALUE" in err
 
 
 def test_results_are_written_whole_or_not_at_all(

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from flangeye.cli.app import complete_recipe
 from flangeye.cli.commands import app
 from flangeye.models.loading import load_model, model_names
-from flangeye.plugin.registry import load_registry
+from flangeye.plugin.registry import PluginNotFoundError, load_registry
 from flangeye.recipe.load import load_recipe
 
 
@@ -99,6 +99,8 @@ def test_a_file_that_is_there_is_told_before_anything_is_asked(kind: str, tmp_pa
 
 def test_a_kind_lists_its_stages() -> None:
     assert "solve.svd" in flangeye("stages", "solve")
+    with pytest.raises(PluginNotFoundError, match="no kind of stages 'slove'; did you mean solve"):
+        flangeye("stages", "slove")
     assert "reader.table" in flangeye("stages", "reader")
 
 

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from typer.core import TyperGroup
 from typer.main import get_group
+from typer.testing import CliRunner
 
 from flangeye import __version__
 from flangeye.cli.commands import app, named_in
@@ -173,12 +174,31 @@ def test_check_stages_plugins_schema(
     assert json.loads(flangeye("schema", "--result")[1])["title"] == "Result"
 
 
+def test_what_was_measured_before_is_shown_as_that(tmp_path: Path) -> None:
+    """Points of a camera that is the base."""
+    rows = [(0.1 * k, 0.1 * (k % 3), 0.1 * (k % 2), 0.2 * k, 0.1, 0.1 * k) for k in range(5)]
+    (tmp_path / "t.csv").write_text("\n".join(",".join(map(str, r + r[:3])) for r in rows))
+    table = (
+        "{table: {file: t.csv, rotation: vector, angle: rad, length: m, pose: base_T_flange, "
+        "columns: [1, 2, 3, 4, 5, 6], target: {columns: [7, 8, 9], rotation: point, length: m}}}"
+    )
+    acquire = f"acquire.centres: {{path: ., reader: {table}}}"
+    (tmp_path / "points.yaml").write_text(f"title: Points\nsteps:\n  - {acquire}\n  - solve.svd\n")
+    run, recipe = str(tmp_path / "run"), str(tmp_path / "points.yaml")
+    CliRunner().invoke(app, ["run", recipe, "--out", run], catch_exceptions=False)
+    shown = CliRunner().invoke(app, ["show", run], catch_exceptions=False).output
+    assert shown.splitlines()[1] == "5 of 5 measurements went through"
+
+
 def test_a_folder_is_kept_once_something_was_gathered(
     flangeye: Callable[..., Any], toy_recipe: Path, tmp_path: Path
 ) -> None:
     code, _, err = flangeye("run", toy_recipe, "--set", "steps.0.count=2", "--out", "kept")
     assert code == 2
-    assert err.splitlines()[1] == "what was gathered is in kept/run.mcap"
+    assert (
+        err.splitlines()[1]
+        == "what was gathered is in kept/run.mcap; flangeye report kept shows it"
+    )
     assert flangeye("show", "kept/run.mcap")[0] == 0
 
 
@@ -250,9 +270,9 @@ def test_ctrl_c_keeps_what_was_gathered(
         code, _, err = flangeye("run", toy_recipe, "--out", "a")
     assert code == 130
     assert err.splitlines()[-3:] == [
-        "what was gathered is in a/run.mcap",
-        "with other parameters: flangeye run toy --from a/run.mcap --at fit.toy --set PATH=VALUE "
-        "(to do segment.toy again, record with --set log.clouds=full)",
+        "what was gathered is in a/run.mcap; flangeye report a shows it",
+        f"with other parameters: flangeye run {toy_recipe} --from a/run.mcap --at fit.toy --set "
+        "PATH=VALUE (to do segment.toy again, record with --set log.clouds=full)",
         "error: stopped by Ctrl-C",
     ]
     assert "3 went through" in flangeye("show", "a/run.mcap")[1]

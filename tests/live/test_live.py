@@ -53,9 +53,9 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
     assert process.returncode == 130
     assert time.monotonic() - sent < 20
     assert err.splitlines()[-4:] == [
-        "what was gathered is in run/run.mcap",
-        "with other parameters: flangeye run cell --from run/run.mcap --at fit.rim --set PATH=VALUE "
-        "(to do segment.flange again, record with --set log.clouds=full)",
+        "what was gathered is in run/run.mcap; flangeye report run shows it",
+        f"with other parameters: flangeye run {recipe} --from run/run.mcap --at fit.rim --set "
+        "PATH=VALUE (to do segment.flange again, record with --set log.clouds=full)",
         "resume it: flangeye run --resume run --move",
         "error: stopped by Ctrl-C",
     ]

@@ -303,4 +303,5 @@ def test_a_log_is_gone_on_with_at_the_first_step_whose_input_it_holds(
     toy_registry: Registry, clouds: str, hint: str
 ) -> None:
     text = f"log: {{clouds: {clouds}}}\n{TOY_RECIPE}"
-    assert restart_hint(parse_recipe(text, "toy", toy_registry), Path("old.mcap")) == hint
+    recipe = parse_recipe(text, "toy", toy_registry)
+    assert restart_hint(recipe, "toy", Path("old.mcap")) == hint

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -134,7 +135,7 @@ def run(  # noqa: PLR0913  one for each option
         start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline, json_))
         folder = RunFolder.create(checked.name, results)
         with _plan_as_json() if json_ else nullcontext():
-            result = _record(checked, registry, folder, start)
+            result = _record(checked, recipe or checked.name, registry, folder, start)
         if result.status == "refused" and checked.header.cell is None:
             _advise(folder.log, registry)
     if result.status == "refused" or (result.weld and not result.weld.completed):
@@ -219,7 +220,9 @@ def _point(
     return restart_at(log, recipe, at, leave_out)
 
 
-def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start) -> Result:
+def _record(
+    recipe: Recipe, called: str, registry: Registry, folder: RunFolder, start: Start
+) -> Result:
     """Run with a log and a progress bar, and say what came of it."""
     from rich.console import Console
 
@@ -234,8 +237,10 @@ def _record(recipe: Recipe, registry: Registry, folder: RunFolder, start: Start)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
-            say(with_urls(f"what was gathered is in {folder.log}"), err=True)
-            say(with_urls(f"with other parameters: {restart_hint(recipe, folder.log)}"), err=True)
+            seen = f"flangeye report {quote(str(folder.path))} shows it"
+            again = restart_hint(recipe, called, folder.log)
+            say(with_urls(f"what was gathered is in {folder.log}; {seen}"), err=True)
+            say(with_urls(f"with other parameters: {again}"), err=True)
             if resumable(recipe):
                 moving = " --move" if start.motion.allowed else ""
                 say(

@@ -244,7 +244,11 @@ def print_log(console: Console, log: RunLog) -> None:
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
     _say(console, f"{log.path}: {state}")
-    _say(console, f"{len(log.poses)}{expected} captures arrived, {len(log.finished)} went through")
+    # Centres or poses of a target that somebody had found already are no captures.
+    measured = any(entry.stage.startswith("acquire.") for entry in log.entries)
+    arrived = "" if measured else f"{len(log.poses)}{expected} captures arrived, "
+    went = f"{len(log.finished)}{expected} measurements" if measured else f"{len(log.finished)}"
+    _say(console, f"{arrived}{went} went through")
     for note in log.source.notes if log.source else ():
         _say(console, f"note: {note}")
     table = Table(box=None, pad_edge=False, header_style="bold")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple, Protocol, TypeVar, get_args
 
 from flangeye import types as t
@@ -328,12 +329,19 @@ def resumable(recipe: Recipe) -> bool:
     return any(t.Resumed in get_args(need) for need in recipe.steps[0].stage.needs.values())
 
 
-def restart_hint(recipe: Recipe, log: Path) -> str:
-    """Return the command that runs on what a log holds, with other parameters."""
+def restart_hint(recipe: Recipe, called: str, log: Path) -> str:
+    """Return the command that runs on what a log holds, with other parameters.
+
+    Args:
+        recipe: What was run.
+        called: How it was called: a name, or a path.
+        log: What it left.
+    """
     later = [step.stage for step in recipe.steps if step.stage.kind != "acquire"]
     whole = recipe.header.log.clouds == "full"
     again = [stage for stage in later if whole or stage.kind != "segment"]
-    command = f"flangeye run {recipe.name} --from {log} --at {again[0].name} --set PATH=VALUE"
+    run = f"flangeye run {quote(called)} --from {quote(str(log))}"
+    command = f"{run} --at {again[0].name} --set PATH=VALUE"
     if again[0] is later[0]:
         return command
     return f"{command} (to do {later[0].name} again, record with --set log.clouds=full)"
