@@ -1,9 +1,16 @@
 """Observations of known truth for every configuration, drawn in a moment."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from flangeye.handeye.components import Noise as Beyond
+from flangeye.handeye.likelihood import Problem, Solution, climb, weigh
+from flangeye.handeye.loop import ArmNoise, Unknowns
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.nuisance import Nuisance, nuisance_of
+from flangeye.handeye.starts import start_of
 from flangeye.maths.geometry import (
     hat,
     invert,
@@ -85,6 +92,7 @@ def moves(rng, n, tilt, reach=0.15):
 
 TILT = np.radians(17)
 ISSUE = Noise()
+NOTHING_BEYOND = Beyond(0.0, 0.0)
 
 
 def session(configuration, rng, n=15, tilt=TILT, noise=ISSUE, feature="pose", poses=None):
@@ -229,3 +237,30 @@ def walking(made, rng, turn=5e-4, shift=2e-4):
         moved = Transform(CAMERA, TARGET, invert(camera) @ motion @ camera @ seen)
         out.append(replace(o, feature=PoseFeature(moved, o.feature.covariance)))
     return replace(made, observations=out)
+
+
+def given(name: str, feature: str, n: int, noise: Noise = ISSUE, **more: Any) -> Problem:
+    """Return the problem of a session of n measurements; its noise is stated, where not said."""
+    configuration = CONFIGURATIONS[name]
+    made = session(configuration, np.random.default_rng(n), n, 0.4, noise, feature)
+    measured = measurements_of(made.observations, configuration, Arm(ROBOT))
+    more = {"stated": True, **more}
+    return Problem(measured, loop_of(configuration), ArmNoise(2e-4, 5e-5), 1e-3, **more)
+
+
+def start(problem: Problem) -> Unknowns:
+    """Return where its search begins."""
+    return start_of(problem.measurements, problem.loop, np.random.default_rng(0))
+
+
+def fitted(problem: Problem, beyond: Beyond = NOTHING_BEYOND) -> Solution:
+    """Return the most likely unknowns, all measurements taking part."""
+    every = np.ones(len(problem.measurements))
+    return climb(problem, weigh(problem, start(problem), beyond, every), beyond, every)
+
+
+def two_numbers(n: int, sized: bool = False) -> Nuisance:
+    """Return two nuisances of random effects, expected at values of their own."""
+    effects = np.random.default_rng(7).normal(size=(3, n, 6, 2))
+    told = nuisance_of(effects[0], effects[1], 2e-4, sized, effects[2])
+    return replace(told, mean=np.array([1e-4, -2e-4]))

@@ -1,12 +1,34 @@
 """Poses held out: the systems they lead to, against least squares by singular values."""
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flangeye.handeye.candidates import LEAST_KEPT, Model, _solved
+from flangeye.handeye import candidates
+from flangeye.handeye.candidates import (
+    LEAST_KEPT,
+    Fit,
+    Model,
+    _solved,
+    better,
+    by_folds,
+    considered,
+    held_out,
+    judged,
+    rms,
+    understated,
+    weighed_with,
+    with_nuisance,
+)
+from flangeye.handeye.consensus import Consensus
+from flangeye.handeye.likelihood import weigh
+from flangeye.handeye.nuisance import no_nuisance
+from flangeye.handeye.walk import StepSize, Walk
 from flangeye.types import ArmCorrection
+from tests.handeye.cells import fitted, given, two_numbers
 
 
 @pytest.mark.parametrize("smallest", [1.0, 1e-3, 1e-7, 1e-11, 0.0])
@@ -31,3 +53,162 @@ def test_joints_are_corrected_where_the_correction_has_offsets_of_them() -> None
     assert [Model(some, each).corrects_joints for each in (None, offset, joints)] == [
         False, False, True,
     ]  # fmt: skip
+
+
+def a_fit(n: int) -> Fit:
+    """Return a fit of four unknowns to n measurements, every seventh left out of it."""
+    rng, inliers = np.random.default_rng(n), np.arange(n) % 7 != 5
+    jacobian, seen = rng.normal(size=(n, 6, 4)), 1e-3 * rng.normal(size=(n, 6))
+    rows = rng.normal(size=(n, 6, 8))
+    weights = rows @ rows.transpose(0, 2, 1)
+    covariance = np.linalg.inv(np.einsum("nai,nab,nbj->ij", *[jacobian[inliers], weights[inliers]],
+                                         jacobian[inliers]))  # fmt: skip
+    told = np.einsum("nai,nab,nb->i", jacobian[inliers], weights[inliers], seen[inliers])
+    return Fit(seen - jacobian @ covariance @ told, jacobian, weights, covariance, inliers)
+
+
+@pytest.mark.parametrize(("n", "folds"), [(4, 4), (14, 5), (140, 6)])
+def test_errors_held_out_are_those_of_a_fit_to_the_other_folds(n: int, folds: int) -> None:
+    fit = a_fit(n)
+    errors, covariances = by_folds(fit)
+    kept = np.flatnonzero(fit.inliers)
+    order = np.random.default_rng(0).permutation(kept)
+    for k in range(folds):
+        part = order[k::folds]
+        rest = np.setdiff1d(kept, part)
+        jacobian, weights = fit.jacobian[rest], fit.weights[rest]
+        known = np.linalg.inv(np.einsum("nai,nab,nbj->ij", jacobian, weights, jacobian))
+        step = known @ np.einsum("nai,nab,nb->i", jacobian, weights, fit.residuals[rest])
+        for i in part:
+            assert errors[i] == pytest.approx((fit.residuals[i] - fit.jacobian[i] @ step)[3:])
+            spread = fit.jacobian[i] @ known @ fit.jacobian[i].T + np.linalg.inv(fit.weights[i])
+            assert covariances[i] == pytest.approx(spread[3:, 3:])
+    out = ~fit.inliers
+    np.testing.assert_array_equal(errors[out], fit.residuals[out, 3:])
+    assert not covariances[out].any()
+
+
+def test_where_the_base_walks_each_is_left_out_alone() -> None:
+    fit = a_fit(9)
+    spread = fit.jacobian @ fit.covariance @ fit.jacobian.transpose(0, 2, 1)
+    linear = SimpleNamespace(residuals=fit.residuals, jacobian=fit.jacobian)
+    found: Any = SimpleNamespace(
+        course=1, inliers=fit.inliers, weights=fit.weights, spread=spread, linear=linear
+    )
+    errors, covariances = held_out(found)
+    for i in range(9):
+        own = np.linalg.inv(fit.weights[i])
+        share = np.linalg.inv(own - spread[i])
+        if fit.inliers[i]:
+            assert errors[i] == pytest.approx((own @ share @ fit.residuals[i])[3:])
+            assert covariances[i] == pytest.approx((own @ share @ own)[3:, 3:])
+        else:
+            assert errors[i] == pytest.approx(fit.residuals[i, 3:]) and not covariances[i].any()
+    found.course, found.covariance = None, fit.covariance
+    np.testing.assert_array_equal(held_out(found)[0], by_folds(fit)[0])
+
+
+@pytest.mark.parametrize(("scale", "told"), [(3.0, 9.0), (0.5, 1.0)])
+def test_covariances_fall_short_by_the_mean_square_of_what_was_held_out(
+    scale: float, told: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = 1e-3 * scale * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [50.0, 0, 0]])
+    stated = errors, np.tile(1e-6 * np.eye(3), (3, 1, 1))
+    monkeypatch.setattr(candidates, "held_out", lambda _: stated)
+    found: Any = SimpleNamespace(inliers=np.array([True, True, False]))
+    assert understated(found) == pytest.approx(told)
+
+
+def test_a_candidate_helps_that_leaves_nine_tenths_or_less() -> None:
+    assert judged(1e-3, 0.9e-3, "it") == (
+        True, "it (held-out error 0.900 mm with it, 1.000 mm without)"
+    )  # fmt: skip
+    assert judged(2e-3, 1.81e-3, "it") == (
+        False,
+        "left out, for it does not help: it (held-out error 1.810 mm with it, 2.000 mm without)",
+    )
+    assert not judged(1.0, np.nan, "it")[0]
+    assert rms(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0]])) == pytest.approx(np.sqrt(13))
+
+
+def test_models_are_compared_where_either_of_them_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    some: Any = None
+    one, two = (Model(SimpleNamespace(found=SimpleNamespace(inliers=np.array(i), off=off)))  # type: ignore[arg-type]
+                for i, off in (([True, True, False], [1.0, 1.0, 9.0]),
+                               ([True, False, False], [0.5, 1.1, 0.0])))  # fmt: skip
+    monkeypatch.setattr(
+        candidates, "held_out", lambda found: (np.outer(found.off, [1e-3, 0.0, 0.0]), some)
+    )
+    chosen = better(one, two, "it")
+    assert chosen.found is two.found
+    assert chosen.notes == ("it (held-out error 0.854 mm with it, 1.000 mm without)",)
+    assert better(two, one, "it").found is two.found
+
+
+def model(n: int = 9, **more: Any) -> Model:
+    problem = given("eye-on-base, marker", "pose", n, **more)
+    return Model(Consensus(problem, fitted(problem)))
+
+
+def test_what_moves_all_poses_alike_is_followed_by_the_answer() -> None:
+    """As it is where what was seen is moved by it, and fitted again."""
+    bare, further = model(), two_numbers(9)
+    found, problem = bare.found, bare.problem
+    effects = weighed_with(problem, found, further).linear.jacobian[:, :, 20:]
+    added = np.zeros((18, 18))
+    for k in range(2):
+        told = np.einsum("nai,nab,nb->i", found.linear.jacobian @ found.basis, found.weights,
+                         effects[:, :, k])  # fmt: skip
+        moved = (found.basis @ np.linalg.solve(found.information, told))[:18] * 2e-4
+        added = added + np.outer(moved, moved)
+    assert considered(bare, further) == pytest.approx(added, rel=1e-6, abs=1e-16)
+    sized = model(nuisance=replace(two_numbers(9, sized=True), mean=np.zeros(2)))
+    same = considered(sized, further)  # what was estimated along is not estimated here
+    alone = replace(sized.problem, nuisance=no_nuisance(9))
+    at = replace(sized.found.at, nuisance=np.zeros(0))
+    left_out = replace(
+        sized, consensus=Consensus(alone, replace(sized.found, at=at, basis=np.eye(20)))
+    )
+    assert same == pytest.approx(considered(left_out, further), rel=1e-9)
+
+
+def test_residuals_stand_in_the_base_with_what_a_smooth_error_explains_or_without() -> None:
+    nuisance = two_numbers(9, sized=True).and_also(two_numbers(9))
+    fit = model(nuisance=nuisance)
+    found, s = fit.found, fit.problem.measurements
+    turns = s.a[:, :3, :3] @ found.at.x[:3, :3]
+    own = found.linear.residuals[:, 3:]
+    sized = own + found.linear.jacobian[:, 3:, 20:22] @ found.at.nuisance[:2]
+    assert fit.residuals() == pytest.approx((turns @ own[..., None])[..., 0])
+    assert fit.residuals(as_reported=True) == pytest.approx((turns @ sized[..., None])[..., 0])
+    walking = model(walk=Walk(np.full((9, 3), 0.3)))
+    noise = replace(walking.found.noise, walk=StepSize(1e-3, 1e-3))
+    problem = walking.problem
+    walked = replace(walking, consensus=Consensus(problem, fitted(problem, noise)))
+    resting = weigh(replace(problem, walk=None), walked.found.at, noise, np.ones(9))
+    turns = problem.measurements.a[:, :3, :3] @ walked.found.at.x[:3, :3]
+    reported = (turns @ resting.linear.residuals[:, 3:, None])[..., 0]
+    assert walked.residuals(as_reported=True) == pytest.approx(reported)
+    assert np.abs(walked.residuals() - reported).max() > 1e-5
+
+
+def test_sized_nuisances_begin_at_the_size_of_the_residuals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        candidates, "again", lambda consensus, problem: replace(consensus, problem=problem)
+    )
+    bare = model()
+    found = replace(bare.found, inliers=np.arange(9) > 2)
+    bare = replace(bare, consensus=Consensus(bare.problem, found))
+    sized, known = two_numbers(9, sized=True), two_numbers(9)
+    one = with_nuisance(bare, sized)
+    assert one is not None
+    assert one.found.noise.size == pytest.approx(rms(found.linear.residuals[3:, 3:]))
+    still = replace(found, linear=replace(found.linear, residuals=0 * found.linear.residuals))
+    least = with_nuisance(replace(bare, consensus=Consensus(bare.problem, still)), sized)
+    assert least is not None and least.found.noise.size == 1e-7
+    two = with_nuisance(one, known)
+    assert two is not None and two.problem.nuisance.sized.tolist() == [True, True, False, False]
+    assert two.found.noise.size == one.found.noise.size
+    assert len(one.problem.nuisance) == 2

@@ -10,6 +10,7 @@ from flangeye.handeye.components import (
     LARGEST,
     Noise,
     Residuals,
+    _factor,
     noise_of,
     with_depth,
     without_arms,
@@ -152,3 +153,8 @@ def test_depth_is_what_neither_features_nor_arms_nor_the_other_noise_explain() -
     noise = with_depth(Noise(1e-8, 0.0, arms=2.0), residuals(9e-8), known, known)
     assert noise.depth == pytest.approx(5e-8 - FINEST**2, rel=1e-5)
     assert (noise.pose, noise.arms) == (1e-8, 2.0)
+
+
+@pytest.mark.parametrize(("shares", "wanted"), [(0.0, 3.0), (0.0, 0.0), (1.0, 0.0), (1.0, -1.0)])
+def test_noise_that_explains_nothing_is_the_largest_there_is(shares: float, wanted: float) -> None:
+    assert _factor(np.full(4, 9.0), np.full(4, shares), wanted) == LARGEST

@@ -1,15 +1,16 @@
 """What a scanner's own smooth distortion does to a calibration."""
 
 from dataclasses import replace
+from math import factorial
 
 import numpy as np
 import pytest
 
 from flangeye.handeye import calibration
-from flangeye.handeye.distortion import distortion_of, edges_of
+from flangeye.handeye.distortion import _Field, distortion_of, edges_of
 from flangeye.handeye.measurements import Measurements, by_depth, measurements_of
 from flangeye.handeye.nuisance import no_nuisance
-from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.geometry import basis_of_plane, hat, rotation_exp
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.configuration import DEFAULT
 from flangeye.types import CAMERA, TARGET, CircleFeature, Observation, PoseFeature, Transform
@@ -141,3 +142,90 @@ def test_circles_that_all_face_the_camera_say_nothing_of_their_edges() -> None:
     turns = np.array([basis_of_plane(ray).T for ray in rays])
     assert edges_of(replace(s, rotations=turns), np.ones(20, bool)).prior == 0.0
     assert edges_of(s, np.zeros(20, bool)).prior == 0.0
+
+
+def test_a_field_is_as_large_as_said_over_the_view_and_has_no_rigid_part() -> None:
+    """Exactly so on the grid over which it is made: seven points an axis, from edge to edge."""
+    near, far = SCANNER.range
+    slopes = np.tan(np.array(SCANNER.field_of_view) / 2)
+    steps = np.linspace(-1.0, 1.0, 7)
+    points = np.array([
+        [x * slopes[0], y * slopes[1], 1.0] * np.full(3, (near + far) / 2 + z * (far - near) / 2)
+        for x in steps for y in steps for z in steps
+    ])  # fmt: skip
+    moved = _Field(SCANNER)._at(points)
+    assert moved.shape == (343, 3, 3 * 20)  # along the ray and across; powers to the third
+    assert np.sqrt((moved**2).sum(axis=(1, 2)).mean()) == pytest.approx(SCANNER.calibration_error)
+    assert np.abs(moved.sum(axis=0)).max() < 1e-12
+    assert np.abs(np.cross(points[:, :, None], moved, axis=1).sum(axis=0)).max() < 1e-12
+
+
+def test_a_field_goes_along_rays_and_less_across_by_the_baseline() -> None:
+    near, far = SCANNER.range
+    middle, half = (near + far) / 2, (far - near) / 2
+    slopes = np.tan(np.array(SCANNER.field_of_view) / 2)
+    view = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.3], [-0.2, 0.9, -0.7]])
+    points = np.column_stack([view[:, :2] * slopes, np.ones(3)]) * (middle + half * view[:, 2:])
+    raw = _Field(SCANNER)._raw(points).reshape(3, 3, 20, 3)
+    bells = np.exp(-0.5 * (view**2).sum(axis=1))
+    ratio = min(SCANNER.baseline / middle / np.sqrt(2), 1.0)
+    for i, (x, y, z) in enumerate(view):
+        functions = [
+            x**a * y**b * z**c / np.sqrt(factorial(a) * factorial(b) * factorial(c))
+            for a in range(4) for b in range(4 - a) for c in range(4 - a - b)
+        ]  # fmt: skip
+        ways = np.column_stack([points[i] / points[i, 2], [ratio, 0, 0], [0, ratio, 0]])
+        assert raw[i] == pytest.approx(bells[i] * np.einsum("k,aw->akw", functions, ways))
+    near_base = SCANNER.model_copy(update={"baseline": 0.1 * middle})
+    ways = _Field(near_base)._raw(points[:1]).reshape(3, 20, 3)[:, 0]
+    assert ways == pytest.approx(
+        np.column_stack([[0, 0, 1.0], *(0.1 / np.sqrt(2) * np.eye(3)[:2])])
+    )
+
+
+def test_a_target_turns_and_moves_with_what_it_lies_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a field that turns as a body does, a turn about each axis, any target turns likewise."""
+    monkeypatch.setattr(_Field, "_at", lambda _, points: -hat(points))
+    s = over_the_view(5)
+    moves = _Field(SCANNER).moves(s)
+    assert moves[:, :3] == pytest.approx(np.tile(np.eye(3), (5, 1, 1)), abs=1e-9)
+    np.testing.assert_array_equal(moves[:, 3:], -hat(s.centres))
+
+
+def test_ways_that_move_a_twentieth_of_the_largest_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A turn counts as what it does 0.3 m away."""
+    ways = np.zeros((3, 6, 4))
+    ways[0, 3, 0], ways[1, 4, 1], ways[1, 0, 2], ways[0, 1, 3] = (
+        1.0,
+        0.049,
+        0.051 / 0.3,
+        0.049 / 0.3,
+    )
+    monkeypatch.setattr(_Field, "moves", lambda *_: ways)
+    found = distortion_of(SCANNER, over_the_view(3), np.array([True, True, False]))
+    assert found.prior.tolist() == [1.0, 1.0]
+    assert np.abs(found.seen).sum(axis=(0, 1)) == pytest.approx([1.0, 0.17])
+    assert not found.camera.any() and not found.target.any() and not found.sized.any()
+    blind = distortion_of(SCANNER, over_the_view(3), np.array([False, True, False]))
+    assert np.abs(blind.seen).sum(axis=(0, 1)) == pytest.approx([0.17, 0.049])
+
+
+@pytest.mark.parametrize(("tilt", "told"), [(0.5, True), (1.1e-3, True), (0.9e-3, False)])
+def test_edges_move_a_centre_by_its_noise_in_the_face_over_the_tilt(
+    tilt: float, told: bool
+) -> None:
+    s = over_the_view(6)
+    rays = -s.centres / np.linalg.norm(s.centres, axis=1)[:, None]
+    axes = np.array([basis_of_plane(ray)[0] for ray in rays])
+    turns = rotation_exp(tilt * axes) @ np.array([basis_of_plane(ray).T for ray in rays])
+    normals = turns[:, :, 2]
+    covariances = s.covariances.copy()
+    covariances[:, 3:, 3:] = 4e-8 * np.eye(3) + 5e-8 * normals[:, :, None] * normals[:, None]
+    seen = np.arange(6) < 4
+    found = edges_of(replace(s, rotations=turns, covariances=covariances), seen)
+    assert found.prior == pytest.approx([np.sqrt(8e-8) / np.sin(tilt) if told else 0.0])
+    along = rays - np.cos(tilt) * normals
+    assert found.seen[:4, 3:, 0] == pytest.approx(along[:4], abs=1e-12)
+    assert not found.seen[4:].any() and not found.seen[:, :3].any() and not found.camera.any()

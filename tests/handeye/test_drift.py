@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,16 +13,26 @@ from flangeye.handeye.drift import (
     Information,
     Prior,
     Sightings,
+    _began,
     _change,
+    _deviation,
     _scatter,
+    _slow,
+    _step,
     _surprise,
+    _windows,
     allowance,
     information_of,
+    largest_shift,
     misfits,
     moved_since,
+    prior_of,
+    sightings_of,
     verdict,
 )
-from flangeye.maths.statistics import chi2_quantile
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.statistics import chi2_quantile, f_quantile
+from flangeye.types import Floats
 from flangeye_emulators.world.year import CORNERS, Happening, Year, watch
 from tools import drift_year
 
@@ -217,3 +229,134 @@ def test_a_year_as_the_page_says() -> None:
     alarms, checks = drift_year.false_alarms(3)
     assert alarms <= checks / 1000
     assert max(drift_year.slow(20)) < 0.3
+
+
+def a_sighting(motion: Floats, at: Floats, normal: bool = True) -> Sightings:
+    """Return four sightings of circles, the camera moved since about 0.5 m before it."""
+    rng = np.random.default_rng(3)
+    pose = rigid(rotation_exp(np.array([0.2, 2.8, 0.1])), np.array([0.5, 0.1, 1.2]))
+    poses = np.array([rigid(rotation_exp(rng.uniform(-0.4, 0.4, 3)), rng.uniform(-0.2, 0.2, 3))
+                      for _ in range(4)])  # fmt: skip
+    centres = (poses[:, :3, 3] + 1e-4 - pose[:3, 3]) @ pose[:3, :3]
+    normals = poses[:, :3, 2] @ pose[:3, :3]
+    if not normal:
+        normals[2] = np.nan
+    moved = pose.copy()
+    turn = rotation_exp(motion[:3])
+    moved[:3, :3], moved[:3, 3] = (
+        turn @ pose[:3, :3],
+        turn @ (pose[:3, 3] - ABOUT) + ABOUT + motion[3:],
+    )
+    expected = poses.copy()
+    expected[:, :3, :3] = rotation_exp(at[:3]) @ poses[:, :3, :3]
+    expected[:, :3, 3] += at[3:]
+    jacobians = np.tile(np.eye(6), (4, 1, 1))
+    own = np.tile(1e-8 * np.eye(5), (4, 1, 1))
+    return sightings_of(moved, ABOUT, centres, normals, own, expected, jacobians, np.arange(4))
+
+
+ABOUT = np.array([0.1, -0.2, 0.05])
+
+
+def test_residuals_change_with_the_camera_and_with_the_arm_as_differences_say() -> None:
+    none = np.zeros(6)
+    here = a_sighting(none, none)
+    assert here.residuals[:, :3] == pytest.approx(1e-4) and here.joints is not None
+    for k in range(6):
+        step = 1e-6 * np.eye(6)[k]
+        by_camera = (a_sighting(step, none).residuals - here.residuals) / 1e-6
+        assert by_camera == pytest.approx(here.effects[:, :, k], abs=1e-5)
+        by_arm = (here.residuals - a_sighting(none, step).residuals) / 1e-6
+        assert by_arm == pytest.approx(here.joints[:, :, k], abs=1e-5)
+    blind = a_sighting(none, none, normal=False)
+    assert blind.joints is not None
+    for each in (blind.residuals, blind.effects, blind.joints):
+        assert not each[2, 3:].any() and each[1, 3:].any() == here.effects[1, 3:].any()
+    assert blind.covariances[2] == pytest.approx(np.diag([1e-8] * 3 + [1.0] * 2))
+    assert here.covariances == pytest.approx(np.tile(1e-8 * np.eye(5), (4, 1, 1)))
+
+
+def test_a_calibration_tells_what_its_sightings_do_and_leaves_as_many_numbers() -> None:
+    seen = replace(a_sighting(np.zeros(6), np.zeros(6), normal=False), check=np.zeros(4, int))
+    variances = np.array([1e-2] * 3 + [1e-4] * 3)
+    prior = prior_of(seen, variances)
+    weights = np.linalg.inv(seen.covariances)
+    wanted = np.einsum("nai,nab,nbj->ij", seen.effects, weights, seen.effects)
+    assert prior.told.matrix == pytest.approx(wanted + np.diag(1 / variances))
+    right = -np.einsum("nai,nab,nb->i", seen.effects, weights, seen.residuals)
+    assert prior.told.vector == pytest.approx(right)
+    assert prior.freedom == 3 * 4 + 2 * 3 - 6
+    assert prior_of(seen.of(0, 1), variances).freedom == 12.0
+    each = replace(seen, check=np.arange(4))
+    one = replace(each.of(2, 3), check=np.zeros(1, int))
+    assert prior_of(one, variances).freedom == 1.0
+
+
+def test_checks_are_taken_from_the_first_up_to_the_last() -> None:
+    seen = a_sighting(np.zeros(6), np.zeros(6))
+    assert seen.of(1, 3).check.tolist() == [1, 2] and len(seen.of(1, 3).effects) == 2
+    assert seen.of(1, 3).joints is not None and replace(seen, joints=None).of(0, 2).joints is None
+    each = told(np.random.default_rng(6), 5)
+    assert each.summed(1, 3).matrix == pytest.approx(each.matrix[1] + each.matrix[2])
+    assert each.summed(3, None).vector == pytest.approx(each.vector[3] + each.vector[4])
+    looser = Information.of_covariance(allowance(1e-3), np.arange(6.0)).loosened(2e-3)
+    assert looser.covariance == pytest.approx(5 * allowance(1e-3))
+    assert looser.mean == pytest.approx(np.arange(6.0))
+    assert allowance(1e-3) == pytest.approx(np.diag([4e-6] * 3 + [1e-6] * 3))
+
+
+def test_a_motion_moves_the_farthest_corner_most_and_is_known_along_that() -> None:
+    corners = np.array([[0.1, 0, 0], [0.0, 0.3, 0], [0, 0, 0.2]])
+    motion = np.array([0, 0, 1e-2, 0, 4e-3, 0])
+    assert largest_shift(motion, corners) == pytest.approx(np.hypot(1e-2 * 0.1 + 4e-3, 0.0))
+    turned = np.array([0, 0, 1e-2, -4e-3, 0, 0])
+    assert largest_shift(turned, corners) == pytest.approx(1e-2 * 0.3 + 4e-3)
+    covariance = told(np.random.default_rng(8)).matrix * 1e-9
+    slope = np.array([
+        (largest_shift(turned + d, corners) - largest_shift(turned - d, corners)) / 2e-7
+        for d in 1e-7 * np.eye(6)
+    ])  # fmt: skip
+    assert _deviation(turned, covariance, corners) == pytest.approx(
+        np.sqrt(slope @ covariance @ slope), rel=1e-4
+    )
+
+
+def test_a_drift_began_where_the_mean_of_nine_was_a_quarter_of_the_limit_away() -> None:
+    """A step of the limit at check 20: of nine checks three are after it at check 22."""
+    means = np.zeros((40, 6))
+    means[20:, 3] = 0.4e-3
+    own = 1e12 * np.eye(6)
+    checks = Information(np.tile(own, (40, 1, 1)), means @ own)
+    prior = Prior(Information.of_covariance(np.eye(6)))
+    assert _began(checks, CORNERS, prior, DriftTest()) == 22
+    gone = Information(checks.matrix, (means - means[39]) @ own)  # from the first check on
+    known = Prior(Information.of_covariance(1e-16 * np.eye(6)))
+    back = Information(gone.matrix[:20], gone.vector[:20])
+    assert _began(back, CORNERS, known, DriftTest()) == 8
+    motion, covariance = _slow(checks, prior, DriftTest())
+    assert motion == pytest.approx([0, 0, 0, 4e-4, 0, 0], abs=1e-9)
+    assert covariance == pytest.approx(2 / 9e12 * np.eye(6), rel=1e-3)
+    few = Information(checks.matrix[:12], checks.vector[:12])
+    assert _slow(few, prior, DriftTest())[1] == pytest.approx(
+        (1 / 9 + 1 / 3) / 1e12 * np.eye(6), rel=1e-3
+    )
+    none = Information(checks.matrix[:8], checks.vector[:8])
+    assert not _slow(none, prior, DriftTest())[0].any()
+    assert _slow(none, prior, DriftTest())[1] == pytest.approx(np.eye(6))
+
+
+def test_a_step_is_looked_for_in_the_last_four_checks_against_an_f_distribution() -> None:
+    assert list(_windows(9, DriftTest())) == [1, 2, 3, 4] and list(_windows(2, DriftTest())) == [
+        1,
+        2,
+    ]
+    rng, test = np.random.default_rng(2), DriftTest(reference=12)
+    checks = Information(np.tile(np.eye(6), (20, 1, 1)), rng.standard_normal((20, 6)))
+    start = Prior(Information.of_covariance(1e6 * np.eye(6)), 50.0)
+    ratio, first = _step(checks, start, 18, test)
+    before, after = checks.vector[6:18].mean(axis=0), checks.vector[18:].mean(axis=0)
+    square = ((after - before) ** 2).sum() / (1 / 2 + 1 / 12)
+    known = start.told.plus(checks.summed(6, 18))
+    scale, freedom = _scatter(checks, known, (6, 18), 50.0)
+    limit = 6 * scale * f_quantile(1 - 2e-4 / 4, 6, freedom)
+    assert first == 18 and ratio == pytest.approx(square / limit, rel=1e-4)

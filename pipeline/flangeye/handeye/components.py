@@ -171,5 +171,5 @@ def _factor(squares: Floats, shares: Floats, wanted: float) -> float:
         total, slope = terms.sum(), (terms * shares / (1 + factor * shares)).sum()
         if total <= wanted * (1 + 1e-9) or factor > LARGEST:
             break
-        factor += total * (total - wanted) / (wanted * max(slope, 1e-300))
+        factor += total * (total - wanted) / max(wanted * slope, 1e-200)
     return float(min(factor, LARGEST))

@@ -320,8 +320,9 @@ def _graduate(problem: Problem, start: Solution) -> Solution:
     shares = np.ones(len(limits))
     while mu < 1e8:
         shares = truncated_weights(found.squares / limits, 1.0, mu)
-        # Early on all shares are small, and only their ratios matter.
-        if (np.minimum(shares, 1 - shares) < 1e-6).all() or shares.max() < 1e-9:
+        # Early on all shares are small, and only their ratios matter: none is decided then.
+        decided = shares.max() > 0.5 and (np.minimum(shares, 1 - shares) < 1e-6).all()
+        if decided or not shares.any():
             break
         found = climb(problem, found, noise, shares, iterations=1)
         mu *= GRADUATION
