@@ -423,6 +423,10 @@ def two_poses_of_nobody(folder):
         (clouds, [], "rec: holds 5 scans, but nothing that says where the flange was; put "
          "poses.csv beside them, its first line: cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad; then "
          "a line for each, scan_0.xyz,412.1,-33.0,501.7,2.91,0.12,-0.03"),
+        (lambda folder: (folder / "a.png").touch(), [], "rec: holds 1 scans, but nothing that says "
+         "where the flange was; put poses.csv beside them, its first line: image,x_mm,"),
+        (lambda folder: (folder / "poses.mat").write_bytes(b"MATLAB 7.3 MAT-file"), [],
+         "rec/poses.mat: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew"),
         (odd_heading, [], "rec/log.csv: which columns are the arm's pose is not plain from "
          "u, v, w, alpha, beta, gamma; add --columns with their names, or numbers from 1, position "
          "first: --columns x,y,z,a,b,c --rotation kuka"),

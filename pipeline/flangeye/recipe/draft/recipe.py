@@ -13,6 +13,7 @@ import yaml
 
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import read_cloud
+from flangeye.files.named_arrays import arrays_of
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import Table
@@ -31,7 +32,9 @@ from flangeye.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"
 """What most small arms carry."""
-POSES_LINE = "cloud,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
+POSES_LINE = "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"
+BINARY = (".mat", ".npz")
+"""Files of arrays that hold nothing else."""
 PRINTED = ("charuco", "checkerboard", "circles", "aruco")
 NONE = "none"
 CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
@@ -139,12 +142,18 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
     """Say what is missing, and the line that would bring it."""
     if not isinstance(reason, NotThisLayout):
         return f"{reason}; flangeye init takes such lines as --reader '{{…}}' and --robot NAME"
+    for path in survey.of(BINARY):
+        try:
+            arrays_of(path)
+        except StageError as error:
+            return str(error)
     scans = survey.of(CLOUDS) or survey.of(IMAGES)
     if scans:
+        column = "cloud" if survey.of(CLOUDS) else "image"
         return (
             f"{survey.folder}: holds {len(scans)} scans, but nothing that says where the flange "
-            f"was; put poses.csv beside them, its first line: {POSES_LINE}; then a line for each, "
-            f"{scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
+            f"was; put poses.csv beside them, its first line: {column},{POSES_LINE}; then a line "
+            f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
     closed = survey.of(CLOSED)
     if closed:
