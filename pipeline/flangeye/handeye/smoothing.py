@@ -26,7 +26,7 @@ class Smoothed:
         slope: (p,) that they lose.
         cost: Squares of its steps, in their variances.
         gain: By how much its own move would lower the cost.
-        logdet: Of its precision after what was measured, less that before.
+        logdet_before: Logarithm of the determinant of the covariance that it had before.
     """
 
     told: Tridiagonal
@@ -34,7 +34,12 @@ class Smoothed:
     slope: Floats
     cost: float
     gain: float
-    logdet: float
+    logdet_before: float
+
+    @property
+    def logdet(self) -> float:
+        """Of its precision after what was measured, less that before."""
+        return self.told.logdet + self.logdet_before
 
     @property
     def followed(self) -> Floats:
@@ -84,10 +89,10 @@ def smoothed(
     diagonal = told @ drift + stiff
     diagonal[:-1] += stiff[1:]
     found = solve_tridiagonal(diagonal, -stiff[1:], right)
-    taken = np.einsum("nsp,nsq->pq", right, found.solution)
-    logdet = found.logdet + float(np.log(variances).sum())
+    taken = np.tensordot(right, found.solution, axes=([0, 1], [0, 1]))
+    before = float(np.log(variances).sum())
     cost = float((steps**2 / variances).sum())
-    return Smoothed(found, taken[1:, 1:], taken[1:, 0], cost, float(taken[0, 0]), logdet)
+    return Smoothed(found, taken[1:, 1:], taken[1:, 0], cost, float(taken[0, 0]), before)
 
 
 def size_told(walk: Walk, size: StepSize, course: Course, spread: Floats) -> StepSize:
