@@ -59,7 +59,8 @@ def _distinct(discs: list[Disc], apart: float) -> list[Disc]:
 def _hole_score(disc: Disc, cut: Singles, flange: Flange) -> float:
     """Return how well a disc's holes are the flange's; BLANK where that cannot be told."""
     points = cut.astype(np.float64)
-    face = points[np.abs(disc.plane.heights(points)) < 3 * disc.plane.sigma + 1e-6]
+    on_face = np.abs(disc.plane.heights(points)) < 3 * disc.plane.sigma + 1e-6
+    face = points.compress(on_face, axis=0)
     flat = disc.plane.flatten(face) - disc.plane.flatten(disc.centre[None])
     match = match_holes(flat, flange)
     return BLANK if match is None else match.score

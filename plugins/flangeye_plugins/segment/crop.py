@@ -23,11 +23,11 @@ def crop(xyz: Singles, view: Grid, disc: Disc, radius: float, margin: float) -> 
     """
     reach = radius + margin
     boxed = in_box(view.about(disc.cell, disc.centre, reach, xyz), disc.centre, reach)
-    offsets = boxed - disc.centre
-    height = offsets @ disc.plane.normal
-    across = (offsets**2).sum(axis=1) - height**2
+    offsets = np.subtract(boxed.T, disc.centre[:, None], order="C")
+    height = disc.plane.normal @ offsets
+    across = (offsets**2).sum(axis=0) - height**2
     thick = max(margin, 4 * disc.plane.sigma)
-    return np.asarray(boxed[(np.abs(height) < thick) & (across < reach**2)])
+    return boxed.compress((np.abs(height) < thick) & (across < reach**2), axis=0)
 
 
 def in_box(points: Singles, centre: NDArray[np.float64], reach: float) -> Singles:

@@ -126,7 +126,7 @@ def _drawn(points: Singles, lot: NDArray[np.uint32], share: float) -> Singles:
     """Return about a share of the points."""
     if share >= 0.7:  # not worth a copy
         return points
-    return points[np.flatnonzero(lot < np.uint32(share * 2**32))]
+    return points.take(np.flatnonzero(lot < np.uint32(share * 2**32)), axis=0)
 
 
 def thin_out(image: Singles, pitch: float) -> Grid:
@@ -151,8 +151,8 @@ def _every(length: int) -> int:
 def _angle_between(lines: Singles, axis: int) -> float:
     """Return the median distance of neighbours along ``axis`` over depth; NaN if none are."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        step = np.diff(lines[..., :2] / lines[..., 2:], axis=axis)
-    distance = np.hypot(step[..., 0], step[..., 1])
+        steps = [np.diff(lines[..., k] / lines[..., 2], axis=axis) for k in range(2)]
+        distance = np.hypot(*steps)
     finite = distance[np.isfinite(distance)]
     return float(median(finite)) if finite.size else np.nan
 

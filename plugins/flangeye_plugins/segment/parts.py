@@ -73,8 +73,9 @@ class Patch(NamedTuple):
         if enough is not None:
             # A part of the largest size holds some fifty patches.
             rest = rest[:: 1 + 50 * len(self.members) // enough]
-        offsets = self.piece.points[rest] - self.rough.point.astype(np.float32)
-        return np.asarray(rest[np.einsum("ij,ij->i", offsets, offsets) < reach**2])
+        points, centre = self.piece.points.take(rest, axis=0), self.rough.point.astype(np.float32)
+        offsets = np.subtract(points.T, centre[:, None], order="C")
+        return np.asarray(rest[np.einsum("ij,ij->j", offsets, offsets) < reach**2])
 
 
 def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -> list[Part]:

@@ -77,7 +77,8 @@ def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits)
     for disc, near, plane in zip(right, nearby, planes, strict=True):
         if plane is not None:
             points = near.astype(np.float64)
-            around = points[np.abs(plane.heights(points)) < max(3 * plane.sigma, LEAST_SLAB)]
+            near_it = np.abs(plane.heights(points)) < max(3 * plane.sigma, LEAST_SLAB)
+            around = points.compress(near_it, axis=0)
             pitch = view.angle * float(disc.plane.point[2])
             disc = compare(disc._replace(plane=plane), around, points, pitch, flange, limits)
         compared.append(disc)
