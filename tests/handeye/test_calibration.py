@@ -1,14 +1,21 @@
 """What a calibration says of the noise it found."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flangeye.handeye import calibration
 from flangeye.handeye.calibration import _beyond
+from flangeye.handeye.candidates import Model
 from flangeye.handeye.components import Noise
-from flangeye.handeye.consensus import _first_noise
+from flangeye.handeye.consensus import Consensus, _first_noise
+from flangeye.maths.statistics import covariance_inflation
+from tests.handeye.cells import fitted, given, two_numbers
+
+HAND = "eye-in-hand, marker"
 
 
 @pytest.mark.parametrize(
@@ -38,3 +45,114 @@ def test_noise_that_is_stated_is_all_there_is_from_the_start() -> None:
     stated: Any = SimpleNamespace(stated=True)
     nowhere: Any = None
     assert _first_noise(stated, nowhere) == Noise(pose=0.0, tilt=0.0)
+
+
+def modelled(name: str = HAND, n: int = 9, **more: Any) -> Model:
+    problem = given(name, "pose", n, **{"stated": False, **more})
+    return Model(Consensus(problem, fitted(problem)))
+
+
+def test_what_differs_from_pose_to_pose_is_the_arms_and_what_was_found_beyond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In depth a third an axis; of few degrees of freedom, and understated, the more unknown."""
+    monkeypatch.setattr(calibration, "understated", lambda _: 1.5)
+    found = modelled().found
+    of_arms = np.tile(np.diag([9.0, 9.0, 9.0, 1e-8, 2e-8, 6e-8]), (9, 1, 1))
+    noise = Noise(pose=4e-8, tilt=9.0, centre_scale=0.8, arms=0.5, depth=6e-8)
+    found = replace(found, noise=noise, linear=replace(found.linear, of_arms=of_arms), freedom=10.0)
+    told = calibration._scatter(found)
+    assert told.arm == pytest.approx(0.5 * 3e-8 + 4e-8 + 2e-8) and told.feature_scale == 0.8
+    assert told.widening == pytest.approx(1.5 * covariance_inflation(10.0, 3))
+    assert calibration._scatter(replace(found, freedom=np.inf)).widening == 1.5
+
+
+def test_poses_set_aside_are_told_with_their_distance_turn_and_sigma() -> None:
+    fit = modelled("eye-on-base, marker")
+    found = fit.found
+    residuals = np.zeros((9, 6))
+    residuals[2] = [np.radians(0.3), 0, np.radians(0.4), 3e-3, 0, 4e-3]
+    found = replace(
+        found, inliers=np.arange(9) != 2, squares=np.full(9, 49.0),
+        linear=replace(found.linear, residuals=residuals),
+    )  # fmt: skip
+    fit = replace(fit, consensus=replace(fit.consensus, found=found))
+    cell: Any = SimpleNamespace(observations=list("abcdefghi"))
+    pairs = calibration._pairs(fit, fit, cell)
+    assert pairs[2].reason == "residual 5.0 mm and 0.5 deg, 7 sigma" and not pairs[2].used
+    assert [p.reason for p in pairs if p.used] == [None] * 8
+    np.testing.assert_allclose(pairs[2].residual, fit.residuals()[2])
+    s = fit.problem.measurements
+    circles = replace(fit.problem, measurements=replace(s, freedoms=np.full(9, 5.0)))
+    fit = replace(fit, consensus=replace(fit.consensus, problem=circles))
+    assert calibration._pairs(fit, fit, cell)[2].reason == "residual 5.0 mm, 7 sigma"
+
+
+def test_the_time_between_clocks_is_told_with_which_was_first() -> None:
+    cell: Any = SimpleNamespace(delay=12e-3)
+    told = "the flange was at the poses {} ms {} the times they are paired by"
+    assert calibration._clock_told(cell, 3e-3, 0.5e-3) == told.format("15.0 +- 0.5", "after")
+    assert calibration._clock_told(cell, -20e-3, 1e-3) == told.format("8.0 +- 1.0", "before")
+    cell.delay = None
+    assert calibration._clock_told(cell, -2e-3, 1e-3) == told.format("2.0 +- 1.0", "before")
+    fit = modelled(nuisance=replace(two_numbers(9), mean=np.zeros(2)))
+    at, sigma = calibration._delay_of(fit)
+    assert at == fit.found.at.nuisance[0]
+    assert sigma == pytest.approx(np.sqrt(np.diag(np.linalg.inv(fit.found.information))[-2]))
+
+
+def test_more_noise_in_depth_is_looked_for_of_whole_poses_whose_noise_is_not_stated() -> None:
+    fit = modelled()
+    assert calibration._with_depth(fit).problem.in_depth
+    stated = modelled(stated=True)
+    assert calibration._with_depth(stated) is stated
+    circles = given("eye-on-base, flange", "normal", 9, stated=False)
+    of_circles = Model(Consensus(circles, fitted(circles)))
+    assert calibration._with_depth(of_circles) is of_circles
+
+
+def test_what_no_pose_tells_is_set_so_that_the_camera_has_none_of_it() -> None:
+    """And the covariance is of the rest, as a fit has it that keeps to it."""
+    fit = modelled()
+    weak = np.zeros((20, 1))
+    weak[[3, 4, 15]] = np.array([[0.6], [0.5], [0.4]])
+    weak /= np.linalg.norm(weak)
+    moved = calibration._without(fit, weak)
+    along = weak[3:6, 0]
+    assert along @ moved.found.at.x[:3, 3] == pytest.approx(0.0, abs=1e-12)
+    step = (moved.found.at.x[:3, 3] - fit.found.at.x[:3, 3]) @ along / (along @ along)
+    assert moved.found.at.z[:3, 3] - fit.found.at.z[:3, 3] == pytest.approx(step * weak[15:18, 0])
+    rest = np.linalg.svd(fit.found.basis - weak @ (weak.T @ fit.found.basis))[0][:, :11]
+    information = rest[:18].T @ _whole(fit) @ rest[:18]
+    expected = rest @ np.linalg.inv(information) @ rest.T
+    assert moved.found.covariance == pytest.approx(expected, rel=1e-5, abs=1e-16)
+
+
+def _whole(fit: Model) -> Any:
+    basis = fit.found.basis[:18]
+    return basis @ fit.found.information @ basis.T
+
+
+def test_whether_zeros_are_in_the_covariance_is_said() -> None:
+    options: Any = SimpleNamespace(joint_zeros=True)
+
+    def said(kinematics: Any, zeros: Any = 1, default: bool = True) -> tuple[str, ...]:
+        flange = SimpleNamespace(kinematics=kinematics, deviation=2e-4, zeros=lambda _: zeros)
+        cell: Any = SimpleNamespace(
+            flange=flange, configuration=SimpleNamespace(is_default=default)
+        )
+        return calibration._note_of_zeros(cell, options)
+
+    (unknown,) = said(None)
+    assert unknown.startswith("what the arm does wrong alike at all poses is not in the covariance")
+    (known,) = said(1)
+    assert known.startswith("unknown joint zeros (0.2 mrad each) are in the covariance: they move")
+    (missed,) = said(1, zeros=None)
+    assert missed == (
+        "unknown joint zeros (0.2 mrad each) not considered: the arm's model misses these poses"
+    )
+    assert said(1, default=False) == ()
+    options.joint_zeros = False
+    assert said(None) == () and said(1) == ()
+    none: Any = SimpleNamespace(flange=None, configuration=SimpleNamespace(is_default=True))
+    assert calibration._note_of_zeros(none, options) == ()

@@ -1,15 +1,22 @@
 """What poses can tell: centres in a mirror are told from centres with noise."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from flangeye.errors import CalibrationRefused, StageError
+from flangeye.handeye.loop import weights_of
 from flangeye.handeye.observability import (
+    FLOOR,
+    ObservabilityLimits,
     _about_one_line,
     _fault_of,
+    _fit_rms,
     _median_distance,
+    _of_what,
+    _scale,
     _stands_still,
     _turns,
     in_base,
@@ -22,10 +29,12 @@ from flangeye.handeye.observability import (
     robust_sigma,
     spread_of,
     telling,
+    unobservable,
     weak_moves,
 )
 from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import Floats
+from tests.handeye.cells import fitted, given
 
 
 def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
@@ -213,3 +222,56 @@ def test_a_turn_about_a_line_far_away_is_about_one_line() -> None:
     assert _about_one_line(poses)
     poses[:, 2, 3] += [0, 0.01, 0, 0.02, 0, 0]
     assert not _about_one_line(poses)
+
+
+@pytest.mark.parametrize(
+    ("at", "told"),
+    [
+        ({0: 1.0}, "rotation of the camera's pose"),
+        ({5: 1.0}, "translation of the camera's pose"),
+        ({2: 0.11, 3: 0.99}, "rotation and translation of the camera's pose"),
+        ({2: 0.09, 3: 0.99}, "translation of the camera's pose"),
+        ({6: 1.0}, "part of the second base's pose"), ({11: 1.0}, "part of the second base's pose"),
+        ({0: 0.09, 14: 0.9}, "part of the target's place"), ({15: 1.0}, "part of the target's place"),
+        ({8: 0.6, 17: 0.8}, "part of the target's place"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_told_is_named(at: dict[int, float], told: str) -> None:
+    weak = np.zeros((20, 1))
+    weak[list(at), 0] = list(at.values())
+    assert _of_what(weak) == f"{told} cannot be told from these poses"
+
+
+def test_each_move_has_the_limit_of_a_turn_or_of_a_shift() -> None:
+    turns = [0, 1, 2, 6, 7, 8, 12, 13, 14, 18, 19]
+    limits = ObservabilityLimits(rotation=2.0, translation=3.0, mark=True)
+    expected = np.where(np.isin(np.arange(23), turns), 2.0, 3.0)
+    assert _scale(np.eye(23), limits).tolist() == expected.tolist()
+    mixed = np.zeros((20, 2))
+    mixed[[14, 3], 0], mixed[[3, 17], 1] = 0.6, 0.8
+    assert _scale(mixed, limits).tolist() == [2.0, 3.0]
+
+
+def test_poses_leave_weak_what_the_least_noise_there_is_would_leave() -> None:
+    """Of those that agree, and no better than any camera and arm do, whatever was stated."""
+    problem = given("eye-in-hand, marker", "pose", 12)
+    found = replace(fitted(problem), inliers=np.arange(12) < 10)
+    ten = problem.where(np.arange(12) < 10)
+    weights = weights_of(ten.measurements, found.linear.where(found.inliers), FLOOR)
+    rows = found.linear.jacobian[:10] @ found.basis
+    known = np.linalg.inv(np.einsum("nai,nab,nbj->ij", rows, weights, rows))
+    sigmas = np.sqrt(np.diag(known))
+    rotation, translation = sigmas[[0, 1, 2, 6, 7, 8]].max(), sigmas[[3, 4, 5, 9, 10, 11]].max()
+    wide = ObservabilityLimits(4 * rotation, 4 * translation, mark=False)
+    assert unobservable(problem, found, wide).shape == (20, 0)
+    narrow = replace(wide, translation=0.5 * translation)
+    with pytest.raises(CalibrationRefused, match="cannot be told from these poses"):
+        unobservable(problem, found, narrow)
+    with pytest.raises(CalibrationRefused):
+        unobservable(problem, found, replace(wide, rotation=0.5 * rotation, mark=True))
+
+
+def test_a_fit_leaves_the_root_of_the_mean_square_distance() -> None:
+    corners = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    bent = corners + np.outer([0.3, -0.3, -0.3, 0.3], [0.0, 0.0, 1.0])
+    assert _fit_rms(corners + 3.0, bent) == pytest.approx(0.3)
