@@ -1,5 +1,6 @@
 """Whether a flat part is the flange, by its size, rim, bore, plate and tilt."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from flangeye.maths.geometry import basis_of_plane
 from flangeye.maths.planes import Plane
 from flangeye.models.loading import load_model
 from flangeye.models.targets import wrist_circle_of
+from flangeye_plugins.segment import choice
 from flangeye_plugins.segment.choice import choose
 from flangeye_plugins.segment.discs import (
     Disc,
@@ -264,3 +266,24 @@ def test_patches_are_squares_of_three_points_at_least(side: float, points: int) 
     assert len(np.unique(patch)) == len(np.unique(rows)) * len(np.unique(columns))
     for r, c in ((0, 0), (1, 2)):
         assert len(np.unique(patch[(rows == r) & (columns == c)])) == 1
+
+
+def test_holes_are_looked_for_in_the_discs_plane_about_its_centre(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Three times its scatter before and behind, wherever the plane has its own point."""
+    plane = Plane(AT + [0.1, -0.2, 0.0], np.array([0.0, 0.0, -1.0]), 1e-4)
+    at = np.array([[0.02, 0.01, 2.9e-4], [-0.03, 0.0, -2.9e-4], [0.0, 0.0, 3.2e-4], [0, 0, -1.0]])
+    seen: list[Any] = []
+
+    def holes(flat: Any, flange: Any) -> Any:
+        seen.append(flat)
+        return SimpleNamespace(score=0.7)
+
+    monkeypatch.setattr(choice, "match_holes", holes)
+    one = disc(ring(BORE, UR5.rim))._replace(plane=plane, centre=AT)
+    assert choice._hole_score(one, (AT + at).astype(np.float32), UR5) == 0.7
+    (flat,) = seen
+    assert np.linalg.norm(flat, axis=1) == pytest.approx([np.hypot(0.02, 0.01), 0.03], abs=1e-6)
+    monkeypatch.setattr(choice, "match_holes", lambda *_: None)
+    assert choice._hole_score(one, AT[None].astype(np.float32), UR5) == choice.BLANK
