@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from flangeye.handeye import calibration
-from flangeye.handeye.calibration import _beyond
+from flangeye.handeye.calibration import TYPICAL_ARM, _beyond
 from flangeye.handeye.candidates import Model
 from flangeye.handeye.components import Noise
 from flangeye.handeye.consensus import Consensus, _first_noise
+from flangeye.handeye.likelihood import Problem
+from flangeye.handeye.loop import ArmNoise
 from flangeye.maths.statistics import covariance_inflation
-from tests.handeye.cells import fitted, given, two_numbers
+from tests.handeye.cells import CONFIGURATIONS, Session, fitted, given, session, two_numbers
 
 HAND = "eye-in-hand, marker"
 
@@ -156,3 +158,30 @@ def test_whether_zeros_are_in_the_covariance_is_said() -> None:
     assert said(None) == () and said(1) == ()
     none: Any = SimpleNamespace(flange=None, configuration=SimpleNamespace(is_default=True))
     assert calibration._note_of_zeros(none, options) == ()
+
+
+def test_what_is_stated_of_noise_goes_into_the_problem() -> None:
+    """Standard deviations as variances; a typical arm where nothing is said of it."""
+    made = session(CONFIGURATIONS[HAND], np.random.default_rng(0), 5)
+    circles = session(
+        CONFIGURATIONS["eye-on-base, flange"], np.random.default_rng(0), 5, feature="normal"
+    )
+    options: Any = SimpleNamespace(
+        normals=True, normal_bias=1e-3, robot_noise=None, pose_noise=None
+    )
+
+    def problem(of: Session) -> Problem:
+        cell: Any = SimpleNamespace(
+            observations=of.observations, configuration=of.configuration, arm=None
+        )
+        return calibration._problem(cell, options)
+
+    assert problem(made).arms == TYPICAL_ARM and problem(made).tilt == 1e-3
+    assert problem(made).pose_noise is None and not problem(made).stated
+    assert problem(circles).arms is None
+    options.pose_noise, options.robot_noise = 3e-4, ArmNoise(1e-4, 2e-4)
+    assert problem(made).pose_noise == pytest.approx(9e-8)
+    assert problem(made).stated and problem(circles).arms == ArmNoise(1e-4, 2e-4)
+    assert problem(circles).measurements.have_normals
+    options.normals = False
+    assert not problem(circles).measurements.have_normals

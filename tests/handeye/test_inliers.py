@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from flangeye.handeye import inliers
 from flangeye.handeye.inliers import (
     MEDIAN_EFFICIENCY,
     _fit_sets,
@@ -125,8 +126,8 @@ def test_many_fits_at_once_are_those_of_each_by_itself() -> None:
 def test_weights_fall_from_one_to_none_between_their_ends() -> None:
     limit, mu = 4e-6, 0.7
     low, high = mu / (mu + 1) * limit, (mu + 1) / mu * limit
-    ends = truncated_weights(np.array([0.0, low, high, 9 * high]), limit, mu)
-    assert ends.tolist() == [1.0, 1.0, 0.0, 0.0]
+    ends = truncated_weights(np.array([0.0, 0.9 * low, low, high, 1.1 * high, 9 * high]), limit, mu)
+    assert ends.tolist() == [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
     between = np.geomspace(low * (1 + 1e-9), high * (1 - 1e-9), 50)
     found = truncated_weights(between, limit, mu)
     assert found[[0, -1]] == pytest.approx([1.0, 0.0], abs=1e-7)
@@ -145,3 +146,19 @@ def test_inliers_are_those_within_the_threshold_of_their_own_fit(wrong: int) -> 
         kept = graduated_non_convexity(centres, tcps, 4e-3, start)
         assert np.array_equal(kept, np.arange(14) >= wrong)
         assert np.array_equal(rest(centres, tcps, kept) < 4e-3, kept)
+
+
+def test_pairs_agree_within_the_quantile_that_a_median_of_so_many_gives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[float] = []
+
+    def every(centres: Floats, tcps: Floats, threshold: float, start: Mask) -> Mask:
+        seen.append(threshold)
+        return np.ones(len(centres), dtype=bool)
+
+    monkeypatch.setattr(inliers, "graduated_non_convexity", every)
+    centres, tcps = pairs(np.random.default_rng(0), 12, 1e-3)
+    _, sigma = find_inliers(centres, tcps, 1e-5)
+    square = 3 * stats.f(3, MEDIAN_EFFICIENCY * (3 * 12 - 6)).ppf(gate(12))
+    assert seen[-1] == pytest.approx(sigma * np.sqrt(square), rel=1e-6)
