@@ -414,10 +414,12 @@ def _noise_notes(model: Model, cell: Cell, weak: Floats) -> tuple[str, ...]:
     notes, found = [], model.found
     if not model.problem.stated:
         notes += _beyond(found, model.problem)
-    if cell.configuration.is_default and not model.problem.measurements.are_poses:
-        notes.append(
-            roll_note(_agreeing(model, cell), found.at.x[:3, :3], found.covariance[:3, :3])
-        )
+    agreeing = _agreeing(model, cell)
+    plates = not model.problem.measurements.are_poses and any(
+        o.circle.normal is not None for o in agreeing
+    )
+    if cell.configuration.is_default and plates:  # a sphere, or a point, has no holes
+        notes.append(roll_note(agreeing, found.at.x[:3, :3], found.covariance[:3, :3]))
     if weak.shape[1]:
         notes.append(
             f"not observable from these poses, and set to zero: {weak.shape[1]} translation"

@@ -121,6 +121,7 @@ class Sphere(BaseModel):
         """
         if self.size is None:
             raise StageError(
-                "feature.sphere.diameter is unknown, and this step needs it: write the diameter"
+                "feature.sphere.diameter is unknown: segment.sphere and fit.sphere find it in "
+                "scans; to simulate them, or for profiles of a line scanner, write the diameter"
             )
         return self.size

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flangeye import StageError
 from flangeye.maths.geometry import basis_of_plane
 from flangeye.models.targets import Sphere
 from flangeye.types import (
@@ -249,3 +250,9 @@ def test_four_points_are_enough_for_a_sphere() -> None:
     found = fit_cap(points, centre + 1e-4, 1.01 * radius, np.radians(80), free=True)
     assert found.centre == pytest.approx(centre, abs=1e-8)
     assert found.radius == pytest.approx(radius, abs=1e-8)
+
+
+def test_what_needs_the_size_of_an_unknown_sphere_says_what_for() -> None:
+    unknown = Sphere(size=None, centre_in_flange=SPHERE.centre_in_flange)
+    with pytest.raises(StageError, match="to simulate them, or for profiles of a line scanner"):
+        _ = unknown.radius

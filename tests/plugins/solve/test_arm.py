@@ -167,6 +167,15 @@ def test_a_flange_roll_that_cannot_be_told_is_named(ur5: RobotModel) -> None:
     ) in solver(ur5)(simulate(ur5, 20)).notes
 
 
+def test_of_what_has_no_face_nothing_is_said_of_its_holes(ur5: RobotModel) -> None:
+    """A sphere's centre, or a point, has no normal."""
+    points = [
+        replace(o, feature=replace(o.circle, normal=None, normal_covariance=None))
+        for o in simulate(ur5, 20)
+    ]
+    assert not [n for n in solver(ur5)(points).notes if "flange roll" in n]
+
+
 def test_a_good_arm_is_not_corrected(ur5: RobotModel) -> None:
     calibration = solver(ur5, joint_offsets="auto")(simulate(ur5, 30))
     assert calibration.correction is None
