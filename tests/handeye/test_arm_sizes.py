@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from flangeye.handeye.arm_sizes import LIKELY, RATIOS, Sizes, likely_sizes
+from flangeye.handeye.arm_sizes import (
+    BESIDE,
+    LIKELY,
+    RATIOS,
+    Sizes,
+    _combined,
+    _one_each,
+    likely_sizes,
+)
 
 FREEDOM = 240.0
 
@@ -85,3 +93,11 @@ def test_sizes_weigh_as_much_as_they_are_likely() -> None:
     assert 5 < kept.sum() < len(kept)
     assert sizes.factors[:, 0] == pytest.approx(np.array(factors)[kept])
     assert sizes.weights == pytest.approx(weights[kept] / weights[kept].sum())
+
+
+def test_one_kind_at_a_time_is_larger_or_smaller_where_that_is_asked_for() -> None:
+    assert list(_one_each(1)) == list(_combined(1)) == [(b,) for b in BESIDE]
+    few = list(_one_each(5))
+    assert len(few) == len(set(few)) == 1 + 2 * 5
+    assert set(few) < set(_combined(5))
+    assert (1.0,) * 5 in few and (1.0, 3.0, 1.0, 1.0, 1.0) in few

@@ -243,7 +243,8 @@ def test_two_arms_and_a_circle_of_unknown_place_are_refused() -> None:
 def test_noise_that_is_not_stated_is_found() -> None:
     rng = np.random.default_rng(15)
     made = session(MARKER, rng, n=60, noise=Noise(arm_shift=5e-4))
-    (note,) = solve(made).notes
+    note, of_arm = solve(made).notes
+    assert of_arm.startswith("what the arm does wrong alike at all poses is in the covariance")
     beyond = float(note.removeprefix("noise beyond the features' own: ").split(" mm")[0])
     assert 0.4 < beyond < 0.65
 

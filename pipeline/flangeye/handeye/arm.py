@@ -71,7 +71,8 @@ class MovedFlange:
                 yield follow(arm, self.poses, first)
 
     @cached_property
-    def _some_joints(self) -> Floats | None:
+    def some_joints(self) -> Floats | None:
+        """(N, n) joint angles [rad] on one branch; None where the model reaches no pose."""
         return next(self.branches(starts=12), None)
 
     def zeros(self, deviation: float, sized: bool = False) -> Nuisance | None:
@@ -79,7 +80,7 @@ class MovedFlange:
 
         The first joint's zero is right by definition: it fixes the base's x axis.
         """
-        joints = self._some_joints
+        joints = self.some_joints
         if joints is None or self.kinematics is None:
             return None
         return self.nuisance(self.kinematics.jacobian(joints)[:, :, 1:], deviation, sized)
@@ -167,13 +168,13 @@ def with_joint_offsets(model: Model, flange: MovedFlange, prior: float) -> Model
     return better(model, best, what)
 
 
-def unknown_zeros(model: Model, flange: MovedFlange) -> Floats | None:
+def unknown_zeros(model: Model, flange: MovedFlange) -> Floats:
     """Return what unknown joint zeros add to the (18, 18) covariance of the transforms.
 
-    None when the arm's model does not reach the poses.
+    Nothing when the arm's model does not reach the poses.
     """
     zeros = flange.zeros(flange.deviation)
-    return None if zeros is None else considered(model, zeros)
+    return np.zeros((18, 18)) if zeros is None else considered(model, zeros)
 
 
 def _with_offsets(model: Model, flange: MovedFlange, joints: Floats, prior: float) -> Model | None:

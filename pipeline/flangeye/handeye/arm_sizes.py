@@ -7,7 +7,7 @@ mixture of variances.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -57,7 +57,9 @@ class Sizes:
         return np.asarray(mixture_inflation(squares @ shares, self.weights) * mean)
 
 
-def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom: float) -> Sizes:
+def likely_sizes(
+    rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom: float, one_each: bool = False
+) -> Sizes:
     """Return how large errors of some kinds are likely to be.
 
     Args:
@@ -65,6 +67,8 @@ def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom:
         kinds: (N, 6, k) what errors of each kind, as large as was said, do to them.
         errors: (N, 6) their residuals.
         freedom: How many numbers those are.
+        one_each: Whether one kind at a time is larger or smaller beside the others, not each in
+            every combination: with six kinds that takes a twentieth of the time.
     """
     p, counts = rows.shape[2], [kind.shape[2] for kind in kinds]
     known = np.linalg.qr(rows.reshape(-1, p))[0]
@@ -72,7 +76,7 @@ def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom:
     told = told - known @ (known.T @ told)
     gram, left = told.T @ told, max(freedom - p, 1.0)
     cases = []
-    for beside in product(BESIDE, repeat=len(kinds) - 1):
+    for beside in (_one_each if one_each else _combined)(len(kinds) - 1):
         scale = np.repeat([1.0, *beside], counts)
         gains, noises = _likelihoods(gram, scale, left)
         factors = np.outer(np.sqrt(noises) * RATIOS, [1.0, *beside])
@@ -85,6 +89,14 @@ def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom:
     some = weights > LIKELY
     weights, every = weights[some] / weights[some].sum(), every[some]
     return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0))
+
+
+def _combined(kinds: int) -> Iterable[tuple[float, ...]]:
+    return product(BESIDE, repeat=kinds)
+
+
+def _one_each(kinds: int) -> Iterable[tuple[float, ...]]:
+    return (b for b in _combined(kinds) if sum(size != 1.0 for size in b) <= 1)
 
 
 def _likelihoods(gram: Floats, scale: Floats, left: float) -> tuple[Floats, Floats]:

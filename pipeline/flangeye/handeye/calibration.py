@@ -14,6 +14,7 @@ from flangeye.handeye.arm import (
     with_joint_offsets,
     with_tool_offset,
 )
+from flangeye.handeye.arm_errors import with_arm_errors
 from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
 from flangeye.handeye.certificate import certificate_note
 from flangeye.handeye.consensus import find_consensus
@@ -125,8 +126,9 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     reported, model = (
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
     )
-    camera, *others = _estimates(reported, cell, options, weak)
-    notes = (*_noise_notes(model, cell, weak), *_note_of_zeros(cell, options))
+    covariance, told = _with_arm_errors(reported, cell, options, weak)
+    camera, *others = _estimates(reported, cell, options, weak, covariance)
+    notes = (*_noise_notes(model, cell, weak), *told)
     if not weak.shape[1]:
         notes = (*notes, *_note_of_distortion(model, cell, options))
     if options.certify:
@@ -283,23 +285,63 @@ def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> Corr
     """Return the answer for the arm with its joint offsets corrected, if they were found."""
     if model.correction is None or not model.corrects_joints:
         return None
-    ignoring = replace(options, joint_zeros=False)
-    camera, *others = _estimates(model, cell, ignoring, weak)
+    camera, *others = _estimates(model, cell, options, weak, _covariance(model))
     return CorrectedArm(camera, model.correction, tuple(others))
 
 
-def _estimates(model: Model, cell: Cell, options: Options, weak: Floats) -> list[TransformEstimate]:
-    """Return the transforms with their covariances."""
-    found, configuration = model.found, cell.configuration
-    at, alone = found.at, not (model.problem.loop.y or model.problem.loop.z)
+def _inflation(model: Model) -> float:
+    """Return by how much a covariance is larger whose noise was itself estimated."""
+    alone = not (model.problem.loop.y or model.problem.loop.z)
+    freedom = freedom_of_sizes(model.problem, model.found)
+    return covariance_inflation(freedom, 6 if alone else model.found.parameters)
+
+
+def _covariance(model: Model) -> Floats:
+    """Return the (18, 18) covariance of the transforms that the fit itself leaves."""
+    return np.asarray(model.found.covariance[:18, :18] * _inflation(model))
+
+
+def _with_arm_errors(
+    model: Model, cell: Cell, options: Options, weak: Floats
+) -> tuple[Floats, tuple[str, ...]]:
+    """Return the (18, 18) covariance with what the arm does wrong alike at all poses, and say so.
+
+    That moves the answer, and held-out errors do not show it.
+    """
+    own, flange = _covariance(model), cell.flange
+    if flange is None or not options.joint_zeros:
+        return own, ()
+    if flange.kinematics is None:
+        return own, (
+            "what the arm does wrong alike at all poses is not in the covariance, for its "
+            "kinematics are not known: name them in the recipe (robot: model, or urdf)",
+        )
+    each = f"unknown joint zeros ({flange.deviation * 1e3:g} mrad each)"
+    if flange.some_joints is None:
+        return own, (f"{each} not considered: the arm's model misses these poses",)
+    if cell.configuration.is_default:
+        return own + unknown_zeros(model, flange), (
+            f"{each} are in the covariance: they move all poses alike, which held-out errors do "
+            "not show",
+        )
+    if weak.shape[1] or model.problem.walk is not None:
+        return own, ()
+    covariance, sizes = with_arm_errors(model, flange, _inflation(model))
+    zeros = flange.deviation * float(sizes.expected[0]) * 1e3
+    return covariance, (
+        f"what the arm does wrong alike at all poses is in the covariance, as large as the "
+        f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "
+        "twists and a smooth error beside them",
+    )
+
+
+def _estimates(
+    model: Model, cell: Cell, options: Options, weak: Floats, covariance: Floats
+) -> list[TransformEstimate]:
+    """Return the transforms with their covariances, begun at the (18, 18) given."""
+    configuration, at = cell.configuration, model.found.at
     transforms = transforms_of(configuration, at.x, at.y, at.z)
     points = points_of_interest(configuration, transforms, _agreeing(model, cell), cell.arm)
-    freedom = freedom_of_sizes(model.problem, found)
-    wider = covariance_inflation(freedom, 6 if alone else found.parameters)
-    covariance = found.covariance[:18, :18] * wider
-    if _considers_zeros(cell, options):
-        added = unknown_zeros(model, cell.flange) if cell.flange else None
-        covariance = covariance if added is None else covariance + added
     distortion = None if weak.shape[1] else _distortion(model, cell, options)
     if distortion is not None:
         covariance = covariance + considered(model, distortion)
@@ -341,30 +383,6 @@ def _note_of_distortion(model: Model, cell: Cell, options: Options) -> tuple[str
         f"the scanner's smooth distortion ({cell.scanner.calibration_error * 1e3:g} mm rms over "
         "its volume, by its file) is in the covariance: it is the same at every pose, which "
         "held-out errors do not show",
-    )
-
-
-def _considers_zeros(cell: Cell, options: Options) -> bool:
-    known = cell.flange is not None and cell.flange.kinematics is not None
-    return known and options.joint_zeros and cell.configuration.is_default
-
-
-def _note_of_zeros(cell: Cell, options: Options) -> tuple[str, ...]:
-    """Say whether the covariance includes unknown joint zeros."""
-    flange = cell.flange
-    if flange is not None and flange.kinematics is None and options.joint_zeros:
-        return (
-            "what the arm does wrong alike at all poses is not in the covariance, for its "
-            "kinematics are not known: name them in the recipe (robot: model, or urdf)",
-        )
-    if flange is None or not _considers_zeros(cell, options):
-        return ()
-    each = f"unknown joint zeros ({flange.deviation * 1e3:g} mrad each)"
-    if flange.zeros(flange.deviation) is None:
-        return (f"{each} not considered: the arm's model misses these poses",)
-    return (
-        f"{each} are in the covariance: they move all poses alike, which held-out errors do not "
-        "show",
     )
 
 

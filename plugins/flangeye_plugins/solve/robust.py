@@ -81,7 +81,8 @@ class RobustParams(Params):
     joint_zeros: Literal["consider", "ignore"] = Field(
         "consider",
         description="Whether the covariance includes what the zeros of the joints may be off by, "
-        "as the robot's file has it (joint_accuracy).",
+        "as the robot's file has it (joint_accuracy). But for a flange seen from the base, with "
+        "encoders, sag, lengths and twists, all as large as the residuals show them.",
     )
     joint_prior: Angle = param(
         "0.5 deg", gt=0, description="Expected standard deviation of a joint's offset."
