@@ -135,29 +135,48 @@ def _whole(fit: Model) -> Any:
     return basis @ fit.found.information @ basis.T
 
 
-def test_whether_zeros_are_in_the_covariance_is_said() -> None:
+def test_whether_the_arms_errors_are_in_the_covariance_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     options: Any = SimpleNamespace(joint_zeros=True)
+    fit, added = modelled(), 1e-6 * np.eye(18)
+    own = calibration._covariance(fit)
+    sizes = SimpleNamespace(expected=np.array([7.0, 1.0]))
+    monkeypatch.setattr(calibration, "unknown_zeros", lambda model, flange: added)
+    monkeypatch.setattr(calibration, "with_arm_errors", lambda model, flange, by: (by * own, sizes))
 
-    def said(kinematics: Any, zeros: Any = 1, default: bool = True) -> tuple[str, ...]:
-        flange = SimpleNamespace(kinematics=kinematics, deviation=2e-4, zeros=lambda _: zeros)
+    def told(kinematics: Any, joints: Any = 1, default: bool = True, weak: int = 0) -> Any:
+        flange = SimpleNamespace(kinematics=kinematics, deviation=2e-4, some_joints=joints)
         cell: Any = SimpleNamespace(
             flange=flange, configuration=SimpleNamespace(is_default=default)
         )
-        return calibration._note_of_zeros(cell, options)
+        covariance, said = calibration._with_arm_errors(fit, cell, options, np.zeros((20, weak)))
+        return covariance, *said
 
-    (unknown,) = said(None)
+    covariance, unknown = told(None)
     assert unknown.startswith("what the arm does wrong alike at all poses is not in the covariance")
-    (known,) = said(1)
+    np.testing.assert_array_equal(covariance, own)
+    covariance, known = told(1)
     assert known.startswith("unknown joint zeros (0.2 mrad each) are in the covariance: they move")
-    (missed,) = said(1, zeros=None)
-    assert missed == (
-        "unknown joint zeros (0.2 mrad each) not considered: the arm's model misses these poses"
-    )
-    assert said(1, default=False) == ()
+    np.testing.assert_array_equal(covariance, own + added)
+    for default in (True, False):
+        covariance, missed = told(1, None, default)
+        assert missed == (
+            "unknown joint zeros (0.2 mrad each) not considered: the arm's model misses these poses"
+        )
+        np.testing.assert_array_equal(covariance, own)
+    covariance, sized = told(1, default=False)
+    assert "joint zeros of about 1.4 mrad, and encoders" in sized
+    np.testing.assert_array_equal(covariance, calibration._inflation(fit) * own)
+    (covariance,) = told(1, default=False, weak=1)
+    np.testing.assert_array_equal(covariance, own)
     options.joint_zeros = False
-    assert said(None) == () and said(1) == ()
+    for kinematics in (None, 1):
+        (covariance,) = told(kinematics)
+        np.testing.assert_array_equal(covariance, own)
     none: Any = SimpleNamespace(flange=None, configuration=SimpleNamespace(is_default=True))
-    assert calibration._note_of_zeros(none, options) == ()
+    options.joint_zeros = True
+    assert calibration._with_arm_errors(fit, none, options, np.zeros((20, 0)))[1] == ()
 
 
 def test_what_is_stated_of_noise_goes_into_the_problem() -> None:
