@@ -231,3 +231,16 @@ def test_kronecker_alone_is_a_start() -> None:
 def test_where_a_parabola_is_zero_or_nearest_to_it(parabola: Any, expected: list[float]) -> None:
     found = [s / t for s, t in _ratios(*parabola)]
     assert sorted(found) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("roots", [(0.3, -2.0), (-1.5, 4.0)])
+@pytest.mark.parametrize("scale", [1.0, -7.0])
+def test_ratios_solve_their_quadratic_or_stand_at_its_vertex(
+    roots: tuple[float, float], scale: float
+) -> None:
+    """Noise may leave a double root short of zero: whichever way round it is solved, it is that."""
+    one, other = roots
+    found = _ratios(scale, -scale * (one + other), scale * one * other)
+    assert sorted(s / t for s, t in found) == pytest.approx(sorted(roots))
+    ((s, t),) = _ratios(scale, -2 * scale * one, scale * one**2 * (1 + 1e-9))
+    assert s / t == pytest.approx(one, rel=1e-6)
