@@ -1,12 +1,14 @@
 """The next sighting of a cell is the one that shrinks the whole graph's uncertainty most."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye.files.bundled import bundled
+from flangeye.handeye import cell_plan
 from flangeye.handeye.cell import solve_cell
 from flangeye.handeye.cell_plan import _moved, errors_at_work, foreseen, is_foretold, most_telling
 from flangeye.handeye.graph import LIMITS
@@ -89,3 +91,24 @@ def test_a_circle_is_foreseen_with_its_normal_known_as_well_across_it() -> None:
     assert np.array_equal(moved.covariance, own) and moved.radii == {"rim": 0.03}
     bare: Any = _moved(replace(like, normal=None, normal_covariance=None), pose)
     assert bare.centre == pytest.approx(pose[:3, 3]) and bare.normal is None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_most_telling_leaves_the_least_error_at_the_work(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the information says that each adds to what is known."""
+    rng = np.random.default_rng(seed)
+    nothing: Any = None
+    half, levers, rows = (
+        rng.normal(size=(9, 5)),
+        rng.normal(size=(3, 5)),
+        rng.normal(size=(9, 6, 5)),
+    )
+    known, some = np.linalg.inv(half.T @ half), SimpleNamespace(joint=np.linalg.inv(half.T @ half))
+    monkeypatch.setattr(cell_plan, "_rows", lambda *_: (rows, nothing))
+    monkeypatch.setattr(cell_plan, "_levers", lambda *_: levers)
+    left = [np.linalg.inv(np.linalg.inv(known) + r.T @ r) for r in rows]
+    expected = int(np.argmin([np.trace(levers @ each @ levers.T) for each in left]))
+    asked: Any = [nothing, some, nothing, nothing]
+    assert most_telling(*asked) == expected
