@@ -101,3 +101,14 @@ def test_one_kind_at_a_time_is_larger_or_smaller_where_that_is_asked_for() -> No
     assert len(few) == len(set(few)) == 1 + 2 * 5
     assert set(few) < set(_combined(5))
     assert (1.0,) * 5 in few and (1.0, 3.0, 1.0, 1.0, 1.0) in few
+
+
+def test_sizes_that_nothing_tells_are_as_was_expected_beforehand() -> None:
+    """Of a normal logarithm that is not below nought; what was not expected stays open."""
+    rng = np.random.default_rng(8)
+    rows, kind = rng.standard_normal((40, 6, 12)), 1e-9 * rng.standard_normal((40, 6, 3))
+    errors = rng.standard_normal((40, 6))
+    open_, told = (likely_sizes(rows, [kind], errors, 240.0, s) for s in (np.inf, 1.2))
+    logs = np.log(told.factors[:, 0])
+    assert told.weights @ logs**2 == pytest.approx(1.2**2, rel=0.05)
+    assert open_.expected[0] > 10 * told.expected[0]

@@ -19,6 +19,10 @@ from flangeye.handeye.candidates import Model, weighed_with
 from flangeye.handeye.likelihood import Solution
 from flangeye.types import Floats
 
+WORSE = 1.2
+"""Standard deviation of the logarithm of how much worse an arm is than its file says: one in three
+is three times worse, one in twenty ten times. Where few poses tell, this does."""
+
 
 def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tuple[Floats, Sizes]:
     """Return the (18, 18) covariance of the transforms with the arm's errors in it.
@@ -42,7 +46,7 @@ def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tupl
     rows, effects = told[:, :, :p], np.split(told[:, :, p:], ends[:-1], axis=2)
     errors = (w @ fit.linear.residuals[kept][..., None])[..., 0]
     measured = np.trace(model.problem.measurements.projectors[kept], axis1=1, axis2=2).sum()
-    sizes = likely_sizes(rows, effects, errors, float(measured), one_each=True)
+    sizes = likely_sizes(rows, effects, errors, float(measured), WORSE, one_each=True)
     known: Floats = np.asarray(np.linalg.inv(fit.information[:p, :p]), dtype=np.float64)
     followed = [known @ np.einsum("nij,nik->jk", rows, kind) for kind in effects]
     mixed = sizes.mixed([inflation * known, *(kind @ kind.T for kind in followed)])

@@ -58,7 +58,12 @@ class Sizes:
 
 
 def likely_sizes(
-    rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom: float, one_each: bool = False
+    rows: Floats,
+    kinds: Sequence[Floats],
+    errors: Floats,
+    freedom: float,
+    spread: float = np.inf,
+    one_each: bool = False,
 ) -> Sizes:
     """Return how large errors of some kinds are likely to be.
 
@@ -67,6 +72,7 @@ def likely_sizes(
         kinds: (N, 6, k) what errors of each kind, as large as was said, do to them.
         errors: (N, 6) their residuals.
         freedom: How many numbers those are.
+        spread: Standard deviation of the logarithm of the first kind's size about what was said.
         one_each: Whether one kind at a time is larger or smaller beside the others, not each in
             every combination: with six kinds that takes a twentieth of the time.
     """
@@ -85,6 +91,7 @@ def likely_sizes(
     every = every[every[:, 2] >= 1.0]
     if not len(every):
         return Sizes(np.ones(1), np.ones((1, len(kinds))), np.ones(1))
+    every[:, 0] -= (np.log(every[:, 2]) / spread) ** 2
     weights = np.exp((every[:, 0] - every[:, 0].max()) / 2)
     some = weights > LIKELY
     weights, every = weights[some] / weights[some].sum(), every[some]
