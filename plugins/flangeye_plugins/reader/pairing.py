@@ -105,16 +105,20 @@ def _offset(
     params: PairingParams,
 ) -> tuple[float, str]:
     if params.clock_offset is not None:
-        return params.clock_offset, f"clock offset {params.clock_offset * 1e3:.1f} ms as given"
+        return params.clock_offset, f"clock offset {_ms(params.clock_offset)} as given"
     if signals is not None and min(len(times) for times, _ in signals) > 20:
         offset, alike = clock_offset(*signals)
         if alike > 0:
             how = f"estimated by how both move (correlation {alike:.2f})"
-            return offset, f"clock offset {offset * 1e3:.1f} ms, {how}"
+            return offset, f"clock offset {_ms(offset)}, {how}"
     if len(spans) >= MIN_CAPTURES:
         offset = offset_into(list(spans), events)
-        return offset, f"clock offset {offset * 1e3:.1f} ms, the least that fits the standstills"
+        return offset, f"clock offset {_ms(offset)}, the least that fits the standstills"
     return 0.0, "clock offset taken to be 0 ms: nothing tells it"
+
+
+def _ms(seconds: float) -> str:
+    return f"{round(seconds * 1e3, 1) + 0.0:.1f} ms"  # a nought without a minus
 
 
 def _standing(arm: tuple[Floats, Floats], spans: Sequence[Span], moved: Floats) -> list[Pair]:

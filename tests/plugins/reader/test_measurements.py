@@ -16,6 +16,7 @@ from flangeye.maths.streams import clock_offset, standstills, turning
 from flangeye.plugin.registry import load_registry
 from flangeye_plugins.reader.corrected import CorrectedParams, corrected
 from flangeye_plugins.reader.matrices import MatricesParams, matrices
+from flangeye_plugins.reader.pairing import _ms
 from flangeye_plugins.reader.table import TableParams, table
 from flangeye_plugins.reader.visp import visp
 
@@ -326,3 +327,7 @@ def test_a_mistake_in_arrays_is_one_line(tmp_path: Path, place: str, message: st
         matrices(tmp_path, MatricesParams.model_validate({"robot": place, "length": "m"}))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_clock_offset_of_nothing_has_no_sign() -> None:
+    assert [_ms(x) for x in (-4e-5, 0.0, -0.2)] == ["0.0 ms", "0.0 ms", "-200.0 ms"]
