@@ -103,12 +103,8 @@ def _environment() -> Environment:
     """Return templates that escape everything, for ids, reasons and titles come from anywhere."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    from flangeye.report.templates import Compiled
-
     environment = Environment(
         loader=FileSystemLoader(_HERE),
-        bytecode_cache=Compiled(),
-        optimized=False,  # what is remembered follows from the text alone, not from filters
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
