@@ -24,7 +24,9 @@ def drawn(
     """Return what an arm's camera, or a camera beside it, saw, and the true transforms."""
     rng, n = np.random.default_rng(seed), 16
     joints = HOME + rng.uniform(-0.5, 0.5, (n, 6))
-    reported, true = ARM.flange(joints), ARM.flange(joints + zeros * rng.standard_normal(6))
+    off = zeros * rng.standard_normal(6)
+    off[0] = 0.0  # by definition: it fixes the base's x axis
+    reported, true = ARM.flange(joints), ARM.flange(joints + off)
     near = rigid(rotation_from_rpy(*rng.normal(0, 0.3, 3)), rng.normal(0, 0.05, 3))
     far = reported[0] @ near @ rigid(rotation_from_rpy(np.pi, 0, 0), np.array([0.0, 0.0, 0.6]))
     if configuration.camera == FLANGE:
@@ -64,12 +66,12 @@ def test_the_stated_regions_hold_for_an_arm_much_worse_than_its_file_says(name: 
         for zeros in held:
             answer = solved(observations, CONFIGURATIONS[name], zeros)
             held[zeros] += sum(square < limit for square in squares(answer, truth))
-    assert held["consider"] >= 5 > 1 > held["ignore"]
+    assert held["consider"] >= 6 > 1 > held["ignore"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("worse", "share"), [(1.0, 0.9), (10.0, 0.65)])
+@pytest.mark.parametrize(("worse", "share"), [(1.0, 0.9), (10.0, 0.75)])
 def test_the_stated_regions_hold(name: str, worse: float, share: float) -> None:
     limit, inside = chi2_quantile(0.95, 6), []
     for seed in range(100, 140):
