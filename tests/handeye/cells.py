@@ -264,3 +264,12 @@ def two_numbers(n: int, sized: bool = False) -> Nuisance:
     effects = np.random.default_rng(7).normal(size=(3, n, 6, 2))
     told = nuisance_of(effects[0], effects[1], 2e-4, sized, effects[2])
     return replace(told, mean=np.array([1e-4, -2e-4]))
+
+
+def with_wrong(problem, count):
+    """Return a problem whose first measurements are wrong, and which those are (N,)."""
+    s, n = problem.measurements, len(problem.measurements)
+    wrong, aside = np.arange(n) < count, rotation_exp(np.random.default_rng(1).normal(size=(n, 3)))
+    rotations = np.where(wrong[:, None, None], aside @ s.rotations, s.rotations)
+    centres = s.centres + np.where(wrong[:, None], [0.3, -0.2, 0.1], 0.0)
+    return replace(problem, measurements=replace(s, rotations=rotations, centres=centres)), wrong

@@ -32,7 +32,7 @@ from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, HandEye, Observation
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
 from tests.handeye import cells
-from tests.handeye.cells import CONFIGURATIONS, ISSUE, ROBOT, errors, fitted, session
+from tests.handeye.cells import CONFIGURATIONS, ISSUE, ROBOT, errors, fitted, session, with_wrong
 
 FLANGE = CONFIGURATIONS["eye-on-base, flange"]
 MADE = session(FLANGE, np.random.default_rng(5), n=20, feature="normal")
@@ -215,13 +215,8 @@ def test_small_sets_are_tried_where_not_all_agree(monkeypatch: pytest.MonkeyPatc
 def test_the_set_that_explains_the_better_half_is_begun_with() -> None:
     """Four of eleven are wrong: a fit to all begins nowhere, one to four good ones at the answer."""
     problem, found = exactly(n=11)
-    s, wrong = problem.measurements, np.arange(11) < 4
-    aside = rotation_exp(np.random.default_rng(1).normal(size=(11, 3)))
-    spoilt = replace(
-        s, rotations=np.where(wrong[:, None, None], aside @ s.rotations, s.rotations),
-        centres=s.centres + np.where(wrong[:, None], [0.3, -0.2, 0.1], 0.0),
-    )  # fmt: skip
-    again = consensus._from_subsets(replace(problem, measurements=spoilt), np.random.default_rng(0))
+    spoilt, wrong = with_wrong(problem, 4)
+    again = consensus._from_subsets(spoilt, np.random.default_rng(0))
     assert again is not None and (again.inliers == ~wrong).all()
     assert again.at.x == pytest.approx(found.at.x, abs=1e-6)
 

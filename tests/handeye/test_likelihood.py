@@ -25,7 +25,7 @@ from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.geometry import rotation_exp
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats
-from tests.handeye.cells import ISSUE, fitted, given, start, two_numbers
+from tests.handeye.cells import ISSUE, fitted, given, start, two_numbers, with_wrong
 
 ARMS = ArmNoise(2e-4, 5e-5)
 NONE = Noise(0.0, 0.0)
@@ -315,11 +315,6 @@ def test_where_the_base_walked_steps_tell_the_noise_as_well() -> None:
 def test_wrong_poses_are_found_where_the_others_agree_far_better_than_was_stated() -> None:
     """Begun at a fit to all, every pose is a thousand times its stated noise away: none is out."""
     problem = given(HAND, "pose", 11, ISSUE.scaled(0.01), stated=False)
-    s, wrong = problem.measurements, np.arange(11) < 4
-    aside = rotation_exp(np.random.default_rng(1).normal(size=(11, 3)))
-    spoilt = replace(
-        s, rotations=np.where(wrong[:, None, None], aside @ s.rotations, s.rotations),
-        centres=s.centres + np.where(wrong[:, None], [0.3, -0.2, 0.1], 0.0),
-    )  # fmt: skip
-    found = settle(replace(problem, measurements=spoilt), start(problem), NONE)
+    spoilt, wrong = with_wrong(problem, 4)
+    found = settle(spoilt, start(problem), NONE)
     assert (found.inliers == ~wrong).all()
