@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
+from flangeye.maths.shared_errors import without_shared
 from flangeye.models.configuration import Configuration
 from flangeye.models.corners import Corners
 from flangeye.types import (
@@ -26,6 +30,7 @@ from flangeye.types import (
 from flangeye_plugins.acquire.intrinsics import camera_of
 from flangeye_plugins.fit.planar import moved_by_camera, poses_from_pixels
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
+from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
 
 MATRIX = np.array([[1400.0, 0, 639.5], [0, 1400, 511.5], [0, 0, 1]])
 LENS = np.array([-0.12, 0.08, 0.0005, -0.0003])
@@ -130,6 +135,38 @@ def test_a_focal_length_known_badly_is_corrected_by_the_arms_motion() -> None:
     )
     assert off > 10e-3
     assert found < 2e-3
+
+
+def held_out(found: HandEye, keeps: bool) -> float:
+    """Return the held-out error [m], with what the features share or, wrongly, without."""
+
+    def again(some: Sequence[Observation]) -> HandEye:
+        answer = solved(list(some), 0.1)
+        return answer if keeps else replace(answer, shared=np.zeros(0))
+
+    return verify_holdout(found, again, HoldoutParams(), configuration=IN_HAND).figures["rms"]
+
+
+def test_poses_held_out_are_judged_by_the_camera_as_it_was_found() -> None:
+    found = solved(longer_focal(0.03, known=False), 0.1)
+    assert 0.8 < abs(float(found.shared[0])) < 1.2  # one standard deviation is what it is off by
+    assert held_out(found, keeps=True) < 0.5e-3
+    assert held_out(found, keeps=False) > 3e-3
+    assert any("1 number, the largest 1.0 of its standard deviation" in n for n in found.notes)
+
+
+def test_a_feature_without_what_all_share_is_where_a_right_camera_has_it() -> None:
+    seen, right = (longer_focal(share, known=False)[0] for share in (0.01, 1e-9))
+    cleaned = without_shared(seen, np.array([1.0])), without_shared(seen, np.array([-1.0]))
+    before = np.linalg.norm(seen.feature.centre - right.feature.centre)
+    after = min(np.linalg.norm(c.feature.centre - right.feature.centre) for c in cleaned)
+    assert before > 4e-3
+    assert after < 0.05 * before
+
+
+def test_nothing_is_taken_from_a_feature_that_shares_nothing() -> None:
+    alone = longer_focal(0.01, known=True)[0]
+    assert without_shared(alone, np.array([1.0])) is alone
 
 
 @pytest.mark.parametrize("share", [0.01, 0.03])

@@ -128,7 +128,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     )
     covariance, told = _with_arm_errors(reported, cell, options, weak)
     camera, *others = _estimates(reported, cell, options, weak, covariance)
-    notes = (*_noise_notes(model, cell, weak), *told)
+    notes = (*_noise_notes(model, cell, weak), *told, *_note_of_shared(_shared_of(reported)))
     if not weak.shape[1]:
         notes = (*notes, *_note_of_distortion(model, cell, options))
     if options.certify:
@@ -142,6 +142,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         tuple(others),
         _corrected(model, cell, options, weak),
         _scatter(model.found),
+        shared=_shared_of(reported),
     )
 
 
@@ -232,10 +233,27 @@ def _with_shared(model: Model, cell: Cell, weak: Floats) -> tuple[Model, Floats]
     """Return the model with the errors that all features share; the weak moves get as many more."""
     seen = shared_errors(cell.observations)
     still = np.zeros_like(seen)
-    moved = with_nuisance(model, nuisance_of(still, still, 1.0, seen=seen)) if seen.any() else None
+    if not seen.any():
+        return model, weak
+    moved = with_nuisance(model, nuisance_of(still, still, 1.0, seen=seen, shared=True))
     if moved is None:
         return model, weak
     return moved, np.pad(weak, ((0, seen.shape[2]), (0, 0)))
+
+
+def _shared_of(model: Model) -> Floats:
+    """Return how much there is of each error that the features share [standard deviations]."""
+    return np.asarray(model.found.at.nuisance[model.problem.nuisance.shared])
+
+
+def _note_of_shared(found: Floats) -> tuple[str, ...]:
+    if not len(found):
+        return ()
+    return (
+        f"what the features share, such as the errors of a camera found by its own views, is found "
+        f"with the poses: {len(found)} number{'s' if len(found) > 1 else ''}, the largest {np.abs(found).max():.1f} of its "
+        "standard deviation; poses held out are judged without it",
+    )
 
 
 def _with_depth(model: Model) -> Model:
@@ -286,7 +304,7 @@ def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> Corr
     if model.correction is None or not model.corrects_joints:
         return None
     camera, *others = _estimates(model, cell, options, weak, _covariance(model))
-    return CorrectedArm(camera, model.correction, tuple(others))
+    return CorrectedArm(camera, model.correction, tuple(others), shared=_shared_of(model))
 
 
 def _inflation(model: Model) -> float:

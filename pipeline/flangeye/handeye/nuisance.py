@@ -21,6 +21,7 @@ class Nuisance:
         prior: (k,) standard deviation known beforehand; infinite where nothing is known.
         mean: (k,) value expected beforehand.
         sized: (k,) whether the prior is itself estimated, one for all that are.
+        shared: (k,) whether it is an error that the features brought along.
     """
 
     camera: Floats
@@ -29,6 +30,7 @@ class Nuisance:
     prior: Floats
     mean: Floats
     sized: Mask
+    shared: Mask
 
     def __len__(self) -> int:
         return len(self.prior)
@@ -36,7 +38,7 @@ class Nuisance:
     def where(self, chosen: Mask | NDArray[np.intp]) -> Nuisance:
         """Return the effects on some of the poses."""
         effects = self.camera[chosen], self.target[chosen], self.seen[chosen]
-        return Nuisance(*effects, self.prior, self.mean, self.sized)
+        return Nuisance(*effects, self.prior, self.mean, self.sized, self.shared)
 
     def and_also(self, other: Nuisance) -> Nuisance:
         """Return both sets of numbers, these first."""
@@ -47,6 +49,7 @@ class Nuisance:
             np.concatenate([self.prior, other.prior]),
             np.concatenate([self.mean, other.mean]),
             np.concatenate([self.sized, other.sized]),
+            np.concatenate([self.shared, other.shared]),
         )
 
     def without_sized(self) -> Nuisance:
@@ -59,6 +62,7 @@ class Nuisance:
             self.prior[kept],
             self.mean[kept],
             self.sized[kept],
+            self.shared[kept],
         )
 
     def of_size(self, size: float) -> Nuisance:
@@ -77,7 +81,9 @@ def nuisance_of(
     deviation: float,
     sized: bool = False,
     seen: Floats | None = None,
+    shared: bool = False,
 ) -> Nuisance:
     """Return numbers of mean zero and one deviation, from their (N, 6, k) effects."""
     k, seen = camera.shape[2], np.zeros_like(camera) if seen is None else seen
-    return Nuisance(camera, target, seen, np.full(k, deviation), np.zeros(k), np.full(k, sized))
+    kinds = np.full(k, sized), np.full(k, shared)
+    return Nuisance(camera, target, seen, np.full(k, deviation), np.zeros(k), *kinds)

@@ -23,6 +23,7 @@ from flangeye.errors import StageError
 from flangeye.maths.arm_correction import corrected_observation
 from flangeye.maths.geometry import each_applied
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.shared_errors import without_shared
 from flangeye.types import (
     BASE,
     BASE2,
@@ -103,8 +104,10 @@ class Configuration:
     def corrected(
         self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
     ) -> list[Observation]:
-        """Return observations with the flange where the corrected arm has it."""
-        return [corrected_observation(o, calibration.correction, arm) for o in observations]
+        """Return observations as the calibration corrects them; see :class:`Layout`."""
+        found, correction = calibration.shared, calibration.correction
+        seen = [without_shared(o, found) for o in observations]
+        return [corrected_observation(o, correction, arm) for o in seen]
 
     def ends(
         self,
@@ -214,6 +217,8 @@ class Layout(Protocol):
         self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
     ) -> list[Observation]:
         """Return observations with every flange where a calibration's correction has it.
+
+        What was seen is rid of the errors that the calibration found all features to share.
 
         Args:
             observations: N of them.

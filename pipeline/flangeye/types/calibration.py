@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from flangeye.types.arrays import Array, freeze
 from flangeye.types.features import Observation
 from flangeye.types.frames import BASE, FrameMismatchError, TransformEstimate
@@ -100,12 +102,17 @@ class CorrectedArm:
         correction: What to correct; None in a cell.
         others: As in :class:`HandEye`.
         arms: As in :class:`HandEye`.
+        shared: As in :class:`HandEye`.
     """
 
     camera: TransformEstimate
     correction: ArmCorrection | None
     others: tuple[TransformEstimate, ...] = ()
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
+    shared: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        freeze(self, shared=(len(self.shared),))
 
 
 @dataclass(frozen=True)
@@ -142,6 +149,8 @@ class HandEye:
             correction.
         noise: What differs from pose to pose, as the residuals show it; None where not estimated.
         arms: In a cell, what it found wrong with each arm, by its name.
+        shared: (k,) how much it found of each error that the features share (such as the camera's,
+            :class:`PoseFeature`), in standard deviations; none where it looked for none.
     """
 
     camera: TransformEstimate
@@ -153,6 +162,10 @@ class HandEye:
     corrected: CorrectedArm | None = None
     noise: ScatterNoise | None = None
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
+    shared: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        freeze(self, shared=(len(self.shared),))
 
     def as_reported(self) -> HandEye:
         """Return the answer for the arm as its controller reports it, alone."""
@@ -166,6 +179,7 @@ class HandEye:
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
+            answer = replace(answer, shared=found.shared)
             others = found.others or self.others
             return replace(answer, others=others, corrected=None, arms=found.arms)
         known = (self.correction, *self.arms.values())
