@@ -249,10 +249,11 @@ def _shared_of(model: Model) -> Floats:
 def _note_of_shared(found: Floats) -> tuple[str, ...]:
     if not len(found):
         return ()
+    numbers = f"{len(found)} number{'s' if len(found) > 1 else ''}"
     return (
-        f"what the features share, such as the errors of a camera found by its own views, is found "
-        f"with the poses: {len(found)} number{'s' if len(found) > 1 else ''}, the largest {np.abs(found).max():.1f} of its "
-        "standard deviation; poses held out are judged without it",
+        "what the features share, such as the errors of a camera found by its own views, is found "
+        f"with the poses: {numbers}, the largest {np.abs(found).max():.1f} standard deviations; "
+        "held-out errors are measured with it corrected",
     )
 
 
