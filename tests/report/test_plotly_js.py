@@ -74,8 +74,22 @@ def test_a_page_holds_the_part_and_finds_it_once(
     find = packed_plotly.__wrapped__
     packed = find(frozenset({"bar"}))
     assert gzip.decompress(base64.b64decode(packed)).decode() == partial_plotly(BUNDLE, {"bar"})
-    monkeypatch.setattr(plotly_js, "partial_plotly", None)
+    monkeypatch.setattr(plotly_js, "pieces_for", None)
     assert find(frozenset({"bar"})) == packed
+
+
+@pytest.mark.parametrize(
+    "kept",
+    ["", "{", "7", "[[1]]", '["alert(1)"]', "[[0, 9999]]", "[[5, 9], [0, 5]]", "[[-9, 5]]"],
+)
+def test_nothing_from_the_cache_but_pieces_in_order_is_in_a_page(
+    kept: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plotly_js, "plotly_js", lambda: BUNDLE)
+    monkeypatch.setattr(plotly_js, "recall", lambda *_: kept)
+    monkeypatch.setattr(plotly_js, "keep", lambda *_: None)
+    packed = packed_plotly.__wrapped__(frozenset({"bar"}))
+    assert gzip.decompress(base64.b64decode(packed)).decode() == partial_plotly(BUNDLE, {"bar"})
 
 
 def test_of_another_structure_the_page_holds_the_whole(
