@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,10 +11,12 @@ import pytest
 
 from flangeye.handeye import arm as rooms
 from flangeye.handeye.arm import MovedFlange, _not_told_apart, _significant
+from flangeye.handeye.candidates import Model, weighed_with
+from flangeye.handeye.consensus import Consensus
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import f_quantile
-from tests.handeye.cells import ROBOT
+from tests.handeye.cells import ROBOT, fitted, given, two_numbers
 from tests.plugins.solve.test_arm import HOME, MM, TRUTH, simulate, solver
 
 ARM = Arm(ROBOT)
@@ -128,3 +131,39 @@ def test_what_is_not_told_apart_is_said_with_the_largest_turn() -> None:
         1.2e-3, turns
     )
     assert "(tool frame, bias of the fit) does not show, for" in _not_told_apart(0.2, turns)
+
+
+def test_a_field_is_looked_for_in_a_dozen_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[Any] = []
+    monkeypatch.setattr(rooms, "with_nuisance", lambda *given: looked.append(given))
+    for inliers in (11, 12):
+        found = SimpleNamespace(inliers=np.arange(40) < inliers)
+        model: Any = SimpleNamespace(corrects_joints=False, found=found)
+        poses = ARM.flange(HOME + np.random.default_rng(0).uniform(-0.3, 0.3, (40, 6)))
+        assert rooms.with_field(model, MovedFlange(poses, None, False)) is model
+        assert len(looked) == (inliers == 12)
+
+
+def test_an_offset_that_turns_about_one_axis_do_not_show_is_not_estimated() -> None:
+    """Along that axis it moves all centres alike, as the camera's place does."""
+    problem = given("eye-on-base, flange", "centre", 14, stated=False)
+    s, turns = problem.measurements, np.linspace(-0.6, 0.6, 14)
+    poses = s.b.copy()
+    poses[:, :3, :3] = rotation_exp(np.outer(turns, [0.0, 0.0, 1.0])) @ s.b[0, :3, :3]
+    problem = replace(problem, measurements=replace(s, b=poses))
+    model = Model(Consensus(problem, fitted(problem)))
+    (note,) = rooms.with_tool_offset(model, MovedFlange(poses, None, False)).notes
+    assert "does not show, for orientations differ by 68.8 deg at most" in note
+
+
+def test_how_well_the_last_are_known_is_a_block_of_the_inverse_of_all_information() -> None:
+    problem = given("eye-on-base, flange", "centre", 14, stated=False)
+    model = Model(Consensus(problem, fitted(problem)))
+    told = rooms._covariance_of_last(model, two_numbers(14), 2)
+    information = weighed_with(problem, model.found, two_numbers(14)).information
+    assert told == pytest.approx(np.linalg.inv(information)[-2:, -2:], rel=1e-6)
+
+
+def test_of_half_a_turn_the_largest_angle_between_orientations_is_told() -> None:
+    turns = np.array([rotation_exp([a, 0.0, 0.0]) for a in (0.0, 0.5, np.pi)])
+    assert "differ by 180.0 deg at most" in _not_told_apart(1e-3, turns)

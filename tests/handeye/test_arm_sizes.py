@@ -39,6 +39,7 @@ def test_what_the_errors_leave_of_the_noise_is_told() -> None:
     sizes = likely_sizes(rows, kinds, errors / 2, FREEDOM)
     assert sizes.weights @ sizes.noise == pytest.approx(0.25, rel=0.4)
     assert sizes.expected[0] == pytest.approx(4.0, rel=0.4)
+    assert (likely_sizes(rows, kinds, 3 * errors, FREEDOM).noise == 1.0).all()  # at most
 
 
 def test_errors_are_no_smaller_than_was_said() -> None:

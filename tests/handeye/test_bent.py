@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.handeye.bent import KINDS, LENGTH, SAG, TWIST, Bent
+from flangeye.handeye.bent import KINDS, LENGTH, SAG, TWIST, Bent, _levers
 from flangeye.maths.geometry import hat, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -14,7 +14,8 @@ ARM = Arm(load_model("robots", "ur5", None))
 HOME = np.array([0.2, -1.4, 1.3, -1.2, -1.4, 0.3])
 JOINTS = HOME + np.random.default_rng(0).uniform(-0.5, 0.5, (30, 6))
 SIZE = 1e-4
-BENT = Bent("arm", ARM, JOINTS, SIZE, np.zeros(6))
+OFF = np.array([0.0, 0.2, -0.3, 0.1, 0.25, -0.15])
+BENT = Bent("arm", ARM, JOINTS - OFF, SIZE, OFF)
 
 
 def twists(after, before):
@@ -47,7 +48,7 @@ def test_joints_give_way_each_by_itself_and_all_together() -> None:
 
 def test_an_encoder_is_off_by_a_wave_of_any_phase() -> None:
     waves = by_kind()["encoders"]
-    turned = replace(BENT, offsets=0.4 * SIZE * np.eye(6)[2])
+    turned = replace(BENT, offsets=OFF + 0.4 * SIZE * np.eye(6)[2])
     at_sine = twists(turned.poses, BENT.poses) * np.sin(JOINTS[:, 2:3])
     assert waves[:, :, 2] == pytest.approx(at_sine, abs=1e-8)
     assert waves.shape == (30, 6, 12)
@@ -63,3 +64,39 @@ def test_the_smooth_rest_does_not_move_the_base() -> None:
     told = rigid.T @ smooth[:, 3:].reshape(len(rigid), -1)
     assert np.abs(told).max() < 1e-9
     assert np.abs(smooth).max() > 0.1 * LENGTH * SIZE
+
+
+def test_weight_beyond_a_joint_pulls_by_its_horizontal_lever() -> None:
+    """Of an arm stretched along x: by the mean of the origins beyond, in metres; none along it."""
+    joints = np.zeros((1, 6))
+    origins, (axes, places) = ARM.frames(joints)[0, :, :3, 3], ARM.axes(joints)
+    found = _levers(ARM, joints)[0]
+    for i in range(6):
+        far = np.mean([origins[k] for k in range(len(origins)) if k > i], axis=0) - places[0, i]
+        # A downward weight turns a joint by its moment about the axis.
+        assert found[i] == pytest.approx(-axes[0, i] @ np.cross(far, [0, 0, -1.0]), abs=1e-12)
+    assert found[1] == pytest.approx(np.abs(found).max()) or found[1] == -np.abs(found).max()
+    assert np.abs(found[1:3]).min() > 0.1
+
+
+def test_kinds_of_errors_are_as_large_beside_a_zero_of_one_radian_as_is_said() -> None:
+    """Lengths 0.1 m, twists 0.2 rad, waves 0.4 rad, and 2 rad a metre of lever."""
+    kinds = by_kind()
+    columns = ARM.jacobian(JOINTS)
+    levers = _levers(ARM, JOINTS)
+    assert kinds["sag"][:, :, :6] == pytest.approx(SIZE * 2.0 * columns * levers[:, None])
+    cosines = kinds["encoders"][:, :, 6:]
+    assert cosines == pytest.approx(SIZE * 0.4 * columns * np.cos(JOINTS)[:, None])
+    for kind, which, step in (("lengths", 5, [0, 0.1, 0]), ("twists", 3, [0, 0, 0.2])):
+        change = np.zeros((6, 3))
+        change[2 if kind == "lengths" else 3] = 1e-6 * np.array(step)
+        built = twists(ARM.altered(change).flange(JOINTS), ARM.flange(JOINTS)) * SIZE / 1e-6
+        assert kinds[kind][:, :, which] == pytest.approx(built, abs=1e-4 * np.abs(built).max())
+
+
+def test_zeros_that_are_off_turn_the_joints_where_they_are_but_the_first() -> None:
+    for k in range(5):
+        turned = ARM.flange(JOINTS + SIZE * np.eye(6)[k + 1])
+        assert BENT.twists[:, :, k] == pytest.approx(twists(turned, BENT.poses), abs=2e-8)
+    moved = BENT.moved(np.array([1.0, -2.0, 3.0, 0.0, 0.5]))
+    assert moved.offsets == pytest.approx(OFF + SIZE * np.array([0, 1, -2, 3, 0, 0.5]))

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from flangeye.handeye.blame import _noise, blame, explained, suspects
 from flangeye.handeye.drift import Information, Sightings, allowance
+from flangeye.maths.geometry import hat
+from flangeye.types import Floats
 from flangeye_emulators.world.year import ABOUT, Happening, Year, watch
 
 DAILY = 3e-5
@@ -69,3 +72,62 @@ def test_blame_is_the_same_with_weights_of_the_arm_that_do_nothing() -> None:
     weighed = blame(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
     assert weighed == pytest.approx(plain, rel=1e-6)
     assert explained(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
+
+
+def one_sighting(residual: Floats) -> Sightings:
+    """Return one sighting by a scanner that stands a metre above, nothing else being known."""
+    own = 1e-8 * np.eye(5)[None]
+    effects = np.concatenate([-hat(np.array([[0, 0, -1.0]])), np.eye(3)[None]], axis=2)
+    effects = np.concatenate([effects, np.zeros((1, 2, 6))], axis=1)
+    turned = np.eye(3)[None]
+    return Sightings(residual[None], effects, own, turned, None, np.zeros(1, dtype=int))
+
+
+NOTHING = Information.of_covariance(1e-12 * np.eye(6))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.99, True), (1.01, False)])
+def test_a_part_may_be_off_by_a_tenth_of_a_metre_or_radian_and_no_chance_is_one_in_a_million(
+    share: float, told: bool
+) -> None:
+    """Along the line to the scanner, where its turns move nothing: by a shift, or the flange."""
+    limit = np.sqrt(stats.chi2(5).isf(1e-6) * (0.1**2 + 1e-8))
+    seen = one_sighting(share * limit * np.eye(5)[2])
+    above = np.array([0.0, 0.0, 1.0])
+    assert explained(NOTHING, seen, above, above, 1e-9) == told
+
+
+def test_each_part_is_as_likely_as_what_it_does_by_a_millimetre_or_milliradian() -> None:
+    """By the normal distributions of what is seen, the parts being as likely beforehand."""
+    seen = one_sighting(np.array([1.2e-3, -0.3e-3, 0.8e-3, 0.0, 0.0]))
+    above = np.array([0.0, 0.0, 1.0])
+    noise = 1e-8 * np.eye(5)
+    turned, shifted = np.diag([1.0, 1.0, 0, 0, 0]) * 1e-6, np.diag([1.0, 1.0, 1.0, 0, 0]) * 1e-6
+    does = {
+        "scanner turned": turned, "scanner shifted": shifted,
+        "scanner moved": turned + shifted, "flange replaced": shifted,
+    }  # fmt: skip
+    density = {
+        part: stats.multivariate_normal(np.zeros(5), noise + spread).pdf(seen.residuals[0])
+        for part, spread in does.items()
+    }
+    expected = {part: each / sum(density.values()) for part, each in density.items()}
+    assert blame(NOTHING, seen, above, above, 1e-9) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_joint_by_itself_or_the_arm_is_blamed_by_what_joints_do() -> None:
+    """Not the first, which turns the base as the scanner would."""
+    columns = np.zeros((1, 5, 3))
+    columns[0, 0, 0], columns[0, 1, 1], columns[0, 2, 2] = 0.5, 0.7, 0.9
+    seen = replace(one_sighting(np.array([0.0, 2e-3, 0.0, 0.0, 0.0])), joints=columns)
+    above = np.array([0.0, 0.0, 1.0])
+    parts = blame(NOTHING, seen, above, above, 1e-9)
+    assert {p for p in parts if "re-mastered" in p} == {
+        "joint 2 re-mastered", "joint 3 re-mastered", "arm re-mastered",
+    }  # fmt: skip
+    one = np.diag([1e-8, 1e-8 + (0.7e-3) ** 2, 1e-8, 1e-8, 1e-8])
+    arm = one + np.diag([0, 0, (0.9e-3) ** 2, 0, 0])
+    ratio = [stats.multivariate_normal(np.zeros(5), s).pdf(seen.residuals[0]) for s in (one, arm)]
+    assert parts["joint 2 re-mastered"] / parts["arm re-mastered"] == pytest.approx(
+        ratio[0] / ratio[1], rel=1e-3
+    )

@@ -33,7 +33,8 @@ def test_noise_beyond_the_features_own_is_the_arms_and_what_else_there_is(
     are_poses: bool, normals: bool, told: list[str]
 ) -> None:
     """Their variances add up: the arms' by their share, and of that in depth a third an axis."""
-    of_arm = np.diag([2 * np.radians(0.3) ** 2] * 3 + [2 * 3e-3**2] * 3)
+    turn, shift = 2 * np.radians(0.3) ** 2, 2 * 3e-3**2
+    of_arm = np.diag([0.5 * turn, turn, 1.5 * turn, 0.8 * shift, 1.3 * shift, 0.9 * shift])
     noise = Noise(pose=3.5**2 * 1e-6, tilt=np.radians(0.4) ** 2, arms=0.5, depth=3 * 3.75e-6)
     found: Any = SimpleNamespace(
         linear=SimpleNamespace(of_arms=np.tile(of_arm, (4, 1, 1))), noise=noise

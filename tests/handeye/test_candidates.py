@@ -59,7 +59,7 @@ def a_fit(n: int) -> Fit:
     """Return a fit of four unknowns to n measurements, every seventh left out of it."""
     rng, inliers = np.random.default_rng(n), np.arange(n) % 7 != 5
     jacobian, seen = rng.normal(size=(n, 6, 4)), 1e-3 * rng.normal(size=(n, 6))
-    rows = rng.normal(size=(n, 6, 8))
+    rows = rng.normal(size=(n, 6, 8)) * np.array([1.0, 2, 1, 30, 50, 300])[:, None]
     weights = rows @ rows.transpose(0, 2, 1)
     covariance = np.linalg.inv(np.einsum("nai,nab,nbj->ij", *[jacobian[inliers], weights[inliers]],
                                          jacobian[inliers]))  # fmt: skip
@@ -212,3 +212,14 @@ def test_sized_nuisances_begin_at_the_size_of_the_residuals(
     assert two is not None and two.problem.nuisance.sized.tolist() == [True, True, False, False]
     assert two.found.noise.size == one.found.noise.size
     assert len(one.problem.nuisance) == 2
+
+
+def test_a_direction_that_is_known_a_thousand_times_better_counts_as_well(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of one that is not known at all nothing is held against the covariances."""
+    errors = np.array([[1e-3, 4e-6, 7.0], [-1e-3, -4e-6, -7.0]])
+    stated = errors, np.tile(np.diag([1e-6, 4e-12, 0.0]), (2, 1, 1))
+    monkeypatch.setattr(candidates, "held_out", lambda _: stated)
+    found: Any = SimpleNamespace(inliers=np.array([True, True]))
+    assert understated(found) == pytest.approx((1 + 4) / 3)

@@ -234,7 +234,7 @@ def test_where_a_parabola_is_zero_or_nearest_to_it(parabola: Any, expected: list
 
 
 @pytest.mark.parametrize("roots", [(0.3, -2.0), (-1.5, 4.0)])
-@pytest.mark.parametrize("scale", [1.0, -7.0])
+@pytest.mark.parametrize("scale", [1.0, -7.0, 1e-4])
 def test_ratios_solve_their_quadratic_or_stand_at_its_vertex(
     roots: tuple[float, float], scale: float
 ) -> None:

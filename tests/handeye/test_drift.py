@@ -51,10 +51,10 @@ def test_the_days_motion_is_marginalised_as_an_unknown_would_be() -> None:
     np.testing.assert_allclose(known.vector[1], -weighted.T @ own.residuals.ravel(), rtol=1e-5)
 
 
-def told(rng: np.random.Generator, *shape: int) -> Information:
-    """Return what a camera's six numbers are known to be: positive, no axis by itself."""
-    rows = rng.standard_normal((*shape, 9, 6))
-    return Information(np.swapaxes(rows, -1, -2) @ rows, rng.standard_normal((*shape, 6)))
+def told(rng: np.random.Generator, *shape: int, numbers: int = 6) -> Information:
+    """Return what is known of a camera's six numbers, or more: positive, no axis by itself."""
+    rows = rng.standard_normal((*shape, 12, numbers))
+    return Information(np.swapaxes(rows, -1, -2) @ rows, rng.standard_normal((*shape, numbers)))
 
 
 def test_a_change_is_what_came_after_less_what_came_before() -> None:
@@ -360,3 +360,35 @@ def test_a_step_is_looked_for_in_the_last_four_checks_against_an_f_distribution(
     scale, freedom = _scatter(checks, known, (6, 18), 50.0)
     limit = 6 * scale * f_quantile(1 - 2e-4 / 4, 6, freedom)
     assert first == 18 and ratio == pytest.approx(square / limit, rel=1e-4)
+
+
+def test_a_change_is_the_cameras_whose_arm_stays_as_wrong_as_it_was() -> None:
+    """Against one system of all that is unknown: the arm's three weights, and both motions."""
+    rng = np.random.default_rng(0)
+    after, before = told(rng, numbers=9), told(rng, numbers=9)
+    change = _change(after, before)
+    # Unknown are what was before, and by what the camera moved since.
+    then, since = np.eye(9, 15), np.eye(9, 15)
+    since[:6, 9:] = np.eye(6)
+    matrix = then.T @ before.matrix @ then + since.T @ after.matrix @ since
+    vector = then.T @ before.vector + since.T @ after.vector
+    assert np.linalg.inv(change.matrix) == pytest.approx(np.linalg.inv(matrix)[9:, 9:], rel=1e-6)
+    mean = np.linalg.solve(matrix, vector)[9:]
+    assert change.mean == pytest.approx(mean, rel=1e-6)
+
+
+def test_of_what_is_told_a_billionth_as_well_nothing_is_told() -> None:
+    for share, rank in ((2e-9, 2), (0.5e-9, 1)):
+        flat = Information(np.diag([4.0, 4.0 * share, 0, 0, 0, 0]), np.array([2.0, 0, 0, 0, 0, 0]))
+        assert int(_surprise(flat)[1]) == rank
+
+
+def test_one_sighting_in_a_million_is_a_misfit_by_chance() -> None:
+    assert pytest.approx(1e-6) == MISFIT
+    seen = a_sighting(np.zeros(6), np.zeros(6))
+    exact = Information.of_covariance(1e-20 * np.eye(6))
+    still = DriftTest(daily=1e-10)
+    limit = np.sqrt(chi2_quantile(1 - 1e-6, 5)) * 1e-4
+    for share, wanted in ((0.99, False), (1.01, True)):
+        off = replace(seen, residuals=share * limit * np.eye(5)[[0, 1, 3, 4]])
+        assert misfits(off, exact, still).tolist() == [wanted] * 4

@@ -1,6 +1,7 @@
 """The most likely unknowns: against differences, dense normal distributions and fits without one."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from flangeye.handeye.smoothing import steps_told
 from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.geometry import rotation_exp
 from flangeye.maths.statistics import f_quantile
-from flangeye.types import Floats
+from flangeye.types import Floats, Mask
 from tests.handeye.cells import ISSUE, fitted, given, start, two_numbers, with_wrong
 
 ARMS = ArmNoise(2e-4, 5e-5)
@@ -236,12 +237,12 @@ def test_noise_that_is_known_is_not_estimated() -> None:
     assert known.noise.pose == 4e-8 and known.freedom == np.inf
     free = with_noise(replace(problem, stated=False), fitted(problem))
     assert free.freedom == pytest.approx(3 * 12 - 6)
-    still = with_noise(
-        replace(problem, stated=False),
-        weigh(problem, start(problem), NONE, np.ones(12)),
-        refit=False,
-    )
-    np.testing.assert_array_equal(still.at.x, start(problem).x)
+    hand = given(HAND, "pose", 12, stated=False)
+    aside = start(hand).moved(np.append([1e-3, 2e-3, 0, 1e-3], np.zeros(16)))
+    for each in (hand, replace(hand, stated=True)):
+        still = with_noise(each, weigh(each, aside, NONE, np.ones(12)), refit=False)
+        np.testing.assert_array_equal(still.at.x, aside.x)
+        np.testing.assert_array_equal(still.at.z, aside.z)
 
 
 def test_noise_in_depth_is_what_goes_beyond_that_across() -> None:
@@ -318,3 +319,53 @@ def test_wrong_poses_are_found_where_the_others_agree_far_better_than_was_stated
     spoilt, wrong = with_wrong(problem, 4)
     found = settle(spoilt, start(problem), NONE)
     assert (found.inliers == ~wrong).all()
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "rounds", "taken"),
+    [
+        ([8], 1, 8),  # the same as before
+        ([7, 7], 2, 7),
+        ([6, 7, 6], 3, 7),  # to and fro
+        ([3, 2], 2, 3),  # three tell an answer, two do not
+        ([7, 6, 5, 4, 7], 5, 4),
+    ],
+)
+def test_those_that_agree_are_fitted_again_until_they_have_been_before(
+    agreeing: list[int], rounds: int, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = given(HAND, "pose", 8)
+    begun, asked = fitted(problem), list[int]()
+
+    def judge(problem: Problem, found: Solution) -> tuple[Floats, Mask]:
+        asked.append(int(found.inliers.sum()))
+        return np.full(8, float(len(asked))), np.arange(8) < agreeing[len(asked) - 1]
+
+    monkeypatch.setattr(likelihood, "judged", judge)
+    found = likelihood.agreeing(problem, begun)
+    assert asked == [8, *agreeing[:-1]][:rounds]
+    assert found.inliers.sum() == taken and (found.squares == rounds).all()
+
+
+def test_from_far_away_a_climb_arrives_in_few_steps_and_never_goes_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, every, costs = given(HAND, "pose", 12), np.ones(12), list[float]()
+    found = fitted(problem)
+    weighing = likelihood.weigh
+
+    def weighed(*given: Any) -> Solution:
+        there = weighing(*given)
+        costs.append(there.cost)
+        return there
+
+    for seed in range(6):
+        step = np.random.default_rng(seed).normal(size=found.basis.shape[1])
+        away = weighing(problem, found.at.moved(found.basis @ (0.6 * step)), NONE, every)
+        costs.clear()
+        with monkeypatch.context() as watched:
+            watched.setattr(likelihood, "weigh", weighed)
+            again = likelihood._climb_on(problem, away, every, 60)
+        assert again.cost == pytest.approx(found.cost, rel=1e-6)
+        assert again.cost == min(costs)
+        assert len(costs) <= 16

@@ -50,6 +50,26 @@ def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
             require_right_handed(mirrored, tcps)
 
 
+@pytest.mark.parametrize(
+    ("rises", "noise", "refused"),
+    [(0.1, 0.018, True), (0.1, 0.0184, False), (5.2e-4, 1e-5, True), (4.8e-4, 1e-5, False)],
+)
+def test_a_mirror_is_named_that_leaves_a_tenth_of_more_than_a_millimetre(
+    rises: float, noise: float, refused: bool
+) -> None:
+    """A saddle: no turn takes it to its mirror, so it is off by twice its height, less noise."""
+    low = np.array([[0.3, 0.3, 0], [-0.3, 0.3, 0], [-0.3, -0.3, 0], [0.3, -0.3, 0]])
+    heights = np.array([1.0, -1.0, 1.0, -1.0])
+    saddle = low + np.outer(heights, [0.0, 0.0, rises])
+    bend = np.outer(heights, [0.0, 0.0, noise])
+    centres = saddle * [1.0, 1.0, -1.0] + bend
+    if not refused:
+        require_right_handed(centres, saddle)
+        return
+    with pytest.raises(StageError, match=f"mirrored \\({noise * 1e3:.1f} mm rms instead of "):
+        require_right_handed(centres, saddle)
+
+
 def test_the_noise_that_residuals_show_is_the_noise_of_one_coordinate() -> None:
     rng, sigma, count = np.random.default_rng(1), 1e-3, 6
     found = []
@@ -275,3 +295,13 @@ def test_a_fit_leaves_the_root_of_the_mean_square_distance() -> None:
     corners = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
     bent = corners + np.outer([0.3, -0.3, -0.3, 0.3], [0.0, 0.0, 1.0])
     assert _fit_rms(corners + 3.0, bent) == pytest.approx(0.3)
+
+
+def test_a_motion_is_named_that_makes_what_is_weak_known_twice_as_well() -> None:
+    """Of what is known a thousand times worse than needed nothing is known."""
+    for excess, after, named in ((10.0, 4.9, True), (10.0, 5.1, False), (9e3, 2e3, False),
+                                 (9e3, 499.0, True), (9e3, 501.0, False)):  # fmt: skip
+        known, better = np.diag([4.0, excess**-2]), np.diag([0.0, after**-2 - excess**-2])
+        chosen, left = telling(known, np.ones(2), {"it": better})
+        assert chosen == (["it"] if named else [])
+        assert left.excess[0] == pytest.approx(after if named else excess)

@@ -1,5 +1,6 @@
 """How far the next prediction may be off: what differs from pose to pose, and the matrix."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +9,8 @@ import pytest
 
 from flangeye.handeye.prediction import prediction_covariance
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.types import BASE, CAMERA, ScatterNoise, Transform
+from flangeye.maths.smooth_field import effects, field_over
+from flangeye.types import BASE, CAMERA, ArmCorrection, ScatterNoise, Transform
 
 TURN = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
 OWN = np.diag([1e-8, 4e-8, 9e-8])
@@ -35,3 +37,27 @@ def test_feature_arm_and_matrix_add_up(noise: Any, scale: float, arm: float, wid
     of_matrix = PLACE + TILT * 0.5**2 * np.array([0, 1, 1])
     found = prediction_covariance(calibration, seen)
     assert found == pytest.approx(np.diag(wider * differing + of_matrix), abs=1e-12)
+
+
+def test_what_is_left_of_a_smooth_error_is_widened_with_the_noise() -> None:
+    rng = np.random.default_rng(0)
+    bare = field_over(rng.uniform(-0.3, 0.3, (12, 3)))
+    k = len(bare.weights)
+    rows = 1e-4 * rng.normal(size=(k, k + 5))
+    field = replace(bare, covariance=rows @ rows.T)
+    place = np.array([0.1, -0.2, 0.15])
+    still = np.zeros((6, 6))
+    estimate = SimpleNamespace(
+        transform=Transform(BASE, CAMERA, np.eye(4)), covariance=still, about=np.zeros(3)
+    )
+    arm = SimpleNamespace(translation=place)
+    seen: Any = SimpleNamespace(
+        feature=SimpleNamespace(centre=place, centre_covariance=OWN), base_T_flange=arm
+    )
+    moved = effects(field, place)
+    for noise, left in ((ScatterNoise(5e-8, 1.0, 1.5), 1.0), (None, 0.0)):
+        for correction in (ArmCorrection(np.zeros(3), field=field), ArmCorrection(np.zeros(3))):
+            calibration: Any = SimpleNamespace(camera=estimate, noise=noise, correction=correction)
+            shared = 0.0 if correction.field is None else left * moved @ field.covariance @ moved.T
+            own = OWN if noise is None else 1.5 * (OWN + 5e-8 * np.eye(3) + shared)
+            assert prediction_covariance(calibration, seen) == pytest.approx(own, abs=1e-14)

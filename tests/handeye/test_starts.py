@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import CalibrationRefused
+from flangeye.handeye import starts as rooms
 from flangeye.handeye.loop import linearise
 from flangeye.handeye.measurements import Loop, Measurements, loop_of, measurements_of
 from flangeye.handeye.starts import fewest, size_of, start_of
@@ -75,3 +76,42 @@ def test_nothing_is_drawn_where_there_is_a_closed_form() -> None:
     never: Any = None
     s, loop = measured("eye-on-base, marker", "pose", 8)
     assert np.abs(linearise(s, loop, start_of(s, loop, never), None).residuals).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"), [(90.0, 90.0), (0.011, 0.011), (120.0, 1.0), (0.009, 1.0)]
+)
+def test_no_target_is_a_hundred_times_as_large_as_was_said_or_as_small(
+    factor: float, told: float
+) -> None:
+    s, loop = measured("eye-in-hand, marker", "pose", 10)
+    found = size_of(replace(s, centres=s.centres / factor), loop, np.random.default_rng(0))
+    assert found == pytest.approx(told, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("errors", "starts", "taken"),
+    [
+        ([0.9], 1, 0),
+        ([1.1, 0.5], 2, 1),
+        ([5.0, 7.0, 6.0, 4.0, 0.9], 5, 4),
+        ([2.0] + [3.0] * 20, 21, 0),
+    ],
+)
+def test_another_start_is_tried_until_rotations_agree_to_a_degree(
+    errors: list[float], starts: int, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty more at most, of 200 steps each; the best is taken."""
+    left, asked = iter(np.radians(errors)), list[int]()
+
+    def alternate(given: Any, start: Any, rounds: int = 0) -> tuple[int, float]:
+        asked.append(rounds)
+        return len(asked) - 1, float(next(left))
+
+    monkeypatch.setattr(rooms, "alternate", alternate)
+    monkeypatch.setattr(rooms, "random_rotations", lambda rng: None)
+    monkeypatch.setattr(rooms, "with_translations", lambda given, best: best)
+    s, loop = measured("two arms, marker", "pose", 6)
+    some: Any = None
+    chosen: Any = rooms._of_two_arms(s, some, 20)
+    assert chosen == taken and asked == [0] + [200] * (starts - 1)

@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye import target_size
-from flangeye.handeye.likelihood import Problem
+from flangeye.handeye.likelihood import Problem, with_noise
 from flangeye.handeye.target_size import (
     EstimatedFactor,
     correlation,
@@ -18,7 +18,7 @@ from flangeye.handeye.target_size import (
     require_size,
 )
 from flangeye.maths.statistics import f_quantile
-from tests.handeye.cells import ISSUE, fitted, given
+from tests.handeye.cells import ISSUE, fitted, given, two_numbers
 
 HAND = "eye-in-hand, marker"
 
@@ -94,3 +94,22 @@ def test_scores_that_are_alike_in_time_vary_more_in_sum() -> None:
     assert correlation(scores) == pytest.approx(1 + 2 * shared / (c @ c))
     assert correlation(np.array([1.0, -1.0] * 8)) == 1.0
     assert correlation(np.ones(9)) == 1.0
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_factor_is_looked_for_beside_noise_in_depth_where_noise_is_not_stated(
+    stated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which would hide a wrong focal length; what poses tell of other nuisances stays."""
+    problem = replace(resized(1.0), stated=stated, nuisance=two_numbers(14))
+    seen: list[Problem] = []
+
+    def watched(problem: Problem, found: Any) -> Any:
+        seen.append(problem)
+        return with_noise(problem, found)
+
+    monkeypatch.setattr(target_size, "with_noise", watched)
+    estimated_factor(problem, fitted(problem), longer_distances(problem.measurements))
+    (free,) = seen
+    assert free.in_depth == (not stated) and len(free.nuisance) == 3
+    assert np.isinf(free.nuisance.prior[2]) and free.nuisance.mean[2] == 0.0

@@ -12,6 +12,7 @@ import numpy as np
 from flangeye.handeye.candidates import Model, better, considered, rms, weighed_with, with_nuisance
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.maths.arm_correction import follow
+from flangeye.maths.geometry import rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import effects, field_over
 from flangeye.maths.statistics import f_quantile
@@ -223,8 +224,8 @@ def _significant(values: Floats, covariance: Floats, freedom: float) -> bool:
 
 
 def _not_told_apart(known: float, turns: Floats) -> str:
-    cosines = (np.einsum("nij,mij->nm", turns, turns) - 1) / 2
-    turn = np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))
+    between = rotation_log(turns[:, None] @ np.swapaxes(turns, 1, 2))
+    turn = np.degrees(np.linalg.norm(between, axis=2).max())
     how = f"would be known to {known * 1e3:.1f} mm only" if known < 0.1 else "does not show"
     return (
         "a constant offset of the seen circle in the flange frame (tool frame, bias of the fit) "

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.maths.geometry import hat, rigid, rotation_exp
+from flangeye.maths.geometry import hat, rigid, rotation_exp, stack_rows
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, Mask
 
@@ -131,7 +131,7 @@ def covariance_at_work(arm: Arm, session: ArmSession, fit: ArmFit) -> Floats:
     The pose alone is known worse: zeros take back what it is off by. What is left of both at the
     poses is a rigid motion and little else; this is the covariance of that.
     """
-    stacked = _jacobian(arm, session, fit).reshape(3 * len(session.poses), -1)
+    stacked = stack_rows(_jacobian(arm, session, fit))
     together = np.linalg.pinv(stacked[:, :6]) @ stacked
     return np.asarray(together @ fit.covariance @ together.T)
 
@@ -169,7 +169,7 @@ def _step(arm: Arm, session: ArmSession, fit: ArmFit, prior: Floats) -> ArmFit:
 
 
 def _over(values: Floats, prior: Floats) -> Floats:
-    return np.asarray(np.where(prior > 0, values / np.maximum(prior, 1e-300), 0.0))
+    return np.divide(values, prior, out=np.zeros_like(prior), where=prior > 0)
 
 
 def _scatter(left: Floats, noise: Floats, freedom: float) -> float:
@@ -193,8 +193,13 @@ def combinations(fit: ArmFit, prior: Floats) -> int:
 
 def _by_poses(fit: ArmFit, prior: Floats) -> Floats:
     """Return (4n, 4n) what the poses leave unknown, in units of the priors."""
+    return _loosely(fit, prior)[6:, 6:]
+
+
+def _loosely(fit: ArmFit, prior: Floats) -> Floats:
+    """Return (6 + 4n, 6 + 4n) what is known where pose and parameters may be off by far more."""
     loose = np.diag(np.concatenate([np.full(6, 1e-9), np.full(prior.size, LOOSE**-2)]))
-    return np.asarray(np.linalg.inv(fit.information + loose)[6:, 6:])
+    return np.asarray(np.linalg.inv(fit.information + loose))
 
 
 def most_telling(
@@ -210,8 +215,7 @@ def most_telling(
     moves = -sensitivity(arm, candidates, fit.parameters)
     scale = np.concatenate([np.ones(6), prior.ravel()])
     rows = np.concatenate([-hat(moved), still, moves], axis=2) * scale
-    loose = np.diag(np.concatenate([np.full(6, 1e-9), np.full(prior.size, LOOSE**-2)]))
-    known = np.linalg.inv(fit.information + loose)
+    known = _loosely(fit, prior)
     noise = float(np.median(candidates.noise)) + fit.scatter
     chosen: list[int] = []
     for _ in range(count):

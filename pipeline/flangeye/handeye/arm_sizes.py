@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 
+from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import mixture_inflation
 from flangeye.types import Floats
 
@@ -77,8 +78,8 @@ def likely_sizes(
             every combination: with six kinds that takes a twentieth of the time.
     """
     p, counts = rows.shape[2], [kind.shape[2] for kind in kinds]
-    known = np.linalg.qr(rows.reshape(-1, p))[0]
-    told = np.concatenate([*kinds, errors[..., None]], axis=2).reshape(-1, sum(counts) + 1)
+    known = np.linalg.qr(stack_rows(rows))[0]
+    told = stack_rows(np.concatenate([*kinds, errors[..., None]], axis=2))
     told = told - known @ (known.T @ told)
     gram, left = told.T @ told, max(freedom - p, 1.0)
     cases = []

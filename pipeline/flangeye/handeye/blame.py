@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flangeye.handeye.drift import MISFIT, Information, Sightings, allowance
-from flangeye.maths.geometry import adjoint_shift
+from flangeye.maths.geometry import adjoint_shift, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
 
@@ -77,17 +77,17 @@ def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tupl
     n = len(after.residuals)
     at_scanner = -after.effects[..., :6] @ adjoint_shift(about - scanner)
     tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
-    moved = at_scanner.reshape(5 * n, 6)
+    moved = stack_rows(at_scanner)
     found = {
         "scanner turned": (moved[:, :3], np.full(3, LARGEST)),
         "scanner shifted": (moved[:, 3:], np.full(3, LARGEST)),
         "scanner moved": (moved, np.full(6, LARGEST)),
-        "flange replaced": (tool.reshape(5 * n, 3), np.full(3, LARGEST)),
+        "flange replaced": (stack_rows(tool), np.full(3, LARGEST)),
     }
     if after.joints is None:
         return found
     k = after.joints.shape[2]
-    columns = after.joints.reshape(5 * n, k)
+    columns = stack_rows(after.joints)
     # The first joint turns the base as the scanner would, so it is no suspect of its own.
     scale = np.full(k - 1, LARGEST)
     one = {f"joint {j + 1} re-mastered": (columns[:, [j]], scale[:1]) for j in range(1, k)}
@@ -96,8 +96,7 @@ def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tupl
 
 def _noise(before: Information, after: Sightings, daily: float) -> Floats:
     """Return the (5N, 5N) covariance of the residuals without a change."""
-    n = len(after.residuals)
-    stacked = after.effects.reshape(5 * n, -1)
+    stacked = stack_rows(after.effects)
     out = stacked @ before.covariance @ stacked.T
     same = np.repeat(after.check, 5)[:, None] == np.repeat(after.check, 5)
     out += same * (stacked[:, :6] @ allowance(daily) @ stacked[:, :6].T)

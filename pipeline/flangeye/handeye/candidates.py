@@ -13,6 +13,7 @@ from flangeye.handeye.consensus import Consensus, again
 from flangeye.handeye.likelihood import Problem, Solution, weigh
 from flangeye.handeye.loop import COLUMNS
 from flangeye.handeye.nuisance import Nuisance
+from flangeye.maths.geometry import stack_rows
 from flangeye.types import ArmCorrection, Floats, Mask
 
 LEAST_KEPT = 1e-9
@@ -193,8 +194,8 @@ def _each_left_out(found: Solution) -> tuple[Floats, Floats]:
 def _without(fit: Fit, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Return (n, 6) errors of a part by a fit to the rest, and their (6 n, 6 n) covariance."""
     size = 6 * len(part)
-    jacobian = fit.jacobian[part].reshape(size, -1)
-    weighted = (fit.weights[part] @ fit.jacobian[part]).reshape(size, -1)
+    jacobian = stack_rows(fit.jacobian[part])
+    weighted = stack_rows(fit.weights[part] @ fit.jacobian[part])
     noise = np.linalg.pinv(fit.weights[part], rcond=1e-12, hermitian=True)
     own = np.zeros((len(part), 6, len(part), 6))
     own[np.arange(len(part)), :, np.arange(len(part))] = noise

@@ -127,7 +127,7 @@ class Linear:
     def fit(self, size: float) -> Fit:
         """Return the fit that left the residuals, zeros of a size expected."""
         jacobian = np.concatenate([self.jacobian, self.zeros], axis=2)
-        weights = np.swapaxes(self.whiteners, 1, 2) @ self.whiteners
+        weights = self.whiteners @ self.whiteners
         return Fit(self.residuals, jacobian, weights, _inverse(self.information(size)), self.kept)
 
 

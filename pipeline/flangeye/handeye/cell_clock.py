@@ -124,7 +124,7 @@ def _delays(timed: Timed, cell: Cell) -> _Delays:
     left = float((errors**2).sum() - values @ np.linalg.solve(covariance[p:, p:], values))
     known = max(left / freedom, 1.0) * covariance[p:, p:]
     square = float(values @ np.linalg.solve(known, values)) / len(values)
-    weights = np.swapaxes(linear.whiteners, 1, 2) @ linear.whiteners
+    weights = linear.whiteners @ linear.whiteners
     jacobian = np.concatenate([linear.jacobian, late], axis=2)
     held = by_folds(Fit(linear.residuals, jacobian, weights, covariance, linear.kept))[0]
     return _Delays(
@@ -153,7 +153,7 @@ def _lateness(timed: Timed, cell: Cell) -> Floats:
 def _error(timed: Timed, cell: Cell) -> float:
     """Return what a fit to other sightings leaves, the times taken as they are [m], rms."""
     linear = timed.sighted.linear(timed.found)
-    weights = np.swapaxes(linear.whiteners, 1, 2) @ linear.whiteners
+    weights = linear.whiteners @ linear.whiteners
     information = information_of(linear.whitened[0])
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     fit = Fit(linear.residuals, linear.jacobian, weights, covariance, linear.kept)

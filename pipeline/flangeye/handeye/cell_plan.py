@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.handeye.cell import mover_noise, sighting_of
 from flangeye.handeye.graph import Solved, rows_of
 from flangeye.maths.frame_graph import Frame, composed
-from flangeye.maths.geometry import hat, invert
+from flangeye.maths.geometry import hat, invert, stack_rows
 from flangeye.maths.statistics import chi2_quantile, largest_error_quantile
 from flangeye.models.cell import Cell
 from flangeye.types import (
@@ -151,5 +151,5 @@ def _levers(found: Solved, cell: Cell, seen: Sequence[Observation]) -> Floats:
         block = np.zeros((len(points), 3, 6 * len(work)))
         block[:, :, 6 * i : 6 * i + 3] = -hat(points - found.places[name][:3, 3])
         block[:, :, 6 * i + 3 : 6 * i + 6] = np.eye(3)
-        blocks.append(block.reshape(-1, block.shape[-1]) / np.sqrt(len(points)))
+        blocks.append(stack_rows(block) / np.sqrt(len(points)))
     return np.concatenate(blocks)

@@ -21,6 +21,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from flangeye.handeye.components import SHIFT, TURN
 from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.maths.geometry import hat, nearest_rotation, rotation_exp, rotation_log
 from flangeye.types import Floats, Indices
@@ -82,8 +83,7 @@ def certificate_note(problem: Problem, found: Solution) -> str:
         return f"{NOT_SHOWN}: that can be done for whole poses and two unknown places alone"
     still = np.broadcast_to(np.eye(4), s.a.shape)
     turning, shifting = (
-        np.trace(found.weights[kept][:, at, at], axis1=1, axis2=2) / 3
-        for at in (slice(0, 3), slice(3, 6))
+        np.trace(found.weights[kept][:, at, at], axis1=1, axis2=2) / 3 for at in (TURN, SHIFT)
     )
     others = (still, s.b @ loop.place) if loop.y else (s.b, still)
     sightings = Sightings(s.a, s.poses, *others, turning, shifting)

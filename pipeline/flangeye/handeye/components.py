@@ -20,6 +20,8 @@ FINEST = 1e-7
 
 LARGEST = 1e8
 """Factor on a noise beyond which nothing is looked for."""
+TURN, SHIFT = slice(3), slice(3, None)
+"""Where rotation and translation stand in six numbers."""
 STEPS = 40
 """Of Newton's method for a factor, at most; three are usual."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
-from flangeye.handeye.components import Noise
+from flangeye.handeye.components import SHIFT, TURN, Noise
 from flangeye.handeye.inliers import find_inliers
 from flangeye.handeye.likelihood import Problem, Solution, agreeing, gates, settle, weigh
 from flangeye.handeye.loop import Unknowns, linearise, weights_of
@@ -251,7 +251,7 @@ def _first_noise(problem: Problem, at: Unknowns) -> Noise:
     if problem.stated:
         return Noise(pose=0.0, tilt=0.0)
     r = linearise(problem.measurements, problem.loop, at, None).residuals
-    turns, shifts = ((r[:, k : k + 3] ** 2).sum(axis=1) for k in (0, 3))
+    turns, shifts = ((r[:, at] ** 2).sum(axis=1) for at in (TURN, SHIFT))
     median = chi2_quantile(0.5, 3)
     return Noise(
         pose=float(np.median(shifts)) / median, tilt=float(np.median(turns)) / median
@@ -274,7 +274,7 @@ def spread(found: Solution) -> tuple[float, float]:
     if not found.inliers.any():
         return np.inf, np.inf
     r = found.linear.residuals[found.inliers]
-    turn, shift = (np.sqrt((r[:, k : k + 3] ** 2).sum(axis=1).mean()) for k in (0, 3))
+    turn, shift = (np.sqrt((r[:, at] ** 2).sum(axis=1).mean()) for at in (TURN, SHIFT))
     return float(shift), float(turn)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from flangeye.handeye.measurements import Measurements
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
-from flangeye.maths.geometry import hat
+from flangeye.maths.geometry import hat, stack_rows
 from flangeye.maths.smooth_field import features
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Mask
@@ -45,7 +45,7 @@ def distortion_of(scanner: ScannerModel, measurements: Measurements, seen: Mask)
     """
     moves = _Field(scanner).moves(measurements) * seen[:, None, None]
     scaled = moves * np.repeat([LEVER, 1.0], 3)[:, None]
-    _, sizes, ways = np.linalg.svd(scaled.reshape(-1, moves.shape[2]), full_matrices=False)
+    _, sizes, ways = np.linalg.svd(stack_rows(scaled), full_matrices=False)
     kept = ways[sizes > NEGLIGIBLE * sizes[0]].T
     still = np.zeros((len(measurements), 6, kept.shape[1]))
     return nuisance_of(still, still, 1.0, seen=moves @ kept)
@@ -104,8 +104,7 @@ class _Field:
         depths = middle + half * GRID[:, 2:]
         points = np.concatenate([GRID[:, :2] * self._slopes * depths, depths], axis=1)
         raw, motions = self._raw(points), self._motions(points)
-        k = raw.shape[2]
-        rigid = np.linalg.lstsq(motions.reshape(-1, 6), raw.reshape(-1, k), rcond=None)[0]
+        rigid = np.linalg.lstsq(stack_rows(motions), stack_rows(raw), rcond=None)[0]
         bent = raw - motions @ rigid
         rms = float(np.sqrt((bent**2).sum(axis=(1, 2)).mean()))
         return np.asarray(rigid), self.scanner.calibration_error / rms

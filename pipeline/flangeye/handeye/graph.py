@@ -248,8 +248,9 @@ class _Graph:
         sightings: Sequence[Sighting],
         freedoms: Mapping[str, Floats] | None = None,
     ) -> _Graph:
-        projectors = np.array([s.projector for s in sightings]).reshape(-1, 6, 6)
-        covariances = np.array([s.covariance for s in sightings]).reshape(-1, 6, 6)
+        shape = len(sightings), 6, 6
+        projectors = np.array([s.projector for s in sightings]).reshape(shape)
+        covariances = np.array([s.covariance for s in sightings]).reshape(shape)
         measured = [n for n, f in frames.items() if f.place is not None and f.place.ndim == 3]
         able = freedoms or {name: np.eye(6) for name in measured}
         return cls(frames, _pairs(sightings), covariances, projectors, able)

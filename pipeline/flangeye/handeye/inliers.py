@@ -161,7 +161,7 @@ def graduated_non_convexity(centres: Floats, tcps: Floats, threshold: float, sta
     mu = limit / (2 * squares.max() - limit)
     while True:
         weights = truncated_weights(squares, limit, mu)
-        if (np.minimum(weights, 1 - weights) < 1e-6).all() or mu > 1e12:
+        if (weights == weights.round()).all() or mu > 1e12:
             return weights > 0.5
         squares = _squares(centres, tcps, kabsch(centres, tcps, weights))
         mu *= 1.4

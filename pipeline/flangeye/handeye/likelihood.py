@@ -12,7 +12,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.handeye.components import FINEST, Noise, Residuals, noise_of, with_depth, without_arms
+from flangeye.handeye.components import (
+    FINEST,
+    SHIFT,
+    TURN,
+    Noise,
+    Residuals,
+    noise_of,
+    with_depth,
+    without_arms,
+)
 from flangeye.handeye.inliers import gate, truncated_weights
 from flangeye.handeye.loop import (
     COLUMNS,
@@ -27,6 +36,7 @@ from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance, no_nuisance
 from flangeye.handeye.smoothing import Smoothed, size_told, smoothed, steps_told
 from flangeye.handeye.walk import Course, StepSize, Walk
+from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats, Mask
 
@@ -204,8 +214,8 @@ def _weighed(
     s = problem.measurements
     weights = weights_of(s, linear, noise) if weights is None else weights
     basis = free_columns(s, problem.loop, at, problem.tilt)
-    jacobian = linear.jacobian.reshape(len(s) * 6, -1) @ basis
-    weighted = (weights @ jacobian.reshape(len(s), 6, -1)).reshape(len(s) * 6, -1)
+    jacobian = stack_rows(linear.jacobian) @ basis
+    weighted = stack_rows(weights @ jacobian.reshape(len(s), 6, -1))
     squares = (linear.residuals * (weights @ linear.residuals[..., None])[..., 0]).sum(axis=1)
     counting = np.repeat(shares, 6)
     known, mean = problem.prior(noise)
@@ -317,12 +327,9 @@ def _graduate(problem: Problem, start: Solution) -> Solution:
     if largest <= 1.0:
         return replace(climb(problem, found, noise, np.ones(len(limits))), freedom=start.freedom)
     mu = 1.0 / (2.0 * largest - 1.0)
-    shares = np.ones(len(limits))
     while mu < 1e8:
         shares = truncated_weights(found.squares / limits, 1.0, mu)
-        # Early on all shares are small, and only their ratios matter: none is decided then.
-        decided = shares.max() > 0.5 and (np.minimum(shares, 1 - shares) < 1e-6).all()
-        if decided or not shares.any():
+        if (shares == shares.round()).all():
             break
         found = climb(problem, found, noise, shares, iterations=1)
         mu *= GRADUATION
@@ -359,7 +366,7 @@ def with_noise(problem: Problem, found: Solution, refit: bool = True) -> Solutio
 def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]:
     """Return the noise that the residuals show, and its degrees of freedom: the fewer, and all."""
     kept = found.inliers
-    turned, shifted = (_residuals(problem, found, at) for at in (slice(0, 3), slice(3, 6)))
+    turned, shifted = (_residuals(problem, found, at) for at in (TURN, SHIFT))
     if problem.pose_noise is not None:
         shifted = replace(shifted, freedom=np.inf)
     own, arms = problem.measurements.covariances[kept], found.linear.of_arms[kept]
@@ -383,7 +390,7 @@ def _in_depth(found: Solution, turned: Residuals, known: tuple[Floats, Floats]) 
     """Return what noise there is if there is more along the camera's axis: the arms', or none."""
     own, arms = known
     axis = np.broadcast_to(np.diag([0.0, 0.0, 1.0]), (len(own), 3, 3))
-    along, across = (_onto(p, found, slice(3, 6)) for p in (axis, np.eye(3) - axis))
+    along, across = (_onto(p, found, SHIFT) for p in (axis, np.eye(3) - axis))
     noises = noise_of(turned, across, own, arms), without_arms(turned, across, own)
     return [with_depth(noise, along, own, arms) for noise in noises]
 
@@ -432,7 +439,7 @@ def freedom_of_sizes(problem: Problem, found: Solution) -> float:
     """
     if problem.walk is None or found.course is None or not np.isfinite(found.freedom):
         return found.freedom
-    left = [_residuals(problem, found, at).freedom for at in (slice(0, 3), slice(3, 6))]
+    left = [_residuals(problem, found, at).freedom for at in (TURN, SHIFT)]
     steps = steps_told(
         problem.walk, found.noise.walk, found.course.spread(problem.walk, found.known)
     )

@@ -112,7 +112,7 @@ def linearise(
         jacobian[:, :, 6:12] = chain.of_second_base()
     if loop.z:
         jacobian[:, :, 12:18] = chain.of_place()
-    jacobian[:, :3, 18:COLUMNS] = (chain.turns @ at.z[:3, :3])[:, :, :2]
+    jacobian[:, :3, 18:COLUMNS] = chain.turns @ at.z[:3, :2]
     residuals = chain.residuals()
     of_camera, of_target = chain.of_camera_arm(), chain.of_arm()
     if nuisance is not None and len(nuisance):

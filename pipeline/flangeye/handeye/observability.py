@@ -18,7 +18,7 @@ from flangeye.handeye.components import Noise
 from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.loop import weights_of
 from flangeye.handeye.starts import fewest
-from flangeye.maths.geometry import hat, invert, kabsch, rotation_log
+from flangeye.maths.geometry import hat, invert, kabsch, rotation_log, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
 
@@ -384,16 +384,14 @@ def _arms(problem: Problem) -> list[tuple[str, Floats]]:
 
 
 def _turns(poses: Floats) -> bool:
-    turned = rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T)
-    return bool(np.linalg.norm(turned, axis=1).max() >= STILL[0])
+    return bool(np.linalg.norm(_turns_of(poses), axis=1).max() >= STILL[0])
 
 
 def _fault_of(poses: Floats) -> str | None:
-    turns = rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T)
-    angles = np.linalg.norm(turns, axis=1)
+    turns = _turns_of(poses)
     if _stands_still(poses):
         return "stood still; move it too"
-    if angles.max() < STILL[0]:
+    if not _turns(poses):
         return "moved without turning; turn it by 20 deg or more about two axes"
     _, sizes, axes = np.linalg.svd(turns, full_matrices=False)
     if sizes[1] > PARALLEL * sizes[0]:
@@ -412,12 +410,16 @@ def _about_one_line(poses: Floats) -> bool:
     """Return whether all poses turn about one fixed line."""
     rotations = poses[:, :3, :3] @ poses[0, :3, :3].T
     shifts = poses[:, :3, 3] - (rotations @ poses[0, :3, 3])
-    rows = (np.eye(3) - rotations).reshape(-1, 3)
+    rows = stack_rows(np.eye(3) - rotations)
     centre = np.linalg.lstsq(rows, shifts.ravel(), rcond=None)[0]
     return bool(np.abs(rows @ centre - shifts.ravel()).max() < STILL[1])
 
 
 def _stands_still(poses: Floats) -> bool:
-    turns = np.linalg.norm(rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T), axis=1)
     shifts = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
-    return bool(turns.max() < STILL[0] and shifts.max() < STILL[1])
+    return not _turns(poses) and bool(shifts.max() < STILL[1])
+
+
+def _turns_of(poses: Floats) -> Floats:
+    """Return the (N, 3) rotation vectors from the first of (N, 4, 4) poses [rad]."""
+    return rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T)

@@ -11,7 +11,7 @@ from flangeye.handeye.walk import FINEST_STEP, Course, StepSize, Walk
 from flangeye.maths.tridiagonal import Tridiagonal, solve_tridiagonal
 from flangeye.types import Floats
 
-GROUPS = slice(0, 3), slice(3, 6), slice(6, 7)
+GROUPS = slice(3), slice(3, 6), slice(6, None)
 """Where turns, shifts and a change of scale stand in a step."""
 
 

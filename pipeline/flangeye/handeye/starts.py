@@ -14,7 +14,14 @@ from flangeye.handeye.closed.motions import motions_of, place_of
 from flangeye.handeye.closed.separable import park_martin
 from flangeye.handeye.loop import Unknowns
 from flangeye.handeye.measurements import Loop, Measurements
-from flangeye.maths.geometry import basis_of_plane, invert, kabsch, nearest_rotation, rigid
+from flangeye.maths.geometry import (
+    basis_of_plane,
+    invert,
+    kabsch,
+    nearest_rotation,
+    rigid,
+    stack_rows,
+)
 from flangeye.types import Floats
 
 GOOD_ENOUGH = np.radians(1.0)
@@ -71,9 +78,9 @@ def size_of(measurements: Measurements, loop: Loop, rng: np.random.Generator) ->
         except (np.linalg.LinAlgError, CalibrationRefused):
             continue
         equations, wanted = _sized_translations(measurements, loop, at)
-        found = np.linalg.lstsq(
-            equations[chosen].reshape(-1, equations.shape[2]), wanted[chosen].ravel(), rcond=None
-        )[0]
+        found = np.linalg.lstsq(stack_rows(equations[chosen]), wanted[chosen].ravel(), rcond=None)[
+            0
+        ]
         median = float(np.median(np.linalg.norm(equations @ found - wanted, axis=1)))
         if median < least and SIZES[0] < found[-1] < SIZES[1]:
             least, size = median, float(found[-1])
@@ -178,9 +185,9 @@ def _centre_rows(s: Measurements, loop: Loop) -> tuple[Floats, Floats]:
     if loop.y:
         rows[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), _targets(s, loop)).reshape(n, 3, 9)
         rows[:, :, 21:] = -np.eye(3)
-        return rows.reshape(-1, 24), -s.a[:, :3, 3].ravel()
+        return stack_rows(rows), -s.a[:, :3, 3].ravel()
     rows[:, :, 12:15] = -s.b[:, :3, :3]
-    return rows.reshape(-1, 24), (s.b[:, :3, 3] - s.a[:, :3, 3]).ravel()
+    return stack_rows(rows), (s.b[:, :3, 3] - s.a[:, :3, 3]).ravel()
 
 
 def _normal_rows(s: Measurements, loop: Loop) -> Floats:
@@ -193,7 +200,7 @@ def _normal_rows(s: Measurements, loop: Loop) -> Floats:
         rows[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), axes).reshape(n, 3, 9)
     else:
         rows[:, :, 15:18] = -s.b[:, :3, :3]
-    return rows.reshape(-1, 24)
+    return stack_rows(rows)
 
 
 def _targets(s: Measurements, loop: Loop) -> Floats:

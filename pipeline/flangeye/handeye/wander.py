@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye.handeye.candidates import Model, rms
+from flangeye.handeye.components import SHIFT, TURN
 from flangeye.handeye.likelihood import log_likelihood, with_noise
 from flangeye.handeye.walk import Of, StepSize, Walk
 from flangeye.maths.geometry import invert, nearest_rotation
@@ -67,9 +68,7 @@ def _walking(model: Model, grows: bool) -> Iterator[tuple[str, Model | None]]:
 def _with(model: Model, walk: Walk) -> Model | None:
     """Return the model with a walk; it begins as large as to leave the residuals there are."""
     found = model.found
-    turn, shift = (
-        rms(found.linear.residuals[found.inliers][:, at]) for at in (slice(0, 3), slice(3, 6))
-    )
+    turn, shift = (rms(found.linear.residuals[found.inliers][:, at]) for at in (TURN, SHIFT))
     step = np.sqrt(2.0 / len(found.inliers))
     size = StepSize(step * turn, step * shift, step * turn)
     started = replace(found, noise=replace(found.noise, walk=size))

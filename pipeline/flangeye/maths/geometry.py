@@ -154,6 +154,11 @@ def each_applied(transforms: Floats, points: Floats) -> Floats:
     return np.asarray((transforms[:, :3, :3] @ points[:, :, None])[..., 0] + transforms[:, :3, 3])
 
 
+def stack_rows(blocks: Floats) -> Floats:
+    """Return (N m, k) the rows of (N, m, k) blocks, one below the other."""
+    return np.asarray(blocks.reshape(-1, blocks.shape[-1]))
+
+
 def angle_between(first: Floats, second: Floats) -> Floats:
     """Return the (...) angles of vectors (..., 3), exact for small ones too [rad]."""
     across = np.linalg.norm(np.cross(first, second), axis=-1)

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.closed.motions import motions_of, place_of
 from flangeye.handeye.closed.separable import park_martin
-from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_from_quaternion
+from flangeye.maths.geometry import (
+    invert,
+    nearest_rotation,
+    rigid,
+    rotation_from_quaternion,
+    stack_rows,
+)
 from flangeye.types import Floats
 
 Triple = tuple[Floats, Floats, Floats]
@@ -36,7 +42,7 @@ def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
     n, identity = len(a), np.eye(3)
     of_x = np.einsum("nik,nlj->nijkl", rotations[0], rotations[1]).reshape(n, 9, 9)
     of_yz = np.einsum("nkl,ia,jb->nijaklb", rotations[2], identity, identity).reshape(n, 9, 81)
-    rows = np.concatenate([of_x, -of_yz], axis=2).reshape(-1, 90)
+    rows = stack_rows(np.concatenate([of_x, -of_yz], axis=2))
     null = np.linalg.eigh(rows.T @ rows)[1][:, 0]
     u, _, vt = np.linalg.svd(null[9:].reshape(9, 9))
     x, y, z = (
@@ -94,7 +100,7 @@ def with_translations(given: Triple, rotations: Triple) -> Triple:
     rows[:, :, 6:] = -y @ c[:, :3, :3]
     seen = np.einsum("nij,jk,nk->ni", a[:, :3, :3], x, b[:, :3, 3])
     right = c[:, :3, 3] @ y.T - a[:, :3, 3] - seen
-    found = np.linalg.lstsq(rows.reshape(-1, 9), right.ravel(), rcond=None)[0]
+    found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
     return rigid(x, found[:3]), rigid(y, found[3:6]), rigid(z, found[6:])
 
 

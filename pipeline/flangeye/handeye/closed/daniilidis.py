@@ -6,7 +6,13 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.closed.motions import Motions
-from flangeye.maths.geometry import hat, quaternion_from_rotation, rigid, rotation_from_quaternion
+from flangeye.maths.geometry import (
+    hat,
+    quaternion_from_rotation,
+    rigid,
+    rotation_from_quaternion,
+    stack_rows,
+)
 from flangeye.types import Floats
 
 
@@ -18,7 +24,7 @@ def daniilidis(motions: Motions) -> Floats:
     Raises:
         CalibrationRefused: No member of that space is one.
     """
-    rows = _screw_rows(motions).reshape(-1, 8)
+    rows = stack_rows(_screw_rows(motions))
     u, v = np.linalg.eigh(rows.T @ rows)[1][:, :2].T
     a, b, c = u[:4] @ u[4:], u[:4] @ v[4:] + v[:4] @ u[4:], v[:4] @ v[4:]
     candidates = [_normalised(s * u + t * v) for s, t in _ratios(a, b, c)]

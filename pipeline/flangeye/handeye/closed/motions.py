@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_log
+from flangeye.maths.geometry import invert, nearest_rotation, rigid, rotation_log, stack_rows
 from flangeye.types import Floats
 
 LARGEST_TURN = np.radians(170.0)
@@ -68,7 +68,7 @@ def translation_of(rotation: Floats, motions: Motions) -> Floats:
     """
     left = motions.a[:, :3, :3] - np.eye(3)
     right = motions.b[:, :3, 3] @ rotation.T - motions.a[:, :3, 3]
-    return np.asarray(np.linalg.lstsq(left.reshape(-1, 3), right.ravel(), rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(stack_rows(left), right.ravel(), rcond=None)[0])
 
 
 def place_of(carried: Floats, x: Floats, seen: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.maths.geometry import invert, nearest_rotation, rigid
+from flangeye.maths.geometry import invert, nearest_rotation, rigid, stack_rows
 from flangeye.types import Floats
 
 
@@ -42,7 +42,7 @@ def li(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
     rows[:, 9:, 9:18] = np.einsum("ij,nl->nijl", identity, bases[:, :3, 3]).reshape(n, 3, 9)
     rows[:, 9:, 18:21], rows[:, 9:, 21:] = -seen[:, :3, :3], identity
     right = np.concatenate([np.zeros((n, 9)), seen[:, :3, 3]], axis=1)
-    found = np.linalg.lstsq(rows.reshape(-1, 24), right.ravel(), rcond=None)[0]
+    found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
     z, x = found[:18].reshape(2, 3, 3).transpose(0, 2, 1)
     return _with_translations(carried, invert(seen), x, z)
 
@@ -59,5 +59,5 @@ def _with_translations(
     left = np.zeros((n, 3, 6))
     left[:, :, :3], left[:, :, 3:] = carried[:, :3, :3], -np.eye(3)
     right = eyes[:, :3, 3] @ z.T - carried[:, :3, 3]
-    found = np.asarray(np.linalg.lstsq(left.reshape(-1, 6), right.ravel(), rcond=None)[0], float)
+    found = np.asarray(np.linalg.lstsq(stack_rows(left), right.ravel(), rcond=None)[0], float)
     return rigid(x, found[:3]), rigid(z, found[3:])

@@ -11,6 +11,7 @@ from flangeye.maths.geometry import (
     rigid,
     rotation_exp,
     rotation_from_quaternion,
+    stack_rows,
 )
 from flangeye.types import Floats
 
@@ -85,6 +86,6 @@ def andreff(motions: Motions) -> Floats:
     rows[:, 9:, :9] = np.einsum("ij,nl->nijl", identity, motions.b[:, :3, 3]).reshape(n, 3, 9)
     rows[:, 9:, 9:] = identity - turns_a
     right = np.concatenate([np.zeros((n, 9)), motions.a[:, :3, 3]], axis=1)
-    found = np.linalg.lstsq(rows.reshape(-1, 12), right.ravel(), rcond=None)[0]
+    found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
     rotation = nearest_rotation(np.asarray(found[:9].reshape(3, 3), dtype=np.float64))
     return rigid(rotation, translation_of(rotation, motions))
