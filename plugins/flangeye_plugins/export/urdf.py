@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from xml.etree import ElementTree
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from pydantic import Field
@@ -86,6 +85,8 @@ def _joints(pose: CalibratedPose, params: UrdfParams) -> str:
 
 
 def _joint(parent: str, child: str, matrix: Floats) -> str:
+    from xml.sax.saxutils import quoteattr  # which imports Python's HTTP client
+
     numbers = fixed(CONVENTIONS["rpy"].numbers(matrix))
     return f"""  <link name={quoteattr(child)}/>
   <joint name={quoteattr(child + "_joint")} type="fixed">

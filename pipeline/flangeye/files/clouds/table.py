@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import filterfalse, islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -80,13 +80,16 @@ class TextTable:
         with self.path.open("rb") as file:
             file.seek(self.offset)
             text = io.TextIOWrapper(file, encoding="latin-1")
-            rows = (row for row in text if not row.isspace())
-            values = self._parse(islice(rows, self.skipped, self.skipped + n))
+            if self.rows == n and self.delimiter is None:
+                values = self._parse(text)  # NumPy drops blank rows too, and takes half the time
+            else:
+                rows = filterfalse(str.isspace, text)
+                values = self._parse(islice(rows, self.skipped, self.skipped + n))
         if values.shape != (n, self.width):
             refuse(self.path, f"its rows have {values.shape[1]} values, not {self.width}")
         return np.ascontiguousarray(values[:, list(self.axes)])
 
-    def _parse(self, rows: Iterator[str]) -> Points:
+    def _parse(self, rows: Iterable[str]) -> Points:
         try:
             return np.loadtxt(rows, np.float32, comments=None, delimiter=self.delimiter, ndmin=2)
         except ValueError as error:
