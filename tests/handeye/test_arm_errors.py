@@ -121,3 +121,10 @@ def test_roots_of_weights_that_are_singular_are_roots() -> None:
 def test_an_arm_of_unknown_kinematics_has_no_kinds_of_error() -> None:
     with pytest.raises(ValueError, match="kinematics are not known"):
         _kinds(MovedFlange(np.tile(np.eye(4), (3, 1, 1)), None, False))
+
+
+def test_an_arm_that_does_not_reach_its_poses_has_no_kinds_of_error() -> None:
+    far = ARM.flange(np.tile(HOME, (4, 1)))
+    far[:, 0, 3] += 5.0
+    with pytest.raises(ValueError, match="do not reach"):
+        _kinds(MovedFlange(far, None, True, ARM, 1e-4))

@@ -1,5 +1,6 @@
 """What a calibration says of the noise it found."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.errors import CalibrationRefused
 from flangeye.handeye import calibration
 from flangeye.handeye.calibration import TYPICAL_ARM, _beyond
 from flangeye.handeye.candidates import Model
@@ -205,3 +207,102 @@ def test_what_is_stated_of_noise_goes_into_the_problem() -> None:
     assert problem(circles).measurements.have_normals
     options.normals = False
     assert not problem(circles).measurements.have_normals
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [("eye-on-base, flange", 6), (HAND, 12), ("two arms, flange", 12), ("two arms, marker", 18)],
+)
+def test_a_covariance_is_wider_by_what_its_noise_is_not_known(name: str, numbers: int) -> None:
+    fit = modelled(name)
+    fit = replace(fit, consensus=replace(fit.consensus, found=replace(fit.found, freedom=9.0)))
+    wider = covariance_inflation(9.0, numbers)
+    assert calibration._inflation(fit) == pytest.approx(wider)
+    assert calibration._covariance(fit) == pytest.approx(wider * fit.found.covariance[:18, :18])
+
+
+def test_errors_that_all_features_share_are_part_of_the_model() -> None:
+    """Of features with fewer such errors the others do nothing; moves of weak ones do neither."""
+    made = session(CONFIGURATIONS[HAND], np.random.default_rng(3), 9)
+    rng = np.random.default_rng(4)
+    shared = [1e-4 * rng.normal(size=(6, 2 if i % 2 else 1)) for i in range(9)]
+    observations = [
+        replace(o, feature=replace(o.feature, shared=s))
+        for o, s in zip(made.observations, shared, strict=True)
+    ]
+    fit, weak = modelled(), np.ones((20, 1))
+    cell: Any = SimpleNamespace(observations=observations)
+    moved, wider = calibration._with_shared(fit, cell, weak)
+    seen = moved.problem.nuisance.seen
+    for each, own in zip(seen, shared, strict=True):
+        assert each[:, : own.shape[1]] == pytest.approx(own)
+        assert not each[:, own.shape[1] :].any()
+    assert moved.problem.nuisance.prior.tolist() == [1.0, 1.0]
+    assert wider.tolist() == [[1.0]] * 20 + [[0.0]] * 2
+    none: Any = SimpleNamespace(observations=made.observations)
+    assert calibration._with_shared(fit, none, weak) == (fit, weak)
+
+
+def sized_by(
+    told: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[float], Callable[[float], tuple[Any, Model]]]:
+    """Return the factors by which a cell is resized, and what finds its size by what is told."""
+    factors, left = list[float](), iter(told)
+    fit = modelled()
+
+    class Resized(SimpleNamespace):
+        def resized(self, factor: float) -> Any:
+            factors.append(factor)
+            return self
+
+    def factor(*_: Any) -> Any:
+        share, sigma = next(left)
+        return SimpleNamespace(share=share, sigma=sigma)
+
+    monkeypatch.setattr(calibration, "estimated_factor", factor)
+    monkeypatch.setattr(calibration, "_agreed", lambda *_: fit)
+    cell: Any = Resized()
+    some: Any = None
+    return factors, lambda size: calibration._with_size(cell, fit, some, size)
+
+
+def test_a_size_is_found_by_steps_until_one_changes_it_by_a_millionth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    factors, find = sized_by([(0.1, 2e-3), (-0.01, 2e-3), (0.9e-6, 1e-3), (9.0, 1e-3)], monkeypatch)
+    (note,) = find(0.5)[1].notes
+    assert factors == pytest.approx([1.1, 0.99, 1.0], abs=1e-5)
+    size = 0.5 * 1.1 * 0.99
+    assert note.startswith(f"by the arm's own motion the target is {size:.5f} +- 0.00054 times as")
+    factors, find = sized_by([(1.1e-6, 1e-6)] * 20, monkeypatch)
+    (note,) = find(1.0)[1].notes
+    assert len(factors) == 10 and "is 1.0000110 +- 0.0000010 times as large" in note
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma", "told"),
+    [(0.0, 0.101, "10.1%"), (0.0, 0.099, None), (-0.91, 0.01, "1.0%"), (-0.89, 0.01, None),
+     (9.1, 0.02, "2.0%"), (8.9, 0.02, None)],
+)  # fmt: skip
+def test_a_size_that_is_not_told_to_a_tenth_or_beyond_ten_times_is_refused(
+    share: float, sigma: float, told: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, find = sized_by([(share, sigma), *[(0.0, sigma)] * 2], monkeypatch)
+    if told is None:
+        assert len(find(1.0)[1].notes) == 1
+        return
+    with pytest.raises(CalibrationRefused, match=f"the target's size is told to {told} only"):
+        find(1.0)
+
+
+def test_what_was_found_is_noted_and_what_no_pose_tells_is_counted() -> None:
+    fit = modelled()
+    plain: Any = SimpleNamespace(
+        observations=list("abcdefghi"), configuration=SimpleNamespace(is_default=True)
+    )
+    for count, said in ((1, "1 translation along"), (2, "2 translations along")):
+        notes = calibration._noise_notes(fit, plain, np.zeros((20, count)))
+        assert notes[-1].startswith(f"not observable from these poses, and set to zero: {said}")
+    (alone,) = calibration._noise_notes(fit, plain, np.zeros((20, 0)))
+    assert alone.startswith("noise beyond the features' own")
+    assert calibration._noise_notes(modelled(stated=True), plain, np.zeros((20, 0))) == ()

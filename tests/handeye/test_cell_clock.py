@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from flangeye import CalibrationRefused
+from flangeye.handeye import cell_clock as room
 from flangeye.handeye.cell import calibrate_cell
+from flangeye.handeye.cell_arms import Linear
 from flangeye.handeye.cell_clock import _told
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.frame_graph import Frame
@@ -111,3 +114,124 @@ def test_how_late_the_arms_are_is_told_of_each_camera() -> None:
         "the arms were at the poses 12.3 +- 1.0 ms after the times that left gives, "
         "4.0 +- 2.0 ms before the times that right gives"
     )
+
+
+def left_over(values: Any, significant: bool = True, error: float = 1e-3) -> Any:
+    """Return what is left of two times, of standard deviations of 1 and 2 ms [s]."""
+    return SimpleNamespace(
+        values=np.array(values), covariance=np.diag([1e-6, 4e-6]), significant=significant,
+        followed=np.eye(12, 2), error=error,
+    )  # fmt: skip
+
+
+class Joint(SimpleNamespace):
+    """A solution that tells its covariance alone."""
+
+    def with_joint(self, joint: Any) -> Any:
+        return Joint(joint=joint)
+
+
+def timed_by(
+    left: list[Any], monkeypatch: pytest.MonkeyPatch, reach: float = 1.0, error: float = 2e-3
+) -> tuple[Any, list[Any]]:
+    """Return the sightings on one clock where such times are left in turn, and the times tried."""
+    tried, left_in_turn = list[Any](), iter(left)
+    here: Any = Joint(joint=np.zeros((12, 12)))
+
+    def delayed(observations: Any, cell: Any, before: Any, delays: Any) -> Any:
+        tried.append(delays)
+        return None if np.abs(delays).max() > reach else room.Timed(tried[:], before.sighted, here)
+
+    monkeypatch.setattr(room, "_delays", lambda *_: next(left_in_turn))
+    monkeypatch.setattr(room, "_delayed", delayed)
+    monkeypatch.setattr(room, "_error", lambda *_: error)
+    moving: Any = [SimpleNamespace(motion=SimpleNamespace(others=["flange"]))] * 3
+    some: Any = None
+    found: Any = here
+    return room.on_one_clock(moving, CELL, some, found), tried
+
+
+def test_times_add_up_until_what_is_left_is_ten_microseconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = [left_over(x) for x in ([8e-3, 0.0], [1e-3, -2e-3], [0.9e-5, -0.9e-5], [9.0, 9.0])]
+    timed, tried = timed_by(left, monkeypatch)
+    assert np.array(tried) == pytest.approx(np.array([[8e-3, 0.0], [9e-3, -2e-3]]))
+    (note,) = timed.notes
+    assert note.startswith("the arms were at the poses 9.0 +- 1.0 ms after the times that left")
+    assert note.endswith("(held-out error 1.000 mm with it, 2.000 mm without)")
+    assert len(timed.observations) == 2
+    assert np.diag(timed.found.joint)[:3] == pytest.approx([1e-6, 4e-6, 0.0])
+    _, tried = timed_by([left_over([1.1e-5, 0.0])] * 9, monkeypatch)
+    assert len(tried) == 6
+
+
+def test_times_that_do_not_help_are_in_the_covariance_as_far_as_they_may_be_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Those that are not significant, those that do not help, and those beyond the recording."""
+    first = left_over([3e-3, 4e-3])
+    off = np.array([[1 + 9, 12.0], [12.0, 4 + 16]]) * 1e-6
+    quiet, tried = timed_by([left_over([3e-3, 4e-3], significant=False)], monkeypatch)
+    assert not tried and quiet.notes == ()
+    worse, tried = timed_by([first, left_over([0.0, 0.0], error=3e-3)], monkeypatch)
+    assert len(tried) == 1 and worse.notes[0].startswith("left out, for it does not help: the arms")
+    beyond, tried = timed_by([first], monkeypatch, reach=3.5e-3)
+    assert beyond.notes[0].startswith("left out, for no pose was recorded so far away: the arms")
+    for timed in (quiet, worse, beyond):
+        assert len(timed.observations) == 3
+        assert timed.found.joint[:2, :2] == pytest.approx(off)
+
+
+def test_clocks_are_looked_for_where_every_sighting_says_how_arms_passed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(room, "_delays", lambda *_: pytest.fail("nothing is to be found"))
+    moved, still = SimpleNamespace(others=["flange"]), SimpleNamespace(others=[])
+    some: Any = None
+    for last in (None, still):
+        seen_: Any = [SimpleNamespace(motion=moved), SimpleNamespace(motion=last)]
+        assert room.on_one_clock(seen_, CELL, some, some).observations is seen_
+
+
+def test_times_are_told_as_by_least_squares_with_all_unknowns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their covariance is as wide as residuals say, which they are held against by Fisher's F."""
+    rng = np.random.default_rng(0)
+    rows, late, kept = rng.normal(size=(9, 6, 4)), rng.normal(size=(9, 6, 2)), np.arange(9) != 2
+    whiteners = rng.uniform(0.5, 2.0, (9, 1, 1)) * np.eye(6)
+    monkeypatch.setattr(room, "_lateness", lambda *_: late)
+    for times, noise, significant in ((3.0, 2.0, True), (0.1, 2.0, False), (1.2, 0.1, True)):
+        left = noise * rng.normal(size=(9, 6)) + times * (late @ [1.0, -1.0])
+        own, counted = (whiteners @ rows)[kept].reshape(-1, 4), (whiteners @ left[..., None])[kept]
+        left = left - rows @ np.linalg.lstsq(own, counted.ravel(), rcond=None)[0]  # as a fit does
+        linear = Linear(left, rows, np.zeros((9, 6, 0)), [], whiteners, kept, 48.0)
+        sighted = SimpleNamespace(linear=lambda found, linear=linear: linear)
+        timed: Any = SimpleNamespace(sighted=sighted, found=None)
+        told = room._delays(timed, CELL)
+        both = (whiteners @ np.concatenate([rows, late], axis=2))[kept].reshape(-1, 6)
+        sides = (whiteners @ left[..., None])[kept].ravel()
+        values = np.linalg.lstsq(both, sides, rcond=None)[0]
+        assert told.values == pytest.approx(-values[4:], rel=1e-5)
+        rest = ((sides - both @ values) ** 2).sum() / (48 - 6)
+        known = max(rest, 1.0) * np.linalg.inv(both.T @ both)[4:, 4:]
+        assert told.covariance == pytest.approx(known, rel=1e-5)
+        square = values[4:] @ np.linalg.solve(known, values[4:]) / 2
+        assert told.significant == significant == (square > stats.f(2, 42).ppf(0.9999))
+        followed = np.linalg.lstsq(both[:, :4], both[:, 4:], rcond=None)[0]
+        assert told.followed == pytest.approx(followed)
+
+
+def test_a_camera_that_nothing_moved_past_has_a_clock_of_which_nothing_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A second is as good as a thousand: its deviation is."""
+    rng = np.random.default_rng(0)
+    late = rng.normal(size=(9, 6, 2)) * [1.0, 0.0]
+    monkeypatch.setattr(room, "_lateness", lambda *_: late)
+    linear = Linear(1e-3 * rng.normal(size=(9, 6)), rng.normal(size=(9, 6, 4)), np.zeros((9, 6, 0)),
+                    [], np.tile(np.eye(6), (9, 1, 1)), np.ones(9, bool), 54.0)  # fmt: skip
+    sighted = SimpleNamespace(linear=lambda found: linear)
+    timed: Any = SimpleNamespace(sighted=sighted, found=None)
+    assert np.sqrt(room._delays(timed, CELL).covariance[1, 1]) == pytest.approx(1e3)

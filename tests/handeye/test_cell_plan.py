@@ -6,13 +6,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from flangeye.files.bundled import bundled
 from flangeye.handeye import cell_plan
 from flangeye.handeye.cell import solve_cell
-from flangeye.handeye.cell_plan import _moved, errors_at_work, foreseen, is_foretold, most_telling
+from flangeye.handeye.cell_plan import (
+    _moved,
+    errors_at_work,
+    foreseen,
+    is_foretold,
+    most_telling,
+    work_of_frames,
+)
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.statistics import largest_error_quantile
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
@@ -112,3 +121,73 @@ def test_the_most_telling_leaves_the_least_error_at_the_work(
     expected = int(np.argmin([np.trace(levers @ each @ levers.T) for each in left]))
     asked: Any = [nothing, some, nothing, nothing]
     assert most_telling(*asked) == expected
+
+
+POSE = rigid(rotation_exp([0.3, -0.2, 0.5]), np.array([0.4, 0.2, 0.9]))
+OTHER = rigid(rotation_exp([-0.1, 0.4, 0.2]), np.array([-0.3, 0.1, 0.2]))
+
+
+def two_frames() -> tuple[Any, list[Any]]:
+    """Return where a camera and a plate are known to be, and what the camera saw."""
+    rng = np.random.default_rng(3)
+    blocks = {n: 1e-8 * (r.T @ r) for n, r in zip(("left", "plate"), rng.normal(size=(2, 9, 6)),
+                                                  strict=True)}  # fmt: skip
+    found = SimpleNamespace(places={"left": POSE, "plate": OTHER}, covariances=blocks)
+    seen = [
+        SimpleNamespace(camera=camera, feature=SimpleNamespace(centre=np.array(centre)))
+        for camera, centre in (
+            ("left", [0.1, 0, 1.0]),
+            ("left", [0, 0.2, 0.8]),
+            ("right", [9, 9, 9]),
+        )
+    ]
+    return found, seen
+
+
+def test_a_camera_works_where_it_saw_something_and_what_it_saw_within_a_tenth_of_a_metre() -> None:
+    found, seen = two_frames()
+    nothing: Any = None
+    work = work_of_frames(found, nothing, seen)
+    points = np.array([[0.1, 0, 1.0], [0, 0.2, 0.8]])
+    assert work["left"] == pytest.approx(points @ POSE[:3, :3].T + POSE[:3, 3])
+    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    wanted = corners @ OTHER[:3, :3].T + OTHER[:3, 3]
+    assert sorted(map(tuple, work["plate"].round(9))) == sorted(map(tuple, wanted.round(9)))
+    errors = errors_at_work(found, nothing, seen)
+    for name, place in found.places.items():
+        told = largest_error_quantile(found.covariances[name], place[:3, 3], work[name])
+        assert errors[name] == pytest.approx(told)
+
+
+def test_the_work_moves_with_each_frame_and_each_counts_alike() -> None:
+    """As its points do by small turns about its origin, in its parent, and shifts."""
+    found, seen = two_frames()
+    nothing: Any = None
+    work, step = work_of_frames(found, nothing, seen), 1e-6
+    levers = cell_plan._levers(found, nothing, seen)
+    at = 0
+    for i, (name, points) in enumerate(work.items()):
+        origin, count = found.places[name][:3, 3], len(points)
+        part = levers[at : at + 3 * count].reshape(count, 3, 12) * np.sqrt(count)
+        at += 3 * count
+        for k in range(6):
+            turn, shift = rotation_exp(step * np.eye(6)[k, :3]), step * np.eye(6)[k, 3:]
+            moved = (points - origin) @ turn.T + origin + shift
+            assert part[:, :, 6 * i + k] == pytest.approx((moved - points) / step, abs=1e-5)
+        assert not part[:, :, 6 * (1 - i) : 6 * (2 - i)].any()
+    assert at == len(levers)
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.99, True), (1.01, False)])
+def test_one_good_sighting_in_a_thousand_is_not_foretold(
+    share: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own noise and what is known of the places add up."""
+    rng, nothing = np.random.default_rng(0), None
+    rows, half, way = rng.normal(size=(6, 4)), rng.normal(size=(4, 7)), rng.normal(size=6)
+    spread = np.eye(6) + rows @ half @ half.T @ rows.T
+    size = np.sqrt(share * stats.chi2(6).ppf(0.999) / (way @ np.linalg.solve(spread, way)))
+    monkeypatch.setattr(cell_plan, "_rows", lambda *_: (rows[None], size * way[None]))
+    found: Any = SimpleNamespace(joint=half @ half.T)
+    some: Any = nothing
+    assert is_foretold(some, found, some) == told

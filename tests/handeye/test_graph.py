@@ -477,3 +477,82 @@ def test_what_would_be_seen_again_is_what_is_told_with_it_moved_either_way() -> 
             rows_of(moved(given, "flange", sign * step), again, places, {})[0]
         )
     assert told["flange", (0, 1, 0, 0, 0, 0)] == pytest.approx(wanted, rel=1e-6, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("costs", "descents", "taken"),
+    [
+        ([5.0, 3.0, 4.0, 3.002, 9.0], 4, 3),  # within a thousandth of the lowest
+        ([5.0, 3.0, 4.0, 3.004, 9.0, 2.999], 6, 5),
+        ([float(60 - k) for k in range(60)], 60, 59),
+        ([float(k) for k in range(1, 61)], 60, 0),
+        ([0.0, 0.0], 2, 1),
+    ],
+)
+def test_of_many_descents_two_that_agree_on_the_lowest_end_the_search(
+    costs: list[float], descents: int, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of sixty at most, each of rotations first."""
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    graph = _Graph.of(given, seen(frames, pairs, np.random.default_rng(4)))
+    whiteners, asked = np.tile(np.eye(6), (2 * N, 1, 1)), list[Any]()
+
+    def descend(graph: Any, places: Any, whiteners: Any, robust: bool = False) -> Any:
+        asked.append((whiteners, robust))
+        return {"after": len(asked)}
+
+    monkeypatch.setattr(room, "_descend", descend)
+    monkeypatch.setattr(_Graph, "residuals", lambda self, places: places["after"] // 2 - 1)
+    monkeypatch.setattr(room, "_squares", lambda whiteners, k: np.full(2 * N, costs[k] / (2 * N)))
+    found: Any = room._best(graph, whiteners)
+    assert len(asked) == 2 * descents and found["after"] == 2 * (taken + 1)
+    assert all(robust for _, robust in asked)
+    assert asked[0][0][0] == pytest.approx(np.diag([1.0, 1, 1, 0, 0, 0]))
+    assert asked[1][0] is whiteners
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_descent_never_rises_and_ends_within_few_steps(
+    robust: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From half a radian and 0.2 m away; what it counts as far off is told by each pair's middle."""
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    graph = _Graph.of(given, seen(frames, pairs, np.random.default_rng(4)))
+    whiteners = room._whiteners(graph.covariances, graph.projectors)
+    rng, looked = np.random.default_rng(5), list[Any]()
+    away = {n: moved(frames, n, np.concatenate([rng.normal(0, 0.3, 3), rng.normal(0, 0.2, 3)]))[n].place
+            for n in unknown}  # fmt: skip
+    linearised = _Graph.linearised
+
+    def watched(self: Any, places: Any, moved: Any = None) -> Any:
+        looked.append(dict(places))
+        return linearised(self, places, moved)
+
+    with monkeypatch.context() as watching:
+        watching.setattr(_Graph, "linearised", watched)
+        found = room._descend(graph, away, whiteners, robust)
+    assert len(looked) <= 20
+    if not robust:
+        costs = [room._squares(whiteners, graph.residuals(p)).sum() for p in looked]
+        assert (np.diff(costs) <= 0).all()
+        for each in unknown:
+            assert np.abs(error(found[each], frames[each].place)).max() < 2e-3
+
+
+def test_a_sighting_counts_less_the_further_it_is_beyond_most_of_its_pair() -> None:
+    """One of each pair is far off: the answer is nearly that of the others alone."""
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    sightings = seen(frames, pairs, np.random.default_rng(4))
+    wrong = [replace(s, pose=pose(0.4, 0, 0, 0.1, 0.2, 0) @ s.pose) if i in (3, 8) else s
+             for i, s in enumerate(sightings)]  # fmt: skip
+    exact: Any = {n: frames[n].place for n in unknown}
+    graph = _Graph.of(given, wrong)
+    own = room._whiteners(graph.covariances, graph.projectors)
+    found = room._descend(graph, exact, own, robust=True)
+    good = _Graph.of(given, [s for i, s in enumerate(sightings) if i not in (3, 8)])
+    alone = room._descend(good, exact, room._whiteners(good.covariances, good.projectors))
+    for each in unknown:
+        assert np.abs(error(found[each], alone[each])).max() < 1e-3

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from flangeye.errors import CalibrationRefused, StageError
+from flangeye.handeye import observability as room
 from flangeye.handeye.loop import weights_of
 from flangeye.handeye.observability import (
     FLOOR,
     ObservabilityLimits,
+    WeakMoves,
     _about_one_line,
     _fault_of,
     _fit_rms,
@@ -305,3 +307,24 @@ def test_a_motion_is_named_that_makes_what_is_weak_known_twice_as_well() -> None
         chosen, left = telling(known, np.ones(2), {"it": better})
         assert chosen == (["it"] if named else [])
         assert left.excess[0] == pytest.approx(after if named else excess)
+
+
+@pytest.mark.parametrize(("turn", "marked"), [(0.049, True), (0.051, False)])
+def test_translations_may_be_marked_whose_moves_hardly_turn(
+    turn: float, marked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = given("eye-in-hand, marker", "pose", 9)
+    found = fitted(problem)
+    move = np.zeros((20, 1))
+    move[[1, 4, 15], 0] = turn, 0.8, np.sqrt(1 - turn**2 - 0.64)
+    weak = WeakMoves(found.basis.T @ move, np.array([9.0]))
+    monkeypatch.setattr(room, "weak_moves", lambda *_: weak)
+    monkeypatch.setattr(room, "missing_motion", lambda _: "turn it")
+    limits = ObservabilityLimits(1e-3, 1e-3, mark=True)
+    if marked:
+        along = unobservable(problem, found, limits)
+        assert np.abs(along.T @ move) == pytest.approx(np.ones((1, 1)))
+    told = "translation of the camera's pose cannot be told from these poses: turn it"
+    for refused in [replace(limits, mark=False)] + ([] if marked else [limits]):
+        with pytest.raises(CalibrationRefused, match=told):
+            unobservable(problem, found, refused)

@@ -445,7 +445,7 @@ def _best(graph: _Graph, whiteners: Floats) -> dict[str, Floats]:
         turned = _descend(graph, start, whiteners @ TURNS, robust=True)
         places = _descend(graph, turned, whiteners, robust=True)
         cost = float(_middles(graph, _squares(whiteners, graph.residuals(places))).sum())
-        if abs(cost - least) <= AGREE * least + 1e-12:
+        if abs(cost - least) <= AGREE * cost + 1e-12:
             return places
         if cost < least:
             best, least = places, cost
