@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye import calibration
@@ -306,3 +307,72 @@ def test_what_was_found_is_noted_and_what_no_pose_tells_is_counted() -> None:
     (alone,) = calibration._noise_notes(fit, plain, np.zeros((20, 0)))
     assert alone.startswith("noise beyond the features' own")
     assert calibration._noise_notes(modelled(stated=True), plain, np.zeros((20, 0))) == ()
+
+
+class Clocked(SimpleNamespace):
+    """A cell whose arm was recorded for so long [s]."""
+
+    def unknown_delay(self) -> Any:
+        return "delay"
+
+    def delayed(self, by: float) -> Any:
+        total = (self.delay or 0.0) + by
+        return None if abs(total) > self.reach else replaced(self, delay=total)
+
+
+def replaced(of: Any, **new: Any) -> Any:
+    return Clocked(**vars(of) | new)
+
+
+def on_one_clock(
+    told: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch, helps: bool = True
+) -> tuple[Any, Any, Model]:
+    """Return cell and model that are taken, and the model without, where such delays are told."""
+    fit, left = modelled(), iter(told)
+    fit = replace(fit, consensus=replace(fit.consensus, found=replace(fit.found, freedom=20.0)))
+    monkeypatch.setattr(calibration, "replace", replaced)
+    monkeypatch.setattr(calibration, "with_nuisance", lambda *_: modelled_as(fit))
+    monkeypatch.setattr(calibration, "_agreed", lambda *_: modelled_as(fit))
+    monkeypatch.setattr(calibration, "_delay_of", lambda _: next(left))
+    monkeypatch.setattr(
+        calibration, "better", lambda m, other, what: (other if helps else m).noted(what)
+    )
+    options: Any = None
+    cell: Any = Clocked(delay=None, reach=0.05, clock_deviation=0.0)
+    return *calibration._with_clock(cell, fit, options), fit
+
+
+def modelled_as(fit: Model) -> Model:
+    return Model(Consensus(fit.problem, replace(fit.found)))
+
+
+def test_a_delay_counts_beyond_what_chance_gives_once_in_ten_thousand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that does not is left in the covariance, as large as it may be."""
+    limit = np.sqrt(stats.f(1, 20).ppf(0.9999)) * 1e-3
+    cell, model, fit = on_one_clock([(0.99 * limit, 1e-3)], monkeypatch)
+    assert model is fit and cell.delay is None
+    assert cell.clock_deviation == pytest.approx(np.hypot(0.99 * limit, 1e-3))
+    cell, model, _ = on_one_clock([(1.01 * limit, 1e-3), (0.0, 1e-3)], monkeypatch)
+    assert cell.delay == pytest.approx(1.01 * limit) and cell.clock_deviation == 0.0
+    assert model.notes[0].startswith("the flange was at the poses ")
+
+
+def test_a_delay_is_found_by_steps_and_taken_where_it_helps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    steps = [(0.02, 1e-3), (-0.003, 1e-3), (0.9e-5, 2e-3), (9.0, 1e-3)]
+    cell, model, _ = on_one_clock(steps, monkeypatch)
+    assert cell.delay == pytest.approx(0.017)
+    assert model.notes == (
+        "the flange was at the poses 17.0 +- 2.0 ms after the times they are paired by",
+    )
+    cell, _, _ = on_one_clock([(0.004, 1e-4)] * 20, monkeypatch)
+    assert cell.delay == pytest.approx(6 * 0.004)
+    cell, model, fit = on_one_clock(steps, monkeypatch, helps=False)
+    assert cell.delay is None and model.found is fit.found
+    assert cell.clock_deviation == pytest.approx(np.hypot(0.02, 1e-3))
+    cell, model, _ = on_one_clock([(0.04, 1e-3), (0.02, 1e-3)], monkeypatch)
+    assert cell.delay is None and model.notes[0].startswith("left out: the flange was at the poses")
+    assert "60.0 +- 1.0 ms after" in model.notes[0]

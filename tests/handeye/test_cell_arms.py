@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.handeye import cell_arms as rooms
 from flangeye.handeye.cell_arms import CorrectedArms, Linear, _explained, _known, _stepped, _told
 from flangeye.maths.statistics import covariance_inflation
 
@@ -111,3 +112,53 @@ def test_offsets_are_told_in_milliradians() -> None:
     corrections = CorrectedArms(nothing, arms).corrections
     assert corrections["right"].tool_offset.tolist() == [0.0] * 3
     assert corrections["right"].joint_offsets is arms[1].offsets
+
+
+def chosen_by(
+    explains: dict[str, float], branches: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    """Return the branches that are taken where each explains so much, by itself."""
+    sizes = SimpleNamespace(expected=np.array([3.0, 9.0]))
+    monkeypatch.setattr(rooms, "_sizes", lambda linear, zeros_alone: sizes)
+
+    def explained(linear: Any, size: float) -> float:
+        assert size == 3.0
+        return sum(explains[arm] for arm in linear)
+
+    monkeypatch.setattr(rooms, "_explained", explained)
+    sighted: Any = SimpleNamespace(linear=lambda found, arms: arms)
+    given: Any = branches
+    return rooms.likeliest(sighted, sighted, given)
+
+
+def test_each_arm_is_taken_on_the_branch_that_explains_most(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    explains = {"up": 1.0, "down": 5.0, "left": 3.0, "right": 2.0, "back": 4.0, "only": 0.0}
+    branches = [["up", "down"], ["only"], ["left", "right", "back"]]
+    assert chosen_by(explains, branches, monkeypatch) == ["down", "only", "back"]
+    explains["down"], explains["back"] = 0.5, 1.0
+    assert chosen_by(explains, branches, monkeypatch) == ["up", "only", "left"]
+
+
+def test_zeros_are_found_in_three_steps_each_about_those_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Seen(SimpleNamespace):
+        def linear(self, found: Any, arms: Any) -> Any:
+            return self.offset, found, arms
+
+        def with_arms(self, arms: Any) -> Any:
+            return Seen(offset=arms)
+
+        def solved(self, start: Any) -> Any:
+            return SimpleNamespace(places=(start, self.offset))
+
+    monkeypatch.setattr(rooms, "_stepped", lambda linear, arms, size: arms + size)
+    sighted: Any = Seen(offset=0)
+    begun: Any = 0
+    reported: Any = SimpleNamespace(places="as reported")
+    answer: Any = rooms._corrected(reported, sighted, begun, 2.0)
+    found, linear, arms = answer
+    assert arms == 6.0 and found.places == ((("as reported", 2.0), 4.0), 6.0)
+    assert linear == (6.0, found, 6.0)

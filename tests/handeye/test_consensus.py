@@ -315,3 +315,48 @@ def test_the_noise_that_a_rotation_is_refused_with_is_the_centres_and_the_arms(
     np.testing.assert_array_equal(tcps, places[3:])
     np.testing.assert_array_equal(used, axes[3:])
     assert information is found.information
+
+
+def test_small_sets_are_sixty_of_one_more_than_a_start_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That counts of which the middle one is nearest; sets without an answer are passed over."""
+    problem, found = exactly(n=9)
+    asked, medians = list[int](), iter([np.nan, 5.0, 3.0, 4.0, *[6.0] * 60])
+
+    def begun(s: Any, loop: Any, rng: Any, restarts: int) -> Unknowns:
+        asked.append(len(s))
+        if len(asked) == 1:
+            raise CalibrationRefused("nothing")
+        if len(asked) == 2:
+            raise np.linalg.LinAlgError
+        return replace(found.at, tilt=np.array([len(asked), 0.0]))
+
+    monkeypatch.setattr(consensus, "start_of", begun)
+    monkeypatch.setattr(
+        consensus, "_distances", lambda *_: np.array([0.0, 0.0, next(medians), 9, 9])
+    )
+    monkeypatch.setattr(consensus, "settle", lambda problem, start, noise: (start, noise))
+    taken: Any = consensus._from_subsets(problem, np.random.default_rng(0))
+    start, noise = taken
+    assert asked == [4] * 60 and start.tilt[0] == 5
+    assert noise == _first_noise(problem, start)
+    asked.clear()
+    three = problem.where(np.arange(9) < 3)
+    monkeypatch.setattr(consensus, "_distances", lambda *_: np.full(3, np.inf))
+    assert consensus._from_subsets(three, np.random.default_rng(0)) is None
+    assert asked == [3] * 60
+
+
+def test_normals_that_disagree_alone_are_left_out_of_those_whose_centres_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, found = exactly("eye-on-base, flange", "normal")
+    every = consensus._without_bad_normals(problem, replace(found, inliers=np.ones(8, dtype=bool)))
+    assert every[0] is problem and every[2] == 0
+    some = replace(found, inliers=np.arange(8) >= 3)
+    again = replace(found, inliers=np.arange(8) >= 1)
+    monkeypatch.setattr(consensus, "agreeing", lambda *_: again)
+    without, fit, dropped = consensus._without_bad_normals(problem, some)
+    assert without.measurements.has_normal.tolist() == [False] * 3 + [True] * 5
+    assert fit is again and dropped == 2

@@ -369,3 +369,101 @@ def test_from_far_away_a_climb_arrives_in_few_steps_and_never_goes_up(
         assert again.cost == pytest.approx(found.cost, rel=1e-6)
         assert again.cost == min(costs)
         assert len(costs) <= 16
+
+
+def test_outliers_are_left_behind_by_degrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Yang et al. (2020): from shares that are all alike, by factors of 1.4, to those of none or one."""
+    problem = given(HAND, "pose", 8)
+    limits = gates(problem, 9.0)
+    ratios = np.array([0.0, 0.5, 0.99, 1.02, 2.0, 30.0, 0.1, 0.2])
+    begun = replace(fitted(problem), squares=ratios * limits, freedom=9.0)
+    begun = replace(begun, inliers=np.arange(8) != 3)
+    asked = list[Any]()
+
+    def climb(
+        problem: Problem, found: Solution, noise: Noise, shares: Floats, iterations: int = 60
+    ) -> Solution:
+        asked.append((shares, iterations))
+        return replace(found, freedom=np.inf)
+
+    monkeypatch.setattr(likelihood, "climb", climb)
+    found = likelihood._graduate(problem, begun)
+    assert found.freedom == 9.0
+    (first, _), *between, (last, steps) = asked
+    assert first.tolist() == [1, 1, 1, 0, 1, 1, 1, 1]
+    assert steps == 60 and last.tolist() == [1, 1, 1, 0, 0, 0, 1, 1]
+    for k, (shares, each) in enumerate(between):
+        mu = 1.4**k / (2 * 30 - 1)
+        expected = np.sqrt(mu * (mu + 1) / np.maximum(ratios, 1e-9)) - mu
+        assert each == 1 and shares == pytest.approx(np.clip(expected, 0, 1), abs=1e-6)
+    # The last that is not decided is the one nearest to its limit: 0.99 from below.
+    mu = 1.4 ** len(between) / 59
+    assert mu / (mu + 1) >= 0.99 > mu / (1.4 + mu)
+    asked.clear()
+    within = replace(begun, squares=np.minimum(ratios, 1.0) * limits)
+    assert likelihood._graduate(problem, within).freedom == 9.0
+    assert [shares.tolist() for shares, _ in asked] == [[1, 1, 1, 0, 1, 1, 1, 1], [1] * 8]
+
+
+def test_noise_and_unknowns_are_found_in_turn_until_the_noise_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """To a thousandth; two steps of the unknowns each time, and then all."""
+    problem = given(HAND, "pose", 8, stated=False)
+    begun, asked = replace(fitted(problem), inliers=np.arange(8) != 3), list[Any]()
+
+    def climb(
+        problem: Problem, found: Solution, noise: Noise, shares: Floats, iterations: int
+    ) -> Solution:
+        asked.append((noise.pose, iterations))
+        assert shares.tolist() == [1, 1, 1, 0, 1, 1, 1, 1]
+        return replace(found, noise=noise)
+
+    def climb_on(problem: Problem, found: Solution, shares: Floats, iterations: int) -> Solution:
+        asked.append(("on", iterations))
+        return found
+
+    monkeypatch.setattr(likelihood, "climb", climb)
+    monkeypatch.setattr(likelihood, "_climb_on", climb_on)
+    for poses, rounds in (
+        ([1.0, 1.0005], 2),
+        ([1.0, 1.002, 1.0025], 3),
+        ([float(k) for k in range(1, 40)], 12),
+    ):
+        for refit in (True, False):
+            left = iter(poses)
+            monkeypatch.setattr(
+                likelihood, "_components", lambda *_, left=left: (Noise(next(left), 0.0), 5.0, 8.0)
+            )
+            asked.clear()
+            found = with_noise(problem, begun, refit)
+            assert (found.freedom, found.all_freedom) == (5.0, 8.0)
+            few, many = (2, 60) if refit else (0, 0)
+            expected = [(0.0, few), *((pose, few) for pose in poses[:rounds]), ("on", many)]
+            assert asked == expected
+
+
+def test_who_agrees_is_found_by_degrees_at_most_four_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the noise of those that do, until the same do, or fewer than three."""
+    problem = given(HAND, "pose", 9)
+    for agreeing, graduated, with_their_noise in (
+        ([7, 7, 5], 2, 1), ([7, 3, 3], 3, 2), ([7, 2], 2, 1), ([8, 7, 6, 5, 4], 4, 4),
+    ):  # fmt: skip
+        calls = list[str]()
+
+        def graduate(
+            problem: Problem, found: Solution, to: Any = agreeing, calls: Any = calls
+        ) -> Solution:
+            calls.append("by degrees")
+            return replace(found, inliers=np.arange(9) < to[calls.count("by degrees") - 1])
+
+        def noised(problem: Problem, found: Solution, calls: Any = calls) -> Solution:
+            calls.append("noise")
+            return found
+
+        monkeypatch.setattr(likelihood, "_graduate", graduate)
+        monkeypatch.setattr(likelihood, "with_noise", noised)
+        monkeypatch.setattr(likelihood, "agreeing", lambda problem, found: found)
+        found = settle(problem, start(problem), NONE)
+        assert calls.count("by degrees") == graduated and calls.count("noise") == with_their_noise
+        assert found.inliers.sum() == agreeing[graduated - 1]

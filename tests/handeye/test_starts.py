@@ -115,3 +115,21 @@ def test_another_start_is_tried_until_rotations_agree_to_a_degree(
     some: Any = None
     chosen: Any = rooms._of_two_arms(s, some, 20)
     assert chosen == taken and asked == [0] + [200] * (starts - 1)
+
+
+def test_a_size_is_told_by_sixty_sets_of_eight_poses_or_of_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = list[int]()
+
+    def never(s: Measurements, loop: Loop, rng: Any, restarts: int) -> Any:
+        asked.append(len(s))
+        assert restarts == 0
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(rooms, "start_of", never)
+    for count, of in ((12, 8), (5, 5)):
+        s, loop = measured("eye-in-hand, marker", "pose", count)
+        assert size_of(s, loop, np.random.default_rng(0)) == 1.0
+        assert asked == [of] * 60
+        asked.clear()
