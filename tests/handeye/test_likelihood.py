@@ -467,3 +467,15 @@ def test_who_agrees_is_found_by_degrees_at_most_four_times(monkeypatch: pytest.M
         found = settle(problem, start(problem), NONE)
         assert calls.count("by degrees") == graduated and calls.count("noise") == with_their_noise
         assert found.inliers.sum() == agreeing[graduated - 1]
+
+
+def test_a_climb_weighs_by_the_noise_it_is_given_not_by_that_before() -> None:
+    problem, every = given(HAND, "pose", 9), np.ones(9)
+    before, noise = fitted(problem), Noise(4e-6, 1e-5)
+    for steps in (0, 5):
+        found = climb(problem, before, noise, every, steps)
+        assert found.noise == noise
+        expected = weights_of(problem.measurements, found.linear, noise)
+        assert found.weights == pytest.approx(expected, rel=1e-6)
+    same = climb(problem, before, before.noise, every, 0)
+    assert same.weights is before.weights  # they are the same, and are not worked out again
