@@ -1,0 +1,114 @@
+"""Whether the tip still sits: a line through what was felt before, and how well it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.consistency import Seating, _newest_from, _Trail
+
+RNG = np.random.default_rng(0)
+
+
+def drawn(scatter: float = 1e-4) -> tuple[Floats, Floats]:
+    """Return samples of a seam that goes aside and up, and five that are beyond them."""
+    before = np.column_stack([np.linspace(0.0, 0.03, 25), np.zeros((25, 2))])
+    before[:, 1:] = before[:, :1] * [0.1, -0.05] + scatter * RNG.standard_normal((25, 2))
+    newest = np.column_stack([np.linspace(0.045, 0.047, 5), RNG.normal(0.0, 1e-3, (5, 2))])
+    return before, newest
+
+
+def test_the_newest_are_held_against_a_line_as_well_as_it_is_known_there() -> None:
+    """The variance of the mean of so many predictions by least squares."""
+    before, newest = drawn()
+    at, count = newest[:, 0].mean(), len(before)
+    for axis, (off, sigma) in zip((1, 2), _newest_from(before, newest), strict=True):
+        slope, height = np.polyfit(before[:, 0], before[:, axis], 1)
+        assert off == pytest.approx(newest[:, axis].mean() - (slope * at + height))
+        left = before[:, axis] - (slope * before[:, 0] + height)
+        variance = (left**2).mean()
+        middle = before[:, 0].mean()
+        spread = ((before[:, 0] - middle) ** 2).sum()
+        share = 1 / 5 + 1 / count + (at - middle) ** 2 / spread
+        assert sigma == pytest.approx(np.sqrt(variance * share))
+
+
+def test_a_line_is_no_steeper_than_a_plan_is_wrong() -> None:
+    before, newest = drawn(scatter=0.0)
+    (aside, _), (lifted, _) = _newest_from(before, newest, (0.02, 0.01))
+    ahead = newest[:, 0].mean() - before[:, 0].mean()
+    mean = newest.mean(axis=0) - before.mean(axis=0)
+    assert aside == pytest.approx(mean[1] - 0.02 * ahead)
+    assert lifted == pytest.approx(mean[2] + 0.01 * ahead)
+    exact = before.copy()
+    assert _newest_from(exact, exact[-5:])[0] == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_samples_are_kept_until_they_are_far_behind_and_seen_between_8_and_45_mm() -> None:
+    trail = _Trail(0.05)
+    for i in range(3000):
+        trail.add(1e-4 * i, float(i), -float(i))
+    rows = trail.rows
+    assert rows[-1].tolist() == [1e-4 * 2999, 2999.0, -2999.0]
+    assert 0.0499 < rows[-1, 0] - rows[0, 0] <= 0.05 and len(rows) in (500, 501)
+    away = 1e-4 * 2999 - trail.behind(1e-4 * 2999)[:, 0]
+    assert away.min() == pytest.approx(8e-3, abs=1.1e-4) and away.min() > 8e-3
+    assert away.max() == pytest.approx(45e-3, abs=1.1e-4) and away.max() < 45e-3
+    trail.clear()
+    assert len(trail.rows) == 0
+
+
+def judged(aside: float, lifted: float, side: float = 1.0, flat: float = 1.0) -> str | None:
+    """Return what is said of a tip that is aside and lifted at the end of a quiet seam [m]."""
+    seating, said = Seating(side, flat), None
+    for i in range(120):
+        off = (aside, lifted) if i >= 115 else (0.0, 0.0)
+        said = seating.judge(i * 2e-4, off[0], off[1])
+        assert i >= 115 or said is None
+    return said
+
+
+@pytest.mark.parametrize(
+    ("aside", "lifted", "side", "flat", "told"),
+    [
+        (0.0, 3.1e-3, 1.0, 1.0, "lifted out of the groove by 3.1 mm"),
+        (0.0, 2.9e-3, 1.0, 1.0, None),
+        (0.36e-3, 0.2e-3, 1.0, 1.0, "climbs the wall: 0.4 mm aside, 0.2 mm up"),
+        (0.34e-3, 0.2e-3, 1.0, 1.0, None),  # too little aside
+        (0.36e-3, 0.36e-3 * 0.34, 1.0, 1.0, None),  # too flat for a tip that climbs
+        (0.36e-3, 0.36e-3 * 0.36, 1.0, 1.0, "climbs the wall: 0.4 mm aside, 0.1 mm up"),
+        (0.36e-3, 0.36e-3 * 0.36, 1.0, 0.5, None),  # the wall is twice as steep
+        (0.36e-3, 0.36e-3 * 0.72, 1.0, 0.5, "climbs the wall: 0.4 mm aside, 0.3 mm up"),
+        (-0.5e-3, 0.4e-3, 1.0, 1.0, None),  # away from the pressed wall
+        (-0.5e-3, 0.4e-3, -1.0, 1.0, "climbs the wall: 0.5 mm aside, 0.4 mm up"),
+    ],
+)  # fmt: skip
+def test_a_tip_is_out_of_its_groove_that_is_lifted_or_climbs_its_wall(
+    aside: float, lifted: float, side: float, flat: float, told: str | None
+) -> None:
+    said = judged(aside, lifted, side, flat)
+    assert (told in said) if told and said else said is told
+
+
+def test_nothing_is_said_of_a_tip_with_fewer_than_ten_samples_behind_it() -> None:
+    for count, told in ((9, False), (10, True)):
+        seating = Seating(1.0, 1.0)
+        for i in range(count):
+            seating.judge(1e-4 * i, 0.0, 0.0)
+        said = [seating.judge(0.012 + 1e-4 * i, 0.0, 5e-3) for i in range(5)]
+        assert (said[-1] is not None) == told
+        seating.forget()
+        assert seating.judge(0.02, 0.0, 9e-3) is None and seating.doubt == 0.0
+
+
+def test_a_tip_is_doubted_by_the_lesser_of_what_it_went_aside_and_what_it_climbed() -> None:
+    for aside, lifted, flat, doubt in (
+        (0.2e-3, 0.5e-3, 1.0, 0.2e-3), (0.3e-3, 0.07e-3, 1.0, 0.2e-3), (0.3e-3, 0.07e-3, 0.5, 0.1e-3),
+        (-0.2e-3, 0.5e-3, 1.0, 0.0),
+    ):  # fmt: skip
+        seating = Seating(1.0, flat)
+        for i in range(120):
+            seating.judge(i * 2e-4, *((aside, lifted) if i >= 119 else (0.0, 0.0)))
+        # One of the newest five is aside; held against a line that knows no scatter.
+        assert seating.doubt == pytest.approx(doubt / 5, rel=1e-6)

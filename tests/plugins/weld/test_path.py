@@ -1,0 +1,82 @@
+"""A seam by arc length: places between its points, slopes, curvature and feet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flangeye_plugins.weld.path import Path
+
+CORNER = Path(np.array([[0.0, 0.0, 0.0], [0.03, 0.04, 0.002], [0.03, 0.08, 0.002]]))
+"""50 mm that climb by 2, then 40 mm that do not."""
+
+
+def test_a_path_is_resampled_every_half_millimetre_of_its_length_in_the_plane() -> None:
+    assert CORNER.length == pytest.approx(0.09) and len(CORNER.points) == 181
+    assert CORNER.step == pytest.approx(0.5e-3)
+    short = Path(np.array([[0.0, 0, 0], [4e-4, 0, 0]]))
+    assert len(short.points) == 3 and short.step == pytest.approx(2e-4)
+
+
+@pytest.mark.parametrize(("s", "point", "height"), [(0.025, (0.015, 0.02), 1e-3), (0.07, (0.03, 0.06), 2e-3),
+                                                    (0.02513, (0.015078, 0.020104), 1.0052e-3)])  # fmt: skip
+def test_places_lie_between_the_points(s: float, point: tuple[float, float], height: float) -> None:
+    place = CORNER.at(s)
+    assert place.point == pytest.approx(point) and place.height == pytest.approx(height)
+    ahead = np.array([0.6, 0.8]) if s < 0.05 else np.array([0.0, 1.0])
+    assert place.tangent == pytest.approx(ahead)
+    assert place.normal == pytest.approx([-ahead[1], ahead[0]])
+
+
+def test_beyond_its_ends_it_goes_on_straight_and_level() -> None:
+    before, after = CORNER.at(-0.01), CORNER.at(0.1)
+    assert before.point == pytest.approx([-0.006, -0.008]) and before.height == 0.0
+    assert after.point == pytest.approx([0.03, 0.09]) and after.height == pytest.approx(2e-3)
+    arc = np.array([-0.01, 0.0, 0.033, 0.0502, 0.09, 0.1])
+    points, tangents = CORNER.evaluate(arc)
+    for s, point, tangent in zip(arc.tolist(), points, tangents, strict=True):
+        place = CORNER.at(s)
+        assert point == pytest.approx([*place.point, place.height])
+        assert tangent == pytest.approx(place.tangent)
+    assert CORNER.climb(0.025) == pytest.approx(0.04) and CORNER.climb(0.07) == pytest.approx(0.0)
+    assert CORNER.climb(-1e-9) == CORNER.climb(0.0901) == 0.0
+    assert CORNER.climb(0.0) == pytest.approx(0.04)
+
+
+def arc(radius: float, angle: float = 1.5) -> Path:
+    turn = np.linspace(0.0, angle, 300)
+    return Path(abs(radius) * np.column_stack(
+        [np.sin(turn), np.sign(radius) * (1 - np.cos(turn)), 0 * turn]
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize("radius", [0.05, -0.08])
+def test_curvature_is_one_over_the_radius_to_the_left_positive(radius: float) -> None:
+    path = arc(radius)
+    for s in (0.0, 0.02, path.length):
+        assert path.bend(s) == pytest.approx(1 / radius, rel=0.02)
+    assert path.bend(-1e-6) == path.bend(path.length + 1e-6) == 0.0
+    assert path.sharpest(0.01, 0.02) == pytest.approx(1 / abs(radius), rel=0.02)
+    assert path.sharpest(path.length + 0.01, path.length + 0.02) == 0.0
+
+
+def test_a_corner_is_curved_where_it_is_by_what_it_turns_within_five_millimetres() -> None:
+    turn = np.arctan2(1.0, 0.0) - np.arctan2(0.8, 0.6)
+    bends = np.array([CORNER.bend(s) for s in CORNER.step * np.arange(181)])
+    assert bends.max() == pytest.approx(turn / 5e-3, rel=0.05)
+    curved = CORNER.step * np.flatnonzero(bends > 1e-3 / 5e-3)
+    assert 0.0445 <= curved.min() < curved.max() <= 0.0555
+    assert bends.sum() * CORNER.step == pytest.approx(turn, rel=0.02)
+    assert CORNER.sharpest(0.0, 0.04) == pytest.approx(0.0, abs=1e-9)
+    assert CORNER.sharpest(0.04, 0.06) == pytest.approx(bends.max())
+
+
+def test_a_foot_is_found_forwards_and_back_and_progress_only_forwards() -> None:
+    path = arc(0.05)
+    place = path.at(0.03)
+    aside = place.point + 2e-3 * place.normal
+    for near in (0.028, 0.03, 0.032):
+        assert path.foot(aside, near) == pytest.approx(0.03, abs=2e-5)
+    assert path.advance(aside, 0.032, 5e-3) == 0.032
+    assert path.advance(aside, 0.028, 5e-3) == pytest.approx(0.03, abs=1.5e-4)
+    assert path.advance(aside, 0.02, 5e-3) == pytest.approx(0.025)
