@@ -1,0 +1,199 @@
+"""What is refused before anything moves: at which limit, and what is said to change."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError
+from flangeye.errors import StageError
+from flangeye.models.finger import Finger
+from flangeye_emulators.weld_world.bench import FINGER
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.checks import (
+    check_belief,
+    check_body,
+    check_finger,
+    check_speeds,
+    check_weave,
+    tool_angles,
+)
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.reachability import _nearest, flange_speed
+from flangeye_plugins.weld.report import _at, _figures, _loop, _stated
+from flangeye_plugins.weld.settings import Following
+
+STIFF = {
+    "rest": ["0 mm"] * 3, "rotation": ["0 deg"] * 3, "gain": np.eye(3).tolist(),
+    "noise": ["0.01 mm", "0.02 mm", "0.06 mm"], "lateral": "2000 N/m", "axial": "3000 N/m",
+    "source": "a test",
+}  # fmt: skip
+
+
+def finger(**given: Any) -> Finger:
+    return Finger.model_validate({**FINGER, **given})
+
+
+def following(**given: Any) -> Following:
+    return Following.model_validate(given)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"deflection": "5.9 mm"}, None),
+        ({"deflection": "6.1 mm"}, "a deflection of 6.1 mm is more than finger bench stands, 6 mm"),
+        ({"preload": "6.1 mm"}, "a deflection of 6.1 mm is more than finger bench stands, 6 mm"),
+    ],
+)
+def test_a_finger_is_displaced_no_further_than_it_stands(given: Any, told: str | None) -> None:
+    if told is None:
+        check_finger(finger(), following(**given))
+        return
+    with pytest.raises(StageError, match=told):
+        check_finger(finger(), following(**given))
+
+
+@pytest.mark.parametrize(("force", "told"), [("5.1 N", False), ("4.9 N", True)])
+def test_a_finger_presses_no_harder_than_it_may(force: str, told: bool) -> None:
+    """2000 N/m by 2 mm aside and 3000 N/m by 1 mm down: 5 N together."""
+    asked = following(deflection="2 mm", preload="1 mm", force=force)
+    if not told:
+        check_finger(finger(calibration=STIFF), asked)
+        return
+    with pytest.raises(
+        StageError, match=r"press with 5 N, allowed are 4.9 N; lower them, or raise"
+    ):
+        check_finger(finger(calibration=STIFF), asked)
+
+
+def test_a_torch_is_known_to_four_sigma_within_the_error_that_is_allowed() -> None:
+    belief, asked = Belief(0.04, torch_sigma=0.2e-3), following()
+    bound = 4 * np.sqrt(belief.fixed_variance(asked))
+    check_belief(belief, asked.model_copy(update={"max_error": 1.001 * bound}))
+    with pytest.raises(StageError, match=f"the torch is known to {bound * 1e3:.2f} mm at best"):
+        check_belief(belief, asked.model_copy(update={"max_error": 0.999 * bound}))
+
+
+@pytest.mark.parametrize(("share", "told"), [(1.41, False), (1.39, True)])
+def test_the_preload_holds_the_tip_with_fourteen_tenths_of_the_push(
+    share: float, told: bool
+) -> None:
+    asked = following()
+    wall = np.arctan(2.0 * asked.preload / (share * asked.deflection))
+    belief = Belief(0.04, 1000.0, 2000.0, float(wall), torch_sigma=0.0)
+    if not told:
+        check_belief(belief, asked)
+        return
+    with pytest.raises(StageError, match=f"holds it with {share:.2f} times what the deflection"):
+        check_belief(belief, asked)
+
+
+@pytest.mark.parametrize(
+    ("up", "told"), [(7.9e-3, None), (8.1e-3, r"\+8.1 mm"), (-8.1e-3, "-8.1 mm")]
+)
+def test_a_torch_is_within_its_height_of_the_seam(up: float, told: str | None) -> None:
+    body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, up]))
+    if told is None:
+        check_body(body, Belief(0.04), following())
+        return
+    with pytest.raises(StageError, match=f"its torch is {told} above the seam, allowed are 8 mm"):
+        check_body(body, Belief(0.04), following())
+    # On a joint the ball's centre is above the seam by its seat.
+    seated = Belief(0.04, half_angle=0.5, radius=1e-3)
+    assert seated.joint is not None
+    body.torch[2] = 7.9e-3 - seated.joint.seat(1e-3)[1]
+    check_body(body, seated, following())
+
+
+def test_a_weave_turns_the_tool_with_four_fifths_of_the_turn_rate_at_most() -> None:
+    rate = following().turn_rate
+    for share, told in ((0.99, False), (1.01, True)):
+        width = share * 0.8 * rate * 0.04 / np.pi  # at 1 Hz
+        asked = following(weave_width=f"{width} m")
+        if not told:
+            check_weave(0.04, asked)
+            continue
+        with pytest.raises(
+            StageError, match="lower 'weave_frequency' to 0.99, or raise 'turn_rate'"
+        ):
+            check_weave(0.04, asked)
+
+
+@pytest.mark.parametrize("radius", [0.05, -0.08])
+def test_a_tool_stands_to_a_circle_by_half_the_arc_of_its_chord(radius: float) -> None:
+    """Once its torch is on it as well, to the inner side; on a straight seam it lies along."""
+    turn = np.linspace(0.0, 2.5, 500)
+    path = Path(abs(radius) * np.column_stack(
+        [np.sin(turn), np.sign(radius) * (1 - np.cos(turn)), 0 * turn]
+    ))  # fmt: skip
+    angles = tool_angles(path, 0.03)
+    half = np.arcsin(0.03 / (2 * abs(radius))) * np.sign(radius)
+    assert angles[20:60] == pytest.approx(half, abs=0.01)
+    line = Path(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
+    assert np.abs(tool_angles(line, 0.03)).max() < 1e-9
+    assert len(tool_angles(line, 0.03)) == 100
+
+
+def test_the_flange_goes_as_fast_as_all_speeds_together_or_a_pass_does() -> None:
+    asked = following(speed="3 mm/s", lateral_speed="2 mm/s", turn_rate="0.5 rad/s")
+    tool = finger(tip=["30 mm", "40 mm", "180 mm"])
+    going = np.sqrt(9.0 + 4 + 4) * 1e-3
+    assert flange_speed(tool, asked) == pytest.approx(going + 0.5 * 0.05)
+    limits: Any = SimpleNamespace(speed=1.001 * (going + 0.025))
+    check_speeds(tool, asked, limits)
+    limits.speed = 0.999 * (going + 0.025)
+    with pytest.raises(StageError, match="together move the flange at 29.1 mm/s"):
+        check_speeds(tool, asked, limits)
+
+
+def test_the_nearest_posture_is_that_whose_farthest_joint_turns_least() -> None:
+    before = np.array([0.1, 3.0])
+    postures = np.array([[0.5, 3.0], [0.3, -3.0], [0.1 + 2 * np.pi, 2.7]])
+    assert _nearest(before, postures) == pytest.approx([0.3, 2 * np.pi - 3.0])
+    assert _nearest(before, postures[[0, 2]]) == pytest.approx([0.1, 2.7])
+
+
+@pytest.mark.parametrize(
+    ("off", "displaced", "told"),
+    [
+        (19e-3, 5.9e-3, None),
+        (-21e-3, 0.0, "the tip is 21 mm away from the plan, allowed are 20 mm"),
+        (0.0, 6.1e-3, "the tip is displaced by 6.1 mm, finger bench stands 6 mm"),
+    ],
+)
+def test_a_tip_keeps_to_the_plan_and_to_what_its_finger_stands(
+    off: float, displaced: float, told: str | None
+) -> None:
+    bounds = Bounds(finger(), Path(np.array([[0.0, 0, 0], [0.1, 0, 0]])), following())
+    pose: Any = SimpleNamespace(position=np.array([0.05, off, 9.0]))
+    felt: Any = SimpleNamespace(displacement=np.array([0.0, displaced, 0.0]))
+    if told is None:
+        bounds.check(pose, 0.03, [felt, felt])
+        return
+    with pytest.raises(DeviceError, match=told):
+        bounds.check(pose, 0.03, [felt])
+
+
+def test_a_report_has_what_was_counted_and_how_the_loop_kept_time() -> None:
+    times, points = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [1, 2, 3], [3, 2, 1.0]])
+    assert _at(np.array([0.5, 2.0]), times, points) == pytest.approx(
+        np.array([[0.5, 1, 1.5], [2, 2, 2]])
+    )
+    assert _stated(np.array([1.0, 2.0])).tolist() == [1.0, 2.0]
+    assert len(_stated(np.array([1.0, np.inf]))) == 0
+    cycles = [SimpleNamespace(turn=t, computing=1e-3 * c, period=8e-3 + p)
+              for t, c, p in ((0.1, 1, 9.0), (-0.4, 3, 0.0), (0.2, 2, 2e-3))]  # fmt: skip
+    log: Any = SimpleNamespace(cycles=cycles, sights=7, felt={1: "one", 4: "two"})
+    assert _figures(log) == {"images": 7.0, "images_with_tag": 2.0, "turn_max": 0.4}
+    told = _loop(log)
+    assert told["cycles"] == 3.0 and told["computing_median"] == pytest.approx(2e-3)
+    assert told["period_median"] == pytest.approx(9e-3)
+    assert told["computing_p99"] == pytest.approx(np.quantile([1e-3, 2e-3, 3e-3], 0.99))
+    assert told["period_p99"] == pytest.approx(np.quantile([8e-3, 10e-3], 0.99))
+    nothing: Any = SimpleNamespace(cycles=[])
+    assert _loop(nothing) == {}

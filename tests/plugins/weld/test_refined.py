@@ -1,0 +1,152 @@
+"""The refined path: its likelihoods as dense normal distributions, and plans that are moved as one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flangeye.types import Floats
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.refined import (
+    PRIOR,
+    RefinedPath,
+    _explained,
+    _Field,
+    _rigid_rows,
+    _unexplained,
+    _whitened,
+)
+
+RNG = np.random.default_rng(0)
+
+
+def circle(radius: float = 0.08, angle: float = 1.5) -> Floats:
+    turn = np.linspace(0.0, angle, 400)
+    return radius * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
+
+
+def test_a_bordered_root_solves_columns_as_the_root_does() -> None:
+    rows = RNG.normal(size=(6, 9))
+    among, columns = rows @ rows.T, RNG.normal(size=(6, 2))
+    root = np.linalg.cholesky(among)
+    diagonal, white = _whitened(among, columns)
+    assert diagonal == pytest.approx(np.diag(root))
+    assert white == pytest.approx(np.linalg.solve(root, columns))
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e-2])
+def test_a_motion_is_as_unlikely_as_one_normal_distribution_of_all_says(size: float) -> None:
+    """Its scale left free; the motion is that of least squares with what is expected of it."""
+    half = RNG.normal(size=(12, 15))
+    among, rows = 1e-9 * half @ half.T, RNG.normal(size=(12, 3)) * [1.0, 1.0, 0.05]
+    felt = size * RNG.normal(size=12)
+    found = _explained(among, rows, felt)
+    total = among + rows @ np.diag(PRIOR**2) @ rows.T
+    scale = felt @ np.linalg.solve(total, felt) / 9
+    prior = 2 * np.log(PRIOR).sum()
+    assert found.unlikely == pytest.approx(
+        9 * np.log(scale) + np.linalg.slogdet(total)[1] - prior, rel=1e-6
+    )
+    information = rows.T @ np.linalg.solve(among, rows) + np.diag(PRIOR**-2)
+    shift = np.linalg.solve(information, rows.T @ np.linalg.solve(among, felt))
+    assert found.shift == pytest.approx(shift)
+    assert found.excess == pytest.approx(max(scale, 1.0))
+    assert found.covariance == pytest.approx(found.excess * np.linalg.inv(information))
+
+
+def test_a_shift_and_a_turn_move_a_plan_along_its_normals() -> None:
+    levers, angles, step = RNG.normal(size=(5, 2)), RNG.uniform(0, 6, 5), 1e-6
+    normals = np.column_stack([np.cos(angles), np.sin(angles)])
+    rows = _rigid_rows(levers, normals)
+    assert rows[:, :2] == pytest.approx(normals)
+    turn = np.array([[np.cos(step), -np.sin(step)], [np.sin(step), np.cos(step)]])
+    moved = ((levers @ turn.T - levers) * normals).sum(axis=1) / step
+    assert rows[:, 2] == pytest.approx(moved, abs=1e-5)
+    assert _unexplained(rows, rows @ [1.0, 2.0, 3.0]) == pytest.approx(0.0, abs=1e-20)
+
+
+def test_a_field_is_what_was_felt_and_what_any_plan_is_off_by() -> None:
+    field = _Field(4e-8, 6e-3, 9e-8)
+    found = field.covariance(np.array([0.0, 0.01]), np.array([0.0, 6e-3, 30e-3]))
+    assert found.shape == (2, 3)
+    assert found[0] == pytest.approx([
+        13e-8, 4e-8 * np.exp(-0.5) + 9e-8 * np.exp(-0.5 * 0.04),
+        4e-8 * np.exp(-0.5 * 25) + 9e-8 * np.exp(-0.5),
+    ])  # fmt: skip
+    assert found[1, 2] == pytest.approx(
+        4e-8 * np.exp(-0.5 * (20 / 6) ** 2) + 9e-8 * np.exp(-0.5 * (2 / 3) ** 2)
+    )
+
+
+def felt_of(
+    shift: tuple[float, float], turn: float, until: float = 0.06
+) -> tuple[RefinedPath, Path, Path]:
+    """Return what was felt of a seam that is a plan shifted and turned, the plan, and the seam."""
+    plan = Path(circle())
+    c, s = np.cos(turn), np.sin(turn)
+    seam = Path(circle() @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [*shift, 0.0])
+    refined = RefinedPath(plan, 0.05)
+    for i, at in enumerate(np.arange(0.005, until, 2e-4).tolist()):
+        refined.add(0.01 * i, at, offset_of(plan, seam, at), at)
+    refined.confirm(100.0)
+    return refined, plan, seam
+
+
+def offset_of(plan: Path, seam: Path, s: float) -> float:
+    """Return how far the seam is to the left of the plan."""
+    place, foot = plan.at(s), s
+    for _ in range(6):
+        there = seam.at(foot)
+        foot -= float((there.point - place.point) @ place.tangent / (there.tangent @ place.tangent))
+    return float((seam.at(foot).point - place.point) @ place.normal)
+
+
+@pytest.mark.parametrize(("shift", "turn"), [((2e-3, -1e-3), 0.0), ((0.0, 1e-3), 0.02)])
+def test_a_plan_that_is_shifted_and_turned_is_found_beyond_what_was_felt(
+    shift: tuple[float, float], turn: float
+) -> None:
+    refined, plan, seam = felt_of(shift, turn)
+    for s, near in ((0.02, 5e-6), (0.05, 5e-6), (0.07, 4e-5), (0.0, 4e-5)):
+        assert refined.offset(s) == pytest.approx(offset_of(plan, seam, s), abs=near)
+    for s in (0.02, 0.04):
+        step = (offset_of(plan, seam, s) - offset_of(plan, seam, s - 1.5e-3)) / 1.5e-3
+        assert refined.slope(s) == pytest.approx(step, abs=2e-3)
+        point, normal = refined.frame(s)
+        foot = seam.at(seam.foot(point, s))
+        assert point == pytest.approx(foot.point, abs=1e-5)
+        assert normal == pytest.approx(foot.normal, abs=3e-3)
+    assert 0 < refined.variance(0.03) < refined.variance(0.08) < refined.variance(0.11)
+    assert refined.angle(0.03, 9.0) == pytest.approx(0.03, abs=6e-4)
+    assert refined.angle(0.1, 9.0) == pytest.approx(0.06, abs=6e-4)
+
+
+def test_where_nothing_was_confirmed_the_plan_stands_and_is_off_by_five_millimetres() -> None:
+    refined = RefinedPath(Path(circle()), 0.05)
+    refined.add(5.0, 0.03, 1e-3, 0.0)
+    refined.confirm(4.99)
+    assert refined.empty and refined.offset(0.03) == 0.0 and refined.angle(0.03, 7.0) == 7.0
+    assert refined.variance(0.03) == pytest.approx(25e-6)
+    refined.forget_pending()
+    refined.confirm(9.0)
+    assert refined.empty
+    refined.add(5.0, 0.03, 1e-3, 0.0)
+    refined.confirm(5.0)
+    assert not refined.empty
+
+
+def test_an_earlier_weld_is_recalled_as_it_was_believed() -> None:
+    refined, plan, _ = felt_of((1e-3, 1e-3), 0.01)
+    refined.add(200.0, 0.061, 2e-3, 0.5, doubt=3e-4)
+    refined.confirm(200.0)
+    samples = refined.samples()
+    assert samples[:, 3].sum() == len(np.arange(0.005, 0.06, 2e-4)) + 1
+    assert samples[-1] == pytest.approx([0.061, 2e-3, 0.5, 1, 3e-4])
+    again = RefinedPath(plan, 0.05)
+    again.recall(samples)
+    assert again.samples() == pytest.approx(samples)
+    for s in (0.01, 0.03, 0.08):
+        assert again.offset(s) == pytest.approx(refined.offset(s), abs=1e-12)
+        assert again.doubt(s) == refined.doubt(s)
+    # A doubt reaches 4 mm along the seam, either way.
+    assert refined.doubt(0.061 - 3.9e-3) == refined.doubt(0.061 + 3.9e-3) == 3e-4
+    assert refined.doubt(0.061 - 4.9e-3) == refined.doubt(0.061 + 4.9e-3) == 0.0
