@@ -7,8 +7,10 @@ clock. A controller that is known to diverge says so where it is declared,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
@@ -35,10 +37,10 @@ class ToolPose:
     position: Floats
     angle: float
 
-    @property
+    @cached_property
     def direction(self) -> Floats:
         """(2,) t_d: from the torch to the tip."""
-        return np.array([np.cos(self.angle), np.sin(self.angle)])
+        return np.array([math.cos(self.angle), math.sin(self.angle)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,5 +147,6 @@ class ControllerPart(Protocol):
 
 def turned(vector: Floats, angle: float) -> Floats:
     """Return a vector (3,) along the tool's axes in the plane's: turned about its normal."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]])
+    c, s = math.cos(angle), math.sin(angle)
+    x, y, z = vector.tolist()
+    return np.array([c * x - s * y, s * x + c * y, z])

@@ -60,6 +60,9 @@ curve are equally near."""
 SWERVE_AHEAD = 10e-3
 """So far before a curve the tip slows down [m]."""
 
+SHARE = 2e-3
+"""A control cycle finds one piece of the felt seam again for so much of its period [s]."""
+
 LATE_SHARE = 0.05
 """Weight of one image in the mean of their delays."""
 
@@ -149,13 +152,14 @@ class Follower:
         self._seen = self._heard = self._bridge = 0.0
         self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
         self._latency = 0.0
-        self._place = plan.at(self.tip)
+        self._place, self._touched = plan.at(self.tip), self.tip
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
         self._seating = Seating(self.side, belief.flat(self.side))
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
         self._elapsed = self._began = 0.0
+        self._period = math.inf  # the shortest yet: one that came late is no longer
         self._swept: list[tuple[ToolPose, Touch]] = []
         self._put_off = False
 
@@ -170,6 +174,8 @@ class Follower:
         if self._time is None:
             self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
+        if self._elapsed > 0.0:
+            self._period = min(self._period, self._elapsed)
         self._track.add(pose)
         self._renew(bool(touches))
         for touch in touches:
@@ -191,13 +197,15 @@ class Follower:
     def _renew(self, touched: bool) -> None:
         """Do a cycle's share of finding the seam again from what was felt up to the last cycle.
 
-        A cycle that has a touch to take in leaves it to the next one.
+        A cycle of one share that has a touch to take in leaves it to the next one.
         """
-        self._put_off = touched and not self._put_off
+        shares = max(round(self._period / SHARE), 1) if self._period < math.inf else 1
+        self._put_off = touched and shares == 1 and not self._put_off
         if self._put_off:
             return
-        here = (self.torch, self._coming, self.tip)
-        self.refined.renew((*here, *(s + BIN for s in here)))
+        here = (self.torch, self._coming, self.tip, self._touched)
+        for _ in range(shares):
+            self.refined.renew((*here, *(s + BIN for s in here)))
 
     def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:
         """Return the command that leads the tip along the seam and the torch behind it.
@@ -284,6 +292,7 @@ class Follower:
         late = (self._time or 0.0) - touch.time + self.learned.stamp
         self._latency += LATE_SHARE * (late - self._latency)
         s, felt, deflection = self._located(pose, touch)
+        self._touched = s
         if self.phase != "seeking" or self._search.found:  # friction on a face is no contact
             self.contact.update(touch.time, deflection, max(self.wanted, self._settings.probe))
         if self.phase == "seeking":

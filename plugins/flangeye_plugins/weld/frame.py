@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flangeye.maths.geometry import rigid
@@ -58,11 +60,13 @@ class Tool:
     def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
         """Return the tool in the plane; its angle goes on where the last one left off."""
         plane = self._plane
-        tip = plane.rotation.T @ (base_T_flange.apply(self._tip) - plane.translation)
-        ahead = plane.rotation.T @ base_T_flange.rotation @ self._flange_R_level[:, 0]
-        angle = float(np.arctan2(ahead[1], ahead[0]))
+        plane_R_base, rotation = plane.rotation.T, base_T_flange.rotation
+        tip_in_base = rotation @ self._tip + base_T_flange.translation
+        tip = plane_R_base @ (tip_in_base - plane.translation)
+        ahead = plane_R_base @ (rotation @ self._flange_R_level[:, 0])
+        angle = math.atan2(ahead[1], ahead[0])
         if self._angle is not None:
-            angle += 2 * np.pi * round((self._angle - angle) / (2 * np.pi))
+            angle += math.tau * round((self._angle - angle) / math.tau)
         self._angle = angle
         return ToolPose(time, tip, angle)
 
@@ -88,11 +92,10 @@ class Tool:
 
     def twist(self, command: Command, base_T_flange: Transform) -> Floats:
         """Return the flange's twist (6,), along the base's axes, that carries out a command."""
-        normal = self._plane.rotation[:, 2]
-        up = base_T_flange.rotation @ self._flange_R_level[:, 2]
+        plane, rotation = self._plane.rotation, base_T_flange.rotation
+        normal, up = plane[:, 2], rotation @ self._flange_R_level[:, 2]
         angular = command.turn * normal + UPRIGHT_GAIN * _cross(up, normal)
-        lever = -base_T_flange.rotation @ self._tip
-        linear = self._plane.rotation @ command.velocity + _cross(angular, lever)
+        linear = plane @ command.velocity - _cross(angular, rotation @ self._tip)
         return np.concatenate([linear, angular])
 
     def base_T_flange(self, position: Floats, angle: float) -> Transform:

@@ -69,6 +69,11 @@ class Path:
 
     def at(self, s: float) -> Place:
         """Return the place at arc length ``s``, which may lie beyond either end."""
+        x, y, tx, ty, z = self._at(s)
+        return Place(np.array([x, y]), np.array([tx, ty]), np.array([-ty, tx]), z)
+
+    def _at(self, s: float) -> tuple[float, float, float, float, float]:
+        """Return point, tangent and height at an arc length."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
         inside = min(max(s, 0.0), self.length)
         index = min(int(inside / self.step), len(self._rows) - 2)
@@ -81,8 +86,7 @@ class Path:
         ty = before[4] + share * (after[4] - before[4])
         norm, beyond = math.hypot(tx, ty), s - inside
         tx, ty = tx / norm, ty / norm
-        point = np.array([x + beyond * tx, y + beyond * ty])
-        return Place(point, np.array([tx, ty]), np.array([-ty, tx]), z)
+        return x + beyond * tx, y + beyond * ty, tx, ty, z
 
     def evaluate(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) and unit tangents (K, 2) at arc lengths (K,)."""
@@ -116,15 +120,19 @@ class Path:
 
         It never goes back, and never jumps to another branch of a path that crosses itself.
         """
-        place = self.at(s)
-        return s + min(max(float((point - place.point) @ place.tangent), 0.0), reach)
+        return s + min(max(self._ahead(point, s), 0.0), reach)
 
     def foot(self, point: Floats, s: float) -> float:
         """Return the arc length of the foot of ``point`` (2,) near ``s``, forwards or back."""
         for _ in range(2):
-            place = self.at(s)
-            s += float((point - place.point) @ place.tangent)
+            s += self._ahead(point, s)
         return s
+
+    def _ahead(self, point: Floats, s: float) -> float:
+        """Return how far ahead of the place at ``s`` a point (2,) is, along the tangent there."""
+        x, y, tx, ty, _ = self._at(s)
+        px, py = point.tolist()
+        return float((px - x) * tx + (py - y) * ty)
 
 
 def _chords(points: Floats) -> Floats:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
 
 from flangeye.types import Floats
 from flangeye_plugins.weld.path import Path
@@ -61,25 +62,28 @@ SAYING, THINNED = 120, 60
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
 
+PRIOR_WEIGHT = np.diag(PRIOR**-2)
+"""(3, 3) their inverse covariance."""
+
 SAMPLE_SIGMA = 0.01e-3
 """Standard deviation of one sample, until it is known [m]."""
 
-CORNER = 1e60
-"""Larger than the square of anything that is whitened."""
-
-SPAN = 4
-"""Bins to both sides of a place at which its fit is tabulated: the direction is taken there."""
+SPAN = 5
+"""Bins to both sides of a place at which its fit is tabulated: the direction is taken there, of the
+bin beside it too."""
 
 
 class _Fit(NamedTuple):
     """The seam around one bin.
 
     Attributes:
+        index: Of the bin.
         offsets: (2 SPAN + 1,) of the seam from the plan at the bins around it [m].
         variance: Of the one in the middle [m^2].
         angle: Of the tool when the nearest bin was felt [rad].
     """
 
+    index: int
     offsets: list[float]
     variance: float
     angle: float
@@ -212,8 +216,9 @@ class RefinedPath:
         """Find one thing again, at the first of these arc lengths where that is due.
 
         A control cycle has time for one, or for one length of the field in a zone's motion; a few
-        cycles later all are renewed. What is due at other places is forgotten: it would be old
-        when the torch comes there.
+        cycles later all are renewed. Where nothing was found yet comes first: who asks there would
+        have to wait for all of it. What is due at other places is forgotten: it would be old when
+        the torch comes there.
         """
         bins = [self._index(s) for s in places]
         if bins != self._used:
@@ -221,15 +226,18 @@ class RefinedPath:
             self._fits = {i: fit for i, fit in self._fits.items() if i in used}
             zones = self._sound_zones.union(index // ZONE for index in bins)
             self._motions = {i: motion for i, motion in self._motions.items() if i in zones}
+        new = next((index for index in bins if index not in self._fits), None)
         due = next((index for index in bins if index not in self._sound), None)
-        if due is not None:
-            self._find(due)
+        if new is not None and (zone := self._known_zone(new)) is not None:
+            self._fits[new] = self._fitted(new, zone)
+        elif new is not None or due is not None:
+            self._find(new if new is not None else due)
 
     def _find(self, index: int) -> None:
         """Find the fit around a bin again; a piece of its zone's motion, where that is due."""
         zone = index // ZONE
         if zone in self._sound_zones:
-            self._fits[index] = self._fitted(index)
+            self._fits[index] = self._fitted(index, zone)
             self._sound.add(index)
             return
         if self._moving is None or self._moving[0] != zone:
@@ -302,7 +310,7 @@ class RefinedPath:
         if fit is None:
             return [0.0] * len(beside)
         table = fit.offsets
-        first = (s - self._middles[self._index(s)]) / BIN + SPAN
+        first = (s - self._start) / BIN - 0.5 - fit.index + SPAN
         offsets = []
         for away in beside:
             place = min(max(first + away / BIN, 0.0), 2 * SPAN - 1e-9)
@@ -315,38 +323,51 @@ class RefinedPath:
         return min(max(int((s - self._start) / BIN), SPAN), len(self._count) - SPAN - 1)
 
     def _fit(self, s: float) -> _Fit | None:
-        """Return how the seam lies about ``s``; kept until something new is believed there."""
+        """Return how the seam lies about ``s``; kept until something new is believed there.
+
+        Who is hurried takes that of the bin beside it, where that is what there is.
+        """
         index = self._index(s)
-        while not (index in self._sound or (self.hurried and index in self._fits)):
-            if self.hurried and index // ZONE in self._motions:
-                self._fits[index] = self._fitted(index)
-            else:
-                self._find(index)
+        if self.hurried:
+            near = next((i for i in (index, index - 1, index + 1) if i in self._fits), None)
+            if near is not None:
+                return self._fits[near]
+            if (zone := self._known_zone(index)) is not None:
+                self._fits[index] = self._fitted(index, zone)
+                return self._fits[index]
+        while index not in self._sound:
+            self._find(index)
         return self._fits[index]
 
-    def _fitted(self, index: int) -> _Fit | None:
-        """Return the plan, shifted and turned onto what was felt, and the field that this leaves.
+    def _known_zone(self, index: int) -> int | None:
+        """Return the zone whose motion does for a bin: its own, or the next where that is known."""
+        zone = index // ZONE
+        return next((z for z in (zone, zone - 1, zone + 1) if z in self._motions), None)
+
+    def _fitted(self, index: int, zone: int) -> _Fit | None:
+        """Return the plan, moved onto what was felt as in a zone, and the field that this leaves.
 
         The variance is that of universal kriging: where the field is held by samples, an error of
         the motion does no harm (Rasmussen and Williams 2006, 2.42).
         """
-        motion = self._motions[index // ZONE]
+        motion = self._motions[zone]
         if motion is None:
             return None
         near, rows, residual = self._residual(motion, index)
         felt, field = self._along[near] / self._count[near], motion.field
-        among = field.covariance(felt, felt) + np.diag(self._noise(near))
-        table = np.arange(index - SPAN, index + SPAN + 1)
+        table = slice(index - SPAN, index + SPAN + 1)
         there = self._rows(motion, table)
-        kernel = field.covariance(self._middles[table], felt)
-        weights = np.linalg.solve(among, kernel.T).T
+        covariance = field.covariance(np.concatenate([felt, self._middles[table]]), felt)
+        among, kernel = covariance[: len(near)], covariance[len(near) :]
+        among.ravel()[:: len(near) + 1] += self._noise(near)
+        weights = _solved(among, kernel.T)[1].T
         offsets = there @ motion.shift + weights @ residual
         free = there[SPAN] - weights[SPAN] @ rows
         held = float(weights[SPAN] @ kernel[SPAN])
         left = motion.excess * max(field.variance + field.wander - held, 0.0)
         variance = left + float(free @ motion.covariance @ free)
         nearest = int(near[np.abs(near - index).argmin()])
-        return _Fit(offsets.tolist(), variance, float(self._angle[nearest]))
+        return _Fit(index, offsets.tolist(), variance, float(self._angle[nearest]))
 
     def _moved(self, zone: int) -> Generator[None, None, _Motion | None]:
         """Find how the plan is moved in a zone, the same for all its bins; a piece at a time.
@@ -364,7 +385,7 @@ class RefinedPath:
         waviness = max(_unexplained(rows, felt), SMALLEST**2)
         squared = (along[:, None] - along) ** 2
         rest = self._wander * np.exp(squared * (-0.5 / SLOW**2))
-        rest += np.diag(self._noise(some) + 1e-6 * waviness)
+        rest.ravel()[:: len(some) + 1] += self._noise(some) + 1e-6 * waviness
         correlation = np.exp(squared * (-0.5 / LENGTHS[-1] ** 2))
         explained: dict[float, _Explained] = {}
         for length in reversed(LENGTHS):
@@ -384,7 +405,7 @@ class RefinedPath:
         rows = self._rows(motion, near)
         return near, rows, self._sum[near] / self._count[near] - rows @ motion.shift
 
-    def _rows(self, motion: _Motion, bins: NDArray[np.intp]) -> Floats:
+    def _rows(self, motion: _Motion, bins: NDArray[np.intp] | slice) -> Floats:
         return _rigid_rows(self._points[bins] - motion.about, self._normals[bins])
 
     def _noise(self, used: NDArray[np.intp]) -> Floats:
@@ -406,7 +427,7 @@ def _left(tangents: Floats) -> Floats:
 def _rigid_rows(levers: Floats, normals: Floats) -> Floats:
     """Return (K, 3): how a shift and a small turn of the plan move it along its normals."""
     turned = normals[:, 1] * levers[:, 0] - normals[:, 0] * levers[:, 1]
-    return np.column_stack([normals, turned])
+    return np.concatenate([normals, turned[:, None]], axis=1)
 
 
 def _unexplained(rows: Floats, felt: Floats) -> float:
@@ -425,26 +446,33 @@ def _explained(among: Floats, rows: Floats, felt: Floats) -> _Explained:
         rows: (K, 3) how a motion moves the plan.
         felt: (K,) offsets [m].
     """
-    diagonal, white = _whitened(among, np.column_stack([rows, felt]))
-    gram = white[:, :3].T @ white[:, :3] + np.diag(PRIOR**-2)
-    inverse: Floats = np.asarray(np.linalg.inv(gram), dtype=np.float64)
-    shift = inverse @ (white[:, :3].T @ white[:, 3])
+    diagonal, white = _whitened(among, np.concatenate([rows, felt[:, None]], axis=1))
+    normal = white[:, :3].T @ white
+    root, inverse = _solved(normal[:, :3] + PRIOR_WEIGHT, np.eye(3))
+    shift = inverse @ normal[:, 3]
     left = white[:, 3] - white[:, :3] @ shift
     freedom = max(len(felt) - 3, 1)
     scale = max(float(left @ left + np.sum((shift / PRIOR) ** 2)) / freedom, 1e-9)
-    volume = float(np.linalg.slogdet(gram)[1] + 2.0 * np.log(diagonal).sum())
+    volume = 2.0 * float(np.log(root).sum() + np.log(diagonal).sum())
     excess = max(scale, 1.0)
     return _Explained(freedom * math.log(scale) + volume, shift, excess * inverse, excess)
 
 
 def _whitened(among: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """Return the diagonal (K,) of a Cholesky root, and columns (K, M) solved by the root.
+    """Return the diagonal (K,) of a covariance's Cholesky root, and columns (K, M) solved by it.
 
-    One factorisation does both: that of a matrix bordered by columns holds them solved in its
-    border. The corner only has to be large enough for the whole to be positive definite.
+    LAPACK itself: a control cycle waits for it, and NumPy's way there takes three times as long.
+    Not its dtrtrs, which wakes threads for whatever size, and waits for them.
     """
-    size, count = columns.shape
-    whole = CORNER * np.eye(size + count)
-    whole[:size, :size], whole[size:, :size] = among, columns.T
-    root: Floats = np.asarray(np.linalg.cholesky(whole), dtype=np.float64)
-    return np.diagonal(root)[:size], root[size:, :size].T
+    root, failed = lapack.dpotrf(among.T, lower=1, clean=0)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of what was felt is not positive definite")
+    return np.diagonal(root), blas.dtrsm(1.0, root, columns, lower=1)
+
+
+def _solved(positive: Floats, columns: Floats) -> tuple[Floats, Floats]:
+    """Return the diagonal (K,) of a (K, K) matrix's Cholesky root, and columns solved by it."""
+    root, solved, failed = lapack.dposv(positive.T, columns, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of what was felt is not positive definite")
+    return np.diagonal(root), solved

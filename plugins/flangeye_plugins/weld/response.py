@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
@@ -24,6 +25,24 @@ GRID = 5e-3
 """Times at which commands and motion are compared [s]; dead times are multiples of it."""
 
 
+class _Told(NamedTuple):
+    """A command, and what all before it lead to.
+
+    Attributes:
+        time: When it was given [s].
+        command: (4,) velocity [m/s] and turn [rad/s].
+        way: (4,) from the first command to this one [m, rad].
+    """
+
+    time: float
+    command: Floats
+    way: Floats
+
+    def way_at(self, time: float) -> Floats:
+        """Return the way (4,) up to a time while this command lasts."""
+        return self.way + (time - self.time) * self.command
+
+
 class Response:
     """Where an arm that is late will come to.
 
@@ -34,7 +53,7 @@ class Response:
 
     def __init__(self) -> None:
         self.dead_time = self.lag = 0.0
-        self._commands: deque[tuple[float, Floats]] = deque()
+        self._commands: deque[_Told] = deque()
         self._speed = np.zeros(4)
 
     @property
@@ -46,20 +65,20 @@ class Response:
         """Remember a command given at ``time`` [s]."""
         if not self.delay:
             return
-        self._commands.append((time, np.array([*command.velocity, command.turn])))
+        way = self._commands[-1].way_at(time) if self._commands else np.zeros(4)
+        self._commands.append(_Told(time, np.array([*command.velocity, command.turn]), way))
 
     def ahead(self, pose: ToolPose) -> ToolPose:
         """Return where the tool will be when all it was told is carried out."""
         if not self._commands:
             return pose
-        motion = np.zeros(4)
-        while len(self._commands) > 1 and pose.time - self._commands[0][0] >= self.dead_time:
-            began, command = self._commands.popleft()
-            lasted = self._commands[0][0] - began
+        sent = pose.time - self.dead_time  # what is carried out now
+        while len(self._commands) > 1 and sent >= self._commands[0].time:
+            began, command, _ = self._commands.popleft()
+            lasted = self._commands[0].time - began
             self._speed += (1 - math.exp(-lasted / max(self.lag, 1e-3))) * (command - self._speed)
-        times = [time for time, _ in self._commands]
-        for (time, command), end in zip(self._commands, [*times[1:], pose.time], strict=True):
-            motion += (end - max(time, pose.time - self.dead_time)) * command
+        first, last = self._commands[0], self._commands[-1]
+        motion = last.way_at(pose.time) - first.way_at(max(first.time, sent))
         motion += self.lag * self._speed
         return ToolPose(pose.time, pose.position + motion[:3], pose.angle + float(motion[3]))
 

@@ -18,7 +18,7 @@ from flangeye_plugins.weld.consistency import Seating
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.refined import LENGTHS, RefinedPath
+from flangeye_plugins.weld.refined import BIN, LENGTHS, ZONE, RefinedPath
 from tests.plugins.weld.bench import curved, misplaced, straight
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -278,12 +278,35 @@ def test_a_hurried_path_finds_one_thing_again_at_a_time_and_is_the_same_in_the_e
     for refined in (exact, hurried):
         refined.confirm(1.0)
     after = []
-    for _ in range(len(LENGTHS) + 2):  # the motion, a length each; then the field about the place
+    # The motion, a length each, then the field about the place: of the one that is new first.
+    for _ in range(2 * (len(LENGTHS) + 2)):
         after.append(hurried.variance(0.03))
         hurried.renew((0.03, 0.05))
     assert set(after) == {first}
     assert hurried.variance(0.03) == exact.variance(0.03) < first
+    assert hurried.variance(0.05) == exact.variance(0.05)
     np.testing.assert_array_equal(hurried.frame(0.03), exact.frame(0.03))
+
+
+def test_a_hurried_path_takes_what_is_known_beside_a_new_place_and_waits_for_nothing() -> None:
+    refined = RefinedPath(Path(curved(0.1)), 0.05)
+    refined.hurried = True
+    for s in np.arange(0.0, 0.05, 2e-4).tolist():
+        refined.add(s, s, 1e-3 * np.cos(s / 10e-3), 0.0)
+    refined.confirm(1.0)
+    edge = next(s for s in np.arange(0.04, 0.046, BIN) if refined._index(s) % ZONE == ZONE - 1)
+    exact = refined.offset(edge)
+    refined._find = None  # whoever finds a motion now would fail
+    beside = refined.offset(edge + 0.9 * BIN)  # by the fit of the bin before
+    assert beside == pytest.approx(1e-3 * np.cos((edge + 0.9 * BIN) / 10e-3), abs=5e-6)
+    assert refined.frame(edge + BIN)[0] != pytest.approx(refined.frame(edge)[0], abs=1e-6)
+    assert len(refined._fits) == 1
+    refined.renew((edge, edge + 2 * BIN))  # the zone's motion is not known: the next one's does
+    assert len(refined._fits) == 2
+    assert refined.offset(edge + 2 * BIN) == pytest.approx(
+        1e-3 * np.cos((edge + 2 * BIN) / 10e-3), abs=5e-6
+    )
+    assert refined.offset(edge) == exact
 
 
 def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
