@@ -35,6 +35,7 @@ WELD = t.WeldReport(
     speed=np.full(401, 5e-3), turn=np.full(401, 0.1), along=5e-3 * TIME - 0.04, phases=PHASES,
     figures={"images": 600.0, "images_with_tag": 590.0},
     loop={"cycles": 20000.0, "computing_median": 2e-4, "computing_p99": 4.2e-4,
+          "answering_median": 3e-4, "answering_p99": 6.1e-4,
           "period_median": 2e-3, "period_p99": 2.3e-3},
 )  # fmt: skip
 SCAN = t.WorkpieceScan(
@@ -104,6 +105,7 @@ def test_speeds_and_the_loop_are_told_in_people_s_units(logged: Callable[..., An
     np.testing.assert_allclose(speeds["robot [mm/s]"][1], 5.0, rtol=1e-5)
     np.testing.assert_allclose(speeds["turning [deg/s]"][1], 5.73, rtol=1e-3)
     assert ("computing, 99 % below", "0.42 ms") in drawing.loop
+    assert ("answering by the clock, 99 % below", "0.61 ms") in drawing.loop
     assert ("with the tag", "590") in drawing.loop
 
 

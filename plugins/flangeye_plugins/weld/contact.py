@@ -6,6 +6,10 @@ import math
 from collections import deque
 from typing import Literal
 
+import numpy as np
+
+from flangeye.types import Floats
+
 State = Literal["seeking", "held", "lost"]
 
 SMOOTHING = 0.05
@@ -16,6 +20,13 @@ DWELL = 0.1
 
 LOST, REGAINED = 0.35, 0.6
 """Shares of the wanted deflection below which contact is doubted, above which it is believed."""
+
+
+HELD = 8
+"""Measurements whose mean tells whether the tip is held in its joint: those not yet believed."""
+
+UNHELD = 2.0
+"""Standard deviations by which they have to say that it is not."""
 
 
 class Contact:
@@ -74,7 +85,8 @@ class Release:
 
     Where the robot is, and what was felt before, say by how much it should be deflected. When it is
     not, its wall is gone; when it is deflected to the other side by more than friction can give,
-    the other wall holds it, whatever was expected.
+    the other wall holds it, whatever was expected. When that does no longer, the tip may have left
+    the groove over it.
 
     Attributes:
         loose: Whether what the tip does says nothing of the seam.
@@ -101,8 +113,34 @@ class Release:
         deflection, expected = (sum(column) / NEWEST for column in zip(*self._newest, strict=True))
         least = LEANING + SURE * sigma / math.sqrt(NEWEST)
         # A tip that goes along and drags agrees with every place the robot leads it to.
+        was = self.other
         self.other = self._two_walls and deflection < -max(least, self._sliding)
         if self.other:
             self.loose = False
-        elif expected > least and deflection < LOST * expected:
+        elif was or (expected > least and deflection < LOST * expected):
             self.loose = True
+
+
+class Hold:
+    """Whether the tip is pressed into its joint enough to stay there, on several measurements.
+
+    Where a joint gets wider faster than the tool comes down, hardly anything presses the tip into
+    it, and what presses it aside moves it up its wall.
+    """
+
+    def __init__(self, holding: Floats) -> None:
+        """Begin; see :meth:`Belief.holding`."""
+        self._holding = holding
+        self._forces: deque[float] = deque(maxlen=HELD)
+
+    def fails(self, deflection: float, compression: float, sigma: Floats) -> bool:
+        """Take a measurement; return whether the newest ones do not hold the tip.
+
+        Args:
+            deflection: Towards the pressed wall [m].
+            compression: Into the joint [m].
+            sigma: (2,) standard deviations of one measurement of both [m].
+        """
+        self._forces.append(float(self._holding @ (deflection, compression)))
+        scatter = float(np.hypot(*(self._holding * sigma))) / math.sqrt(HELD)
+        return len(self._forces) == HELD and sum(self._forces) / HELD < -UNHELD * scatter

@@ -75,25 +75,31 @@ class Clock:
     def __init__(self) -> None:
         self.period = 0.0
         self._started = time.perf_counter()
-        self._began = self._aside = 0.0
+        self._began = self._aside = self._waited = 0.0
 
     def start(self) -> None:
         """Begin a cycle."""
         now = time.perf_counter()
         self.period, self._started = now - self._started, now
-        self._began, self._aside = time.thread_time(), 0.0
+        self._began, self._aside, self._waited = time.thread_time(), 0.0, 0.0
 
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Leave out what is done meanwhile."""
-        began = time.thread_time()
+        began, since = time.thread_time(), time.perf_counter()
         yield
         self._aside += time.thread_time() - began
+        self._waited += time.perf_counter() - since
 
     @property
     def computing(self) -> float:
         """Processor time of this cycle so far [s]."""
         return time.thread_time() - self._began - self._aside
+
+    @property
+    def answering(self) -> float:
+        """This computer's time since the cycle began, waiting for a core included [s]."""
+        return time.perf_counter() - self._started - self._waited
 
 
 @contextmanager
@@ -129,7 +135,7 @@ def _turn(
     command = controller.step(pose, [touch_of(feeling) for feeling in felt])
     twist = cell.tool.twist(command, state.base_T_flange)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
-    took = (clock.computing, clock.period)
+    took = (clock.computing, clock.period, clock.answering)
     weld_log.turned(cycle_of(pose, used, command, controller, took))
 
 
@@ -143,7 +149,7 @@ def cycle_of(
     used: tuple[int, ...],
     command: Command,
     controller: Controller,
-    took: tuple[float, float],
+    took: tuple[float, float, float],
 ) -> Cycle:
     """Return the record of a cycle."""
     x, y, z = pose.position.tolist()

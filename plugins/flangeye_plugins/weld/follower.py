@@ -12,7 +12,7 @@ from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touc
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
 from flangeye_plugins.weld.consistency import LASTING, Seating
-from flangeye_plugins.weld.contact import Contact, Release
+from flangeye_plugins.weld.contact import Contact, Hold, Release
 from flangeye_plugins.weld.motion import SeamReading, Track
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned, Probing
@@ -149,9 +149,9 @@ class Follower:
         self._track = Track()
         self._felt: SeamReading | None = None if touch else SeamReading(0.0, 0.0)
         self._time: float | None = None
-        self._seen = self._heard = self._bridge = 0.0
+        self._seen = self._heard = self._bridge = self._latency = 0.0
         self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
-        self._latency = 0.0
+        self._hold = Hold(belief.holding(settings))
         self._place, self._touched = plan.at(self.tip), self.tip
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)
@@ -159,7 +159,7 @@ class Follower:
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
         self._elapsed = self._began = 0.0
-        self._period = math.inf  # the shortest yet: one that came late is no longer
+        self._period, self._climbs = math.inf, False
         self._swept: list[tuple[ToolPose, Touch]] = []
         self._put_off = False
 
@@ -175,7 +175,7 @@ class Follower:
             self._time = self._seen = self._heard = pose.time
         self._elapsed, self._time = pose.time - self._time, pose.time
         if self._elapsed > 0.0:
-            self._period = min(self._period, self._elapsed)
+            self._period = min(self._period, self._elapsed)  # one that came late is no longer
         self._track.add(pose)
         self._renew(bool(touches))
         for touch in touches:
@@ -305,6 +305,10 @@ class Follower:
             self._probing.feel(touch.time, -self.side * deflection, felt.height, along)
             self._swept.append((pose, touch))
         else:
+            compression = float(self._corrected(touch.displacement)[2])
+            self._climbs = self._hold.fails(deflection, compression, self._search.sigma[1:])
+            if self._climbs:  # what it feels leads it on, but is not where the seam is
+                self.refined.forget_pending()
             self._believe(touch.time, s, felt, deflection, pose.angle)
 
     def _located(self, pose: ToolPose, touch: Touch) -> tuple[float, SeamReading, float]:
@@ -357,7 +361,8 @@ class Follower:
             self._felt = self._smoothed(felt)
             self._compare(s, felt.offset)
             self._watch(s, felt)
-            self.refined.add(time, s, felt.offset, angle, self._seating.doubt)
+            if not self._climbs:
+                self.refined.add(time, s, felt.offset, angle, self._seating.doubt)
         self.refined.confirm(time - BELIEF)
 
     def _tells(self, s: float, felt: SeamReading, deflection: float) -> bool:

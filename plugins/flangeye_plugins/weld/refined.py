@@ -77,13 +77,13 @@ class _Fit(NamedTuple):
     """The seam around one bin.
 
     Attributes:
-        index: Of the bin.
+        bin: Its number.
         offsets: (2 SPAN + 1,) of the seam from the plan at the bins around it [m].
         variance: Of the one in the middle [m^2].
         angle: Of the tool when the nearest bin was felt [rad].
     """
 
-    index: int
+    bin: int
     offsets: list[float]
     variance: float
     angle: float
@@ -230,8 +230,8 @@ class RefinedPath:
         due = next((index for index in bins if index not in self._sound), None)
         if new is not None and (zone := self._known_zone(new)) is not None:
             self._fits[new] = self._fitted(new, zone)
-        elif new is not None or due is not None:
-            self._find(new if new is not None else due)
+        elif (first := due if new is None else new) is not None:
+            self._find(first)
 
     def _find(self, index: int) -> None:
         """Find the fit around a bin again; a piece of its zone's motion, where that is due."""
@@ -310,7 +310,7 @@ class RefinedPath:
         if fit is None:
             return [0.0] * len(beside)
         table = fit.offsets
-        first = (s - self._start) / BIN - 0.5 - fit.index + SPAN
+        first = (s - self._start) / BIN - 0.5 - fit.bin + SPAN
         offsets = []
         for away in beside:
             place = min(max(first + away / BIN, 0.0), 2 * SPAN - 1e-9)

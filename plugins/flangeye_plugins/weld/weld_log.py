@@ -38,6 +38,7 @@ class Cycle(NamedTuple):
         band: The same for 95 % of the seam.
         computing: Processor time that the cycle took, besides reading images [s].
         period: Since the last cycle began, on this computer's clock [s].
+        answering: Until its command was given, by the same clock, besides reading images [s].
     """
 
     time: float
@@ -55,6 +56,7 @@ class Cycle(NamedTuple):
     band: float
     computing: float
     period: float
+    answering: float
 
 
 class WeldLog:

@@ -169,6 +169,9 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
         pytest.param(930731, id="a wave taken for a plan turned by 16 deg"),
         pytest.param(940028, id="the same of a plan that was reported done"),
         pytest.param(950967, id="tip let go of in a gap, nothing felt before"),
+        pytest.param(960657, id="walls that open faster than the tool comes down"),
+        pytest.param(960445, id="the same, before a wall that is missing"),
+        pytest.param(960268, id="tip that leaves the groove over the other wall, let go of"),
         pytest.param(910752, id="curved walls askew in the sweep taken for a finger's gain"),
     ],
 )

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.contact import Contact, Release
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.contact import HELD, Contact, Hold, Release
+from flangeye_plugins.weld.settings import Following
 
 WANTED = 2e-3
 
@@ -104,6 +106,16 @@ def test_the_other_wall_tells_where_the_seam_is_though_the_wall_seemed_lost() ->
     assert not released([0.0] * 5 + [-1e-3] * 5, [0.5e-3] * 10, sliding=0.9e-3).loose
 
 
+def test_a_tip_that_the_other_wall_holds_no_longer_may_have_left_the_groove_over_it() -> None:
+    left = [-1e-3] * 5 + [0.0] * 5
+    found = released(left, [0.0] * 10)
+    assert found.loose and not found.other
+    assert not released([0.0] * 5 + [-1e-3] * 5, [0.0] * 10).loose
+    again = released([*left, *[-1e-3] * 5], [0.0] * 15)
+    assert again.other and not again.loose
+    assert not released(left, [0.0] * 10, two_walls=False).loose  # no wall held it
+
+
 def test_leaning_is_a_tenth_of_a_millimetre_and_four_sigma_of_the_mean() -> None:
     least = 0.1e-3 + 4 * 0.1e-3 / math.sqrt(5)
     for share, said in ((0.99, False), (1.01, True)):
@@ -114,3 +126,44 @@ def test_leaning_is_a_tenth_of_a_millimetre_and_four_sigma_of_the_mean() -> None
     assert not released([0.0] * 5, [1e-4] * 5, sigma=0.0).loose
     assert not released([-1e-4] * 5, [0.0] * 5, sigma=0.0).other
     assert not released([0.35] * 5, [1.0] * 5).loose
+
+
+# --- whether the preload holds the tip in its joint ----------------------------------------------
+
+AXES = Belief(40e-3, lateral=1000.0, axial=2000.0, half_angle=np.pi / 4)
+SIGMA = np.array([0.01e-3, 0.06e-3])
+
+
+def fails(hold, compression, times=1, deflection=2e-3, sigma=SIGMA):
+    return [hold.fails(deflection, compression, sigma) for _ in range(times)]
+
+
+def test_what_holds_a_tip_is_what_the_seating_weighs() -> None:
+    settings = Following()
+    share = AXES.seating(settings)
+    assert share is not None
+    aside, _ = AXES.pressing(settings) @ [settings.deflection, settings.preload]
+    left = AXES.holding(settings) @ [settings.deflection, settings.preload]
+    assert left == pytest.approx((share - 1.0) * aside)  # walls at 45 deg
+    assert AXES.holding(settings) == pytest.approx([-1000.0, 2000.0])
+
+
+def test_a_tip_that_is_pressed_aside_more_than_down_is_not_held_once_several_say_so() -> None:
+    hold = Hold(AXES.holding(Following()))
+    assert fails(hold, 0.5e-3, HELD) == [False] * (HELD - 1) + [True]  # half of what holds it
+    # Held again when the mean is: each of the newest outweighs one of those before.
+    assert fails(hold, 1.6e-3, HELD) == [True] * 3 + [False] * (HELD - 3)
+    assert not any(fails(hold, 1.01e-3, 3 * HELD))
+
+
+@pytest.mark.parametrize(("below", "failed"), [(1.9, False), (2.1, True)])
+def test_who_is_not_held_is_below_what_holds_it_by_two_sigmas(below: float, failed: bool) -> None:
+    sigma = np.array([0.3e-3, 0.2e-3])  # 0.5 N of scatter, 0.3 N and 0.4 N of its parts
+    hold = Hold(AXES.holding(Following()))
+    less = below * 0.5 / np.sqrt(HELD) / 2000.0
+    assert fails(hold, 1e-3 - less, HELD, sigma=sigma)[-1] == failed
+
+
+def test_on_walls_that_are_not_known_a_tip_that_is_pressed_down_at_all_is_held() -> None:
+    unknown = Belief(40e-3, lateral=1000.0, axial=2000.0)
+    assert not any(fails(Hold(unknown.holding(Following())), 0.01e-3, HELD, deflection=5e-3))

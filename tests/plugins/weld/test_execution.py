@@ -25,9 +25,15 @@ def test_a_clock_counts_what_a_cycle_computes_and_nothing_else() -> None:
     time.sleep(20e-3)
     busy(2e-3)
     assert 4e-3 <= clock.computing < 15e-3
+    assert clock.answering >= 24e-3  # it slept
     clock.start()
+    with clock.aside():
+        time.sleep(50e-3)
     assert clock.computing < 2e-3
+    assert clock.answering < 50e-3
     assert clock.period >= 40e-3
+    clock.start()
+    assert clock.answering < 50e-3
 
 
 def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it() -> None:

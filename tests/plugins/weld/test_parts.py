@@ -288,7 +288,9 @@ def test_a_hurried_path_finds_one_thing_again_at_a_time_and_is_the_same_in_the_e
     np.testing.assert_array_equal(hurried.frame(0.03), exact.frame(0.03))
 
 
-def test_a_hurried_path_takes_what_is_known_beside_a_new_place_and_waits_for_nothing() -> None:
+def test_a_hurried_path_takes_what_is_known_beside_a_new_place_and_waits_for_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     refined = RefinedPath(Path(curved(0.1)), 0.05)
     refined.hurried = True
     for s in np.arange(0.0, 0.05, 2e-4).tolist():
@@ -296,7 +298,7 @@ def test_a_hurried_path_takes_what_is_known_beside_a_new_place_and_waits_for_not
     refined.confirm(1.0)
     edge = next(s for s in np.arange(0.04, 0.046, BIN) if refined._index(s) % ZONE == ZONE - 1)
     exact = refined.offset(edge)
-    refined._find = None  # whoever finds a motion now would fail
+    monkeypatch.setattr(refined, "_find", None)  # whoever finds a motion now would fail
     beside = refined.offset(edge + 0.9 * BIN)  # by the fit of the bin before
     assert beside == pytest.approx(1e-3 * np.cos((edge + 0.9 * BIN) / 10e-3), abs=5e-6)
     assert refined.frame(edge + BIN)[0] != pytest.approx(refined.frame(edge)[0], abs=1e-6)
