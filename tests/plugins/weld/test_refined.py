@@ -150,3 +150,33 @@ def test_an_earlier_weld_is_recalled_as_it_was_believed() -> None:
     # A doubt reaches 4 mm along the seam, either way.
     assert refined.doubt(0.061 - 3.9e-3) == refined.doubt(0.061 + 3.9e-3) == 3e-4
     assert refined.doubt(0.061 - 4.9e-3) == refined.doubt(0.061 + 4.9e-3) == 0.0
+
+
+@pytest.mark.parametrize("length", [3e-3, 6e-3, 12e-3])
+def test_the_length_of_a_field_is_that_which_makes_what_was_felt_likeliest(length: float) -> None:
+    """Of samples of a field of that length, on a straight plan; each a bin of its own."""
+    plan, wander = Path(np.array([[0.0, 0, 0], [0.1, 0, 0]])), 1e-5
+    refined, rng = RefinedPath(plan, 0.05, wander), np.random.default_rng(3)
+    along: Floats = np.array([0.25e-3 + 0.5e-3 * i for i in range(10, 50)])
+    drawn = _Field(1e-6, length, wander**2)
+    root = np.linalg.cholesky(drawn.covariance(along, along) + 1e-12 * np.eye(len(along)))
+    felt = root @ rng.normal(size=len(along)) + 1e-5 * rng.normal(size=len(along))
+    for s, offset in zip(along.tolist(), felt.tolist(), strict=True):
+        refined.add(0.0, s, offset, 0.0)
+    refined.confirm(1.0)
+    refined.offset(0.015)
+    (motion,) = [m for m in refined._motions.values() if m is not None]
+    levers = np.column_stack([along, 0 * along]) - motion.about
+    rows = _rigid_rows(levers, np.tile([0.0, 1.0], (len(along), 1)))
+    waviness = float(np.var(felt - rows @ np.linalg.lstsq(rows, felt, rcond=None)[0]))
+    noise = (refined.noise**2 + 1e-6 * waviness) * np.eye(len(along))
+    likely = {
+        each: _explained(
+            _Field(waviness, each, wander**2).covariance(along, along) + noise, rows, felt
+        )
+        for each in (1.5e-3, 3e-3, 6e-3, 12e-3, 24e-3)
+    }
+    best = min(likely, key=lambda each: likely[each].unlikely)
+    assert motion.field.length == best and best in (length / 2, length, 2 * length)
+    assert motion.field.variance == pytest.approx(waviness)
+    assert motion.shift == pytest.approx(likely[best].shift, rel=1e-4, abs=1e-7)
