@@ -186,13 +186,15 @@ def test_a_report_has_what_was_counted_and_how_the_loop_kept_time() -> None:
     )
     assert _stated(np.array([1.0, 2.0])).tolist() == [1.0, 2.0]
     assert len(_stated(np.array([1.0, np.inf]))) == 0
-    cycles = [SimpleNamespace(turn=t, computing=1e-3 * c, period=8e-3 + p)
+    cycles = [SimpleNamespace(turn=t, computing=1e-3 * c, answering=2e-3 * c, period=8e-3 + p)
               for t, c, p in ((0.1, 1, 9.0), (-0.4, 3, 0.0), (0.2, 2, 2e-3))]  # fmt: skip
     log: Any = SimpleNamespace(cycles=cycles, sights=7, felt={1: "one", 4: "two"})
     assert _figures(log) == {"images": 7.0, "images_with_tag": 2.0, "turn_max": 0.4}
     told = _loop(log)
     assert told["cycles"] == 3.0 and told["computing_median"] == pytest.approx(2e-3)
     assert told["period_median"] == pytest.approx(9e-3)
+    assert told["answering_median"] == pytest.approx(4e-3)
+    assert told["answering_p99"] == pytest.approx(np.quantile([2e-3, 4e-3, 6e-3], 0.99))
     assert told["computing_p99"] == pytest.approx(np.quantile([1e-3, 2e-3, 3e-3], 0.99))
     assert told["period_p99"] == pytest.approx(np.quantile([8e-3, 10e-3], 0.99))
     nothing: Any = SimpleNamespace(cycles=[])
