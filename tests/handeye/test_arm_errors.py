@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.handeye.arm import MovedFlange
-from flangeye.handeye.arm_errors import _kinds, _roots
+from flangeye.handeye.arm_errors import _kinds
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import chi2_quantile
@@ -109,13 +109,6 @@ def test_the_answer_itself_does_not_depend_on_what_is_considered() -> None:
     ):
         np.testing.assert_array_equal(one.transform.matrix, other.transform.matrix)
         assert np.trace(one.covariance) > np.trace(other.covariance)
-
-
-def test_roots_of_weights_that_are_singular_are_roots() -> None:
-    half = np.random.default_rng(0).standard_normal((5, 6, 4))
-    weights = half @ np.swapaxes(half, 1, 2)
-    roots = _roots(weights)
-    np.testing.assert_allclose(np.swapaxes(roots, 1, 2) @ roots, weights, atol=1e-12)
 
 
 def test_an_arm_of_unknown_kinematics_has_no_kinds_of_error() -> None:

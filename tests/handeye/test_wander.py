@@ -41,7 +41,7 @@ def test_where_a_wander_is_looked_for(
     loop = SimpleNamespace(y=None, z="flange", camera_moves=camera_moves, target_moves=target_moves)
     found = SimpleNamespace(inliers=np.ones(poses, dtype=bool))
     model: Any = SimpleNamespace(problem=SimpleNamespace(loop=loop), found=found)
-    assert wander.with_walk(model) is model
+    assert wander.with_walk(model) == (model, 0.0)
     assert len(asked) == looked
 
 

@@ -7,13 +7,13 @@ independent noise would average out. ("Consider" covariance, Schmidt 1966.)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye.handeye.arm import MovedFlange
-from flangeye.handeye.arm_sizes import Sizes, likely_sizes
+from flangeye.handeye.arm_sizes import Sizes, sizes_told
 from flangeye.handeye.bent import Bent
 from flangeye.handeye.candidates import Model, weighed_with
 from flangeye.handeye.likelihood import Solution
@@ -38,20 +38,43 @@ def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tupl
     Raises:
         ValueError: The kinematics are not known, or do not reach the poses.
     """
-    kinds = _kinds(flange)
-    fit, ends = _fitted(model, flange, kinds)
-    kept, p = fit.inliers, fit.basis.shape[1] - ends[-1]
-    w = _roots(fit.weights[kept])
-    told = w @ fit.linear.jacobian[kept] @ fit.basis
-    rows, effects = told[:, :, :p], np.split(told[:, :, p:], ends[:-1], axis=2)
-    errors = (w @ fit.linear.residuals[kept][..., None])[..., 0]
-    measured = np.trace(model.problem.measurements.projectors[kept], axis1=1, axis2=2).sum()
-    sizes = likely_sizes(rows, effects, errors, float(measured), WORSE, one_each=True)
+    fit, counts = _fitted(model, flange)
+    p = fit.basis.shape[1] - sum(counts)
     known: Floats = np.asarray(np.linalg.inv(fit.information[:p, :p]), dtype=np.float64)
-    followed = [known @ np.einsum("nij,nik->jk", rows, kind) for kind in effects]
-    mixed = sizes.mixed([inflation * known, *(kind @ kind.T for kind in followed)])
+    sizes = _sizes(model, fit, known, counts)
+    each = np.split(known @ fit.information[:p, p:], np.cumsum(counts)[:-1], axis=1)
+    mixed = sizes.mixed([inflation * known, *(followed @ followed.T for followed in each)])
     basis = fit.basis[:18, :p]
     return np.asarray(basis @ mixed @ basis.T), sizes
+
+
+def evidence(model: Model, flange: MovedFlange) -> float:
+    """Return twice by how much likelier residuals are with errors of the arm than without.
+
+    Args:
+        model: As in :func:`with_arm_errors`.
+        flange: The arm; where its kinematics are not known, or do not reach its poses, it is 0.
+    """
+    if flange.some_joints is None or flange.kinematics is None:
+        return 0.0
+    fit, counts = _fitted(model, flange)
+    p = fit.basis.shape[1] - sum(counts)
+    return _sizes(model, fit, np.asarray(np.linalg.inv(fit.information[:p, :p])), counts).gain
+
+
+def _sizes(model: Model, fit: Solution, known: Floats, counts: Sequence[int]) -> Sizes:
+    """Return how large the arm's errors are, by a fit in which each is expected as the file says.
+
+    Of the fit's information and slope, so that what walked has been taken out as well.
+    """
+    p, own = len(known), fit.information[len(known) :, len(known) :]
+    across = fit.information[:p, p:]
+    along = fit.slope[p:] - across.T @ known @ fit.slope[:p]
+    left = fit.cost - fit.slope[:p] @ known @ fit.slope[:p]
+    effects = own - np.eye(len(own)) - across.T @ known @ across  # less what is expected of each
+    gram = np.block([[effects, along[:, None]], [along, left]])
+    measured = np.trace(model.problem.measurements.projectors[fit.inliers], axis1=1, axis2=2).sum()
+    return sizes_told(gram, counts, float(measured) - p, WORSE, one_each=True)
 
 
 def _kinds(flange: MovedFlange) -> list[Floats]:
@@ -63,16 +86,9 @@ def _kinds(flange: MovedFlange) -> list[Floats]:
     return [arm.twists, *arm.others]
 
 
-def _fitted(
-    model: Model, flange: MovedFlange, kinds: list[Floats]
-) -> tuple[Solution, NDArray[np.intp]]:
-    """Return the fit with errors of the kinds beside its unknowns, and where each kind ends."""
+def _fitted(model: Model, flange: MovedFlange) -> tuple[Solution, list[int]]:
+    """Return the fit with the arm's errors beside its unknowns, and how many each kind has."""
+    kinds = _kinds(flange)
     bare = replace(model.problem, nuisance=model.problem.nuisance.without_sized())
     moves = flange.nuisance(np.concatenate(kinds, axis=2), 1.0)
-    return weighed_with(bare, model.found, moves), np.cumsum([kind.shape[2] for kind in kinds])
-
-
-def _roots(weights: Floats) -> Floats:
-    """Return (N, 6, 6) W with W^T W the weights, which may be singular."""
-    values, axes = np.linalg.eigh(weights)
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * np.swapaxes(axes, 1, 2))
+    return weighed_with(bare, model.found, moves), [kind.shape[2] for kind in kinds]

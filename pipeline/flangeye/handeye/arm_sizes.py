@@ -23,6 +23,8 @@ BESIDE = (1 / 3, 1.0, 3.0)
 """How large errors of one kind may be beside those of another, in what was said of both."""
 LIKELY = 1e-6
 """What is less likely than this, beside the likeliest, does not count."""
+SILENT = 1e-12
+"""Least variance of a noise, in units of what it was taken to be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +35,14 @@ class Sizes:
         weights: (G,) of the cases, one together.
         factors: (G, K) of each kind of error; the first at least one.
         noise: (G,) what that leaves of the noise's variance, at most one.
+        gain: Twice by how much the logarithm of the residuals' likelihood is larger at the
+            likeliest case than without any error of an arm.
     """
 
     weights: Floats
     factors: Floats
     noise: Floats
+    gain: float = 0.0
 
     @property
     def expected(self) -> Floats:
@@ -73,17 +78,32 @@ def likely_sizes(
         kinds: (N, 6, k) what errors of each kind, as large as was said, do to them.
         errors: (N, 6) their residuals.
         freedom: How many numbers those are.
-        spread: Standard deviation of the logarithm of the first kind's size about what was said.
-        one_each: Whether one kind at a time is larger or smaller beside the others, not each in
-            every combination: with six kinds that takes a twentieth of the time.
+        spread: As in :func:`sizes_told`.
+        one_each: As in :func:`sizes_told`.
     """
     p, counts = rows.shape[2], [kind.shape[2] for kind in kinds]
     known = np.linalg.qr(stack_rows(rows))[0]
     told = stack_rows(np.concatenate([*kinds, errors[..., None]], axis=2))
     told = told - known @ (known.T @ told)
-    gram, left = told.T @ told, max(freedom - p, 1.0)
-    cases = []
-    for beside in (_one_each if one_each else _combined)(len(kinds) - 1):
+    return sizes_told(told.T @ told, counts, freedom - p, spread, one_each)
+
+
+def sizes_told(
+    gram: Floats, counts: Sequence[int], freedom: float, spread: float, one_each: bool
+) -> Sizes:
+    """Return how large errors of some kinds are likely to be, by the products of what they do.
+
+    Args:
+        gram: (k + 1, k + 1) products of the effects of all errors as large as was said, and last
+            of the residuals, in units of the noise; what unknowns could take up is left out.
+        counts: How many errors each kind has, k together.
+        freedom: How many numbers residuals are, less the unknowns.
+        spread: Standard deviation of the logarithm of the first kind's size about what was said.
+        one_each: Whether one kind at a time is larger or smaller beside the others, not each in
+            every combination: with six kinds that takes a twentieth of the time.
+    """
+    left, cases = max(freedom, 1.0), []
+    for beside in (_one_each if one_each else _combined)(len(counts) - 1):
         scale = np.repeat([1.0, *beside], counts)
         gains, noises = _likelihoods(gram, scale, left)
         factors = np.outer(np.sqrt(noises) * RATIOS, [1.0, *beside])
@@ -91,12 +111,13 @@ def likely_sizes(
     every = np.concatenate(cases)
     every = every[every[:, 2] >= 1.0]
     if not len(every):
-        return Sizes(np.ones(1), np.ones((1, len(kinds))), np.ones(1))
+        return Sizes(np.ones(1), np.ones((1, len(counts))), np.ones(1))
     every[:, 0] -= (np.log(every[:, 2]) / spread) ** 2
     weights = np.exp((every[:, 0] - every[:, 0].max()) / 2)
     some = weights > LIKELY
     weights, every = weights[some] / weights[some].sum(), every[some]
-    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0))
+    gain = float(every[:, 0].max() + left * np.log(max(gram[-1, -1] / left, SILENT)))
+    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0), gain)
 
 
 def _combined(kinds: int) -> Iterable[tuple[float, ...]]:
@@ -119,5 +140,5 @@ def _likelihoods(gram: Floats, scale: Floats, left: float) -> tuple[Floats, Floa
     values, along = np.maximum(values, 0.0), axes.T @ (scale * gram[:-1, -1])
     squares = RATIOS[:, None] ** 2
     explained = (squares * along**2 / (1 + squares * values)).sum(axis=1)
-    noise = np.maximum((gram[-1, -1] - explained) / left, 1e-12)
+    noise = np.maximum((gram[-1, -1] - explained) / left, SILENT)
     return -left * np.log(noise) - np.log1p(squares * values).sum(axis=1), noise

@@ -14,7 +14,7 @@ from flangeye.handeye.arm import (
     with_joint_offsets,
     with_tool_offset,
 )
-from flangeye.handeye.arm_errors import with_arm_errors
+from flangeye.handeye.arm_errors import evidence, with_arm_errors
 from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
 from flangeye.handeye.certificate import certificate_note
 from flangeye.handeye.consensus import find_consensus
@@ -284,8 +284,8 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
     if flange is None or model.problem.stated:
         return model, model
     if options.smooth_error:
-        walking = with_walk(model, options.finds_size)
-        if walking.problem.walk is not None:
+        walking, gain = with_walk(model, options.finds_size)
+        if gain and gain > (evidence(model, flange) if options.joint_zeros else 0.0):
             return walking, walking
     if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
         considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
@@ -343,7 +343,7 @@ def _with_arm_errors(
             f"{each} are in the covariance: they move all poses alike, which held-out errors do "
             "not show",
         )
-    if weak.shape[1] or model.problem.walk is not None:
+    if weak.shape[1]:
         return own, ()
     covariance, sizes = with_arm_errors(model, flange, _inflation(model))
     zeros = flange.deviation * float(sizes.expected[0]) * 1e3

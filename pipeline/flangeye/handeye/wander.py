@@ -20,11 +20,12 @@ SIGNIFICANT = 0.9999
 """Probability with which poses that rest are not taken for a walk."""
 
 
-def with_walk(model: Model, grows: bool = False) -> Model:
+def with_walk(model: Model, grows: bool = False) -> tuple[Model, float]:
     """Estimate how camera and target walk against each other in time, if the poses speak for it.
 
     Only where one of them rests and the target's place is unknown. Poses are in order of time. What
-    speaks for it is the likelihood of every pose by those before it, all that is fitted taken out.
+    speaks for it is the likelihood of every pose by those before it, all that is fitted taken out:
+    twice by how much its logarithm is larger is the second of what is returned, 0 without a walk.
 
     Args:
         model: What was found without.
@@ -32,17 +33,17 @@ def with_walk(model: Model, grows: bool = False) -> Model:
     """
     loop, kept = model.problem.loop, model.found.inliers
     if loop.y or not loop.z or kept.sum() < FEWEST or loop.camera_moves == loop.target_moves:
-        return model
+        return model, 0.0
     found = [(name, model_of) for name, model_of in _walking(model, grows) if model_of is not None]
     if not found:
-        return model
+        return model, 0.0
     gains = [_gain(model, each) for _, each in found]
     (name, best), gain = found[int(np.argmax(gains))], max(gains)
     if gain < chi2_quantile(SIGNIFICANT, 3 if grows else 2):
-        return model
+        return model, 0.0
     best = _about_the_mean(best)
     size = rms((best.residuals(as_reported=True) - best.residuals())[kept]) * 1e3
-    return best.noted(f"the {name} wandered during the session, by {size:.3f} mm rms")
+    return best.noted(f"the {name} wandered during the session, by {size:.3f} mm rms"), gain
 
 
 def _walking(model: Model, grows: bool) -> Iterator[tuple[str, Model | None]]:
