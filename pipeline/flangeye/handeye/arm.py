@@ -29,14 +29,15 @@ FEWEST_FOR_FIELD = 12
 
 @dataclass(frozen=True, eq=False)
 class MovedFlange:
-    """The arm whose flange carries one end of the loop.
+    """The arm whose flange, or a link of which, carries one end of the loop.
 
     Attributes:
-        poses: (N, 4, 4) base_T_flange as reported.
+        poses: (N, 4, 4) base_T_flange as reported, or that of the link by its joints.
         joints: (N, n) as reported [rad], or None.
         carries_camera: Whether it carries the camera, else the target.
         kinematics: The arm's, where its model is known.
         deviation: Standard deviation of a joint's zero [rad], by the robot's file.
+        link: Which link it is; None for the flange.
     """
 
     poses: Floats
@@ -44,6 +45,7 @@ class MovedFlange:
     carries_camera: bool
     kinematics: Arm | None = None
     deviation: float = 0.0
+    link: int | None = None
 
     def nuisance(self, twists: Floats, deviation: float, sized: bool = False) -> Nuisance:
         """Return numbers that move the flange by (N, 6, k) twists, in ``base`` at its origin."""
@@ -63,7 +65,8 @@ class MovedFlange:
         if arm is None:
             return
         if self.joints is not None:
-            apart = np.linalg.norm((arm.flange(self.joints) - self.poses)[:, :3, 3], axis=1).max()
+            reached = arm.pose(self.joints, self.link)
+            apart = np.linalg.norm((reached - self.poses)[:, :3, 3], axis=1).max()
             if apart < LARGEST_MODEL_ERROR:
                 yield self.joints
             return

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
+from itertools import chain
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from flangeye.handeye.arm_sizes import Sizes, sizes_told
 from flangeye.handeye.bent import Bent
 from flangeye.handeye.candidates import Model, weighed_with
 from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import Floats
 
 WORSE = 1.2
@@ -24,7 +27,11 @@ WORSE = 1.2
 is three times worse, one in twenty ten times. Where few poses tell, this does."""
 
 
-def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tuple[Floats, Sizes]:
+Arms = Sequence[Sequence[MovedFlange]]
+"""What each of some arms moves."""
+
+
+def with_arm_errors(model: Model, arms: Arms, inflation: float) -> tuple[Floats, Sizes]:
     """Return the (18, 18) covariance of the transforms with the arm's errors in it.
 
     With the sizes of these in units of what the robot's file says; see
@@ -32,13 +39,13 @@ def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tupl
 
     Args:
         model: What was found for the arm as reported.
-        flange: The arm, of known kinematics that reach its poses.
+        arms: Those that move camera or target, of known kinematics that reach their poses.
         inflation: Factor on the covariance of the fit itself, for its noise was estimated.
 
     Raises:
         ValueError: The kinematics are not known, or do not reach the poses.
     """
-    fit, counts = _fitted(model, flange)
+    fit, counts = _fitted(model, arms)
     p = fit.basis.shape[1] - sum(counts)
     known: Floats = np.asarray(np.linalg.inv(fit.information[:p, :p]), dtype=np.float64)
     sizes = _sizes(model, fit, known, counts)
@@ -48,16 +55,17 @@ def with_arm_errors(model: Model, flange: MovedFlange, inflation: float) -> tupl
     return np.asarray(basis @ mixed @ basis.T), sizes
 
 
-def evidence(model: Model, flange: MovedFlange) -> float:
-    """Return twice by how much likelier residuals are with errors of the arm than without.
+def evidence(model: Model, arms: Arms) -> float:
+    """Return twice by how much likelier residuals are with errors of the arms than without.
 
     Args:
         model: As in :func:`with_arm_errors`.
-        flange: The arm; where its kinematics are not known, or do not reach its poses, it is 0.
+        arms: Those that move camera or target; where the kinematics of one are not known, or do
+            not reach its poses, it is 0.
     """
-    if flange.some_joints is None or flange.kinematics is None:
+    if any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms)):
         return 0.0
-    fit, counts = _fitted(model, flange)
+    fit, counts = _fitted(model, arms)
     p = fit.basis.shape[1] - sum(counts)
     return _sizes(model, fit, np.asarray(np.linalg.inv(fit.information[:p, :p])), counts).gain
 
@@ -77,18 +85,29 @@ def _sizes(model: Model, fit: Solution, known: Floats, counts: Sequence[int]) ->
     return sizes_told(gram, counts, float(measured) - p, WORSE, one_each=True)
 
 
-def _kinds(flange: MovedFlange) -> list[Floats]:
-    """Return what errors of each kind, as large as the robot's file says, do to the flange."""
-    joints = flange.some_joints
-    if joints is None or flange.kinematics is None:
+def _kinds(arms: Arms) -> list[Nuisance]:
+    """Return the errors of each kind, as large as the robots' files say."""
+    each = [_kinds_of(moved) for moved in arms]
+    return [reduce(Nuisance.and_also, kind) for kind in zip(*each, strict=True)]
+
+
+def _kinds_of(moved: Sequence[MovedFlange]) -> list[Nuisance]:
+    """Return the errors of one arm: they move all that it moves, what is smooth each by itself."""
+    *common, smooth = zip(*map(_moves, moved), strict=True)
+    return [*(reduce(Nuisance.joined, kind) for kind in common), reduce(Nuisance.and_also, smooth)]
+
+
+def _moves(moved: MovedFlange) -> list[Nuisance]:
+    joints, arm = moved.some_joints, moved.kinematics
+    if joints is None or arm is None:
         raise ValueError("the arm's kinematics are not known, or do not reach its poses")
-    arm = Bent("", flange.kinematics, joints, flange.deviation, np.zeros(flange.kinematics.n))
-    return [arm.twists, *arm.others]
+    bent = Bent("", arm, joints, moved.deviation, np.zeros(arm.n), moved.link)
+    return [moved.nuisance(kind, 1.0) for kind in (bent.twists, *bent.others)]
 
 
-def _fitted(model: Model, flange: MovedFlange) -> tuple[Solution, list[int]]:
-    """Return the fit with the arm's errors beside its unknowns, and how many each kind has."""
-    kinds = _kinds(flange)
+def _fitted(model: Model, arms: Arms) -> tuple[Solution, list[int]]:
+    """Return the fit with the arms' errors beside its unknowns, and how many each kind has."""
+    kinds = _kinds(arms)
     bare = replace(model.problem, nuisance=model.problem.nuisance.without_sized())
-    moves = flange.nuisance(np.concatenate(kinds, axis=2), 1.0)
-    return weighed_with(bare, model.found, moves), [kind.shape[2] for kind in kinds]
+    moves = reduce(Nuisance.and_also, kinds)
+    return weighed_with(bare, model.found, moves), [len(kind) for kind in kinds]

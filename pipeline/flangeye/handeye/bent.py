@@ -35,6 +35,7 @@ class Bent:
         joints: (N, n) by which it is where the controller has it [rad].
         deviation: Standard deviation of a zero, by the robot's file [rad].
         offsets: (n,) to add to the joints [rad].
+        link: Which of its links what is moved is fixed to; None for the flange.
     """
 
     name: str
@@ -42,11 +43,12 @@ class Bent:
     joints: Floats
     deviation: float
     offsets: Floats
+    link: int | None = None
 
     @property
     def poses(self) -> Floats:
-        """(N, 4, 4) of the flange in the arm's base, with the offsets."""
-        return self.kinematics.flange(self.joints + self.offsets)
+        """(N, 4, 4) of the flange, or the link, in the arm's base, with the offsets."""
+        return self.kinematics.pose(self.joints + self.offsets, self.link)
 
     @property
     def twists(self) -> Floats:
@@ -54,13 +56,13 @@ class Bent:
 
         The first joint's is right by definition: it fixes the base's x axis.
         """
-        return self.deviation * self.kinematics.jacobian(self.joints + self.offsets)[:, :, 1:]
+        return self.deviation * self._columns[:, :, 1:]
 
     @property
     def others(self) -> tuple[Floats, ...]:
         """(N, 6, m) what each of :data:`KINDS` does to it where zeros are off by one deviation."""
         joints, n = self.joints + self.offsets, self.kinematics.n
-        columns = self.kinematics.jacobian(joints)[:, :, None, :]
+        columns = self._columns[:, :, None, :]
         waves = WAVE * np.stack([np.sin(joints), np.cos(joints)], axis=1)
         sag = columns[:, :, 0] * (SAG * _levers(self.kinematics, joints))[:, None]
         kinds = (
@@ -72,6 +74,11 @@ class Bent:
             self._by_place,
         )
         return tuple(self.deviation * kind for kind in kinds)
+
+    @property
+    def _columns(self) -> Floats:
+        """(N, 6, n) what a turn of each joint does to it."""
+        return self.kinematics.jacobian(self.joints + self.offsets, self.link)
 
     @property
     def _by_place(self) -> Floats:
@@ -86,9 +93,9 @@ class Bent:
         return np.stack([self._by_lengths(step) for step in steps], axis=2)
 
     def _by_lengths(self, step: Floats) -> Floats:
-        """Return (N, 6) how a change (n, 3) of lengths and twists moves the flange, by its size."""
+        """Return (N, 6) how a change (n, 3) of lengths and twists moves it, by its size."""
         arm, joints = self.kinematics, self.joints + self.offsets
-        before, after = arm.flange(joints), arm.altered(DELTA * step).flange(joints)
+        before, after = (x.pose(joints, self.link) for x in (arm, arm.altered(DELTA * step)))
         turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
         moved = after[:, :3, 3] - before[:, :3, 3]
         return np.concatenate([turned, moved], axis=1) / DELTA

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -285,7 +286,7 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
         return model, model
     if options.smooth_error:
         walking, gain = with_walk(model, options.finds_size)
-        if gain and gain > (evidence(model, flange) if options.joint_zeros else 0.0):
+        if gain > (evidence(model, cell.arms) if options.joint_zeros else 0.0):
             return walking, walking
     if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
         considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
@@ -328,25 +329,27 @@ def _with_arm_errors(
     That moves the answer, and held-out errors do not show it.
     """
     own, flange = _covariance(model), cell.flange
-    if flange is None or not options.joint_zeros:
+    if not cell.arms or not options.joint_zeros:
         return own, ()
-    if flange.kinematics is None:
+    if any(moved.kinematics is None for moved in chain(*cell.arms)):
+        which, where = ("arm", "robot") if cell.robot is None else ("second arm", "second_robot")
         return own, (
-            "what the arm does wrong alike at all poses is not in the covariance, for its "
-            "kinematics are not known: name them in the recipe (robot: model, or urdf)",
+            f"what the {which} does wrong alike at all poses is not in the covariance, for its "
+            f"kinematics are not known: name them in the recipe ({where}: model, or urdf)",
         )
-    each = f"unknown joint zeros ({flange.deviation * 1e3:g} mrad each)"
-    if flange.some_joints is None:
+    deviation = cell.arms[0][0].deviation * 1e3
+    each = f"unknown joint zeros ({deviation:g} mrad each)"
+    if any(moved.some_joints is None for moved in chain(*cell.arms)):
         return own, (f"{each} not considered: the arm's model misses these poses",)
-    if cell.configuration.is_default:
+    if flange is not None and cell.configuration.is_default:
         return own + unknown_zeros(model, flange), (
             f"{each} are in the covariance: they move all poses alike, which held-out errors do "
             "not show",
         )
     if weak.shape[1]:
         return own, ()
-    covariance, sizes = with_arm_errors(model, flange, _inflation(model))
-    zeros = flange.deviation * float(sizes.expected[0]) * 1e3
+    covariance, sizes = with_arm_errors(model, cell.arms, _inflation(model))
+    zeros = deviation * float(sizes.expected[0])
     return covariance, (
         f"what the arm does wrong alike at all poses is in the covariance, as large as the "
         f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "

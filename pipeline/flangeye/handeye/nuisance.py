@@ -52,6 +52,15 @@ class Nuisance:
             np.concatenate([self.shared, other.shared]),
         )
 
+    def joined(self, other: Nuisance) -> Nuisance:
+        """Return the same numbers, which move what the others' effects say as well."""
+        return replace(
+            self,
+            camera=self.camera + other.camera,
+            target=self.target + other.target,
+            seen=self.seen + other.seen,
+        )
+
     def without_sized(self) -> Nuisance:
         """Return those whose size is known."""
         kept = ~self.sized

@@ -13,10 +13,10 @@ from flangeye.handeye.nuisance import Nuisance
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import later, pose_at, rates_of
-from flangeye.models.configuration import Configuration
+from flangeye.models.configuration import LINK, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import BASE, FLANGE, FLANGE2, Motion, Observation, PoseFeature
+from flangeye.types import BASE, FLANGE, FLANGE2, Floats, Motion, Observation, PoseFeature
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,7 @@ class Cell:
         delay: Time by which the flange's poses were found to be too early, and are so no more [s];
             what is left of it is unknown. None where the clocks are taken to agree.
         clock_deviation: Standard deviation of that time where it is taken to be none [s].
+        second_robot: The model of the arm that carries the target before another's camera.
     """
 
     observations: Sequence[Observation]
@@ -39,6 +40,7 @@ class Cell:
     scanner: ScannerModel | None = None
     delay: float | None = None
     clock_deviation: float = 0.0
+    second_robot: RobotModel | None = None
 
     @cached_property
     def arm(self) -> Arm | None:
@@ -55,12 +57,41 @@ class Cell:
         known = [o.joints for o in self.observations if o.joints is not None]
         usable = arm is not None and all(len(q) == arm.n for q in known)
         return MovedFlange(
-            np.array([o.base_T_flange.matrix for o in self.observations]),
+            self._poses(FLANGE),
             np.array(known) if usable and len(known) == len(self.observations) else None,
             self.configuration.camera == FLANGE,
             arm,
             self.robot.joint_accuracy if self.robot else 0.0,
         )
+
+    @cached_property
+    def arms(self) -> list[list[MovedFlange]]:
+        """What each arm moves that carries camera or target: its flange, a link, or both."""
+        first = [self.flange] if self.flange else []
+        return [arm for arm in (first + self._link, self._second) if arm]
+
+    @property
+    def _link(self) -> list[MovedFlange]:
+        """The first arm, where a link of its carries the camera: then its joints are known."""
+        carrier, arm = self.configuration.camera, self.arm
+        if arm is None or self.robot is None or not carrier.startswith(LINK):
+            return []
+        link = int(carrier.removeprefix(LINK))
+        joints = np.array([o.joints for o in self.observations], dtype=np.float64)
+        poses, deviation = arm.pose(joints, link), self.robot.joint_accuracy
+        return [MovedFlange(poses, joints, True, arm, deviation, link)]
+
+    @property
+    def _second(self) -> list[MovedFlange]:
+        if self.configuration.target != FLANGE2:
+            return []
+        poses, robot = self._poses(FLANGE2), self.second_robot
+        if robot is None:
+            return [MovedFlange(poses, None, False)]
+        return [MovedFlange(poses, None, False, Arm(robot), robot.joint_accuracy)]
+
+    def _poses(self, flange: str) -> Floats:
+        return np.array([o.poses[flange].matrix for o in self.observations])
 
     @property
     def motions(self) -> list[Motion] | None:
@@ -93,10 +124,9 @@ class Cell:
         delay = self.flange.nuisance(rates_of(motions)[..., None], np.inf)
         if self.configuration.target != FLANGE2:
             return delay
-        second = np.array([o.poses[FLANGE2].matrix for o in self.observations])
         moves = rates_of(motions, FLANGE2)[..., None]
-        carried = MovedFlange(second, None, carries_camera=False).nuisance(moves, np.inf)
-        return replace(delay, target=delay.target + carried.target)
+        carried = MovedFlange(self._poses(FLANGE2), None, False).nuisance(moves, np.inf)
+        return delay.joined(carried)
 
     def resized(self, factor: float) -> Cell:
         """Return the cell with all poses of the target so many times as far from the camera."""

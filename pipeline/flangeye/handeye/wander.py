@@ -25,7 +25,8 @@ def with_walk(model: Model, grows: bool = False) -> tuple[Model, float]:
 
     Only where one of them rests and the target's place is unknown. Poses are in order of time. What
     speaks for it is the likelihood of every pose by those before it, all that is fitted taken out:
-    twice by how much its logarithm is larger is the second of what is returned, 0 without a walk.
+    twice by how much its logarithm is larger than chance may make it is the second of what is
+    returned, 0 without a walk.
 
     Args:
         model: What was found without.
@@ -39,11 +40,14 @@ def with_walk(model: Model, grows: bool = False) -> tuple[Model, float]:
         return model, 0.0
     gains = [_gain(model, each) for _, each in found]
     (name, best), gain = found[int(np.argmax(gains))], max(gains)
-    if gain < chi2_quantile(SIGNIFICANT, 3 if grows else 2):
+    beyond_chance = gain - chi2_quantile(SIGNIFICANT, 3 if grows else 2)
+    if beyond_chance < 0:
         return model, 0.0
     best = _about_the_mean(best)
     size = rms((best.residuals(as_reported=True) - best.residuals())[kept]) * 1e3
-    return best.noted(f"the {name} wandered during the session, by {size:.3f} mm rms"), gain
+    return best.noted(
+        f"the {name} wandered during the session, by {size:.3f} mm rms"
+    ), beyond_chance
 
 
 def _walking(model: Model, grows: bool) -> Iterator[tuple[str, Model | None]]:

@@ -204,14 +204,21 @@ class Arm:
         """Return direction and a point of each joint's axis, (..., n) -> two (..., n, 3)."""
         return self._axes(self.frames(joints))
 
-    def jacobian(self, joints: Floats) -> Floats:
+    def pose(self, joints: Floats, link: int | None = None) -> Floats:
+        """Return ``base_T_link`` of one link, or of the flange, (..., n) -> (..., 4, 4)."""
+        return self.flange(joints) if link is None else self.frames(joints)[..., link, :, :]
+
+    def jacobian(self, joints: Floats, link: int | None = None) -> Floats:
         """Return the geometric Jacobian of the flange, (..., n) -> (..., 6, n).
 
         Column i is the flange's twist in ``base``, taken at the flange's origin, when joint i
-        moves at unit speed.
+        moves at unit speed; or that of a link, which the joints beyond do not move.
         """
         frames = self.frames(joints)
-        return self._columns(frames, (frames[..., -1, :, :] @ self._tool)[..., :3, 3])
+        moved = frames[..., -1, :, :] @ self._tool if link is None else frames[..., link, :, :]
+        columns = self._columns(frames, moved[..., :3, 3])
+        columns[..., link or self.n :] = 0.0
+        return columns
 
     def manipulability(self, joints: Floats) -> Floats:
         """Return sqrt(det(J J^T)), (..., n) -> (...); zero where the arm is singular.

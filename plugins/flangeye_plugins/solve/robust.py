@@ -15,7 +15,7 @@ from flangeye.handeye.observability import ObservabilityLimits
 from flangeye.handeye.observed import Cell
 from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
-from flangeye.models.robots import RobotModel
+from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.workspace import workspace_of
 from flangeye.types import (
@@ -150,6 +150,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     stage_log: StageLog | None = None,
     configuration: Configuration | None = None,
     scanner: ScannerModel | None = None,
+    second: SecondRobot | None = None,
 ) -> HandEye:
     """Robust maximum likelihood: reject outlier poses and estimate every unknown transform.
 
@@ -169,7 +170,9 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     """
 
     def solve(pulled: Sequence[Observation]) -> HandEye:
-        return solve_poses(pulled, params, robot, configuration, scanner=scanner)
+        other = second.model if second else None
+        cell = Cell(pulled, configuration or DEFAULT, robot, scanner, second_robot=other)
+        return solve_cell(cell, params)
 
     if params.required is None:
         return solve(list(observations))
@@ -221,10 +224,15 @@ def solve_poses(
     scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Solve observations that are all there; see :func:`solve_robust`."""
-    configuration = configuration or DEFAULT
-    if configuration.is_default and all(isinstance(o.feature, CircleFeature) for o in pulled):
-        check_poses(pulled)
-    return calibrate(Cell(pulled, configuration, robot, scanner), _options(params), method)
+    return solve_cell(Cell(pulled, configuration or DEFAULT, robot, scanner), params, method)
+
+
+def solve_cell(cell: Cell, params: RobustParams, method: str = "solve.robust") -> HandEye:
+    """Solve what was observed, where; see :func:`solve_robust`."""
+    circles = all(isinstance(o.feature, CircleFeature) for o in cell.observations)
+    if cell.configuration.is_default and circles:
+        check_poses(cell.observations)
+    return calibrate(cell, _options(params), method)
 
 
 def _options(params: RobustParams) -> Options:
