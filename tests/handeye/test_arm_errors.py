@@ -1,5 +1,7 @@
 """Errors of an arm are in what is stated, as large as the residuals show them."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 
@@ -92,7 +94,7 @@ def carried(frame: str, arms: list[tuple[Floats, Floats]]) -> Floats:
     return ARM.pose(arms[frame == FLANGE2][1], link)
 
 
-def poses(reported: list[Floats], i: int) -> dict[str, Transform]:
+def poses(reported: list[Floats], i: int) -> Mapping[str, Transform]:
     """Return the flanges' poses at one moment, as the controllers have them."""
     names = ((BASE, FLANGE), (BASE2, FLANGE2))
     return by_frame(*(Transform(*n, r[i]) for n, r in zip(names, reported, strict=False)))

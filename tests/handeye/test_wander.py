@@ -132,7 +132,8 @@ def test_the_likelier_walk_is_taken_where_chance_gives_it_once_in_ten_thousand(
     monkeypatch.setattr(wander, "_gain", lambda _, each: gains[id(each)])
     for first, second, name in ((1.01, 0.5, "target"), (0.5, 1.01, "world"), (0.99, 0.5, None)):
         gains.update({id(one): first * limit, id(two): second * limit})
-        found = wander.with_walk(model, grows)
+        found, beyond_chance = wander.with_walk(model, grows)
+        assert beyond_chance == pytest.approx(max(max(first, second) - 1, 0.0) * limit)
         if name is None:
             assert found is model
             continue
