@@ -145,24 +145,45 @@ def test_whether_the_arms_errors_are_in_the_covariance_is_said(
     options: Any = SimpleNamespace(joint_zeros=True)
     fit, added = modelled(), 1e-6 * np.eye(18)
     own = calibration._covariance(fit)
-    sizes = SimpleNamespace(expected=np.array([7.0, 1.0]))
+    sizes = SimpleNamespace(expected=np.array([7.0, 1.0]), beyond=2.0)
     monkeypatch.setattr(calibration, "unknown_zeros", lambda model, flange: added)
-    monkeypatch.setattr(calibration, "with_arm_errors", lambda model, flange, by: (by * own, sizes))
+    monkeypatch.setattr(calibration, "with_arm_errors", lambda model, arms, by: (by * own, sizes))
 
-    def told(kinematics: Any, joints: Any = 1, default: bool = True, weak: int = 0) -> Any:
+    def told(
+        kinematics: Any, joints: Any = 1, default: bool = True, weak: int = 0, first: bool = True
+    ) -> Any:
         flange = SimpleNamespace(kinematics=kinematics, deviation=2e-4, some_joints=joints)
         cell: Any = SimpleNamespace(
-            flange=flange, configuration=SimpleNamespace(is_default=default)
+            flange=flange,
+            arms=[[flange]],
+            robot=1 if first else None,
+            configuration=SimpleNamespace(is_default=default),
         )
-        covariance, said = calibration._with_arm_errors(fit, cell, options, np.zeros((20, weak)))
-        return covariance, *said
+        stated = calibration._stated(fit, cell, options, np.zeros((20, weak)))
+        of_scatter = (
+            own + added if joints and kinematics and default and options.joint_zeros else own
+        )
+        np.testing.assert_array_equal(stated.of_scatter, of_scatter)
+        return stated.covariance, *stated.notes
 
     covariance, unknown = told(None)
-    assert unknown.startswith("what the arm does wrong alike at all poses is not in the covariance")
+    assert unknown == (
+        "what the second arm does wrong alike at all poses is not in the covariance, for its "
+        "kinematics are not known: name them in the recipe (second_robot: model, or urdf)"
+    )
+    covariance, unknown = told(None, first=False)
+    assert unknown == (
+        "what the arm does wrong alike at all poses is not in the covariance, for its "
+        "kinematics are not known: name them in the recipe (robot: model, or urdf)"
+    )
     np.testing.assert_array_equal(covariance, own)
     covariance, known = told(1)
     assert known.startswith("unknown joint zeros (0.2 mrad each) are in the covariance: they move")
     np.testing.assert_array_equal(covariance, own + added)
+    sizes.beyond = 2.1
+    covariance, worse = told(1)
+    assert "joint zeros of about 1.4 mrad, and encoders" in worse
+    np.testing.assert_array_equal(covariance, calibration._inflation(fit) * own)
     for default in (True, False):
         covariance, missed = told(1, None, default)
         assert missed == (
@@ -178,9 +199,9 @@ def test_whether_the_arms_errors_are_in_the_covariance_is_said(
     for kinematics in (None, 1):
         (covariance,) = told(kinematics)
         np.testing.assert_array_equal(covariance, own)
-    none: Any = SimpleNamespace(flange=None, configuration=SimpleNamespace(is_default=True))
+    none: Any = SimpleNamespace(arms=[], flange=None)
     options.joint_zeros = True
-    assert calibration._with_arm_errors(fit, none, options, np.zeros((20, 0)))[1] == ()
+    assert calibration._stated(fit, none, options, np.zeros((20, 0))).notes == ()
 
 
 def test_what_is_stated_of_noise_goes_into_the_problem() -> None:

@@ -10,7 +10,15 @@ import pytest
 from flangeye.handeye.prediction import prediction_covariance
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.smooth_field import effects, field_over
-from flangeye.types import BASE, CAMERA, ArmCorrection, ScatterNoise, Transform
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    ArmCorrection,
+    HandEye,
+    ScatterNoise,
+    Transform,
+    TransformEstimate,
+)
 
 TURN = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
 OWN = np.diag([1e-8, 4e-8, 9e-8])
@@ -31,7 +39,9 @@ def test_feature_arm_and_matrix_add_up(noise: Any, scale: float, arm: float, wid
         covariance=np.diag([TILT] * 3 + [PLACE] * 3),
         about=pose.apply(centre) - [0.5, 0.0, 0.0],
     )
-    calibration: Any = SimpleNamespace(camera=estimate, noise=noise, correction=None)
+    calibration: Any = SimpleNamespace(
+        camera=estimate, noise=noise, correction=None, scatter_covariance=estimate.covariance
+    )
     seen: Any = SimpleNamespace(feature=SimpleNamespace(centre=centre, centre_covariance=OWN))
     differing = scale * np.array([4e-8, 1e-8, 9e-8]) + arm
     of_matrix = PLACE + TILT * 0.5**2 * np.array([0, 1, 1])
@@ -57,7 +67,20 @@ def test_what_is_left_of_a_smooth_error_is_widened_with_the_noise() -> None:
     moved = effects(field, place)
     for noise, left in ((ScatterNoise(5e-8, 1.0, 1.5), 1.0), (None, 0.0)):
         for correction in (ArmCorrection(np.zeros(3), field=field), ArmCorrection(np.zeros(3))):
-            calibration: Any = SimpleNamespace(camera=estimate, noise=noise, correction=correction)
+            calibration: Any = SimpleNamespace(
+                camera=estimate, noise=noise, correction=correction, scatter_covariance=still
+            )
             shared = 0.0 if correction.field is None else left * moved @ field.covariance @ moved.T
             own = OWN if noise is None else 1.5 * (OWN + 5e-8 * np.eye(3) + shared)
             assert prediction_covariance(calibration, seen) == pytest.approx(own, abs=1e-14)
+
+
+def test_what_the_arm_does_alike_at_all_poses_is_not_in_a_prediction() -> None:
+    """There it errs as it did when the camera's pose was found from it."""
+    pose = TransformEstimate(Transform(BASE, CAMERA, np.eye(4)), 9e-8 * np.eye(6), np.zeros(3))
+    for own in (None, 4e-8 * np.eye(6)):
+        found = HandEye(pose, (), "solve.x", noise=ScatterNoise(0.0, 1.0, pose=own))
+        stated = 9e-8 * np.eye(6) if own is None else own
+        np.testing.assert_array_equal(found.scatter_covariance, stated)
+    bare = HandEye(pose, (), "solve.x")
+    np.testing.assert_array_equal(bare.scatter_covariance, pose.covariance)

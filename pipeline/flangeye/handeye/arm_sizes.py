@@ -37,12 +37,14 @@ class Sizes:
         noise: (G,) what that leaves of the noise's variance, at most one.
         gain: Twice by how much the logarithm of the residuals' likelihood is larger at the
             likeliest case than without any error of an arm.
+        beyond: The same, than with errors that are as large as was said.
     """
 
     weights: Floats
     factors: Floats
     noise: Floats
     gain: float = 0.0
+    beyond: float = 0.0
 
     @property
     def expected(self) -> Floats:
@@ -102,11 +104,14 @@ def sizes_told(
         one_each: Whether one kind at a time is larger or smaller beside the others, not each in
             every combination: with six kinds that takes a twentieth of the time.
     """
-    left, cases = max(freedom, 1.0), []
+    left, cases, as_said = max(freedom, 1.0), [], 0.0
     for beside in (_one_each if one_each else _combined)(len(counts) - 1):
         scale = np.repeat([1.0, *beside], counts)
         gains, noises = _likelihoods(gram, scale, left)
-        factors = np.outer(np.sqrt(noises) * RATIOS, [1.0, *beside])
+        sizes = np.sqrt(noises) * RATIOS
+        if set(beside) <= {1.0}:
+            as_said = float(np.interp(1.0, sizes, gains))
+        factors = np.outer(sizes, [1.0, *beside])
         cases.append(np.column_stack([gains, noises, factors]))
     every = np.concatenate(cases)
     every = every[every[:, 2] >= 1.0]
@@ -116,8 +121,9 @@ def sizes_told(
     weights = np.exp((every[:, 0] - every[:, 0].max()) / 2)
     some = weights > LIKELY
     weights, every = weights[some] / weights[some].sum(), every[some]
-    gain = float(every[:, 0].max() + left * np.log(max(gram[-1, -1] / left, SILENT)))
-    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0), gain)
+    likeliest, silent = float(every[:, 0].max()), -left * np.log(max(gram[-1, -1] / left, SILENT))
+    more = likeliest - float(silent), likeliest - as_said
+    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0), *more)
 
 
 def _combined(kinds: int) -> Iterable[tuple[float, ...]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,9 @@ CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
 SIZES, EXACT_SIZE, LOOSEST_SIZE = 10, 1e-6, 0.1
 """Steps to find a target's size, the share by which the last one changes it, and the largest
 standard deviation of what is taken for found."""
+LIKELIER = 2.0
+"""Twice by how much likelier residuals have to be of an arm that is worse than its file says, as
+one number more has to make them (Akaike 1974)."""
 TYPICAL_ARM = ArmNoise(np.radians(0.01), 0.05e-3)
 """Noise of the poses of an arm of which nothing is known: what else is found is in its ratio."""
 
@@ -127,8 +131,12 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     reported, model = (
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
     )
-    covariance, told = _with_arm_errors(reported, cell, options, weak)
-    camera, *others = _estimates(reported, cell, options, weak, covariance)
+    stated = _stated(reported, cell, options, weak)
+    camera, *others = _estimates(reported, cell, options, weak, stated.covariance)
+    scatter, told = _scatter(model.found), stated.notes
+    if stated.of_scatter is not stated.covariance:
+        alone = _estimates(reported, cell, options, weak, stated.of_scatter)[0]
+        scatter = replace(scatter, pose=alone.covariance)
     notes = (*_noise_notes(model, cell, weak), *told, *_note_of_shared(_shared_of(reported)))
     if not weak.shape[1]:
         notes = (*notes, *_note_of_distortion(model, cell, options))
@@ -142,7 +150,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         reported.correction,
         tuple(others),
         _corrected(model, cell, options, weak),
-        _scatter(model.found),
+        scatter,
         shared=_shared_of(reported),
     )
 
@@ -321,39 +329,63 @@ def _covariance(model: Model) -> Floats:
     return np.asarray(model.found.covariance[:18, :18] * _inflation(model))
 
 
-def _with_arm_errors(
-    model: Model, cell: Cell, options: Options, weak: Floats
-) -> tuple[Floats, tuple[str, ...]]:
-    """Return the (18, 18) covariance with what the arm does wrong alike at all poses, and say so.
+class _Stated(NamedTuple):
+    """What is stated of the transforms.
 
-    That moves the answer, and held-out errors do not show it.
+    Attributes:
+        covariance: (18, 18) with what the arm does wrong alike at all poses.
+        of_scatter: (18, 18) as scatter leaves it, and zeros as the robot's file has them.
+        notes: What is to be said of it.
+    """
+
+    covariance: Floats
+    of_scatter: Floats
+    notes: tuple[str, ...] = ()
+
+
+def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated:
+    """Return the covariance with what the arm does wrong alike at all poses, and say so.
+
+    That moves the answer, and held-out errors do not show it. Of a flange seen from the base it is
+    what the zeros may be off by as the robot's file has it, unless the residuals are likelier of an
+    arm that is worse.
     """
     own, flange = _covariance(model), cell.flange
     if not cell.arms or not options.joint_zeros:
-        return own, ()
+        return _Stated(own, own)
     if any(moved.kinematics is None for moved in chain(*cell.arms)):
-        which, where = ("arm", "robot") if cell.robot is None else ("second arm", "second_robot")
-        return own, (
-            f"what the {which} does wrong alike at all poses is not in the covariance, for its "
-            f"kinematics are not known: name them in the recipe ({where}: model, or urdf)",
-        )
+        return _Stated(own, own, (_note_of_unknown_arm(cell),))
     deviation = cell.arms[0][0].deviation * 1e3
     each = f"unknown joint zeros ({deviation:g} mrad each)"
     if any(moved.some_joints is None for moved in chain(*cell.arms)):
-        return own, (f"{each} not considered: the arm's model misses these poses",)
+        return _Stated(own, own, (f"{each} not considered: the arm's model misses these poses",))
+    by_file = None
     if flange is not None and cell.configuration.is_default:
-        return own + unknown_zeros(model, flange), (
+        own = own + unknown_zeros(model, flange)
+        note = (
             f"{each} are in the covariance: they move all poses alike, which held-out errors do "
-            "not show",
+            "not show"
         )
+        by_file = _Stated(own, own, (note,))
     if weak.shape[1]:
-        return own, ()
+        return by_file or _Stated(own, own)
     covariance, sizes = with_arm_errors(model, cell.arms, _inflation(model))
+    if by_file and sizes.beyond <= LIKELIER:
+        return by_file
     zeros = deviation * float(sizes.expected[0])
-    return covariance, (
+    note = (
         f"what the arm does wrong alike at all poses is in the covariance, as large as the "
         f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "
-        "twists and a smooth error beside them",
+        "twists and a smooth error beside them"
+    )
+    return _Stated(covariance, own, (note,))
+
+
+def _note_of_unknown_arm(cell: Cell) -> str:
+    which, where = ("arm", "robot") if cell.robot is None else ("second arm", "second_robot")
+    return (
+        f"what the {which} does wrong alike at all poses is not in the covariance, for its "
+        f"kinematics are not known: name them in the recipe ({where}: model, or urdf)"
     )
 
 

@@ -23,7 +23,7 @@ def prediction_covariance(calibration: HandEye, observation: Observation) -> Flo
     estimate, feature = calibration.camera, observation.feature
     turn = estimate.transform.rotation
     mapped = estimate.transform.apply(feature.centre)
-    of_matrix = covariance_at(estimate.covariance, estimate.about, mapped[None])[0]
+    of_matrix = covariance_at(calibration.scatter_covariance, estimate.about, mapped[None])[0]
     noise, own = calibration.noise, turn @ feature.centre_covariance @ turn.T
     if noise is None:
         return np.asarray(own + of_matrix)

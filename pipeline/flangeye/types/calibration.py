@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flangeye.types.arrays import Array, freeze
+from flangeye.types.arrays import Array, Floats, freeze
 from flangeye.types.features import Observation
 from flangeye.types.frames import BASE, FrameMismatchError, TransformEstimate
 
@@ -125,11 +125,19 @@ class ScatterNoise:
         feature_scale: Factor on the features' own covariances, at most 1.
         widening: Factor on what is stated of a single prediction: for what is unknown of the noise,
             and for what errors on poses held out show beyond it; at least 1.
+        pose: (6, 6) covariance of the camera's pose as scatter leaves it, like an estimate's: of
+            errors at poses as those it was found from, where the arm errs as it did there. None
+            where the estimate's is no larger.
     """
 
     arm: float
     feature_scale: float
     widening: float = 1.0
+    pose: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.pose is not None:
+            freeze(self, pose=(6, 6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +192,12 @@ class HandEye:
             return replace(answer, others=others, corrected=None, arms=found.arms)
         known = (self.correction, *self.arms.values())
         return self if any(each is not None and each.of_arm for each in known) else None
+
+    @property
+    def scatter_covariance(self) -> Floats:
+        """(6, 6) of the camera's pose for poses like these; see :class:`ScatterNoise`."""
+        own = None if self.noise is None else self.noise.pose
+        return self.camera.covariance if own is None else own
 
     @property
     def base_T_camera(self) -> TransformEstimate:

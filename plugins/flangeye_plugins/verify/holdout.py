@@ -224,7 +224,7 @@ def _measure(
     rotation, seen = estimate.transform.rotation, observation.feature
     mapped = estimate.transform.apply(seen.centre)
     held.errors[i] = mapped - (expected[:3, :3] @ observation.centre_in_mount + expected[:3, 3])
-    of_pose = covariance_at(estimate.covariance, estimate.about, mapped[None])[0]
+    of_pose = covariance_at(calibration.scatter_covariance, estimate.about, mapped[None])[0]
     held.covariances[i] = rotation @ seen.centre_covariance @ rotation.T + of_pose
     if seen.normal is not None:
         held.tilts[i] = angle_between(rotation @ seen.normal, expected[:3, 2])
