@@ -128,7 +128,8 @@ class RobustParams(Params):
         None,
         gt=0,
         description="Stop acquiring once no point of the workspace is off by more, with 95 % "
-        "probability; by default every pose is used.",
+        "probability, but for what the arm does wrong alike at all poses: more poses do not mend "
+        "that. By default every pose is used.",
     )
 
     def requires(self) -> Mapping[type, str]:
@@ -212,7 +213,7 @@ def _error_at_work(
     box = workspace_of(source, workspace, found.pairs)
     known = found.camera
     corners = corners_of(box.centre, box.size) if box else known.about[None]
-    return largest_error_quantile(known.covariance, known.about, corners)
+    return largest_error_quantile(found.scatter_covariance, known.about, corners)
 
 
 def solve_poses(
