@@ -294,7 +294,7 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
         return model, model
     if options.smooth_error:
         walking, gain = with_walk(model, options.finds_size)
-        if gain > (evidence(model, cell.arms) if options.joint_zeros else 0.0):
+        if gain and gain > (evidence(model, cell.arms) if options.joint_zeros else 0.0):
             return walking, walking
     if options.tool_offset and cell.configuration.target == FLANGE and not model.problem.loop.z:
         considered = flange if options.joint_zeros else replace(flange, deviation=0.0)
@@ -376,7 +376,8 @@ def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated
     note = (
         f"what the arm does wrong alike at all poses is in the covariance, as large as the "
         f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "
-        "twists and a smooth error beside them"
+        "twists and a smooth error beside them; at poses like these most of it cancels, and "
+        "held-out errors show what does not"
     )
     return _Stated(covariance, own, (note,))
 

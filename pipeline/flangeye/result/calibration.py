@@ -119,7 +119,7 @@ def _expected(calibration: t.HandEye, inliers: float | None) -> float | None:
     seen = [p.observation for p in calibration.pairs if p.used]
     own = [o.feature.centre for o in seen if o.camera == camera.transform.child]
     places = camera.transform.apply(np.array(own).reshape(-1, 3))
-    of_pose = covariance_at(camera.covariance, camera.about, places)
+    of_pose = covariance_at(calibration.scatter_covariance, camera.about, places)
     least = float(np.trace(of_pose, axis1=1, axis2=2).mean()) if own else 0.0
     return float(np.sqrt(max(inliers**2 - noise, least)))
 
