@@ -14,6 +14,7 @@ from flangeye.types import (
     BASE,
     CAMERA,
     ArmCorrection,
+    CorrectedArm,
     HandEye,
     ScatterNoise,
     Transform,
@@ -82,5 +83,8 @@ def test_what_the_arm_does_alike_at_all_poses_is_not_in_a_prediction() -> None:
         found = HandEye(pose, (), "solve.x", noise=ScatterNoise(0.0, 1.0, pose=own))
         stated = 9e-8 * np.eye(6) if own is None else own
         np.testing.assert_array_equal(found.scatter_covariance, stated)
+        corrected = replace(found, corrected=CorrectedArm(pose, None)).as_corrected()
+        assert corrected is not None  # its pose has a covariance of its own
+        np.testing.assert_array_equal(corrected.scatter_covariance, pose.covariance)
     bare = HandEye(pose, (), "solve.x")
     np.testing.assert_array_equal(bare.scatter_covariance, pose.covariance)

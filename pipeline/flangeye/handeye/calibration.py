@@ -134,7 +134,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     stated = _stated(reported, cell, options, weak)
     camera, *others = _estimates(reported, cell, options, weak, stated.covariance)
     scatter, told = _scatter(model.found), stated.notes
-    if stated.of_scatter is not stated.covariance:
+    if cell.configuration.is_default and stated.of_scatter is not stated.covariance:
         alone = _estimates(reported, cell, options, weak, stated.of_scatter)[0]
         scatter = replace(scatter, pose=alone.covariance)
     notes = (*_noise_notes(model, cell, weak), *told, *_note_of_shared(_shared_of(reported)))

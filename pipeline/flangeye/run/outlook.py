@@ -97,7 +97,7 @@ def _error(found: t.HandEye, recipe: Recipe, source: t.Source) -> float:
     camera = found.camera
     box = work_of(found, source, recipe.context.get(t.Box))
     corners = camera.about[None] if box is None else corners_of(box.centre, box.size)
-    return largest_error_quantile(camera.covariance, camera.about, corners)
+    return largest_error_quantile(found.scatter_covariance, camera.about, corners)
 
 
 def _coverage(recipe: Recipe, seen: Sequence[t.Observation], source: t.Source) -> Coverage | None:

@@ -187,7 +187,8 @@ class HandEye:
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
-            answer = replace(answer, shared=found.shared)
+            noise = self.noise and replace(self.noise, pose=None)
+            answer = replace(answer, shared=found.shared, noise=noise)
             others = found.others or self.others
             return replace(answer, others=others, corrected=None, arms=found.arms)
         known = (self.correction, *self.arms.values())

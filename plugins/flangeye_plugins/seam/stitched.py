@@ -28,7 +28,6 @@ from flangeye.types import (
     HandEye,
     ScanPlace,
     Transform,
-    TransformEstimate,
     WorkpieceScan,
 )
 from flangeye_plugins.seam.planned import scanner_covariance
@@ -116,7 +115,7 @@ def seen_in_base(
         raise CalibrationRefused(f"{stage}: the scanner {told}; scan the workpiece with {use}")
     points = scan.cloud.points().astype(np.float64)
     if not scan.places:
-        return Seen(points, camera.transform, _AsOnePlace(camera), np.zeros((1, 3)))
+        return Seen(points, camera.transform, _AsOnePlace(answer), np.zeros((1, 3)))
     stands = [_stand(place, answer, robot) for place in scan.places]
     ends = np.cumsum([place.points for place in scan.places])
     clouds = np.split(points, ends[:-1])
@@ -138,13 +137,16 @@ def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Trans
 
 @dataclass(frozen=True, eq=False)
 class _AsOnePlace:
-    """The hand-eye pose alone: the scan of the workpiece took no part in the calibration."""
+    """The hand-eye pose alone: the scan of the workpiece took no part in the calibration.
 
-    base_T_camera: TransformEstimate
+    For the same arm, which errs at the seam much as it did at the poses nearby.
+    """
+
+    answer: HandEye
 
     def __call__(self, points_in_base: Floats) -> Floats:
-        known = self.base_T_camera
-        return covariance_at(known.covariance, known.about, points_in_base)
+        about = self.answer.base_T_camera.about
+        return covariance_at(self.answer.scatter_covariance, about, points_in_base)
 
 
 @dataclass(frozen=True, eq=False)
