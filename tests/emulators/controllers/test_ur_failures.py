@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -59,11 +60,16 @@ class Client:
             text=True,
         )
 
-    def line(self):
-        """Wait for the next line it says; the library says things too."""
-        while line := self.process.stdout.readline():
-            if line.startswith("says "):
-                return line[5:-1]
+    def line(self, patience=60.0):
+        """Wait for the next line it says; the library says things too, and hangs now and then."""
+        watchdog = threading.Timer(patience, self.process.kill)
+        watchdog.start()
+        try:
+            while line := self.process.stdout.readline():
+                if line.startswith("says "):
+                    return line[5:-1]
+        finally:
+            watchdog.cancel()
         return None
 
     def go_on(self):
