@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -139,69 +139,81 @@ def _whole(fit: Model) -> Any:
     return basis @ fit.found.information @ basis.T
 
 
-def test_whether_the_arms_errors_are_in_the_covariance_is_said(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    options: Any = SimpleNamespace(joint_zeros=True)
-    fit, added = modelled(), 1e-6 * np.eye(18)
-    own = calibration._covariance(fit)
-    sizes = SimpleNamespace(expected=np.array([7.0, 1.0]), beyond=2.0)
-    monkeypatch.setattr(calibration, "unknown_zeros", lambda model, flange: added)
-    monkeypatch.setattr(calibration, "with_arm_errors", lambda model, arms, by: (by * own, sizes))
+class Stating:
+    """What is stated of a fit by arms of which this or that is known."""
 
-    def told(
-        kinematics: Any, joints: Any = 1, default: bool = True, weak: int = 0, first: bool = True
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.fit, self.options = modelled(), SimpleNamespace(joint_zeros=True)
+        self.own, self.zeros = calibration._covariance(self.fit), 1e-6 * np.eye(18)
+        self.worse = calibration._inflation(self.fit) * self.own
+        self.sizes = SimpleNamespace(expected=np.array([7.0, 1.0]), beyond=2.0)
+        monkeypatch.setattr(calibration, "unknown_zeros", lambda model, flange: self.zeros)
+        monkeypatch.setattr(
+            calibration, "with_arm_errors", lambda model, arms, by: (by * self.own, self.sizes)
+        )
+
+    def __call__(
+        self, kinematics: Any, joints: Any = 1, default: bool = True, weak: int = 0, robot: Any = 1
     ) -> Any:
+        """Return the covariance and the notes; what is stated of scatter has zeros at most."""
         flange = SimpleNamespace(kinematics=kinematics, deviation=2e-4, some_joints=joints)
-        cell: Any = SimpleNamespace(
-            flange=flange,
-            arms=[[flange]],
-            robot=1 if first else None,
-            configuration=SimpleNamespace(is_default=default),
-        )
-        stated = calibration._stated(fit, cell, options, np.zeros((20, weak)))
-        of_scatter = (
-            own + added if joints and kinematics and default and options.joint_zeros else own
-        )
+        kind, options = SimpleNamespace(is_default=default), self.options
+        cell: Any = SimpleNamespace(flange=flange, arms=[[flange]], robot=robot, configuration=kind)
+        stated = calibration._stated(self.fit, cell, cast(Any, options), np.zeros((20, weak)))
+        considered = joints and kinematics and default and options.joint_zeros
+        of_scatter = self.own + self.zeros if considered else self.own
         np.testing.assert_array_equal(stated.of_scatter, of_scatter)
         return stated.covariance, *stated.notes
 
-    covariance, unknown = told(None)
-    assert unknown == (
-        "what the second arm does wrong alike at all poses is not in the covariance, for its "
-        "kinematics are not known: name them in the recipe (second_robot: model, or urdf)"
-    )
-    covariance, unknown = told(None, first=False)
-    assert unknown == (
-        "what the arm does wrong alike at all poses is not in the covariance, for its "
-        "kinematics are not known: name them in the recipe (robot: model, or urdf)"
-    )
-    np.testing.assert_array_equal(covariance, own)
-    covariance, known = told(1)
-    assert known.startswith("unknown joint zeros (0.2 mrad each) are in the covariance: they move")
-    np.testing.assert_array_equal(covariance, own + added)
-    sizes.beyond = 2.1
-    covariance, worse = told(1)
-    assert "joint zeros of about 1.4 mrad, and encoders" in worse
-    np.testing.assert_array_equal(covariance, calibration._inflation(fit) * own)
+
+def test_whether_the_arms_errors_are_in_the_covariance_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = Stating(monkeypatch)
+    for robot, arm, where in ((1, "second arm", "second_robot"), (None, "arm", "robot")):
+        covariance, unknown = told(None, robot=robot)
+        assert unknown == (
+            f"what the {arm} does wrong alike at all poses is not in the covariance, for its "
+            f"kinematics are not known: name them in the recipe ({where}: model, or urdf)"
+        )
+        np.testing.assert_array_equal(covariance, told.own)
     for default in (True, False):
         covariance, missed = told(1, None, default)
         assert missed == (
             "unknown joint zeros (0.2 mrad each) not considered: the arm's model misses these poses"
         )
-        np.testing.assert_array_equal(covariance, own)
+        np.testing.assert_array_equal(covariance, told.own)
     covariance, sized = told(1, default=False)
     assert "joint zeros of about 1.4 mrad, and encoders" in sized
-    np.testing.assert_array_equal(covariance, calibration._inflation(fit) * own)
+    np.testing.assert_array_equal(covariance, told.worse)
     (covariance,) = told(1, default=False, weak=1)
-    np.testing.assert_array_equal(covariance, own)
+    np.testing.assert_array_equal(covariance, told.own)
+
+
+def test_a_flange_seen_from_the_base_shows_whether_its_arm_is_worse_than_its_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = Stating(monkeypatch)
+    covariance, known = told(1)
+    assert known.startswith("unknown joint zeros (0.2 mrad each) are in the covariance: they move")
+    np.testing.assert_array_equal(covariance, told.own + told.zeros)
+    told.sizes.beyond = 2.1
+    covariance, worse = told(1)
+    assert "joint zeros of about 1.4 mrad, and encoders" in worse
+    np.testing.assert_array_equal(covariance, told.worse)
+
+
+def test_nothing_is_said_of_arms_where_they_are_ignored_or_there_are_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = Stating(monkeypatch)
+    none: Any = SimpleNamespace(arms=[], flange=None)
+    options: Any = told.options
+    assert calibration._stated(told.fit, none, options, np.zeros((20, 0))).notes == ()
     options.joint_zeros = False
     for kinematics in (None, 1):
         (covariance,) = told(kinematics)
-        np.testing.assert_array_equal(covariance, own)
-    none: Any = SimpleNamespace(arms=[], flange=None)
-    options.joint_zeros = True
-    assert calibration._stated(fit, none, options, np.zeros((20, 0))).notes == ()
+        np.testing.assert_array_equal(covariance, told.own)
 
 
 def test_what_is_stated_of_noise_goes_into_the_problem() -> None:
