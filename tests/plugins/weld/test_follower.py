@@ -1,0 +1,738 @@
+"""The follower decision by decision: what it asks of the arm, what it states, and why it stops."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.motion import SeamReading
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import Learned
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import straight
+
+DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05
+
+
+def following(**given: Any) -> Following:
+    return Following.model_validate(given)
+
+
+def circle(turns: float = 0.4) -> Any:
+    angle = np.linspace(0.0, 2 * np.pi * turns, 600)
+    return RADIUS * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
+
+
+def make(
+    phase: str = "following", plan: Any = None, touch: bool = True, belief: Any = None,
+    before: Any = None, **given: Any,
+) -> Any:  # fmt: skip
+    """A follower of a straight plan along x, in a phase."""
+    points = straight(LENGTH) if plan is None else plan
+    own = belief or Belief(DISTANCE)
+    found: Any = Follower(Path(points), own, following(**given), touch, before)
+    found.phase = phase
+    return found
+
+
+def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: float = 0.0) -> Any:
+    return ToolPose(time, np.array([x, y, z]), angle)
+
+
+def felt_along(found: Any, offset: float, until: float = 0.1) -> None:
+    """Let the seam be felt so far to the left of the plan [m]."""
+    for s in np.arange(0.005, until, 2e-4).tolist():
+        found.refined.add(0.0, s, offset, 0.0)
+    found.refined.confirm(1.0)
+
+
+# --- how well the torch is known ------------------------------------------------------------------
+
+
+def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
+    found = make()
+    asked, belief = following(), Belief(DISTANCE)
+    found.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
+    found.learned = Learned(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
+    found._time = found._began = 5.0
+    gain = 0.03 * asked.deflection
+    always = belief.fixed_variance(asked) + gain**2 + (0.02e-3) ** 2 + (0.03e-3) ** 2 + 9e-10
+    assert found._variance(0.0, 0.1) == pytest.approx(always)
+    # A tool that slants to the path is off across it by what its length is off by.
+    slanting = (0.4 * belief.along_sigma) ** 2
+    assert found._variance(0.4, 0.1) == pytest.approx(always + slanting)
+    # What the tip is off by in the flange goes with the torch, but for what the tool has turned.
+    moved = (2 * math.sin(0.6 / 2) * belief.tip_sigma) ** 2
+    assert found._variance(0.0, 0.7) == pytest.approx(always + moved)
+    # The gain that the sweep found ages; before it nothing was found.
+    found._time = 5.0 + 120.0
+    aged = (0.03 + 2 * asked.gain_drift) * asked.deflection
+    assert found._variance(0.0, 0.1) == pytest.approx(always - gain**2 + aged**2)
+    found.phase = "seeking"
+    assert found._variance(0.0, 0.1) == pytest.approx(always)
+    # A swing is early or late by what the arm's delay is not known to.
+    weaving = make(weave_width="3 mm")
+    weaving.refined, weaving.learned = found.refined, found.learned
+    late = (math.pi * 3e-3 * 10e-3) ** 2 / 2
+    assert weaving._variance(0.0, 0.1) == pytest.approx(always + late)
+
+
+@pytest.mark.parametrize("off", [0.3e-3, -0.3e-3])
+def test_what_the_torch_is_stated_to_be_off_by_is_its_error_its_doubt_and_its_sigmas(
+    off: float,
+) -> None:
+    found = make(max_error="5 mm", offset_across="0.1 mm")
+    felt_along(found, 1e-3)
+    found.refined.suspect(0.04, 0.06, 0.2e-3)
+    found.torch, tip = 0.05, 0.05 + DISTANCE
+    found._estimate(pose(tip, 1e-3 + 0.1e-3 + off))
+    error = 0.3e-3 + 0.2e-3
+    assert found.sigma == pytest.approx(math.sqrt(found._variance(0.0, 0.0)))
+    assert found.band == pytest.approx(error + 2 * found.sigma, abs=1e-6)
+    assert found.bound == pytest.approx(error + 4 * found.sigma, abs=1e-6)
+    vision = make(touch=False)
+    vision._estimate(pose(tip, off))
+    assert vision.bound == 0.0
+
+
+def doubtful(torch: float, lit: float | None, off: float = 3e-3, **given: Any) -> Any:
+    """A follower whose torch is off by so much, after its estimate."""
+    found = make(**given)
+    felt_along(found, 0.0)
+    found.torch, found.lit = torch, lit
+    found._estimate(pose(torch + DISTANCE, off))
+    return found
+
+
+def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
+    assert doubtful(0.01, None, off=0.0).lit == 0.01
+    assert doubtful(0.02, 0.01, off=0.0).lit == 0.01
+    assert doubtful(-0.01, None, off=0.0).lit is None  # it is not on the seam yet
+    assert doubtful(0.01, None, off=0.0, offset_along="15 mm").lit is None
+    assert doubtful(0.016, None, off=0.0, offset_along="15 mm").lit == 0.016
+    assert doubtful(0.01, None, off=0.0, phase="probing").lit is None
+    stopped = doubtful(0.02, 0.01)
+    assert stopped.phase == "stopped" and stopped.lit == 0.01
+    assert stopped.reason.startswith("the torch is known to 3.")
+    assert stopped.reason.endswith(" mm only, max_error is 1 mm")
+
+
+def test_a_torch_has_three_tool_lengths_to_come_onto_the_seam() -> None:
+    assert doubtful(0.119, None).phase == "following"
+    long = straight(0.3)
+    assert doubtful(0.119, None, plan=long).phase == "following"
+    assert doubtful(0.121, None, plan=long).phase == "stopped"
+    assert doubtful(0.131, None, plan=long, offset_along="15 mm").phase == "following"
+    assert doubtful(0.136, None, plan=long, offset_along="15 mm").phase == "stopped"
+
+
+def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> None:
+    before = ResumePoint(np.zeros((0, 5)), 0.03)
+    assert doubtful(0.029, None, before=before).phase == "following"
+    assert doubtful(0.031, 0.02, off=0.0, before=before).phase == "following"
+    told = doubtful(0.031, None, before=before)
+    assert told.reason == (
+        "the torch was not on the seam again where it had stopped; raise 'overlap'"
+    )
+
+
+# --- how hard the tip is to press -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("phase", "first", "goal", "rate"),
+    [
+        ("following", 0.0, "deflection", "ramp"),
+        ("bridging", 2e-3, "probe", "ramp"),
+        ("ending", 2e-3, None, "release"),
+    ],
+)
+def test_the_wanted_deflection_goes_to_what_the_phase_asks_for_at_its_rate(
+    phase: str, first: float, goal: str | None, rate: str
+) -> None:
+    found, asked = make(phase), following()
+    found.wanted, target = first, 0.0 if goal is None else getattr(asked, goal)
+    found._ramp(0.1)
+    step = 0.1 * getattr(asked, rate)
+    assert found.wanted == pytest.approx(first + math.copysign(step, target - first))
+    found._ramp(60.0)
+    assert found.wanted == pytest.approx(target)
+
+
+def test_nothing_is_pressed_before_a_wall_was_found_nor_without_touch() -> None:
+    seeking, vision = make("seeking"), make(touch=False)
+    for found in (seeking, vision):
+        found._ramp(60.0)
+        assert found.wanted == 0.0
+    seeking._search.found = True
+    seeking._ramp(60.0)
+    assert seeking.wanted == following().deflection
+
+
+def test_the_deflection_has_ended_where_the_tip_is_to_stop_pressing() -> None:
+    found, asked = make(), following()
+    going, way = 0.0, found._pressing_ends
+    found.phase, found.wanted = "ending", asked.deflection
+    while found.wanted > 1e-12:
+        found._ramp(1e-3)
+        going, way = going + 1e-3, way + 1e-3 * asked.speed
+    assert way == pytest.approx(LENGTH - asked.ending, abs=1e-5)
+
+
+# --- how fast -------------------------------------------------------------------------------------
+
+
+def test_where_the_seam_curves_the_tip_goes_as_fast_as_it_swerves_by_three_tenths() -> None:
+    """Straight on for the time in which it is blind, off a circle by (v t)^2 / 2 R."""
+    found = make(plan=circle())
+    found.tip = found.torch = 0.05
+    assert found._agility() == math.inf  # nothing is late
+    found._latency, found._response.dead_time, found._response.lag = 0.2, 0.15, 0.25
+    way = found._agility() * 0.6
+    assert way**2 / (2 * RADIUS) == pytest.approx(0.3e-3, rel=1e-2)
+    found._latency = 1e3
+    assert found._agility() == pytest.approx(0.1 * following().speed)
+    straight_on = make()
+    straight_on._latency = 1.0
+    assert straight_on._agility() == math.inf
+
+
+def test_a_curve_slows_the_tip_ten_millimetres_before_and_until_the_torch_is_through() -> None:
+    angle = np.linspace(0.0, 1.0, 200)
+    bent = [[0.1 + RADIUS * np.sin(a), RADIUS * (1 - np.cos(a)), 0.0] for a in angle]
+    end = np.array(bent[-1]) + np.outer(
+        np.linspace(1e-3, 0.1, 100), [math.cos(1.0), math.sin(1.0), 0]
+    )
+    found = make(plan=np.concatenate([straight(0.1)[:-1], bent, end]))
+    found._latency = 1.0
+
+    def slow(torch: float, tip: float) -> bool:
+        found.torch, found.tip = torch, tip
+        return bool(found._agility() < 2 * math.sqrt(2 * 0.3e-3 * RADIUS))
+
+    assert not slow(0.04, 0.082) and slow(0.06, 0.1)
+    through = 0.1 + RADIUS
+    assert slow(through - 0.01, through + 0.03) and not slow(through + 8e-3, through + 0.048)
+
+
+def test_a_tip_that_is_not_firmly_on_its_wall_waits_for_it_but_never_stands() -> None:
+    found, asked = make(), following()
+    found.wanted = asked.deflection
+    for share, kept in ((0.7, 1.0), (0.9, 1.0), (0.35, 0.5), (0.07, 0.2), (-1.0, 0.2)):
+        found.contact.deflection = share * asked.deflection
+        assert found._firmness() == pytest.approx(kept)
+    found.wanted, found.contact.deflection = 0.0, 0.35 * asked.probe
+    assert found._firmness() == pytest.approx(0.5)
+    found.contact.deflection = 0.0
+    for other in (make("bridging"), make("ending"), make(touch=False)):
+        assert other._firmness() == 1.0
+
+
+def test_the_tip_slows_down_while_no_image_comes() -> None:
+    found, asked, along = make(), following(), np.array([0.0, 1.0])
+    found.wanted, found.contact.deflection = asked.deflection, asked.deflection
+    for silence, share in ((0.0, 1.0), (0.0999, 1.0), (0.11, 0.8), (0.149, 0.02)):
+        found._heard = 7.0 - silence
+        assert found._pace(pose(0.05, time=7.0), along) == pytest.approx(
+            share * asked.speed, abs=1e-9
+        )
+    found.phase = "seeking"
+    assert found._pace(pose(0.05, time=7.0), along) == 0.0
+    assert found._silence(7.0) == pytest.approx(0.149)
+    for blind in (make("ending"), make(touch=False)):
+        blind._heard = 3.0
+        assert blind._silence(7.0) == 0.0
+
+
+# --- where to ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
+def test_the_servo_brings_deflection_and_preload_to_what_is_wanted(side: str, sign: float) -> None:
+    found, asked = make(side=side), following()
+    found.wanted, found._felt = asked.deflection, SeamReading(1e-3, 0.4e-3)
+    y, z = 1e-3 + sign * asked.deflection, 0.4e-3 - asked.preload
+    there = found._velocity(pose(0.05, y, z), 4e-3)
+    assert there == pytest.approx([4e-3, 0.0, 0.0], abs=1e-12)
+    near = found._velocity(pose(0.05, y + 0.2e-3, z + 0.1e-3), 0.0)
+    assert near == pytest.approx(
+        [0.0, -asked.servo_gain * 0.2e-3, -asked.height_gain * 0.1e-3], abs=1e-12
+    )
+    far = found._velocity(pose(0.05, y - 0.1, z - 0.1), 0.0)
+    assert far == pytest.approx([0.0, asked.lateral_speed, asked.lateral_speed])
+
+
+def test_the_tip_climbs_with_the_plan_and_leaves_it_with_the_seam() -> None:
+    climbing = straight(LENGTH) * [1.0, 1.0, 0.0] + straight(LENGTH)[:, [1, 1, 0]] * 0.05
+    found, asked = make(plan=climbing), following()
+    found.tip, found._felt, found.wanted = 0.05, SeamReading(0.0, 0.0), asked.deflection
+    found._place = found._plan.at(0.05)
+    seated = pose(0.05, asked.deflection, 0.05 * 0.05 - asked.preload)
+    assert found._velocity(seated, 4e-3) == pytest.approx([4e-3, 0.0, 0.05 * 4e-3], abs=1e-9)
+    for s in np.arange(0.005, 0.06, 2e-4).tolist():
+        found.refined.add(0.0, s, 0.1 * (s - 0.05), 0.0)
+    found.refined.confirm(1.0)
+    assert found._velocity(seated, 4e-3)[1] == pytest.approx(0.1 * 4e-3, rel=0.03)
+    found.phase, found._felt = "ending", SeamReading(0.0, 0.0)
+    assert found._drifting() == 0.0
+
+
+def test_a_vision_weld_presses_nothing_down() -> None:
+    found = make(touch=False)
+    assert found._velocity(pose(0.05), 4e-3) == pytest.approx([4e-3, 0.0, 0.0], abs=1e-12)
+
+
+def test_while_the_groove_is_sought_the_search_says_where_to() -> None:
+    found, asked = make("seeking"), following()
+    found._search.down = True
+    sideways = found._velocity(pose(0.005, 0.0, -asked.preload), 0.0)
+    assert sideways == pytest.approx([0.0, asked.lateral_speed, 0.0], abs=1e-12)
+    near = found._velocity(pose(0.005, asked.reach - 1e-3, -asked.preload), 0.0)
+    assert near == pytest.approx([0.0, asked.servo_gain * 1e-3, 0.0], abs=1e-12)
+
+
+def test_while_nothing_is_felt_the_seam_is_where_what_was_felt_leads() -> None:
+    found = make()
+    assert found._seam_at_tip().offset == 0.0
+    found._felt, found.tip = SeamReading(3e-3, 0.2e-3), 0.05
+    felt_along(found, 1e-3)
+    assert found._seam_at_tip().offset == 3e-3
+    for phase in ("bridging", "ending"):
+        found.phase = phase
+        assert found._seam_at_tip().offset == pytest.approx(1e-3, abs=1e-6)
+        assert found._seam_at_tip().height == 0.2e-3
+
+
+def test_tip_and_torch_go_on_by_a_tenth_of_a_second_s_way_at_most() -> None:
+    found, asked = make(), following()
+    found.tip, found._coming, found.torch = 0.05, 0.01, 0.009
+    found._progress(pose(0.0504), pose(0.0506))
+    assert [found.tip, found._coming, found.torch] == pytest.approx([0.0505, 0.0105, 0.0095])
+    found._progress(pose(0.0496), pose(0.0503))
+    assert [found.tip, found._coming, found.torch] == pytest.approx([0.0505, 0.0105, 0.0096])
+    assert asked.speed * 0.1 == pytest.approx(0.5e-3)
+    assert found._torch_position(pose(0.05, 0.01, angle=np.pi / 2)) == pytest.approx([0.05, -0.03])
+
+
+# --- what the finger says -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
+    found, rest = make(side=side), np.array([0.1e-3, -0.2e-3, 0.3e-3])
+    found._search.rest, true = rest, np.array([0.4e-3, 1.5e-3, 1.2e-3])
+    sign = 1.0 if side == "left" else -1.0
+    for gain, up in ((0.1, 1.1), (-0.1, 1.0)):  # a preload that is shown larger presses harder
+        found.learned = Learned(gain=gain, width=0.05e-3)
+        shown = rest + true * [1 + gain, 1 + gain, up] + [0.0, sign * 0.05e-3, 0.0]
+        assert found._corrected(shown) == pytest.approx(true)
+
+
+def test_a_finger_that_is_let_go_of_goes_through_its_play_to_the_other_side() -> None:
+    found, most = make("ending"), following().deflection
+    found.learned = Learned(width=-0.1e-3)
+    for less, where in ((0.0, 1.0), (0.05e-3, 0.5), (0.1e-3, 0.0), (0.2e-3, -1.0), (1e-3, -1.0)):
+        found.wanted = most - less
+        assert found._pressing() == pytest.approx(where)
+    found.phase = "following"
+    assert found._pressing() == 1.0
+    found.phase, found.learned = "ending", Learned()
+    assert found._pressing() == 1.0
+
+
+@pytest.mark.parametrize(
+    ("noise", "share"), [(0.01e-3, 1.0), (0.03e-3, 1.0), (0.06e-3, 0.25), (1e-3, 0.1)]
+)
+def test_the_noisier_a_finger_the_longer_the_mean_that_is_followed(
+    noise: float, share: float
+) -> None:
+    found = make()
+    assert found._smoothed(SeamReading(5.0, 6.0)).offset == 5.0
+    found._felt, found.refined.noise = SeamReading(1.0, 2.0), noise
+    mean = found._smoothed(SeamReading(2.0, 4.0))
+    assert [mean.offset, mean.height] == pytest.approx([1 + share, 2 + 2 * share])
+
+
+@pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
+def test_the_seam_is_where_the_tip_is_beside_its_ball_and_the_deflection_what_it_lags(
+    side: str, sign: float
+) -> None:
+    belief = Belief(
+        DISTANCE, half_angle=math.pi / 4, lean=-sign * math.pi / 4, two_walls=False, radius=2e-3
+    )
+    found = make(side=side, belief=belief)
+    found.tip, turned_by = 0.05, 0.3
+    c, s = math.cos(turned_by), math.sin(turned_by)
+    moved = np.array([0.1e-3, -sign * 1.4e-3, 0.6e-3])  # of the tip, in the plane
+    shown = np.array([c * moved[0] + s * moved[1], -s * moved[0] + c * moved[1], moved[2]])
+    at, felt, deflection = found._located(pose(0.05, 3e-3, -1e-3, turned_by), Touch(0.0, shown))
+    assert at == pytest.approx(0.0501)
+    assert felt.offset == pytest.approx(3e-3 - sign * 1.4e-3 + sign * 2e-3)
+    assert felt.height == pytest.approx(-0.4e-3)
+    assert deflection == pytest.approx(1.4e-3)
+    assert found._lateral(pose(0.05, 3e-3)) == pytest.approx(3e-3 + sign * 2e-3)
+
+
+def test_a_measurement_meets_the_pose_of_its_image_and_its_delay_is_learned() -> None:
+    found = make("bridging")
+    for i in range(101):
+        found._track.add(pose(0.05 + 1e-3 * i, time=i * 0.01))
+    found._time, found.learned, found._latency = 1.0, Learned(stamp=0.05), 0.1
+    places = list[float]()
+    located = found._located
+
+    def noted(at: Any, touch: Any) -> Any:
+        places.append(float(at.position[0]))
+        return located(at, touch)
+
+    found._located = noted
+    found._feel(Touch(0.9, np.array([0.0, 0.0, 1e-3])))
+    assert places == [pytest.approx(0.05 + 85e-3)]
+    assert found._latency == pytest.approx(0.1 + 0.05 * (0.15 - 0.1))
+    assert (found._seen, found._heard) == (0.9, 1.0)
+    found._feel(Touch(0.0, np.zeros(3)))  # from before the first pose
+    assert len(places) == 1
+
+
+@pytest.mark.parametrize(("moved", "told"), [(0.19e-3, False), (0.21e-3, True), (-0.21e-3, True)])
+def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
+    moved: float, told: bool
+) -> None:
+    samples = np.array([[s, 1e-3, 0.0, 1, 0.0] for s in np.arange(0.005, 0.05, 5e-4).tolist()])
+    found = make(before=ResumePoint(samples, 0.03))
+    for i in range(14):
+        found._compare(0.02 + 1e-4 * i, 1e-3 + moved + (5e-3 if i % 3 == 0 else 0.0))
+    assert found.phase == "following"
+    found._compare(0.06, 9.0)  # nothing was felt there before
+    found._compare(0.04, 1e-3 + moved)
+    assert (found.phase == "stopped") == told
+    if told:
+        assert found.reason.startswith("the seam has moved by 0.2") and "a seam of its own" in (
+            found.reason
+        )
+    else:
+        found._compare(0.04, 9.0)  # fifteen were compared, and that is that
+        assert len(found._moved) == 15
+
+
+def test_what_contact_has_not_been_doubted_for_after_a_while_is_believed() -> None:
+    found = make()
+    found.contact.hold(1.0, 2e-3)
+    found.wanted = 2e-3
+    held = SeamReading(1e-3, 0.0)
+    found._believe(1.29, 0.05, held, 2e-3, 0.0)
+    found.refined.confirm(9.0)
+    assert found.refined.empty  # contact is too new
+    found._believe(1.31, 0.05, held, 2e-3, 0.0)
+    found._believe(1.5, 0.05, held, 0.3 * 2e-3, 0.0)  # one that speaks against contact
+    found._believe(1.6, 0.05, held, 2e-3, 0.0)
+    assert found.refined.empty  # not 0.3 s old
+    found._believe(1.62, 0.05, held, 2e-3, 0.0)
+    assert found.refined.samples()[:, 3].tolist() == [1.0]
+    near = LENGTH - following().ending / 2
+    for s, kept in ((near - 1e-4, True), (near + 1e-4, False)):
+        found._believe(5.0, s, SeamReading(2e-3, 0.0), 2e-3, 0.0)
+        assert (found._felt.offset == 2e-3) == kept
+        found._felt = held
+    found._climbs = True  # it leads the tip, but is not where the seam is
+    found.refined.forget_pending()
+    found._believe(6.0, 0.05, SeamReading(2e-3, 0.0), 2e-3, 0.0)
+    assert found._felt.offset == 2e-3 and not found.refined._pending
+
+
+def test_a_wall_tells_while_it_holds_the_tip() -> None:
+    found, felt = make(), SeamReading(0.0, 0.0)
+    assert not found._tells(0.05, felt, 2e-3)
+    found.contact.hold(0.0, 2e-3)
+    assert found._tells(0.05, felt, 2e-3)
+    found.phase = "probing"
+    assert not found._tells(0.05, felt, 2e-3)
+    found.phase = "bridging"
+    for deflection, other in ((-3e-3, True), (3e-3, False)):
+        for _ in range(6):
+            told = found._tells(0.05, felt, deflection)
+        assert told == other
+    found._release.other = True
+    assert not found._tells(0.05, felt, 1e-9)
+
+
+def test_a_wall_that_is_gone_while_the_tip_is_let_go_of_is_noticed() -> None:
+    """By where the arm is, and where the seam was felt before."""
+    for lags, loose in ((1.0, False), (0.2, True)):
+        found = make("ending", side="right")
+        felt_along(found, 0.0)
+        found.refined.add(2.0, 0.09, 0.0, 0.0)
+        for _ in range(6):  # the arm presses by 2 mm; a tip that goes along stays aside of the seam
+            deflection = lags * 2e-3
+            aside = -(2e-3 - deflection)
+            found._notice_loss(0.09, SeamReading(aside, 0.0), deflection)
+        assert found._release.loose == loose
+        assert bool(found.refined._pending) != loose
+    unfelt = make("ending")
+    for _ in range(6):
+        unfelt._notice_loss(0.09, SeamReading(2e-3, 0.0), 0.0)
+    assert not unfelt._release.loose
+
+
+# --- from phase to phase --------------------------------------------------------------------------
+
+
+def judged(found: Any, **state: Any) -> str:
+    for name, value in state.items():
+        setattr(found, name, value)
+    found._judge(pose(0.05))
+    return str(found.phase)
+
+
+def test_phases_follow_from_what_was_felt() -> None:
+    ends = make()._pressing_ends
+    assert judged(make(), tip=ends - 1e-5) == "following"
+    assert judged(make(), tip=ends + 1e-5) == "ending"
+    assert judged(make("bridging"), tip=ends + 1e-5) == "ending"
+    lost = make()
+    lost.refined.add(0.0, 0.05, 0.0, 0.0)
+    lost.contact.state = "lost"
+    assert judged(lost, tip=0.06) == "bridging"
+    assert lost._bridge == 0.06 and not lost.refined._pending
+    lost.contact.state = "held"
+    assert judged(lost) == "following"
+    for seated, probing, phase in ((False, True, "seeking"), (True, True, "probing"),
+                                   (True, False, "following")):  # fmt: skip
+        found = make("seeking", probing=probing)
+        found.contact.state, found._search.seated = "held", seated
+        assert judged(found) == phase
+
+
+def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
+    assert judged(make("ending"), torch=LENGTH - 1e-6, lit=0.0) == "ending"
+    assert judged(make("ending"), torch=LENGTH, lit=0.0) == "done"
+    never = make("ending")
+    assert judged(never, torch=LENGTH, lit=None, bound=1.5e-3) == "stopped"
+    assert never.reason == "the torch is known to 1.50 mm only, max_error is 1 mm"
+    assert judged(make("ending", touch=False), torch=LENGTH) == "done"
+    stopped = make("stopped")
+    stopped.reason = "why"
+    assert judged(stopped, torch=LENGTH, lit=0.0) == "stopped" and stopped.reason == "why"
+
+
+def test_a_tip_is_let_go_of_by_what_was_felt_or_by_nothing() -> None:
+    for phase, felt, loose in (("following", True, False), ("bridging", True, True),
+                               ("following", False, True)):  # fmt: skip
+        found = make(phase)
+        if felt:
+            felt_along(found, 0.0)
+        found._enter("ending")
+        assert found._release.loose == loose
+        found._enter("following")
+        assert not found._release.loose
+
+
+def refused(found: Any, at: Any = None, **state: Any) -> str:
+    for name, value in state.items():
+        setattr(found, name, value)
+    found._refuse(at or pose(0.05, time=1.0), found._settings)
+    return str(found.reason)
+
+
+def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
+    assert refused(make(), _seen=0.501) == ""
+    assert refused(make(), _seen=0.499) == "no tag was seen for 500 ms"
+    assert refused(make("ending"), _seen=0.0) == ""
+    assert refused(make(touch=False), _seen=0.0) == ""
+    assert refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0599) == ""
+    told = refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0601)
+    assert told == "no contact for 40 mm of the seam"
+    bent = make("seeking")
+    bent._search.bent = True
+    assert refused(bent, _seen=1.0) == "the tip is displaced though nothing should touch it"
+    over = make("seeking")
+    over._search.over = True
+    assert refused(over, _seen=1.0) == "no groove within 8 mm of the plan's start"
+    for z, told in ((-7.9e-3, ""), (-8.1e-3, "no groove within 8 mm of the plan's start")):
+        assert refused(make("seeking"), pose(0.05, z=z, time=1.0), _seen=1.0) == told
+    for phase in ("done", "stopped"):
+        assert refused(make(phase), _seen=0.0) == ""
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_an_arm_is_no_nearer_to_a_curve_s_centre_than_three_tenths_of_its_radius(
+    side: float,
+) -> None:
+    """There all places of the curve are equally near."""
+    for share, stopped in ((0.68, True), (0.72, False), (-0.72, False)):
+        found = make(plan=circle() * [1.0, side, 1.0])
+        found.tip = 0.1
+        found._place = found._plan.at(0.1)
+        centre = np.array([0.0, side * RADIUS])
+        # Towards the centre by 1 - share of the radius; or as far away from it.
+        towards = (centre - found._place.point) * (1.4 - abs(share)) * np.sign(share)
+        x, y = (found._place.point + towards).tolist()
+        told = refused(found, pose(x, y, time=1.0), _seen=1.0)
+        assert bool(told) == stopped
+        if told:
+            assert told.startswith("the plan curves with a radius of 50.") and "off towards" in told
+
+
+def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it() -> None:
+    found, asked = make("probing"), following()
+    found._probing = SimpleNamespace(over=True, learned=lambda: "it is broken")
+    assert judged(found) == "stopped" and found.reason == "it is broken"
+    found = make("probing")
+    learned = Learned(dead_time=0.06, lag=0.1, noise=20e-6)
+    found._probing = SimpleNamespace(over=True, learned=lambda: learned)
+    found._search.sigma, found._time, found._seen = np.array([0, 35e-6, 0]), 4.0, 3.9
+    down = np.array([0.0, -asked.deflection, 0.0])
+    found._swept = [(pose(0.05, asked.deflection), Touch(3.9, down))] * 3
+    assert judged(found) == "following"
+    assert found.learned.noise == found.refined.noise == 35e-6
+    assert (found._response.dead_time, found._response.lag) == (0.06, 0.1)
+    assert found._began == 4.0 and found.wanted == pytest.approx(asked.deflection)
+    assert found.contact.state == "held" and found.contact.since == 3.9
+    quiet = make("probing")
+    quiet._probing, quiet._search.sigma = found._probing, np.array([0, 5e-6, 0])
+    quiet._swept = found._swept
+    quiet._learn()
+    assert quiet.refined.noise == 20e-6
+
+
+# --- cycle by cycle -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("period", "touched", "shares"),
+    [(8e-3, True, 4), (8e-3, False, 4), (5e-3, True, 2), (2e-3, False, 1), (1e-3, False, 1)],
+)
+def test_a_cycle_finds_the_seam_again_by_a_share_for_each_two_milliseconds(
+    period: float, touched: bool, shares: int
+) -> None:
+    found, renewed = make(), list[Any]()
+    found._period = period
+    found.refined = SimpleNamespace(renew=lambda places: renewed.append(places))
+    found.torch, found._coming, found.tip, found._touched = 0.01, 0.011, 0.05, 0.049
+    found._renew(touched)
+    assert len(renewed) == shares
+    here = [0.01, 0.011, 0.05, 0.049]
+    assert renewed[0] == pytest.approx([*here, *(s + 0.5e-3 for s in here)])
+
+
+def test_a_short_cycle_with_a_touch_leaves_its_share_to_the_next_one() -> None:
+    found, renewed = make(), list[Any]()
+    found._period = 2e-3
+    found.refined = SimpleNamespace(renew=lambda places: renewed.append(places))
+    counts = []
+    for touched in (True, True, True, False, True):
+        found._renew(touched)
+        counts.append(len(renewed))
+    assert counts == [0, 1, 1, 2, 2]
+    unknown = make()
+    unknown.refined = found.refined
+    unknown._renew(False)  # before the second cycle
+    assert len(renewed) == 3
+
+
+def test_a_cycle_takes_what_was_not_given_before_and_a_late_one_makes_none_longer() -> None:
+    found, felt = make("bridging"), list[Any]()
+    found._felt = SeamReading(0.0, 0.0)
+    found._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    found._feel = lambda touch: felt.append(touch)
+    touch = Touch(3.05, np.array([1e-3, 2e-3, 3e-3]))
+    found.step(pose(0.05, time=3.0), [])
+    found.step(pose(0.05, time=3.1), [Touch(2.9, np.zeros(3)), Touch(3.0, np.zeros(3)), touch])
+    assert [each.time for each in felt] == [3.05]
+    assert felt[0].displacement == pytest.approx([2e-3, 1e-3, 3e-3])  # in level axes
+    assert found._period == pytest.approx(0.1)
+    found.step(pose(0.05, time=3.4), [])
+    assert found._period == pytest.approx(0.1) and found._elapsed == 0.0  # silent: no ramp
+    vision = make(touch=False)
+    vision._feel = found._feel
+    vision.step(pose(0.05, time=3.0), [])
+    vision.step(pose(0.05, time=3.1), [touch])
+    assert len(felt) == 1
+
+
+def test_an_arm_stands_where_its_camera_has_been_silent_for_too_long() -> None:
+    for silence, still in ((0.149, False), (0.151, True)):
+        found = make("bridging")
+        found._felt, found._time, found._seen, found._heard = SeamReading(0.0, 0.0), 1.0, 1.0, 1.0
+        found.tip, found._bridge, found.torch, found._coming = 0.05, 0.05, 0.01, 0.01
+        command = found.step(pose(0.05, 1e-3, time=1.0 + silence), [])
+        assert (command is STILL) == still
+        assert (found.wanted > 0.0) != still  # the ramp waits too
+    waiting = make("seeking")
+    waiting._felt = SeamReading(0.0, 0.0)
+    assert waiting._search.resting
+    assert waiting.step(pose(0.005, time=1.0), []) is STILL
+    waiting._search.resting = False
+    assert waiting.step(pose(0.005, z=5e-3, time=1.01), []).velocity[2] < 0.0
+
+
+def test_the_tool_turns_for_a_torch_that_is_off_and_stands_where_the_tip_does() -> None:
+    found, asked = make(touch=False), following()
+    found.tip, found.torch, found._coming = 0.05, 0.01, 0.01
+    found._time = 0.0
+    left = pose(0.05, 0.0, angle=-0.01, time=0.01)  # its torch is 0.4 mm to the left of the seam
+    command = found.step(left, [])
+    gain = max(asked.cross_track_gain, asked.speed / 8e-3)
+    error = DISTANCE * math.sin(0.01)
+    assert command.turn == pytest.approx(gain * error / DISTANCE, rel=0.02)
+    aside = make(touch=False, offset_across="0.4 mm")
+    aside.tip, aside.torch, aside._coming, aside._time = 0.05, 0.01, 0.01, 0.0
+    assert abs(aside.step(left, []).turn) < 0.02 * command.turn
+    standing = make("seeking")
+    standing._felt, standing._search.resting = SeamReading(0.0, -1.5e-3), False
+    standing._velocity = lambda p, pace: np.zeros(3)
+    standing._search.down = True
+    assert standing._lead(left, left).turn == 0.0
+
+
+def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late() -> None:
+    found = make(weave_width="4 mm", weave_frequency=0.5, offset_across="1 mm")
+    found._response.dead_time, found._response.lag = 0.1, 0.05
+    found._coming = -1e-6
+    assert found._swayed(3.0) == (0.0, 0.0, 0.0) and found.aim == 1e-3
+    found._coming = 0.0
+    turn = math.pi  # a second
+    assert found._swayed(7.0).aside == pytest.approx(2e-3 * turn * 0.05)  # it begins at 7.1 s
+    now = found._swayed(7.6)  # 0.5 s after that
+    assert found.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
+    early = turn * 0.6
+    assert now.aside == pytest.approx(2e-3 * (math.sin(early) + 0.05 * turn * math.cos(early)))
+    later = make(weave_width="4 mm", offset_along="10 mm")
+    for coming, swings in ((9.9e-3, False), (10.1e-3, True)):
+        later._coming = coming
+        later._swayed(1.0)
+        assert (later._swings is not None) == swings
+
+
+def test_the_sweep_moves_across_and_along_the_seam_and_is_told_where_the_arm_is() -> None:
+    found, noted = make("probing"), list[Any]()
+    found._place, found._elapsed = found._plan.at(0.05), 8e-3
+    found._probing = SimpleNamespace(
+        velocity=lambda elapsed: 2e-3, along=lambda elapsed: 0.5e-3,
+        note=lambda *given: noted.append(given),
+    )  # fmt: skip
+    command = found._probe(pose(0.05, 1e-3, time=4.0))
+    assert isinstance(command, Command) and command.turn == 0.0
+    assert command.velocity == pytest.approx([0.5e-3, 2e-3, 0.0])
+    assert noted == [(4.0, 2e-3, pytest.approx(1e-3))]
+
+
+def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None:
+    found = make()
+    felt_along(found, 1e-3)
+    found.torch = 0.03
+    assert found.kept() is None  # the torch was not on the seam
+    found.lit = 0.0
+    kept = found.kept()
+    assert kept.torch == 0.03 and kept.number == 0 and kept.traced.shape == (0, 3)
+    assert kept.samples == pytest.approx(found.refined.samples())
+    again = make(before=kept)
+    assert again.refined.offset(0.05) == pytest.approx(1e-3, abs=1e-6)
+    assert again.tip == following().inset and again.torch == following().inset - DISTANCE

@@ -1,0 +1,306 @@
+"""The passes after the root's: back above the work, along what was found, and how well known."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.motion.seam_following import STILL, Command, ToolPose
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.follower import ResumePoint
+from flangeye_plugins.weld.passes import Passes, Traced, _nearest, _towards
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.probing import Learned
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import straight
+
+DISTANCE, LENGTH, RADIUS = 40e-3, 0.1, 0.08
+SIGMA = 0.1e-3
+
+
+def circle() -> Floats:
+    turn = np.linspace(0.0, LENGTH / RADIUS, 400)
+    return RADIUS * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
+
+
+class Root:
+    """A root pass that found the plan, so much to its left, with its tool at a height [m]."""
+
+    def __init__(self, plan: Path, aside: float = 0.0) -> None:
+        def frame(s: float) -> tuple[Floats, Floats]:
+            place = plan.at(s)
+            return place.point + aside * place.normal, place.normal
+
+        self.refined: Any = SimpleNamespace(frame=frame, hurried=True, noise=0.0)
+        self.mode, self.side, self.phase, self.reason = "tactile", 1.0, "following", ""
+        self.tip, self.torch, self.wanted, self.aim = DISTANCE, 0.0, 2e-3, 0.0
+        self.sigma, self.bound, self.band, self.lit = SIGMA, 0.0, 0.0, 0.0
+        self.learned = Learned(dead_time=0.08, lag=0.05)
+        self.ends = False
+
+    def step(self, pose: Any, touches: Any) -> Command:
+        self.phase = "done" if self.ends else "following"
+        return STILL
+
+    def kept(self) -> Any:
+        return ResumePoint(np.zeros((1, 5)), self.torch, self.learned)
+
+
+def passes(
+    *asked: dict[str, Any], points: Any = None, aside: float = 0.0, before: Any = None, **given: Any
+) -> Any:
+    settings = Following.model_validate({"passes": list(asked), **given})
+    plan = Path(straight(LENGTH) if points is None else points)
+    root: Any = Root(plan, aside)
+    return Passes(root, plan, Belief(DISTANCE), settings, before)
+
+
+def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: float = 0.0) -> Any:
+    return ToolPose(time, np.array([x, y, z]), angle)
+
+
+def rooted(found: Any, height: float = -1e-3) -> Any:
+    """Let the root pass go to its end, with the tool's end point at a height [m]."""
+    for s in np.arange(0.0, LENGTH + 1e-4, 1e-3).tolist():
+        found.root.torch = s
+        found.step(pose(s + DISTANCE, z=height), [])
+    found.root.ends = True
+    found.step(pose(LENGTH + DISTANCE, z=height), [])
+    return found
+
+
+def driven(found: Any, start: Any, until: str, longest: float = 90.0) -> list[tuple[Any, Any, str]]:
+    """Let an arm that is never late carry out what is commanded, until a phase has ended."""
+    found._response.dead_time = found._response.lag = 0.0
+    rows, here, seen = [], start, False
+    while here.time < longest:
+        command = found.step(here, [])
+        rows.append((here, command, found.phase))
+        seen = seen or found.phase == until
+        if found.phase in ("done", "stopped") or (seen and found.phase != until):
+            return rows
+        here = ToolPose(
+            here.time + 8e-3, here.position + 8e-3 * command.velocity,
+            here.angle + 8e-3 * command.turn,
+        )  # fmt: skip
+    raise AssertionError(found.phase)
+
+
+def test_the_height_of_the_root_pass_is_kept_every_half_millimetre() -> None:
+    plan = Path(straight(LENGTH))
+    root: Any = Root(plan)
+    traced = Traced(root, plan, np.zeros((0, 3)))
+    for s in np.arange(0.0, 10e-3, 0.1e-3).tolist():
+        root.torch, root.sigma = s, SIGMA + s
+        traced.note(2 * s)
+    along, height, sigma = np.array(traced.rows).T
+    assert np.diff(along) == pytest.approx(0.5e-3, abs=0.11e-3)
+    assert along[0] == 0.0 and len(along) in range(16, 21)
+    assert height == pytest.approx(2 * along) and sigma == pytest.approx(SIGMA + along)
+    later = Traced(root, plan, np.array(traced.rows))
+    assert later.rows == traced.rows and later.sigma(4e-3) == pytest.approx(SIGMA + 4e-3)
+
+
+@pytest.mark.parametrize("points", [straight(LENGTH), circle()])
+def test_a_pass_goes_aside_of_what_was_found_and_higher_than_the_tool_was(points: Any) -> None:
+    found = rooted(passes({"across": "2 mm", "up": "4 mm", "along": "10 mm"}, points=points,
+                          aside=0.5e-3))  # fmt: skip
+    path, plan = found._path, Path(points)
+    assert found.phase == "returning" and found.number == 1 and not found.root.refined.hurried
+    for end, s in ((0.0, 10e-3), (path.length, LENGTH)):
+        there, place = path.at(end), plan.at(s)
+        assert there.point == pytest.approx(place.point + 2.5e-3 * place.normal, abs=0.3e-3)
+        assert (there.point - place.point) @ place.normal == pytest.approx(2.5e-3, abs=2e-5)
+        assert there.height == pytest.approx(-1e-3 + 4e-3)
+    assert found.aim == 2e-3 and found.bound == found.sigma == found.wanted == 0.0
+
+
+def test_between_passes_the_tool_is_lifted_crosses_and_comes_down_where_the_pass_begins() -> None:
+    found = rooted(passes({"across": "2 mm", "up": "3 mm"}))
+    start = pose(LENGTH + DISTANCE, 1e-3, -1e-3, 0.3)
+    rows = driven(found, start, "returning")
+    higher, speed = 2e-3 + 15e-3, found._settings.return_speed
+    heights = np.array([row[0].position[2] for row in rows])
+    places = np.array([row[0].position for row in rows])
+    assert heights.max() == pytest.approx(higher, abs=0.2e-3)
+    crossing = np.linalg.norm(places[:, :2] - start.position[:2], axis=1) > 1e-4
+    away = np.linalg.norm(places[:, :2] - [DISTANCE, 2e-3], axis=1) > 1e-3
+    assert heights[crossing & away].min() > higher - 5e-3 - 0.5e-3
+    last = rows[-1][0]
+    assert last.position == pytest.approx([DISTANCE, 2e-3, 2e-3], abs=0.15e-3)
+    assert abs(last.angle) < math.radians(0.2)
+    fastest = [np.linalg.norm(row[1].velocity[:2]) for row in rows[:-1]]
+    assert max(fastest) == pytest.approx(speed)
+    assert max(abs(row[1].velocity[2]) for row in rows[:-1]) == pytest.approx(speed)
+    assert max(abs(row[1].turn) for row in rows[:-1]) <= found._settings.turn_rate
+
+
+@pytest.mark.parametrize(
+    ("off", "there"),
+    [
+        ((0.0, 0.09e-3, 0.0), True),
+        ((0.0, 0.11e-3, 0.0), False),
+        ((0.0, 0.0, 0.19), True),
+        ((0.0, 0.0, -0.21), False),
+    ],
+)
+def test_a_place_is_reached_within_a_tenth_of_a_millimetre_and_a_fifth_of_a_degree(
+    off: Any, there: bool
+) -> None:
+    found = rooted(passes({"up": "3 mm"}))
+    x, y, angle = off
+    above = pose(DISTANCE + x, y, 10e-3, math.radians(angle))
+    command = found._return(above)
+    assert (command.velocity[2] < 0.0) == there  # down, or up to where it may cross
+    for z, phase in ((2.11e-3, "returning"), (2.09e-3, "passing"), (1.91e-3, "passing")):
+        found.phase = "returning"
+        found._return(pose(DISTANCE, 0.0, z, 0.0))
+        assert found.phase == phase
+
+
+def test_a_tool_that_is_off_is_brought_back_at_two_a_second() -> None:
+    found = rooted(passes({"up": "3 mm"}))
+    command = found._return(pose(DISTANCE + 1e-3, -2e-3, 17e-3, 0.05))
+    assert command.velocity == pytest.approx([-2e-3, 4e-3, 0.0], abs=1e-9)
+    assert command.turn == pytest.approx(-0.1)
+    low = found._return(pose(DISTANCE + 1e-3, -2e-3, 11e-3, 0.05))  # lifted first
+    assert low.velocity == pytest.approx([0.0, 0.0, 2 * 6e-3]) and low.turn == 0.0
+
+
+@pytest.mark.parametrize("points", [straight(LENGTH), circle()])
+def test_the_torch_goes_along_its_pass_and_the_passes_after_it_follow(points: Any) -> None:
+    found = rooted(
+        passes({"across": "1 mm"}, {"across": "-2 mm", "along": "20 mm"}, points=points),
+        height=0.0,
+    )
+    for number in (1, 2):
+        begins = found._path.at(0.0)
+        heading = math.atan2(begins.tangent[1], begins.tangent[0])
+        x, y = (begins.point + DISTANCE * begins.tangent).tolist()
+        path = found._path
+        rows = driven(found, pose(x, y, begins.height, heading), "passing")
+        torches = [
+            row[0].position[:2] - DISTANCE * row[0].direction for row in rows if row[2] == "passing"
+        ]
+        for torch in torches[:: len(torches) // 10]:
+            foot = path.at(path.foot(torch, found.torch if found.number == number else 0.05))
+            assert np.linalg.norm(torch - foot.point) < 0.15e-3
+        speed = np.linalg.norm(np.diff(np.array(torches), axis=0), axis=1) / 8e-3
+        assert np.median(speed) == pytest.approx(5e-3, rel=0.01)
+        assert found.number == min(number + 1, 2)
+    assert found.phase == "done"
+
+
+def passing(found: Any, torch: float = 0.03) -> Any:
+    found.phase, found.torch = "passing", torch
+    return found
+
+
+def test_a_torch_that_is_off_and_a_tool_that_is_askew_are_brought_back() -> None:
+    found = passing(rooted(passes({"up": "3 mm"}), height=0.0))
+    turn = 2.0 * -0.02  # towards the path's heading, at two a second
+    command = found._weld(
+        pose(0.03 + DISTANCE * math.cos(0.02), DISTANCE * math.sin(0.02), 3e-3, 0.02)
+    )
+    assert command.turn == pytest.approx(turn)
+    assert command.velocity[1] == pytest.approx(DISTANCE * turn * math.cos(0.02))
+    passing(found)
+    command = found._weld(pose(0.03 + DISTANCE, 0.2e-3, 2e-3))
+    assert command.velocity == pytest.approx([5e-3, -2 * 0.2e-3, 3.0 * 1e-3])
+    assert command.turn == pytest.approx(0.0, abs=1e-9)
+    passing(found)
+    assert found._weld(pose(0.0304 + DISTANCE, 0.0, 3e-3)) and found.torch == pytest.approx(0.0304)
+    assert found.tip == pytest.approx(0.0304 + DISTANCE)
+    found._weld(pose(0.05 + DISTANCE, 0.0, 3e-3))  # a tenth of a second's way at most
+    assert found.torch == pytest.approx(0.0309)
+    ahead = rooted(passes({"along": "20 mm"}))
+    passing(ahead)._weld(pose(0.05 + DISTANCE, 0.0, 2e-3))
+    assert ahead.tip == pytest.approx(ahead.torch + 20e-3 + DISTANCE)
+
+
+def test_on_a_curve_the_tool_turns_as_the_path_does_and_climbs_with_it() -> None:
+    found = passing(rooted(passes({"up": "3 mm"}, points=circle()), height=0.0))
+    assert found._bend() == pytest.approx(1 / RADIUS, rel=1e-3)
+    place = found._path.at(0.03)
+    heading = math.atan2(place.tangent[1], place.tangent[0])
+    x, y = (place.point + DISTANCE * place.tangent).tolist()
+    command = found._weld(pose(x, y, 3e-3, heading))
+    assert command.turn == pytest.approx(5e-3 / RADIUS, rel=0.02)
+    climbing = passes({"up": "3 mm"})
+    for s in np.arange(0.0, LENGTH + 1e-4, 1e-3).tolist():
+        climbing.root.torch = s
+        climbing.step(pose(s + DISTANCE, z=0.05 * s), [])
+    climbing.root.ends = True
+    climbing.step(pose(LENGTH + DISTANCE, z=0.05 * LENGTH), [])
+    up = passing(climbing)._weld(pose(0.03 + DISTANCE, 0.0, 3e-3 + 0.05 * 0.03)).velocity[2]
+    assert up == pytest.approx(0.05 * 5e-3, rel=0.02)
+
+
+def test_a_pass_is_known_as_the_root_was_and_by_what_arm_and_heat_do_since() -> None:
+    asked = {"arm_sigma": "0.04 mm", "distortion": "0.07 mm", "max_error": "1 mm"}
+    found = passing(rooted(passes({"along": "10 mm", "weave_width": "2 mm"}, **asked)))
+    late = (math.pi * 2e-3 * 10e-3) ** 2 / 2
+    sigma = math.sqrt(SIGMA**2 + (2 * 0.04e-3) ** 2 + (0.07e-3) ** 2 + late)
+    found._estimate(-0.2e-3)
+    assert found.sigma == pytest.approx(sigma)
+    assert found.band == pytest.approx(0.2e-3 + 2 * sigma)
+    assert found.bound == pytest.approx(0.2e-3 + 4 * sigma)
+    assert found.phase == "passing"
+    found._estimate(1e-3 - 3.99 * sigma)
+    assert found.phase == "stopped" and found.reason == (
+        "in pass 2 the torch is known to 1.00 mm only, max_error is 1 mm"
+    )
+    found._traced._sigma = np.linspace(0.0, 1e-3, len(found._traced._along))
+    found.torch = 0.05
+    found._estimate(0.0)  # the seam as it was known where the torch is now
+    assert found.sigma**2 - sigma**2 + SIGMA**2 == pytest.approx((0.6e-3) ** 2, rel=0.02)
+
+
+def test_a_swing_of_a_pass_is_commanded_early_and_stated_as_it_is() -> None:
+    found = rooted(passes({"across": "1 mm", "weave_width": "4 mm", "weave_frequency": 0.5}))
+    assert (found._response.dead_time, found._response.lag) == (0.08, 0.05)
+    found._began = 3.0
+    turn, swing = math.pi, found._swayed(3.5)
+    assert swing.aside == pytest.approx(
+        2e-3 * (math.sin(turn * 0.5) + 0.05 * turn * math.cos(turn * 0.5)), abs=1e-9
+    )
+    assert found.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.42))
+    found._swayed(3.05)
+    assert found.aim == 1e-3  # the arm is not yet there
+
+
+def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
+    first = passing(rooted(passes({"along": "10 mm"}, {"across": "1 mm"})), 0.03)
+    kept = first.kept()
+    assert kept.number == 1 and kept.torch == pytest.approx(0.04)
+    assert kept.traced == pytest.approx(np.array(first._traced.rows))
+    again = passes({"along": "10 mm"}, {"across": "1 mm"}, before=kept, offset_along="25 mm")
+    assert again.number == 1 and again.phase == "returning"
+    assert again.torch == again._start == pytest.approx(15e-3)
+    assert again.root.learned == kept.learned and again.lit == 25e-3
+    assert again._response.dead_time == 0.08 and again.root.refined.noise == kept.learned.noise
+    early = passes({"along": "10 mm"}, before=kept, offset_along="5 mm")
+    assert early._start == 0.0
+    begun = passes({"along": "10 mm"})
+    begun.root.torch = 0.02
+    begun.step(pose(0.06), [])
+    assert begun.kept().number == 0 and begun.kept().torch == 0.02
+    assert len(begun.kept().traced) == 1
+
+
+@pytest.mark.parametrize(
+    ("angle", "near"), [(0.1, 0.1), (6.2, 6.2 - 2 * math.pi), (-4.0, 2 * math.pi - 4.0)]
+)
+def test_an_angle_is_taken_within_half_a_turn(angle: float, near: float) -> None:
+    assert _nearest(angle) == pytest.approx(near)
+
+
+def test_a_place_is_gone_to_at_a_speed_and_slower_near_to_it() -> None:
+    assert _towards(np.array([3.0, 4.0]), 0.1) == pytest.approx([0.06, 0.08])
+    assert _towards(np.array([3e-3, 4e-3]), 0.1) == pytest.approx([6e-3, 8e-3])
+    assert _towards(np.zeros(2), 0.1) == pytest.approx([0.0, 0.0])
