@@ -242,7 +242,7 @@ def test_on_a_curve_the_tool_turns_as_the_path_does_and_climbs_with_it() -> None
 
 
 def test_a_pass_is_known_as_the_root_was_and_by_what_arm_and_heat_do_since() -> None:
-    asked = {"arm_sigma": "0.04 mm", "distortion": "0.07 mm", "max_error": "1 mm"}
+    asked: dict[str, Any] = {"arm_sigma": "0.04 mm", "distortion": "0.07 mm", "max_error": "1 mm"}
     found = passing(rooted(passes({"along": "10 mm", "weave_width": "2 mm"}, **asked)))
     late = (math.pi * 2e-3 * 10e-3) ** 2 / 2
     sigma = math.sqrt(SIGMA**2 + (2 * 0.04e-3) ** 2 + (0.07e-3) ** 2 + late)

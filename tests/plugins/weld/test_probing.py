@@ -1,12 +1,21 @@
 """The sweep of the seated tip: what it finds, and what it refuses to begin with."""
 
 import math
+import re
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye_plugins.weld.belief import Belief
-from flangeye_plugins.weld.probing import MARGIN, Learned, Probing
+from flangeye_plugins.weld.probing import (
+    MARGIN,
+    Learned,
+    Probing,
+    _dragged,
+    _explained,
+    _scatter,
+)
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.sliding import STROKE, Sliding
 
@@ -96,3 +105,324 @@ def test_a_finger_too_noisy_to_tell_says_so() -> None:
         "whether the tip climbs the wall is known to 0.10 mm only; raise 'preload' or lower "
         "'deflection', or see to it that the tag is read better"
     )
+
+
+# --- where to go ----------------------------------------------------------------------------------
+
+
+def going(two_walls: bool = True, side: float = 1.0, noise: float = 10e-6, **given: Any) -> Any:
+    settings = Following.model_validate(given)
+    belief = Belief(40e-3, half_angle=math.radians(40.0), two_walls=two_walls, noise=(noise, 6e-5))
+    found: Any = Probing(settings, belief, side)
+    return found
+
+
+def driven(found: Any, pressed: float, side: float = 1.0) -> tuple[Any, Any]:
+    """Let a finger of no noise be swept from where it is pressed by so much; places and speeds [m]."""
+    where, speeds, places = pressed, list[float](), list[float]()
+    for cycle in range(6000):
+        speed = found.velocity(PERIOD)
+        found.note(cycle * PERIOD, speed, side * where)
+        if cycle % IMAGES == 0:
+            found.feel(cycle * PERIOD, -side * where, 0.0, 0.0)
+        found.along(PERIOD)
+        where += side * speed * PERIOD
+        speeds.append(side * speed)
+        places.append(where)
+        if found.over:
+            break
+    assert found.over
+    return np.array(places), np.array(speeds)
+
+
+def turns_of(places: Any) -> list[float]:
+    """Where a way turns round, and where it ends [m]."""
+    steps = np.sign(np.round(np.diff(places), 12))
+    moving = np.flatnonzero(steps)
+    turned = moving[:-1][steps[moving[:-1]] != steps[moving[1:]]]
+    return [float(places[i + 1]) for i in turned] + [float(places[-1])]
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_tip_between_walls_is_pressed_to_both_and_ends_outwards(side: float) -> None:
+    d = SETTINGS.deflection
+    places, speeds = driven(going(side=side), 0.5e-3, side)
+    ends = [1.25 * d, -1.25 * d, 1.25 * d, 0.5 * d, 0.75 * d]
+    assert turns_of(places) == pytest.approx(ends, abs=1e-6)
+    assert np.abs(speeds).max() <= 4e-3 + 1e-12
+    assert places[np.flatnonzero(speeds)[0] - 1] == pytest.approx(0.5e-3)
+
+
+def test_a_tip_on_one_wall_keeps_pressing_it() -> None:
+    d = SETTINGS.deflection
+    places, _ = driven(going(two_walls=False), 0.5e-3)
+    assert turns_of(places) == pytest.approx([1.25 * d, 0.4 * d, 0.75 * d], abs=1e-6)
+
+
+def test_a_sweep_s_speed_swings_so_that_no_delay_looks_like_play() -> None:
+    """Between a fifth of it and all of it; it is that across the seam, at most 4 mm/s."""
+    _, speeds = driven(going(deflection="9 mm"), 0.5e-3)
+    forwards = speeds[speeds > 0][:280]
+    assert forwards.max() == pytest.approx(4e-3, rel=0.01)
+    assert forwards.min() == pytest.approx(0.2 * 4e-3, rel=0.05)
+    peaks = np.flatnonzero((forwards[1:-1] > forwards[:-2]) & (forwards[1:-1] >= forwards[2:]))
+    assert np.diff(peaks) * PERIOD == pytest.approx(0.8, abs=2 * PERIOD)
+    _, slow = driven(going(lateral_speed="2 mm/s"), 0.5e-3)
+    assert slow.max() == pytest.approx(2e-3, rel=0.01)
+
+
+def test_a_sweep_begins_where_the_tip_has_come_to_rest() -> None:
+    found = going(noise=0.1e-3)
+    enough = (0.1 / 0.03) ** 2
+    for cycle in range(2000):  # it slides first, and rests in the newer half
+        assert found.velocity(PERIOD) == 0.0
+        if found._wanted is not None:
+            break
+        found.feel(cycle * PERIOD, -(3e-3 if cycle < 12 else 1e-3), 0.0, 0.0)
+    assert found._wanted == pytest.approx(1e-3)
+    assert cycle * PERIOD > 0.4 - 2 * PERIOD and cycle >= enough
+    unseen = going()
+    waited = 0.0
+    while unseen._wanted is None:
+        unseen.velocity(PERIOD)
+        waited += PERIOD
+    assert unseen._wanted == SETTINGS.deflection  # nothing says otherwise
+    assert waited == pytest.approx(4.0, abs=2 * PERIOD)
+
+
+def test_a_standing_loop_commands_nothing() -> None:
+    found = going()
+    found._wanted = 0.5e-3
+    assert found.velocity(0.0) == 0.0
+
+
+def test_where_the_tip_is_pressed_hardest_enough_is_felt() -> None:
+    for noise, least in ((10e-6, 0), (0.15e-3, 25)):
+        found = going(noise=noise)
+        found._wanted, count = 1.25 * SETTINGS.deflection, 0
+        while len(found._turns) == 3:
+            found.velocity(PERIOD)
+            found.feel(0.0, -2.5e-3, 0.0, 0.0)
+            count += 1
+        assert count == pytest.approx(max(least, 1), abs=1.5)
+    blind = going(noise=0.15e-3)
+    blind._wanted, cycles = 1.25 * SETTINGS.deflection, 0
+    while len(blind._turns) == 3:
+        blind.velocity(PERIOD)
+        cycles += 1
+    assert cycles * PERIOD == pytest.approx(4.0, abs=3 * PERIOD)  # no longer is it pressed for that
+
+
+# --- what follows from it -------------------------------------------------------------------------
+
+
+def fitted(
+    gain=0.0, width=0.0, stamp=0.0, askew=0.0, noise=10e-6, side=1.0, seed=0, dead=0.0, waves=0.0,
+    climbs=0.0, two_walls=True,
+):  # fmt: skip
+    """What is learned of a finger and arm that are off so: by a sweep of both [m, s].
+
+    Args:
+        gain: It shows more by this share.
+        width: Half of its play.
+        stamp: Its timestamps are late by this.
+        askew: Tangent of the walls' angle to the plan.
+        noise: Of one measurement.
+        side: That is pressed.
+        seed: Of the noise.
+        dead: Dead time of the arm.
+        waves: Amplitude of something that no model explains.
+        climbs: How far the tip rises per displacement.
+        two_walls: Whether there is another wall.
+    """
+    rng, found = np.random.default_rng(seed), going(two_walls=two_walls, side=side, noise=1e-6)
+    d = SETTINGS.deflection
+    corners = [0.5 * d, 1.25 * d, -1.25 * d if two_walls else 0.4 * d, 0.75 * d]
+    time = np.arange(0.0, 6.0, PERIOD)
+    way = np.cumsum(np.abs(np.diff(corners, prepend=corners[0])))
+    speed = 1.0 - 0.8 * np.cos(np.pi * time / 0.8) ** 2
+    gone = np.cumsum(speed) / speed.sum() * way[-1]
+    told = side * np.interp(gone, way, corners)
+    where = np.interp(time - dead, time, told)
+    dragged = where.copy()
+    for i in range(1, len(where)):
+        dragged[i] = np.clip(dragged[i - 1], where[i] - 0.1e-3, where[i] + 0.1e-3)
+    # A tip on walls that stand askew slides along them: what is left is across the wall.
+    turned = math.atan(askew)
+    along = (1.0 + gain) * math.sin(turned) * math.cos(turned) * where
+    shown = width * (dragged - where) / 0.1e-3 - (1.0 + gain) * math.cos(turned) ** 2 * where
+    for i, t in enumerate(time):
+        found.note(t, np.gradient(told, PERIOD)[i], where[i])
+        if i % IMAGES == 0:
+            odd = waves * math.sin(8.0 * t) + noise * rng.standard_normal()
+            height = (
+                climbs * max(side * where[i] - 0.9 * d, 0.0) + 6 * noise * rng.standard_normal()
+            )
+            found.feel(t + stamp, shown[i] + odd, height, along[i])
+    return found
+
+
+def learned(**given: Any) -> Any:
+    return fitted(**given).learned()
+
+
+@pytest.mark.parametrize("two_walls", [True, False])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_what_finger_clock_and_arm_are_off_by_is_found(side: float, two_walls: bool) -> None:
+    found = learned(
+        gain=0.08, width=0.04e-3, stamp=0.03, askew=0.2, dead=0.08, side=side, two_walls=two_walls
+    )
+    assert found.gain == pytest.approx(0.08, abs=2e-3)
+    assert found.width == pytest.approx(-0.04e-3, abs=4e-6)
+    assert (found.dead_time, found.lag) == (pytest.approx(0.08), 0.0)
+    assert found.stamp == pytest.approx(0.03) and found.askew == pytest.approx(0.2, abs=2e-3)
+    assert found.noise == pytest.approx(10e-6, rel=0.25)
+    assert found.unexplained < 5e-6
+    early = learned(stamp=-0.05, gain=-0.02)
+    assert early.stamp == pytest.approx(-0.05) and early.gain == pytest.approx(-0.02, abs=2e-3)
+
+
+def test_a_gain_is_known_as_well_as_a_line_through_so_many_measurements() -> None:
+    found = fitted(noise=30e-6)
+    at = -np.array([sample[1] for sample in found._felt])
+    sigma = 30e-6 / math.sqrt(((at - at.mean()) ** 2).sum())
+    assert found.learned().gain_sigma == pytest.approx(sigma, rel=0.25)
+    # Walls askew may be curved too.
+    askew = fitted(noise=30e-6, askew=0.2).learned().gain_sigma
+    assert askew == pytest.approx(math.hypot(sigma, 0.04), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"gain": 0.34}, None),
+        ({"gain": 0.37}, "the finger's gain is off by 37%; calibrate it again"),
+        ({"gain": -0.37}, "the finger's gain is off by -37%; calibrate it again"),
+        ({"width": 0.093e-3}, None),
+        ({"width": 0.107e-3}, "the finger has 0.2[12] mm of play or hysteresis, at most 0.20 mm"),
+        ({"width": -0.107e-3}, "the finger has 0.2[12] mm of play or hysteresis, at most 0.20 mm"),
+        ({"waves": 0.05e-3}, None),
+        ({"waves": 0.08e-3}, "the finger's displacement is not understood: 0.0[56] mm are left"),
+        ({"waves": 0.08e-3, "askew": 0.3}, None),
+        ({"waves": 0.14e-3, "askew": 0.3}, "the finger's displacement is not understood"),
+        ({"waves": 0.14e-3, "askew": -0.3}, "the finger's displacement is not understood"),
+        ({"climbs": 0.05}, None),
+        ({"climbs": 0.4}, "the tip climbs the wall by 0."),
+        ({"gain": -0.1}, None),
+        ({"gain": -0.1, "noise": 0.15e-3},
+         "the finger shows [0-9]+% less than its file says, or the tip climbs"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("two_walls", [True, False])
+def test_a_weld_begins_with_a_finger_that_is_understood(
+    given: Any, told: str | None, two_walls: bool
+) -> None:
+    found = learned(**given, two_walls=two_walls)
+    if told is None:
+        assert isinstance(found, Learned), found
+    else:
+        assert re.match(told, str(found)), found
+
+
+def test_a_tag_that_is_seen_less_than_fifteen_times_says_nothing() -> None:
+    found = going()
+    for i in range(14):
+        found.feel(0.1 * i, -1e-3, 0.0, 0.0)
+    assert found.learned() == "the tag was seen too seldom while the finger was probed"
+    full = fitted()
+    full._felt = full._felt[::13][:15]
+    assert isinstance(full.learned(), Learned)
+    full._felt.pop()
+    assert "too seldom" in full.learned()
+
+
+def test_what_is_felt_after_the_sweep_s_end_is_not_the_finger_s() -> None:
+    found = fitted(gain=0.05)
+    found._swept = len(found._felt), len(found._cycles)
+    for i in range(200):
+        found.feel(6.0 + 0.03 * i, 9e-3, 0.0, 0.0)
+        found.note(6.0 + 0.03 * i, 0.0, 9e-3)
+    assert found.learned().gain == pytest.approx(0.05, abs=2e-3)
+
+
+def test_measurements_scatter_as_their_second_differences_do() -> None:
+    """A drift is no scatter, and one that is far off counts little."""
+    rng = np.random.default_rng(0)
+    values = 3e-5 * rng.standard_normal(4000) + np.linspace(0.0, 5e-3, 4000)
+    assert _scatter(values) == pytest.approx(3e-5, rel=0.05)
+    values[100] += 1.0
+    assert _scatter(values) == pytest.approx(3e-5, rel=0.05)
+
+
+def test_a_dead_band_drags_what_is_in_it_along() -> None:
+    way = np.array([[0.0, 1.0, 3.0, 2.5, 1.0, -2.0, -1.5]])
+    assert _dragged(way, np.array([1.0]))[0] == pytest.approx([0, 0, 2, 2, 2, -1, -1])
+    both = _dragged(np.vstack([way, way]), np.array([1.0, 0.0]))
+    assert both[1] == pytest.approx(way[0]) and both[0] == pytest.approx([0, 0, 2, 2, 2, -1, -1])
+
+
+def test_offset_gain_and_play_are_those_of_least_squares() -> None:
+    rng = np.random.default_rng(1)
+    at, widths = np.cumsum(rng.normal(0, 1e-4, (3, 80)), axis=1), np.array([1e-4, 2e-4, 5e-5])
+    felt = rng.normal(0, 1e-4, 80)
+    rms, solutions = _explained(at, widths, felt)
+    for row, width, left, solved in zip(at, widths, rms, solutions, strict=True):
+        reversal = (_dragged(row[None], np.array([width]))[0] - row) / width
+        rows = np.column_stack([np.ones(80), -row, reversal])
+        best = np.linalg.lstsq(rows, felt, rcond=None)[0]
+        assert solved == pytest.approx(best)
+        assert left == pytest.approx(np.sqrt(np.mean((felt - rows @ best) ** 2)))
+
+
+def test_the_rise_of_a_tip_that_leaves_its_seat_is_found_with_its_sigma() -> None:
+    """It goes aside and up from eight tenths of the deflection on."""
+    rises = []
+    for seed in range(30):
+        found = fitted(seed=seed, noise=20e-6)
+        felt, cycles = np.array(found._felt), np.array(found._cycles)
+        at = np.interp(felt[:, 0], cycles[:, 0], cycles[:, 2])
+        beyond = np.maximum((at / SETTINGS.deflection - 0.8) / (1.25 - 0.8), 0.0)
+        felt[:, 1] += FLAT * 0.3e-3 * beyond
+        felt[:, 2] += 0.3e-3 * beyond
+        known = Learned(noise=20e-6)
+        rises.append(found._knee(felt, at, known))
+    means, sigmas = np.array(rises).T
+    assert means.mean() == pytest.approx(0.3e-3, abs=0.02e-3)
+    assert means.std() == pytest.approx(sigmas.mean(), rel=0.4)
+    few = found._knee(felt[:5], np.zeros(5), known)
+    assert few == (0.0, math.inf)
+
+
+def test_a_tip_that_is_just_held_rises_by_what_the_margin_presses_it_more() -> None:
+    """Where its preload would just hold it at the deflection: by energy, pressed by a quarter more."""
+    found, asked = going(), SETTINGS
+    # Per rise h it goes aside by flat h: the wall's force balance of a spring pair whose stiffness
+    # is such that at the deflection the preload just holds it.
+    axial = 1.0
+    lateral = axial * asked.preload / (asked.deflection * FLAT)
+    # Along the wall (aside flat, up 1): lateral flat (1.25 d - flat h) = axial (preload + h)
+    rise = (lateral * FLAT * 1.25 * asked.deflection - axial * asked.preload) / (
+        lateral * FLAT**2 + axial
+    )
+    assert found._just_held() == pytest.approx(rise)
+
+
+@pytest.mark.parametrize(
+    ("rise", "aside", "sigma", "told"),
+    [
+        (0.04e-3, 0.0, 1e-6, None),
+        (0.06e-3, 0.0, 1e-6, "the tip climbs the wall by 0.06 mm when it slides along it"),
+        (0.06e-3, 0.0, 5e-6, None),
+        (0.0, 1e-3, 0.2e-3, "whether the tip climbs the wall where it slides along it is known to 0.20"),
+        (0.0, 1e-3, 0.05e-3, None),
+        (0.0, -1e-3, 0.2e-3, None),
+    ],
+)  # fmt: skip
+def test_a_stroke_tells_of_a_rise_or_that_it_cannot_tell(
+    rise: float, aside: float, sigma: float, told: str | None
+) -> None:
+    found = going()
+    both = np.array([aside, rise]), np.array([sigma, sigma])
+    found._sliding = type("Stroke", (), {"climbed": lambda self: both})()
+    said = found._slid()
+    assert said is None if told is None else str(said).startswith(told)
