@@ -27,7 +27,9 @@ def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> 
         outer: Farthest if true, nearest otherwise.
     """
     at_edge, sector = _fringe(flat, centre, bins, 0.0, outer)
-    return at_edge[np.unique(sector, return_index=True)[1]]
+    first = np.full(bins, -1, dtype=np.intp)
+    first[sector[::-1]] = at_edge[::-1]  # of several at the same distance the first stays
+    return first[first >= 0]
 
 
 def fringe(flat: Floats, centre: Floats, bins: int, depth: float, outer: bool = True) -> Indices:

@@ -82,6 +82,11 @@ def thinned(points: NDArray[T], enough: int = ENOUGH) -> NDArray[T]:
     return points[:: 1 + len(points) // enough]
 
 
+def chosen(points: Floats, which: Mask) -> Floats:
+    """Return the chosen ones of N points, a column after the other in memory as in ``flatten``."""
+    return points.T.compress(which, axis=1).T
+
+
 def robust_plane(points: Floats, rough: Plane, gate: float) -> Plane | None:
     """Return the plane most points near a rough one lie on; see :func:`robust_planes`."""
     return robust_planes([points], [rough], np.array([gate]))[0]

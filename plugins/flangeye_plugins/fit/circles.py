@@ -38,7 +38,9 @@ def circle_residuals(circles: Circles, points: Floats, ring: NDArray[np.intp]) -
     return np.asarray(distances(offsets) - circles.radii[ring])
 
 
-def fit_concentric(points: Floats, ring: NDArray[np.intp], start: Circles, scale: float) -> Circles:
+def fit_concentric(
+    points: Floats, ring: NDArray[np.intp], start: Circles, scale: float, within: float = 1e-8
+) -> Circles:
     """Return the circles that minimise the points' distances, far ones counting less and less.
 
     Cauchy's loss of the geometric distance, by Newton steps where they lower it, else by
@@ -51,6 +53,7 @@ def fit_concentric(points: Floats, ring: NDArray[np.intp], start: Circles, scale
         ring: (N,) which circle each point belongs to.
         start: Where to begin.
         scale: Distance at which a point's weight is a half [m].
+        within: The last step [m].
     """
     circles, residual = start, circle_residuals(start, points, ring)
     loss = cauchy_loss(residual, scale)
@@ -65,7 +68,7 @@ def fit_concentric(points: Floats, ring: NDArray[np.intp], start: Circles, scale
             if reached < loss:
                 break
         circles, residual, loss = moved, after, reached
-        if np.abs(step).max() < 1e-8:
+        if np.abs(step).max() < within:
             break
     return circles
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye.maths.circles import distances
-from flangeye.maths.planes import Plane, robust_plane, thinned
+from flangeye.maths.planes import Plane, chosen, robust_plane, thinned
 from flangeye.maths.statistics import median
 from flangeye.types import Floats, Indices
 
@@ -26,7 +26,7 @@ def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: flo
         The plane, or None when fewer than three points lie near it.
     """
     reach = distances(rough.flatten(points))
-    candidates = points.compress((reach >= ring[0]) & (reach < ring[1]), axis=0)
+    candidates = chosen(points, (reach >= ring[0]) & (reach < ring[1]))
     if len(candidates) < 3:
         return None
     plane = robust_plane(candidates, likeliest_plane(candidates, rough), gate)

@@ -9,7 +9,7 @@ from pydantic import Field
 from flangeye import Params, stage
 from flangeye.maths.circles import distances
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.maths.planes import Plane, fit_plane, thinned
+from flangeye.maths.planes import Plane, chosen, fit_plane, thinned
 from flangeye.models.bolt_pattern import roll_angle
 from flangeye.models.targets import Flange
 from flangeye.types import CircleFeature, FlangeCloud, Floats, Rejected
@@ -93,12 +93,12 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     is no randomness. For a wrist circle the centre is moved along the normal by the plate's
     thickness, to where the robot's flange frame has its origin.
     """
-    points = cloud.cloud.xyz.astype(np.float64)
+    points = cloud.cloud.xyz.astype(np.float64, order="F")
     rough = Plane(cloud.centre, cloud.normal)
     face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
     if face is None:
         return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
-    flat = face.flatten(points.compress(_on_face(face, points, params), axis=0))
+    flat = face.flatten(chosen(points, _on_face(face, points, params)))
     if len(flat) < FEWEST_POINTS:
         return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
     start = face.flatten(cloud.centre[None])[0]
@@ -149,11 +149,11 @@ def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -
     radius = distances(offsets)
     rim, *bore = rings.circles.radii
     inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
-    inner = points.compress(inside, axis=0)
+    inner = chosen(points, inside)
     plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
     # The face is near enough already for a few rounds of its own slab to settle it.
     for some in (thinned(inner), thinned(inner), inner):
-        near = some.compress(np.abs(plane.heights(some)) < half, axis=0)
+        near = chosen(some, np.abs(plane.heights(some)) < half)
         if len(near) < FEWEST_POINTS:
             return face
         plane = fit_plane(near, face.normal)
@@ -169,7 +169,7 @@ def _feature(
     axes = basis_of_plane(plane.normal)
     heights = plane.heights(points)
     near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
-    about_centre = Plane(centre, plane.normal).flatten(points.compress(near, axis=0))
+    about_centre = Plane(centre, plane.normal).flatten(chosen(points, near))
     of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
     to_flange = flange.details.thickness if flange.bore is None else 0.0
     return CircleFeature(

@@ -97,7 +97,7 @@ def _settled(
     for _ in range(ROUNDS):
         before = circles.centre
         points, ring = _edges_near(flat, circles.centre, nominal, bins)
-        circles = fit_concentric(points, ring, circles, scale)
+        circles = fit_concentric(points, ring, circles, scale, 0.1 * within)
         if np.abs(circles.centre - before).max() < within:
             break
     return Rings(circles, points, ring, bins, scale)
