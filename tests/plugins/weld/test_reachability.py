@@ -1,0 +1,299 @@
+"""The arm's way, posture by posture: what bars one, which is told of, and how it is come to."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.files.bundled import bundled
+from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
+from flangeye.motion.limits import MotionLimits
+from flangeye.motion.route import STEP, Barred, Route
+from flangeye_plugins.weld import reachability
+from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.reachability import Bar, SeamReach, Station, _stations, flange_speed
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import straight
+
+FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
+FREE = Bar(9, "")
+
+
+def reach_of(**given: Any) -> Any:
+    """A seam's reach that has looked for nothing yet; of an arm of two joints."""
+    found: Any = SeamReach.__new__(SeamReach)
+    found._task = SimpleNamespace(**given)
+    return found
+
+
+def limits(**given: Any) -> Any:
+    bounds = {"lower": np.radians([-180.0, -360.0]), "upper": np.radians([180.0, 360.0])}
+    return SimpleNamespace(**{**bounds, **given})
+
+
+# --- which postures --------------------------------------------------------------------------------
+
+
+def barred(table=False, itself=False, beyond=None, turn=0.0, fastest=0.1) -> Any:
+    """Why a posture is barred for such reasons; turned by so much from the last one [deg]."""
+    found = reach_of(limits=limits(beyond=lambda joints, room: beyond, joint_speed=0.5))
+    found._arm = SimpleNamespace(frames=lambda joints: joints)
+    found._volume = SimpleNamespace(
+        axes=lambda frames: frames,
+        above=lambda axes, floor: not table,
+        apart=lambda axes: not itself,
+    )
+    found._fastest = lambda joints: fastest
+    return found._bars(np.zeros(2), np.radians([1.0, -turn]))
+
+
+def test_of_all_that_bars_a_posture_the_first_is_told() -> None:
+    """The farther down this list it came the nearer it was to being driven."""
+    reasons = [
+        barred(table=True, itself=True), barred(itself=True, beyond="joint 1 is at 9 deg", turn=90),
+        barred(beyond="joint 1 is at 9 deg", turn=90), barred(turn=30.1, fastest=1.0),
+        barred(turn=29.9, fastest=0.6),
+    ]  # fmt: skip
+    assert [each.reason for each in reasons] == [
+        "the arm touches the table", "the arm touches itself", "joint 1 is at 9 deg",
+        "the arm would have to change its posture",
+        "a joint may have to turn at 34 deg/s, robot.limits.joint_speed allows 29 deg/s",
+    ]  # fmt: skip
+    ranks = [each.rank for each in reasons]
+    assert ranks == sorted(set(ranks))
+    assert barred(turn=29.9, fastest=0.499) is None
+
+
+def test_a_joint_turns_as_fast_as_going_and_turning_together_ask_for() -> None:
+    """By the inverse of the arm's Jacobian: the tool turns about the plane's normal, and goes."""
+    rng = np.random.default_rng(0)
+    jacobian, normal = rng.normal(size=(6, 6)), np.array([0.0, 0.6, 0.8])
+    settings = Following.model_validate({})
+    found = reach_of(tool=SimpleNamespace(normal=normal), finger=FINGER, params=settings)
+    found._arm = SimpleNamespace(jacobian=lambda joints: jacobian)
+    speed = flange_speed(FINGER, settings)
+    worst = 0.0
+    for _ in range(20000):
+        way = rng.normal(size=3)
+        twist = np.concatenate([settings.turn_rate * normal * rng.choice([-1, 1]),
+                                speed * way / np.linalg.norm(way)])  # fmt: skip
+        worst = max(worst, float(np.abs(np.linalg.solve(jacobian, twist)).max()))
+    assert found._fastest(np.zeros(6)) == pytest.approx(worst, rel=0.01)
+    assert found._fastest(np.zeros(6)) >= worst
+
+
+def chained(bars: dict[tuple[int, int], Bar], starts: int = 2, stations: int = 3) -> Any:
+    """Chains from postures that start 1 rad apart, of which some are barred at some stations."""
+    found = reach_of()
+    firsts = np.arange(starts, dtype=float)[:, None]
+    postures = [firsts + 0.01 * i for i in range(stations)]
+    asked: list[tuple[int, int]] = []
+
+    def bars_of(before: Any, joints: Any) -> Bar | None:
+        start = round(float(joints[0]))
+        asked.append((start, round((float(joints[0]) - start) / 0.01)))
+        assert abs(float(joints[0] - before[0])) < 0.011
+        return bars.get(asked[-1])
+
+    found._bars = bars_of
+    nowhere: Any = None
+    named = [Station(f"at {i}", nowhere) for i in range(stations)]
+    return found._drivable(named, postures)
+
+
+def test_every_posture_that_starts_a_whole_chain_is_kept() -> None:
+    both = chained({})
+    assert [chain.ravel().tolist() for chain in both] == [
+        pytest.approx([0.0, 0.01, 0.02]), pytest.approx([1.0, 1.01, 1.02]),
+    ]  # fmt: skip
+    (one,) = chained({(0, 1): Bar(0, "table")})
+    assert one.ravel() == pytest.approx([1.0, 1.01, 1.02])
+
+
+def test_of_several_refusals_the_one_that_came_farthest_is_told() -> None:
+    with pytest.raises(StageError, match="weld.tactile: at 2, the arm touches the table"):
+        chained({(0, 1): Bar(3, "posture"), (1, 2): Bar(0, "the arm touches the table")})
+    with pytest.raises(StageError, match="weld.tactile: at 1, the posture"):
+        chained({(0, 1): Bar(3, "the posture"), (1, 1): Bar(0, "the table")})
+
+
+def test_a_chain_is_wound_to_where_the_arm_stands_where_its_limits_let_it() -> None:
+    """Each joint by whole turns; two degrees stay free."""
+    found = reach_of(limits=limits())
+    chain = np.radians([[170.0, -100.0], [175.0, -110.0]])
+    here = np.radians([-170.0, 250.0])
+    assert np.degrees(found._turned_to(here, chain)) == pytest.approx(
+        np.array([[170.0, 260.0], [175.0, 250.0]])
+    )
+    for last, wound in ((357.0, 357.0), (359.0, -1.0)):
+        chain = np.radians([[0.0, -10.0], [0.0, last - 360.0]])
+        assert np.degrees(found._turned_to(np.radians([0.0, 350.0]), chain))[1, 1] == pytest.approx(
+            wound
+        )
+    for last, wound in ((-357.0, -357.0), (-359.0, 1.0)):
+        chain = np.radians([[0.0, 10.0], [0.0, last + 360.0]])
+        assert np.degrees(found._turned_to(np.radians([0.0, -350.0]), chain))[1, 1] == (
+            pytest.approx(wound)
+        )
+
+
+# --- the way to the start -------------------------------------------------------------------------
+
+
+def started(ways: dict[float, Any], here: float = 0.0) -> Any:
+    """Start from a joint angle, of chains that begin at others and whose way is this [rad]."""
+    found, tried = reach_of(), list[float]()
+    found._chains = [np.array([[start], [start + 0.1], [9.0]]) for start in ways]
+    found._turned_to = lambda at, chain: chain
+
+    def way(at: Any, high: Any, low: Any) -> Any:
+        assert low[0] == pytest.approx(high[0] + 0.1)
+        tried.append(float(high[0]))
+        return ways[float(high[0])]
+
+    found._way = way
+    return found.to_start(np.array([here])), tried
+
+
+def test_the_way_is_taken_to_the_posture_that_is_nearest_and_free() -> None:
+    free, other = Route(()), Route(())
+    route, tried = started({2.0: other, -1.0: free, -3.0: other})
+    assert route is free and tried == [-1.0]
+    route, tried = started({2.0: free, -1.0: Barred("a wall"), -3.0: other})
+    assert route is free and tried == [-1.0, 2.0]
+    with pytest.raises(StageError) as told:
+        started({2.0: Barred("the far one"), -1.0: Barred("the near one")})
+    assert str(told.value) == (
+        "weld.tactile: no collision-free path from the arm's pose to the seam: the near one; "
+        "bring the arm above the work by hand"
+    )
+
+
+@pytest.mark.parametrize(
+    ("over", "down", "touches", "told"),
+    [
+        (None, None, None, None),
+        ("over", None, None, "over"),
+        (None, "down", None, "down"),
+        ("over", "down", "work", "over"),
+        (None, "down", "work", "down"),
+        (None, None, "work", "work"),
+    ],
+)
+def test_a_way_goes_over_and_down_and_what_bars_it_first_is_told(
+    monkeypatch: pytest.MonkeyPatch, over: Any, down: Any, touches: Any, told: Any
+) -> None:
+    asked = list[Any]()
+
+    class Router:
+        def __init__(self, model: Any, limits: Any, here: Any) -> None:
+            asked.append(limits)
+
+        def route(self, start: Any, goal: Any) -> Any:
+            why = over if goal == "high" else down
+            assert (start, goal) in (("here", "high"), ("high", "low"))
+            return Barred(why) if why else Route((goal,))
+
+    monkeypatch.setattr(reachability, "Router", Router)
+    full = np.full(2, 9.0)
+    kept: Any = MotionLimits.__new__(MotionLimits)
+    for name in MotionLimits.__dataclass_fields__:
+        object.__setattr__(kept, name, full)
+    for given, slower in ((0.01, 0.01), (0.3, 0.1)):
+        object.__setattr__(kept, "speed", given)
+        object.__setattr__(kept, "joint_speed", 2 * given)
+        params = SimpleNamespace(approach_speed=0.1, approach_joint_speed=0.2)
+        found = reach_of(model=None, limits=kept, params=params)
+        found._touches = lambda start, goal: Barred(touches) if touches else None
+        way = found._way("here", "high", "low")
+        assert (way.reason if isinstance(way, Barred) else None) == told
+        if told is None:
+            assert way.legs == ("high", "low")
+        assert (asked[-1].speed, asked[-1].joint_speed) == (slower, 2 * slower)
+
+
+def test_neither_finger_nor_torch_comes_nearer_to_the_work_than_nine_tenths_of_the_clearance() -> (
+    None
+):
+    plan = Path(np.column_stack([straight(0.1)[:, :2], np.linspace(0.0, 2e-3, 200)]))
+    found = reach_of(
+        plan=plan, params=SimpleNamespace(clearance=20e-3), tool=SimpleNamespace(lowest=float)
+    )
+    found._arm = SimpleNamespace(flange=lambda postures: postures[:, 0])  # its joint is its height
+    low = 2e-3 + 0.9 * 20e-3
+    assert found._touches(np.array([0.5]), np.array([low + 1e-6])) is None
+    assert found._touches(np.array([low + 1e-6]), np.array([0.5])) is None
+    for start, goal in ((0.5, low - 1e-6), (low - 1e-6, 0.5), (low - 1e-6, low - 2e-6)):
+        told = found._touches(np.array([start]), np.array([goal]))
+        assert told.reason == (
+            "finger or torch would come to 20 mm above the work, 20 mm are asked for"
+        )
+    found._arm = SimpleNamespace(flange=lambda postures: np.abs(postures[:, 0]))
+    told = found._touches(np.array([-1.0]), np.array([1.001]))  # between them it is at the work
+    assert told is not None
+    steps = list[Any]()
+
+    def seen(postures: Any) -> Any:
+        steps.append(postures)
+        return postures[:, 0]
+
+    found._arm = SimpleNamespace(flange=seen)
+    found._touches(np.array([0.1, 0.0]), np.array([0.2, -1.0]))
+    ways = steps[0]
+    assert ways[0] == pytest.approx([0.1, 0.0]) and ways[-1] == pytest.approx([0.2, -1.0])
+    assert np.abs(np.diff(ways, axis=0)).max() <= STEP
+
+
+# --- the poses that are looked at -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("angle", "turns"), [(0.0, 2), (-0.5, 4), (math.pi / 2, 8)])
+def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_its_end(
+    angle: float, turns: int
+) -> None:
+    points = straight(0.1)
+    plane = WorkPlane(points, np.tile([0.0, 0, 1.0], (len(points), 1)))
+    tool = Tool(FINGER, plane)
+    plan = Path(plane.points(points))
+    params: Any = SimpleNamespace(inset=5e-3, clearance=15e-3, start_angle=angle)
+    task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER)
+    stations = _stations(task)
+    poses = [tool.pose(station.pose, 0.0) for station in stations]
+    places = np.array([pose.position for pose in poses])
+    start = plan.at(5e-3).point + 2e-3 * plan.at(5e-3).normal
+    above = [station.name == "above the seam's start" for station in stations]
+    count = above.index(False)
+    assert not any(above[count:]) and count == turns
+    assert places[0] == pytest.approx([*start, 15e-3 + 0.05])
+    assert places[1:count] == pytest.approx(np.tile([*start, 15e-3], (count - 1, 1)))
+    angles = np.array([pose.angle for pose in poses])
+    assert angles[0] == angles[1] == pytest.approx(angle)
+    assert np.abs(np.diff(angles[:count])).max(initial=0.0) <= math.radians(15.0) + 1e-9
+    assert angles[count - 1 :] == pytest.approx(0.0 if count > 2 else angle, abs=1e-9)
+    along = places[count:, 0] - places[count, 0]
+    assert along == pytest.approx(10e-3 * np.arange(len(along)))
+    assert 0.1 + FINGER.torch - 10e-3 <= along[-1] < 0.1 + FINGER.torch + 1e-9
+    assert places[count:, 1:] == pytest.approx(0.0, abs=1e-9)
+    assert stations[count + 3].name == "30 mm along the seam (the tip goes on beyond its end)"
+
+
+def test_later_passes_may_swing_and_go_back_faster_than_the_root_pass_goes() -> None:
+    turning = Following.model_validate({}).turn_rate * math.hypot(*FINGER.tip[:2])
+
+    def going(**given: Any) -> float:
+        return flange_speed(FINGER, Following.model_validate(given)) - turning
+
+    slow = {"lateral_speed": "1 mm/s", "return_speed": "2 mm/s"}
+    one = {"weave_width": "4 mm", "weave_frequency": 1.5}
+    swing = math.pi * 1.5 * 4e-3
+    assert going(**slow) == pytest.approx(math.sqrt(25 + 1 + 1) * 1e-3)
+    assert going(**slow, passes=[{}, one]) == pytest.approx(math.hypot(5e-3, swing))
+    assert going(passes=[{}], return_speed="50 mm/s") == pytest.approx(math.sqrt(2) * 50e-3)
+    assert going(**slow, passes=[{}]) == pytest.approx(math.sqrt(25 + 1 + 1) * 1e-3)
