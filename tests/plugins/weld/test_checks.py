@@ -10,15 +10,21 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.errors import StageError
+from flangeye.maths.seam_geometry import tube_radii
 from flangeye.models.finger import Finger
+from flangeye.plugin.stage import BoundPart
+from flangeye.types import Seam
 from flangeye_emulators.weld_world.bench import FINGER
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.checks import (
     check_belief,
     check_body,
+    check_controller,
     check_finger,
+    check_seam,
     check_speeds,
+    check_tool,
     check_weave,
     tool_angles,
 )
@@ -199,3 +205,114 @@ def test_a_report_has_what_was_counted_and_how_the_loop_kept_time() -> None:
     assert told["period_p99"] == pytest.approx(np.quantile([8e-3, 10e-3], 0.99))
     nothing: Any = SimpleNamespace(cycles=[])
     assert _loop(nothing) == {}
+
+
+# --- seams ----------------------------------------------------------------------------------------
+
+
+def seam_of(points: Any, lean: float = 0.0, sigma: float = 1e-4) -> Any:
+    """A seam whose opening leans by so much more at its ends than in its middle [rad]."""
+    leans = np.linspace(-lean, lean, len(points))
+    openings = np.column_stack([0 * leans, np.sin(leans), np.cos(leans)])
+    covariance = np.tile(np.eye(3) * sigma**2, (len(points), 1, 1))
+    return Seam(points, openings, covariance)
+
+
+def checked(points: Any, distance: float = 0.04, given: Any = None, **more: Any) -> str:
+    try:
+        check_seam(seam_of(points, **more), Path(points), distance, following(**(given or {})))
+    except StageError as told:
+        return str(told)
+    return ""
+
+
+def line(length: float, slope: float = 0.0) -> Any:
+    x = np.linspace(0.0, length, 300)
+    return np.column_stack([x, 0 * x, slope * x])
+
+
+def test_a_seam_is_longer_than_the_tip_needs_to_come_down_and_to_let_go() -> None:
+    asked = {"inset": "6 mm", "ending": "9 mm", "speed": "5 mm/s", "deflection": "2 mm",
+             "release": "0.5 mm/s"}  # fmt: skip
+    used = 6e-3 + 9e-3 + 20e-3
+    assert checked(line(used + 1e-4), given=asked) == ""
+    told = checked(line(used - 1e-4), given=asked)
+    assert told == (
+        "weld.tactile: the seam is 35 mm long; inset, ending and release alone take 35 mm"
+    )
+
+
+@pytest.mark.parametrize(
+    ("slope", "lean", "told"),
+    [
+        (9.9, 0.0, ""),
+        (-9.9, 14.9, ""),
+        (10.1, 0.0, "it climbs by 10 deg (allowed 10), its opening turns by 0 deg (allowed 15)"),
+        (-10.1, 0.0, "it climbs by 10 deg"),
+        (0.0, 15.1, "it climbs by 0 deg (allowed 10), its opening turns by 15 deg (allowed 15)"),
+    ],
+)
+def test_a_seam_stays_in_its_plane(slope: float, lean: float, told: str) -> None:
+    found = checked(line(0.1, float(np.tan(np.radians(slope)))), lean=float(np.radians(lean)))
+    assert bool(found) == bool(told) and told in found
+
+
+def test_a_tool_is_never_pushed_round_a_bend() -> None:
+    """At 60 deg to the seam it would be; on a circle by half the arc of its chord."""
+    turn = np.linspace(0.0, 3.0, 600)
+    for radius, told in ((0.0235, ""), (0.0226, "the tool would stand at 6")):
+        bend = radius * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
+        distance = 2 * radius * np.sin(np.radians(59.0 if not told else 61.5))
+        found = checked(bend, float(distance))
+        assert bool(found) == bool(told) and told in found
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.98, False), (1.02, True)])
+def test_a_plan_is_known_at_its_start_to_within_what_is_sought(share: float, told: bool) -> None:
+    asked = following()
+    one = float(tube_radii(seam_of(line(0.1), sigma=1.0))[0])
+    found = checked(line(0.1), sigma=share * asked.reach / one)
+    assert ("plan better, or raise 'reach'" in found) == told == bool(found)
+
+
+@pytest.mark.parametrize(("share", "told"), [(1.41, False), (1.39, True)])
+def test_on_one_wall_the_deflection_outweighs_friction_by_fourteen_tenths(
+    share: float, told: bool
+) -> None:
+    asked = following()
+    axial = 1000.0 * asked.deflection / (share * asked.friction * asked.preload)
+    belief = Belief(0.04, 1000.0, axial, torch_sigma=0.0, two_walls=False)
+    if not told:
+        check_belief(belief, asked)
+    else:
+        with pytest.raises(StageError, match=f"pushes with {share:.2f} times what the plate"):
+            check_belief(belief, asked)
+    check_belief(Belief(0.04, 1000.0, axial, torch_sigma=0.0), asked)
+    two = Belief(0.04, torch_sigma=0.0)
+    with pytest.raises(StageError, match="set 'root_gap', less than 3 mm for a ball of radius 1.5"):
+        check_belief(two, following(joint="butt"))
+
+
+def test_a_tool_that_cannot_hold_swing_or_stand_as_asked_is_refused() -> None:
+    body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, 0.0]), distance=0.04)
+    check_tool(body, Belief(0.04), following())
+    for belief, asked, told in (
+        (Belief(0.04, torch_sigma=1e-3), following(), "the torch is known to"),
+        (Belief(0.04), following(weave_width="9 mm", weave_frequency=3), "a weave of 9 mm at 3 Hz"),
+        (Belief(0.04, half_angle=0.5, radius=20e-3), following(), "above the seam"),
+    ):
+        with pytest.raises(StageError, match=told):
+            check_tool(body, belief, asked)
+
+
+def test_a_controller_for_simulated_arms_is_refused_with_any_other() -> None:
+    wild: Any = BoundPart.__new__(BoundPart)
+    object.__setattr__(wild, "part", SimpleNamespace(simulation_only=True, name="controller.wild"))
+    real: Any = SimpleNamespace(simulated=False, name="robot.ur")
+    simulated: Any = SimpleNamespace(simulated=True)
+    check_controller(wild, simulated)
+    check_controller("tactile", real)
+    with pytest.raises(StageError, match="controller.wild is known to diverge and runs on a sim"):
+        check_controller(wild, real)
+    object.__setattr__(wild, "part", SimpleNamespace(simulation_only=False, name="controller.own"))
+    check_controller(wild, real)
