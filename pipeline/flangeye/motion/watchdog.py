@@ -23,6 +23,7 @@ from flangeye.devices import GRACE, DeviceError, MovedByHand, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
+from flangeye.motion.precedence import GUARDING, take_precedence
 from flangeye.motion.route import Leg
 from flangeye.motion.supervision import SafetyFault, Sample, Supervisor
 
@@ -73,6 +74,7 @@ def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> Non
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
     keyboard = _terminal(charge.keyboard)
+    take_precedence(GUARDING)
     guard(wire, charge._replace(alarm=alarm.fileno(), keyboard=keyboard))
 
 

@@ -16,6 +16,7 @@ from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following, Mode
+from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from flangeye_plugins.weld.weave import Weave
 
 LEAN = np.deg2rad(15.0)
@@ -36,11 +37,12 @@ SEATING = 1.4
 
 
 def check_finger(finger: Finger, settings: Following) -> None:
-    """Refuse a deflection that the finger does not stand, or a force beyond the limit.
+    """Refuse a deflection that the finger does not stand, a force beyond the limit, or its tag.
 
     Raises:
         StageError: Which, and what is allowed.
     """
+    TagDetector(finger)
     asked = max(settings.deflection, settings.preload)
     if asked > finger.travel:
         raise StageError(

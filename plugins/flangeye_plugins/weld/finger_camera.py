@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import queue
-import threading
-from typing import Any, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
-from flangeye.devices import DeviceError, RobotState, SensorFrame, TactileSensor
-from flangeye.errors import FlangeyeError
+from flangeye.devices import KnowsTorch, RobotState, SensorFrame, StateSource, TactileSensor
 from flangeye.models.finger import Finger
+from flangeye.plugin.stage import BoundPart
+from flangeye.types import Floats, Seed
 from flangeye_plugins.weld.touch.region_of_interest import Piece, RegionOfInterest
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplacement
 
 CONFIDENT = 0.3
 """Readings below this confidence are not used."""
-
-POLLING = 2e-3
-"""Between two looks for a new image, in real time [s]."""
 
 
 class TagObservation(NamedTuple):
@@ -68,7 +64,7 @@ class Reader:
 
 
 class LatestState:
-    """The newest sample of the arm, for a sensor that asks for it from another thread."""
+    """The newest sample of the arm, for a sensor that asks for it."""
 
     def __init__(self, state: RobotState) -> None:
         self._state = state
@@ -82,6 +78,27 @@ class LatestState:
         self._state = state
 
 
+class CameraJob(NamedTuple):
+    """What opens a finger's camera, in this process or another.
+
+    Attributes:
+        sensor: Opens it, given finger, arm and seed.
+        finger: The finger, calibrated.
+        state: Of the arm, where it stands now.
+        seed: For what is simulated.
+    """
+
+    sensor: BoundPart
+    finger: Finger
+    state: RobotState
+    seed: Seed
+
+    def open(self, robot: StateSource) -> TactileSensor:
+        """Open the camera, which may ask ``robot`` where it is."""
+        sensor: TactileSensor = self.sensor(self.finger, robot, self.seed)
+        return sensor
+
+
 class FingerCameraReader(Protocol):
     """Gives what was seen since the last cycle, oldest first."""
 
@@ -93,6 +110,14 @@ class FingerCameraReader(Protocol):
         """
         ...
 
+    def tell(self, state: RobotState) -> None:
+        """Take the arm's newest sample, for a sensor that asks for it; never waits."""
+        ...
+
+    def true_torch(self) -> tuple[Floats, Floats] | None:
+        """Return where a simulated torch really was, once the weld has ended; else None."""
+        ...
+
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *_: object) -> None: ...
@@ -101,61 +126,35 @@ class FingerCameraReader(Protocol):
 class SteppedReader:
     """Reads in the loop itself: in simulated time nothing is late by being computed."""
 
-    def __init__(self, sensor: TactileSensor, reader: Reader) -> None:
-        self._sensor, self._reader = sensor, reader
+    def __init__(self, job: CameraJob) -> None:
+        """Open the camera.
+
+        Raises:
+            StageError: It cannot be opened.
+        """
+        self._latest = LatestState(job.state)
+        self._reader, self._sensor = Reader(job.finger), job.open(self._latest)
 
     def seen(self) -> list[TagObservation]:
         """Return what has arrived; raise DeviceError where the camera is lost."""
         frame = self._sensor.frame()
         return [] if frame is None else [self._reader.read(frame)]
 
+    def tell(self, state: RobotState) -> None:
+        """Take the arm's newest sample."""
+        self._latest.tell(state)
+
+    def true_torch(self) -> tuple[Floats, Floats] | None:
+        """Return where a simulated torch really was, or None."""
+        return torch_of(self._sensor)
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to end."""
+        self._sensor.close()
 
 
-class ThreadedReader:
-    """Reads in a thread: the loop never waits for an image or its detection."""
-
-    def __init__(self, sensor: TactileSensor, reader: Reader) -> None:
-        self._sensor, self._reader = sensor, reader
-        self._sights: queue.SimpleQueue[TagObservation] = queue.SimpleQueue()
-        self._ending = threading.Event()
-        self._error: FlangeyeError | None = None
-        self._thread = threading.Thread(target=self._watch, name="finger", daemon=True)
-
-    def seen(self) -> list[TagObservation]:
-        """Return what has arrived; raise DeviceError where the camera is lost."""
-        if self._error is not None:
-            raise self._error
-        sights: list[TagObservation] = []
-        while not self._sights.empty():
-            sights.append(self._sights.get())
-        return sights
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._ending.set()
-        self._thread.join(timeout=2.0)
-
-    def _watch(self) -> None:
-        while not self._ending.is_set():
-            try:
-                frame = self._sensor.frame()
-                if frame is not None:
-                    self._sights.put(self._reader.read(frame))
-                    continue
-            except FlangeyeError as error:
-                self._error = error
-                return
-            except Exception as error:  # a camera's client may fail in any way
-                self._error = DeviceError(
-                    f"{self._sensor.name}: failed with {type(error).__name__}: {error}"
-                )
-                return
-            self._ending.wait(POLLING)
+def torch_of(sensor: TactileSensor) -> tuple[Floats, Floats] | None:
+    """Return where the torch of a simulated sensor really was; of any other, None."""
+    return sensor.true_torch() if isinstance(sensor, KnowsTorch) else None

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from typing import Any
 
-from flangeye.devices import KnowsTorch, MotionAllowed, Robot, RobotDriver, TactileSensor
+from flangeye.devices import MotionAllowed, Robot, RobotDriver
 from flangeye.errors import NothingMoved
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
@@ -14,6 +14,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.motion.executor import Executor
 from flangeye.motion.leading import led
 from flangeye.motion.limits import limits_of
+from flangeye.motion.precedence import LEADING, precedence
 from flangeye.plugin.stage import stage
 from flangeye.recipe.header import LimitsSection
 from flangeye.types import Floats, Seam, Seed, StageLog, VerifiedHandEye, WeldReport
@@ -22,15 +23,10 @@ from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.bounds import Bounds
+from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Cell, follow
-from flangeye_plugins.weld.finger_camera import (
-    FingerCameraReader,
-    LatestState,
-    Reader,
-    SteppedReader,
-    ThreadedReader,
-)
+from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import ResumePoint
 from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
@@ -68,7 +64,6 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     plan = Path(points)
     body = body_of(finger, params)
     tool = Tool(finger, plane, body)
-    reader = Reader(finger)
     allowed = limits_of(limits, model)
     checks.check_finger(finger, params)
     checks.check_seam(seam, plan, body.distance, params)
@@ -86,23 +81,24 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
         robot: Robot = opened.enter_context(led(driver, model, allowed))
-        latest = LatestState(robot.state())
-        sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
-        eyes = opened.enter_context(_tag_reader(sensor, reader, simulated))
+        job = CameraJob(params.sensor, finger, robot.state(), seed)
+        eyes = opened.enter_context(_tag_reader(job, simulated))
         weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        drive = Executor(robot, model, allowed, latest.tell)
+        drive = Executor(robot, model, allowed, eyes.tell)
         cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
         approach(cell, passage, weld_log, params.mode)
         passes = 1 + 2 * len(params.passes)  # there and back
         longest = 60.0 + 3.0 * passes * (plan.length + body.distance) / params.speed
+        if not simulated:
+            opened.enter_context(precedence(LEADING))
         reason = follow(cell, controller, weld_log, longest)
-        truth = sensor.true_torch() if isinstance(sensor, KnowsTorch) else None
+        truth = eyes.true_torch()
     return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
 
 
-def _tag_reader(sensor: TactileSensor, reader: Reader, simulated: bool) -> FingerCameraReader:
-    return SteppedReader(sensor, reader) if simulated else ThreadedReader(sensor, reader)
+def _tag_reader(job: CameraJob, simulated: bool) -> FingerCameraReader:
+    return SteppedReader(job) if simulated else CameraProcess(job)
 
 
 def _plan_text(plan: Path, params: WeldTactileParams) -> str:

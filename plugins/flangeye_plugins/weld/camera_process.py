@@ -1,0 +1,171 @@
+"""The finger's camera in a process of its own, beside the control loop.
+
+There its images are taken and read, and drawn where it is simulated: none of that keeps a cycle
+waiting, and a camera's client that crashes takes no weld with it. The process answers one question
+after the other, so that nothing ever queues up; a thread of the program asks them.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import signal
+import threading
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import Any, Self
+
+from flangeye.devices import PATIENCE, DeviceError, RobotState, TactileSensor
+from flangeye.errors import FlangeyeError
+from flangeye.files.children import keep_current_folder_out
+from flangeye.files.load import busy
+from flangeye.types import Floats
+from flangeye_plugins.weld.finger_camera import (
+    CameraJob,
+    LatestState,
+    Reader,
+    TagObservation,
+    torch_of,
+)
+
+OPENING = 30.0
+"""Longest time for a camera to open, the start of its process included [s]."""
+
+POLLING = 2e-3
+"""Between two looks for a new image [s]."""
+
+OPENED, TORCH = "opened", "torch"
+"""What the process says once the camera is open; what it is asked for where the torch was."""
+
+
+class CameraProcess:
+    """Reads a finger's camera in another process: the loop never waits for an image."""
+
+    def __init__(self, job: CameraJob) -> None:
+        """Prepare for a camera; it is opened when the context begins."""
+        self._wire, self._theirs = multiprocessing.Pipe()
+        self._process = multiprocessing.get_context("spawn").Process(
+            target=camera_process, args=(self._theirs, job), name="finger", daemon=True
+        )
+        self._state = job.state
+        self._sights: queue.SimpleQueue[TagObservation] = queue.SimpleQueue()
+        self._ending = threading.Event()
+        self._error: DeviceError | None = None
+        self._thread = threading.Thread(target=self._watch, name="finger", daemon=True)
+
+    def seen(self) -> list[TagObservation]:
+        """Return what has arrived; raise DeviceError where the camera is lost."""
+        if self._error is not None:
+            raise self._error
+        sights: list[TagObservation] = []
+        while not self._sights.empty():
+            sights.append(self._sights.get())
+        return sights
+
+    def tell(self, state: RobotState) -> None:
+        """Take the arm's newest sample; the thread passes it on."""
+        self._state = state
+
+    def true_torch(self) -> tuple[Floats, Floats] | None:
+        """Return where a simulated torch really was, or None; no image is read any more."""
+        self._end_watch()
+        with suppress(OSError, EOFError):
+            self._wire.send(TORCH)
+            if self._wire.poll(PATIENCE):
+                truth: tuple[Floats, Floats] | None = self._wire.recv()
+                return truth
+        return None
+
+    def __enter__(self) -> Self:
+        """Open the camera.
+
+        Raises:
+            DeviceError: It cannot be opened, or not in time.
+        """
+        keep_current_folder_out()
+        self._process.start()
+        self._theirs.close()
+        try:
+            self._check_opened()
+        except DeviceError:
+            self._end()
+            raise
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_watch()
+        self._end()
+
+    def _check_opened(self) -> None:
+        try:
+            if not self._wire.poll(OPENING):
+                raise DeviceError(f"the finger's camera does not open ({OPENING:.0f} s){busy()}")
+            answer = self._wire.recv()
+        except (EOFError, OSError):
+            raise DeviceError("the finger's camera cannot be opened: its process ended") from None
+        if isinstance(answer, DeviceError):
+            raise answer
+
+    def _watch(self) -> None:
+        try:
+            while not self._ending.is_set():
+                self._wire.send(self._state)
+                answer = self._wire.recv()
+                if isinstance(answer, DeviceError):
+                    self._error = answer
+                    return
+                if answer is None:
+                    self._ending.wait(POLLING)
+                else:
+                    self._sights.put(answer)
+        except (EOFError, OSError):
+            self._error = DeviceError("the finger's camera is lost: its process has ended")
+
+    def _end_watch(self) -> None:
+        self._ending.set()
+        self._thread.join(PATIENCE)
+
+    def _end(self) -> None:
+        """Let go of the camera; a client of it that hangs is ended."""
+        self._wire.close()
+        self._process.join(PATIENCE)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def camera_process(wire: Connection, job: CameraJob) -> None:
+    """Open the camera and answer until the program lets go; the main function of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program is told, and ends this
+    latest = LatestState(job.state)
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the program is gone
+        try:
+            reader, sensor = Reader(job.finger), job.open(latest)
+        except Exception as error:
+            wire.send(_told("the finger's camera", error))
+            return
+        with sensor:
+            wire.send(OPENED)
+            while True:
+                question = wire.recv()
+                wire.send(_answer(question, sensor, reader, latest))
+
+
+def _answer(question: Any, sensor: TactileSensor, reader: Reader, latest: LatestState) -> Any:
+    """Return where the torch was; or, told where the arm is, what is seen, or why nothing is."""
+    if question == TORCH:
+        return torch_of(sensor)
+    latest.tell(question)
+    try:
+        frame = sensor.frame()
+        return None if frame is None else reader.read(frame)
+    except Exception as error:
+        return _told(sensor.name, error)
+
+
+def _told(name: str, error: Exception) -> DeviceError:
+    """Return what a camera's client did wrong; it may fail in any way."""
+    if isinstance(error, FlangeyeError):
+        return DeviceError(str(error))
+    return DeviceError(f"{name}: failed with {type(error).__name__}: {error}")
