@@ -174,10 +174,13 @@ class Contact:
         moved_by = np.array([y - across, z - up])
         push_y, push_z = (stiff @ moved_by).tolist()
         along = self._drag(math.hypot(push_y, push_z)) + float(slides @ moved_by)
-        place = root.at(self._s + along)
         self.force = np.array([self._tip.lateral * along, push_y, push_z])
-        side = y + moved + aside
-        self.position = np.array([*(place.point + side * place.normal), place.height + fill + z])
+        # Beyond a curve's centre a foot jumps, and the tip with it: only what moves it counts.
+        there, offset = root.at(self._s + along), moved + aside
+        aside_to = there.point + (y + offset) * there.normal
+        aside_from = place.point + (across + offset) * place.normal
+        rise = there.height - place.height + z - up
+        self.position = rest + np.array([*(aside_to - aside_from), rise])
         return self.position
 
     def _section(self, wider: float) -> Joint:

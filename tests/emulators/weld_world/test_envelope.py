@@ -172,6 +172,7 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
         pytest.param(960657, id="walls that open faster than the tool comes down"),
         pytest.param(960445, id="the same, before a wall that is missing"),
         pytest.param(960268, id="tip that leaves the groove over the other wall, let go of"),
+        pytest.param(970674, id="off a seam whose waves are narrower than that, in the air"),
         pytest.param(910752, id="curved walls askew in the sweep taken for a finger's gain"),
     ],
 )

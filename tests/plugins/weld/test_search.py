@@ -58,6 +58,20 @@ def test_a_tip_that_is_bent_aside_by_half_a_millimetre_touches_something(
     assert rested(rest=rest).bent == bent
 
 
+def test_a_tip_that_moves_about_in_the_air_is_not_free() -> None:
+    search = Search(SETTINGS, Belief(40e-3))
+    for i in range(10):
+        search.feel(np.array([(-1) ** i * 0.6e-3, 0.0, 0.0]), 0.0, 0.0)
+    assert np.linalg.norm(search.rest) < 0.5e-3 and search.bent
+
+
+def test_a_tag_that_is_misread_once_bends_nothing() -> None:
+    search = Search(SETTINGS, Belief(40e-3))
+    for i in range(10):
+        search.feel(np.array([6e-3 * (i == 4), 0.0, 0.0]), 0.0, 0.0)
+    assert not search.bent
+
+
 def test_something_is_touched_at_half_the_preload_by_three_measurements() -> None:
     search = fed(rested(), 9, 0.0, 0.49 * PRELOAD)
     assert not search.down and search.step(0.0) == 0.0
