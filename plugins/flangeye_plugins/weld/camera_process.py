@@ -103,7 +103,9 @@ class CameraProcess:
                 raise DeviceError(f"the finger's camera does not open ({OPENING:.0f} s){busy()}")
             answer = self._wire.recv()
         except (EOFError, OSError):
-            raise DeviceError("the finger's camera cannot be opened: its process ended") from None
+            raise DeviceError(
+                "the finger's camera cannot be opened: its process has ended"
+            ) from None
         if isinstance(answer, DeviceError):
             raise answer
 
@@ -141,7 +143,7 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
     latest = LatestState(job.state)
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the program is gone
         try:
-            reader, sensor = Reader(job.finger), job.open(latest)
+            reader, sensor = Reader(job.finger), job.camera(latest)
         except Exception as error:
             wire.send(_told("the finger's camera", error))
             return

@@ -93,7 +93,7 @@ class CameraJob(NamedTuple):
     state: RobotState
     seed: Seed
 
-    def open(self, robot: StateSource) -> TactileSensor:
+    def camera(self, robot: StateSource) -> TactileSensor:
         """Open the camera, which may ask ``robot`` where it is."""
         sensor: TactileSensor = self.sensor(self.finger, robot, self.seed)
         return sensor
@@ -133,7 +133,7 @@ class SteppedReader:
             StageError: It cannot be opened.
         """
         self._latest = LatestState(job.state)
-        self._reader, self._sensor = Reader(job.finger), job.open(self._latest)
+        self._reader, self._sensor = Reader(job.finger), job.camera(self._latest)
 
     def seen(self) -> list[TagObservation]:
         """Return what has arrived; raise DeviceError where the camera is lost."""
