@@ -9,7 +9,7 @@ import pytest
 
 from flangeye.devices import DeviceError, RobotState, SensorFrame
 from flangeye.errors import StageError
-from flangeye.types import BASE, FLANGE, Image, Transform
+from flangeye.types import BASE, FLANGE, Image, Seed, Transform
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
 from tests.plugins.weld.test_touch import FINGER
@@ -89,7 +89,7 @@ def state(time_ns: int) -> RobotState:
 
 
 def job(sensor: Any) -> CameraJob:
-    return CameraJob(sensor, FINGER, state(1), 0)
+    return CameraJob(sensor, FINGER, state(1), Seed(0))
 
 
 def first_sight(camera: CameraProcess) -> Any:
