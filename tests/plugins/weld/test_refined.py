@@ -180,3 +180,10 @@ def test_the_length_of_a_field_is_that_which_makes_what_was_felt_likeliest(lengt
     assert motion.field.length == best and best in (length / 2, length, 2 * length)
     assert motion.field.variance == pytest.approx(waviness)
     assert motion.shift == pytest.approx(likely[best].shift, rel=1e-4, abs=1e-7)
+
+
+def test_a_suspected_piece_is_doubted_four_millimetres_beyond_its_ends_and_no_farther() -> None:
+    refined = RefinedPath(Path(np.array([[0.0, 0, 0], [0.1, 0, 0]])), 0.05)
+    refined.suspect(0.0301, 0.0501, 1e-3)
+    for s, doubted in ((0.0261, True), (0.0256, False), (0.0541, True), (0.0546, False)):
+        assert (refined.doubt(s) == 1e-3) == doubted
