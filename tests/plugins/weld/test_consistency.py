@@ -112,3 +112,19 @@ def test_a_tip_is_doubted_by_the_lesser_of_what_it_went_aside_and_what_it_climbe
             seating.judge(i * 2e-4, *((aside, lifted) if i >= 119 else (0.0, 0.0)))
         # One of the newest five is aside; held against a line that knows no scatter.
         assert seating.doubt == pytest.approx(doubt / 5, rel=1e-6)
+
+
+def test_a_tip_is_higher_for_long_when_it_was_so_for_two_centimetres_of_its_own_way() -> None:
+    """Wherever on the seam it began, and by more than joints are uneven and plans tilted."""
+    began = 0.2
+    seating = Seating(1.0, 1.0)
+    seating.seated(np.array([[began + 1e-5 * i, 0.0, 0.0] for i in range(40)]))
+    felt = list[tuple[float, float]]()
+    for away in np.arange(0.0, 0.03, 0.3e-3).tolist():
+        assert seating.judge(began + away, 0.0, 2e-3) is None
+        felt.append((away, seating.risen))
+    assert all(risen == 0.0 for away, risen in felt if away < 19.9e-3)
+    assert all(risen > 0.0 for away, risen in felt if away > 20.5e-3)
+    # What the plan may be tilted by to the middle of those two centimetres is not told.
+    away, risen = felt[-1]
+    assert risen == pytest.approx((2e-3 - 0.02 * (away - 0.01)) / 0.35, rel=0.01)
