@@ -76,11 +76,10 @@ def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: f
     votes = np.zeros(size * size)
     for points, radius in edges:
         angle = np.arange(0, 2 * np.pi, cell / radius)
-        circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        circle = radius / cell * np.stack([np.cos(angle), np.sin(angle)])
+        near = (points - start).T / cell + half
         x, y = (
-            np.rint(np.add.outer(points[:, k] - start[k], circle[:, k]) / cell).astype(np.intp)
-            + half
-            for k in range(2)
+            np.rint(np.add.outer(*each)).astype(np.intp) for each in zip(near, circle, strict=True)
         )
         # Seen without a sign, what lies before the first cell lies beyond the last as well.
         inside = np.maximum(x.view(np.uintp), y.view(np.uintp)) < size

@@ -6,6 +6,7 @@ Calibrations find the optical frame (z along the view); a camera's own URDF hang
 
 from __future__ import annotations
 
+from html import escape  # that of xml.sax imports Python's HTTP client
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -85,13 +86,11 @@ def _joints(pose: CalibratedPose, params: UrdfParams) -> str:
 
 
 def _joint(parent: str, child: str, matrix: Floats) -> str:
-    from xml.sax.saxutils import quoteattr  # which imports Python's HTTP client
-
     numbers = fixed(CONVENTIONS["rpy"].numbers(matrix))
-    return f"""  <link name={quoteattr(child)}/>
-  <joint name={quoteattr(child + "_joint")} type="fixed">
-    <parent link={quoteattr(parent)}/>
-    <child link={quoteattr(child)}/>
+    return f"""  <link name="{escape(child)}"/>
+  <joint name="{escape(child)}_joint" type="fixed">
+    <parent link="{escape(parent)}"/>
+    <child link="{escape(child)}"/>
     <origin xyz="{" ".join(numbers[:3])}" rpy="{" ".join(numbers[3:])}"/>
   </joint>
 """
