@@ -304,3 +304,15 @@ def test_a_place_is_gone_to_at_a_speed_and_slower_near_to_it() -> None:
     assert _towards(np.array([3.0, 4.0]), 0.1) == pytest.approx([0.06, 0.08])
     assert _towards(np.array([3e-3, 4e-3]), 0.1) == pytest.approx([6e-3, 8e-3])
     assert _towards(np.zeros(2), 0.1) == pytest.approx([0.0, 0.0])
+
+
+def test_a_torch_on_its_swing_goes_on_with_it_and_one_beside_it_is_brought_back() -> None:
+    found = rooted(passes({"up": "3 mm", "weave_width": "4 mm", "weave_frequency": 0.5}), 0.0)
+    found._response.dead_time = found._response.lag = 0.0
+    turn, half = math.pi, 2e-3
+    for off in (0.0, 0.3e-3, -0.3e-3):
+        passing(found)._began = 5.0
+        aside, rate = half * math.sin(turn * 0.3), half * turn * math.cos(turn * 0.3)
+        there = pose(0.03 + DISTANCE, aside + off, 3e-3, time=5.3)
+        assert found._weld(there).velocity[1] == pytest.approx(rate - 2 * off)
+        assert found.band == pytest.approx(abs(off) + 2 * found.sigma)

@@ -12,7 +12,8 @@ from flangeye_plugins.weld.weld_log import Cycle, WeldLog, columns
 
 
 def cycle(i: int) -> Any:
-    return Cycle(*(float(i) for _ in Cycle._fields))
+    every: Any = [float(i)] * len(Cycle._fields)
+    return Cycle(*every)
 
 
 def sight(felt: Any = None) -> Any:
@@ -43,7 +44,7 @@ def test_images_are_numbered_from_when_the_weld_begins_and_kept_where_a_tag_was_
     with WeldLog(lambda name, value: written.append((name, value)), False) as log:
         log.before(sight("touched"))
         assert [log.saw(sight(felt)) for felt in (None, "left", "right")] == [0, 1, 2]
-    assert log.felt == {1: "left", 2: "right"} and log.sights == 3
+    assert dict[int, Any](log.felt) == {1: "left", 2: "right"} and log.sights == 3
     sights = [value for name, value in written if name == "sight"]
     assert [(each["number"], each["tag"]) for each in sights] == [
         (-1, True), (0, False), (1, True), (2, True),
