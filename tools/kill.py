@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from flangeye.batch.scratch import PREFIX
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command
 from flangeye.log.read import read_run
@@ -148,7 +149,7 @@ class Trial:
         for pid, command in left.items():
             yield f"a process is left: {command}"
             os.kill(pid, signal.SIGKILL)
-        forgotten = {*_temporary(out).iterdir(), *map(Path, shared)} - {_scratch(out)}
+        forgotten = {*_temporary(out).iterdir(), *map(Path, shared)} - {*_scratch(out)}
         yield from (f"{path} is left" for path in sorted(forgotten) if path.exists())
 
     def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
@@ -178,7 +179,7 @@ class Trial:
         _, told = again.communicate()
         if again.returncode not in (0, 1):
             yield f"{' '.join(command)}: {told.decode().strip()}"
-        yield from (f"{path} is left" for path in _scratch(out).glob("*/"))
+        yield from (f"{path} is left" for path in _scratch(out))
 
     def _start(
         self, command: tuple[str, ...], out: Path, stderr: int = subprocess.DEVNULL
@@ -198,9 +199,9 @@ def _temporary(out: Path) -> Path:
     return out.with_name(f"{out.name}-tmp")
 
 
-def _scratch(out: Path) -> Path:
-    """Return where dask's workers have their folders; its next start removes the killed ones'."""
-    return _temporary(out) / "dask-scratch-space"
+def _scratch(out: Path) -> list[Path]:
+    """Return where dask's processes have their folders; the next batch removes a killed one's."""
+    return list(_temporary(out).glob(f"{PREFIX}*"))
 
 
 def _finished(log: Path) -> list[str]:

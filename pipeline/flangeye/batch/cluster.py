@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from itertools import groupby, islice
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from flangeye.batch.dataset import BLOCK
 from flangeye.batch.outcome import SessionOutcome
 from flangeye.batch.plan import BatchSession
 from flangeye.batch.request import BatchError, Tls
+from flangeye.batch.scratch import scratch
 from flangeye.batch.work import WORKER_DIED, Chunk, ChunkTold, Job, run_chunk, write_rows
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import keep_current_folder_out, python_command
@@ -73,6 +75,11 @@ _LOCAL = {
 }
 
 
+def _local(folder: Path) -> dict[str, Any]:
+    """Return dask's settings for workers of this machine, whose files are in a folder."""
+    return {**_LOCAL, "temporary-directory": str(folder)}
+
+
 def check_installed() -> None:
     """Refuse to start without the packages of the extra.
 
@@ -100,7 +107,7 @@ def local_client(workers: int) -> Iterator[Client]:
 
     keep_current_folder_out()
 
-    with dask.config.set(_LOCAL), ExitStack() as stack:
+    with scratch() as folder, dask.config.set(_local(folder)), ExitStack() as stack:
         with _interrupts_kept_here():
             cluster = LocalCluster(
                 n_workers=workers,
