@@ -440,3 +440,16 @@ def test_as_many_heights_are_felt_beside_the_stroke_as_make_their_mean_known() -
                 found.feel(cycle * PERIOD, -where, sigma * rng.standard_normal(), 0.0)
             where += speed * PERIOD
         assert found._sliding._enough == pytest.approx(max(enough, 6.0), rel=0.4)
+
+
+@pytest.mark.parametrize("images", [0, 1, 2, 3])
+def test_a_sweep_in_which_the_tag_is_hardly_seen_comes_to_its_end_and_says_so(images: int) -> None:
+    found = going()
+    for cycle in range(6000):
+        found.note(cycle * PERIOD, found.velocity(PERIOD), 0.0)
+        if found.over:
+            break
+        found.along(PERIOD)
+        if cycle < images:
+            found.feel(cycle * PERIOD, -1e-3, 0.0, 0.0)
+    assert found.over and "seen too seldom" in found.learned()
