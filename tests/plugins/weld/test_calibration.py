@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.devices import SensorFrame
 from flangeye.errors import StageError
 from flangeye.files.bundled import bundled
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Floats, Image
+from flangeye_plugins.weld.finger_camera import Reader
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.pivot import pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
@@ -264,3 +266,18 @@ def test_one_tag_and_no_other_is_taken_for_the_finger_s(
         assert corners is None and detector.find(image) is None
     else:
         assert corners == pytest.approx(shown.corners[found][0])
+
+
+def test_a_tag_that_is_seen_with_three_tenths_of_confidence_is_felt() -> None:
+    """Its corners are then off by 0.7 px at most; what is worth less is no touch."""
+    image, corners = Image(np.zeros((60, 90), np.uint8), MATRIX), np.full((4, 2), 30.0)
+    for confidence, felt in ((0.29, False), (0.31, True)):
+        reader: Any = Reader(FINGER)
+        seen = TagReading(REST, np.zeros(3), np.eye(3), confidence, corners)
+        reader._detector = SimpleNamespace(find=lambda piece, seen=seen: seen)
+        found = reader.read(SensorFrame(image, 5))
+        assert (found.feeling is not None) == felt and found.time_ns == 5
+        assert reader.read(SensorFrame(image, 6)).piece.corner == (14, 14)  # there it is looked for
+        reader._detector = SimpleNamespace(find=lambda piece: None)
+        assert reader.read(SensorFrame(image, 7)).feeling is None
+        assert reader.read(SensorFrame(image, 8)).piece.corner == (0, 0)
