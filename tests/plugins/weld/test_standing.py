@@ -23,7 +23,14 @@ from flangeye_plugins.weld.joint import Joint, JointKind, edges_half_angle, join
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.resuming import _require_same, controller_of, set_back, task_of
+from flangeye_plugins.weld.resuming import (
+    _ahead,
+    _behind,
+    _require_same,
+    controller_of,
+    set_back,
+    task_of,
+)
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.touch.region_of_interest import RegionOfInterest, cut, shifted
 from tests.plugins.weld.bench import straight
@@ -304,3 +311,16 @@ def test_room_is_round_the_outside_of_an_upright_plate_alone(
             continue
         with pytest.raises(StageError, match="would run into a wall"):
             leg_of(seam, given)
+
+
+@pytest.mark.parametrize("distance", [0.031, 0.0364, 0.0407])
+def test_tip_and_torch_are_set_down_a_tool_s_length_apart_to_half_a_millimetre(
+    distance: float,
+) -> None:
+    turn = np.linspace(0.0, 4.0, 800)
+    plan = Path(0.06 * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn]))
+    for place in (0.05, 0.09, 0.1303):
+        here = plan.at(place).point
+        for found in (_ahead(plan, place, distance), _behind(plan, place, distance)):
+            apart = np.linalg.norm(plan.at(found).point - here)
+            assert distance - 1e-12 <= apart < distance + 0.5e-3
