@@ -92,7 +92,16 @@ def with_body(finger: Finger, found: Pivoted) -> Finger:
 
 def summary_lines(found: Pivoted) -> list[str]:
     """Return what was found, for people."""
-    return [_line("tip", found.tip), _line("torch", found.torch)]
+    tip, torch = (
+        "'" + ", ".join(f"{x * 1e3:.2f} mm" for x in point.point) + "'" for point in found
+    )
+    return [
+        _line("tip", found.tip),
+        _line("torch", found.torch),
+        "check      bring either to a point that the scanner saw, X,Y,Z in a calibration's RUN:",
+        f"           flangeye touch RUN --seen X,Y,Z --tip {tip}",
+        f"           flangeye touch RUN --seen X,Y,Z --tip {torch}",
+    ]
 
 
 def _line(name: str, found: Pivot) -> str:

@@ -1,5 +1,6 @@
 """Where tip and torch are: pivots with known truth, what is refused, and the guided procedure."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import load_recipe
+from flangeye.units import parse_quantity
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.guide.pivoting import ATTITUDES, Pivoted, with_body
 from flangeye_plugins.guide.tactile import guide_tool
@@ -137,3 +139,6 @@ def test_the_guided_procedure_finds_tip_and_torch(tmp_path: Path) -> None:
     assert found.calibration is not None
     assert "\ntip        at (1.5" in told
     assert 0.03e-3 < found.tip_sigma < 0.3e-3
+    tips = re.findall(r"flangeye touch RUN --seen X,Y,Z --tip '(.+)'$", told, re.MULTILINE)
+    given = [[parse_quantity(each, "length") for each in tip.split(", ")] for tip in tips]
+    np.testing.assert_allclose(given, [found.tip, torch], atol=0.006e-3)
