@@ -140,5 +140,5 @@ def test_the_guided_procedure_finds_tip_and_torch(tmp_path: Path) -> None:
     assert "\ntip        at (1.5" in told
     assert 0.03e-3 < found.tip_sigma < 0.3e-3
     tips = re.findall(r"flangeye touch RUN --seen X,Y,Z --tip '(.+)'$", told, re.MULTILINE)
-    given = [[parse_quantity(each, "length") for each in tip.split(", ")] for tip in tips]
-    np.testing.assert_allclose(given, [found.tip, torch], atol=0.006e-3)
+    given = np.array([[parse_quantity(each, "length") for each in t.split(", ")] for t in tips])
+    np.testing.assert_allclose(given, np.array([found.tip, torch]), atol=0.006e-3)
