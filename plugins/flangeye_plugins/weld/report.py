@@ -32,7 +32,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     """Return the report of a weld; ``truth`` is of a simulation: times, and the true torch."""
     every = columns(weld_log.cycles)
     kept = np.unique(np.linspace(0, len(weld_log.cycles) - 1, SAMPLES).round().astype(int))
-    kept = kept[kept >= 0]
+    kept = kept[: len(weld_log.cycles)]  # none where there was no cycle
     cycle = {name: np.array(every[name])[kept] for name in ("time", "angle", "velocity", "turn")}
     robot = np.array(every["position"]).reshape(-1, 3)[kept]
     tip, deflection = _tip_displacements(weld_log, plan, body, kept)

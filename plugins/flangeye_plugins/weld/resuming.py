@@ -166,9 +166,9 @@ def set_back(
     release = params.speed * params.deflection / params.release
     last = plan.length - params.ending - release - PRESSING
     lit = kept.torch - params.overlap
-    tip = min(_ahead(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
-    if tip < params.inset:
+    if last < params.inset:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
+    tip = min(_ahead(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
     return _standing(params, plan, distance, max(lit, params.offset_along), tip)
 
 

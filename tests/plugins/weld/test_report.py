@@ -145,3 +145,9 @@ def test_what_the_sweep_found_is_among_the_figures() -> None:
     assert learned_figures(controller)["lit_from"] == 0.02
     other: Any = SimpleNamespace()
     assert learned_figures(other) == {}
+
+
+def test_a_weld_that_ended_before_its_first_cycle_says_why() -> None:
+    report = reported(logged(0), reason="the arm is lost")
+    assert report.reason == "the arm is lost" and not report.completed
+    assert report.time.shape == (0,) and report.tip.shape == report.torch.shape == (0, 3)

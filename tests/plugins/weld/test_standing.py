@@ -54,6 +54,11 @@ def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Weld
 # --- going on -------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("torch", [0.0, 2e-3, 5e-3, 10.9e-3])
+def test_a_weld_that_has_hardly_begun_begins_again_where_it_did(torch: float) -> None:
+    assert again(torch).inset == pytest.approx(params().inset)
+
+
 def test_the_torch_is_lit_an_overlap_before_the_stop_and_set_down_a_run_in_before_that() -> None:
     """In which it takes back what the sweep led it aside by: twice 8 mm."""
     found = again(0.2, overlap="30 mm")
