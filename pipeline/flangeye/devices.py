@@ -266,6 +266,52 @@ class TactileSensor(Protocol):
 
 
 @dataclass(frozen=True)
+class WeldProfile:
+    """One look at the bead behind a torch.
+
+    Attributes:
+        offset: How far the bead's middle is to the left of the joint, seen along the weld [m].
+        sigma: Standard deviation of that [m].
+        time_ns: When the profile was taken, on the robot's clock.
+    """
+
+    offset: float
+    sigma: float
+    time_ns: int
+
+
+@runtime_checkable
+class Profiler(Protocol):
+    """A profile sensor on the tool that looks at the bead, a fixed way behind the torch.
+
+    Attributes:
+        name: For people.
+        behind: How far behind the torch it looks [m].
+    """
+
+    name: str
+    behind: float
+
+    def profile(self) -> WeldProfile | None:
+        """Return the newest look not yet returned, or None; never waits.
+
+        Where no bead and joint can be told in a profile there is no look.
+
+        Raises:
+            DeviceError: The sensor is lost.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the sensor; safe to call twice."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@dataclass(frozen=True)
 class RobotDriver:
     """The recipe's ``robot.driver``, not yet opened.
 

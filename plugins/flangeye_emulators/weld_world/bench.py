@@ -71,7 +71,8 @@ def try_condition(
     controller = controller_of(plan, belief, settings, "tactile")
     watch(controller)
     nominal = Nominal(true, section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
-    start = replace(start_at(plan, belief, settings, period), longest=120.0 * passes)
+    start = start_at(plan, belief, settings, period)
+    start = replace(start, longest=120.0 * passes, look=condition.look)
     return run_trial(controller, nominal, condition.truth, start, seed)
 
 
@@ -90,7 +91,8 @@ def known(condition: Condition, body: Body, settings: Following) -> tuple[Sectio
         half_angle = condition.half_angle or SECTION.half_angle
         section = Section(half_angle, SECTION.depth)
     belief = belief_of(Finger.model_validate(FINGER), body, half_angle, settings)
-    return section, replace(belief, **condition.belief)
+    behind = None if condition.look is None else condition.look.behind
+    return section, replace(belief, behind=behind, **condition.belief)
 
 
 def start_at(plan: Path, belief: Belief, settings: Following, period: float) -> Start:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye_emulators.weld_world.groove import Section, square_butt
-from flangeye_emulators.weld_world.settings import WorldParams
+from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
 
 
 class Condition(NamedTuple):
@@ -21,6 +21,7 @@ class Condition(NamedTuple):
         belief: What the files say of the tool, beside its defaults.
         half_angle: Half angle of the groove [rad], as planned too, where it is not the usual one.
         section: Cross-section of another joint; the controller knows its kind alone.
+        look: A look behind the torch, if there is one.
     """
 
     world: Mapping[str, Mapping[str, Any]] = {}
@@ -29,6 +30,7 @@ class Condition(NamedTuple):
     belief: Mapping[str, Any] = {}
     half_angle: float | None = None
     section: Section | None = None
+    look: LookTruth | None = None
 
     @property
     def truth(self) -> WorldParams:
@@ -70,8 +72,20 @@ CONDITIONS: Mapping[str, Condition] = {
     "heat: seam moves 2 mm": Condition(
         {"heat": {"shift": "2 mm"}}, {"distortion": "0.3 mm", "max_error": "2 mm"}
     ),
+    "heat: seam moves 2 mm, with a look behind": Condition(
+        {"heat": {"shift": "2 mm"}}, {"distortion": "0.3 mm", "max_error": "2 mm"},
+        look=LookTruth(),
+    ),
     "heat: 1 mm around the torch": Condition(
         {"heat": {"local": "1 mm"}}, {"distortion": "0.5 mm", "max_error": "2.5 mm"}
+    ),
+    "heat: 1 mm around the torch, with a look behind": Condition(
+        {"heat": {"local": "1 mm"}}, {"distortion": "0.5 mm", "max_error": "3.5 mm"},
+        look=LookTruth(),
+    ),
+    "torch 0.2 mm aside": Condition({"tool": {"torch": ["0 mm", "0.2 mm"]}}),
+    "torch 0.2 mm aside, with a look behind": Condition(
+        {"tool": {"torch": ["0 mm", "0.2 mm"]}}, look=LookTruth()
     ),
     "seam wavy 1 mm per 10 mm": Condition(
         {"workpiece": {"wave": "1 mm"}}, {"max_error": "1.5 mm"}

@@ -111,6 +111,23 @@ class HeatTruth(Params):
     radius: Length = param("15 mm", gt=0, description="How far that reaches.")
 
 
+class LookTruth(Params):
+    """A profile sensor behind the torch: what it sees, and when."""
+
+    behind: Length = param("30 mm", gt=0, le=0.2, description="How far behind the torch it looks.")
+    noise: Length = param("0.05 mm", gt=0, description="Standard deviation of one look; stated.")
+    rate: float = Field(10.0, gt=0, le=200, description="Looks per second.")
+    latency: Duration = param("50 ms", ge=0, description="From the exposure to the measurement.")
+    jitter: Duration = param("5 ms", ge=0, description="Standard deviation of the latency.")
+    dropped: float = Field(0.1, ge=0, lt=1, description="Share of looks that see no bead.")
+
+    @property
+    def clock(self) -> ClockTruth:
+        """When it looks, and when that arrives."""
+        named = ("rate", "latency", "jitter", "dropped")
+        return ClockTruth().model_copy(update={name: getattr(self, name) for name in named})
+
+
 class WorldParams(Params):
     """All that is true of a simulated weld."""
 

@@ -11,8 +11,10 @@ from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_emulators.weld_world.arm import ArmResponse
 from flangeye_emulators.weld_world.clock import Shutter
-from flangeye_emulators.weld_world.settings import WorldParams
+from flangeye_emulators.weld_world.look import LookBehind
+from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
+from flangeye_plugins.weld.follower import Follower
 
 
 class Row(NamedTuple):
@@ -91,12 +93,14 @@ class Start:
         angle: Angle of the tool [rad].
         period: Period of a cycle [s].
         longest: When it is broken off [s].
+        look: A look behind the torch, if there is one.
     """
 
     position: tuple[float, float, float]
     angle: float = 0.0
     period: float = 8e-3
     longest: float = 120.0
+    look: LookTruth | None = None
 
 
 def run_trial(
@@ -109,6 +113,7 @@ def run_trial(
     pose = ToolPose(1.0, np.asarray(start.position, dtype=np.float64), start.angle)
     arm = ArmResponse(truth.arm, pose, start.period)
     noise = truth.finger.noise * np.array([1.0, 1.0, 6.0])
+    look = None if start.look is None else LookBehind(start.look, np.random.default_rng([seed, 2]))
     rows: list[Row] = []
     phases: list[str] = []
     while arm.pose.time < start.longest and controller.phase not in ("done", "stopped"):
@@ -117,6 +122,10 @@ def run_trial(
         if shutter.due(age) and not shutter.hidden(age):
             shutter.expose(arm.pose.time, age, shown + noise * rng.standard_normal(3))
         seen = shutter.arrived(arm.pose.time)
+        if look is not None and isinstance(controller, Follower):
+            look.watch(arm.pose.time, world)
+            if (profile := look.profile(arm.pose.time)) is not None:
+                controller.looked(profile)
         command = controller.step(arm.pose, [Touch(*seen)] if seen else [])
         rows.append(_row(world, arm.pose, controller, command))
         phases.append(controller.phase)

@@ -59,6 +59,7 @@ class Belief:
         lean: Of the walls' bisector from the plane's normal, to the left [rad].
         radius: Of the tip's ball [m].
         level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.body`.
+        behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
     """
 
     distance: float
@@ -73,6 +74,7 @@ class Belief:
     lean: float = 0.0
     radius: float = 1.5e-3
     level_R_tool: tuple[tuple[float, ...], ...] = UPRIGHT
+    behind: float | None = None
 
     @property
     def joint(self) -> Joint | None:
@@ -158,6 +160,10 @@ class Belief:
         creep = CREEP * settings.deflection
         parts = (self.torch_sigma, 2.0 * settings.arm_sigma, settings.distortion, creep)
         return sum(part**2 for part in parts) + self._seat_variance(settings)
+
+    def arm_variance(self, settings: Following) -> float:
+        """Return the arm's part of the fixed variance [m^2]."""
+        return (2.0 * settings.arm_sigma) ** 2
 
     def _seat_variance(self, settings: Following) -> float:
         """Return the variance of where the tip rests in a joint whose walls lean differently."""

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
+from flangeye_plugins.weld.bias import Bias, Trail
 from flangeye_plugins.weld.consistency import LASTING, Seating
 from flangeye_plugins.weld.contact import Contact, Hold, Release
 from flangeye_plugins.weld.motion import SeamReading, Track
@@ -104,6 +106,7 @@ class Follower:
         band: The same for 95 % of the seam [m].
         aim: How far to the left of the seam the torch is to be [m].
         lit: Where the torch first was within ``max_error``, and so may weld, by arc length [m].
+        bias: What a look behind the torch says of errors that nothing else measures.
     """
 
     def __init__(
@@ -140,6 +143,9 @@ class Follower:
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
         self._belief, self.learned = belief, Learned()
+        prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
+        self.bias = Bias(prior, settings.distortion, belief.distance)
+        self._trail = Trail()
         self.sigma = self.bound = self.band = 0.0
         self.aim = self._offset = settings.offset_across
         self._weave = Weave(settings.weave_width, settings.weave_frequency)
@@ -220,7 +226,7 @@ class Follower:
         velocity = self._velocity(coming, self._pace(coming, normal))
         sway = self._swayed(coming.time)
         there = float((self._torch_position(coming) - point) @ normal)
-        error = there - self._offset - sway.aside
+        error = there - (self._offset - self.bias.value) - sway.aside
         self._estimate(pose)
         turn = self._steering.turn(velocity[:2], coming.direction, normal, error, sway.rate)
         return Command(velocity, turn if velocity[:2].any() else 0.0)
@@ -246,9 +252,10 @@ class Follower:
         if not self._touching:
             return
         point, normal = self.refined.frame(self.torch)
-        error = abs(float((self._torch_position(pose) - point) @ normal) - self.aim)
-        error += self.refined.doubt(self.torch)
-        self.sigma = math.sqrt(self._variance(float(pose.direction @ normal), pose.angle))
+        raw = float((self._torch_position(pose) - point) @ normal)
+        error = abs(raw - (self.aim - self.bias.value)) + self.refined.doubt(self.torch)
+        variance = self._variance(float(pose.direction @ normal), pose.angle)
+        self.sigma = math.sqrt(variance)
         self.band, self.bound = error + BAND * self.sigma, error + LIMIT * self.sigma
         welds_from = max(self._settings.offset_along, 0.0)
         if (
@@ -256,6 +263,8 @@ class Follower:
             or not welds_from <= self.torch <= self._plan.length
         ):
             return
+        if self.lit is not None:
+            self._trail.pass_by(pose.time, self.torch, raw, variance - self._unseen())
         if self.bound <= self._settings.max_error:
             self.lit = self.torch if self.lit is None else self.lit
         elif self.lit is not None or self.torch > welds_from + LEAD_IN * self._belief.distance:
@@ -273,13 +282,34 @@ class Follower:
         settings, learned = self._settings, self.learned
         aged = settings.gain_drift * ((self._time or 0.0) - self._began) / MINUTE
         gain = (learned.gain_sigma + aged * (self.phase != "seeking")) * settings.deflection
-        fixed = self._belief.fixed_variance(settings) + (self._belief.along_sigma * slant) ** 2
+        fixed = self._unseen() + (self._belief.along_sigma * slant) ** 2
         play = (PLAYED * learned.width) ** 2 + learned.unexplained**2
         # What the tip is off by is off for the torch too: all but what the tool has turned between.
         turned_by = 2.0 * math.sin((angle - self.refined.angle(self.torch, angle)) / 2.0)
         tip = (self._belief.tip_sigma * turned_by) ** 2
         felt = self.refined.variance(self.torch) + self._weave.variance
         return fixed + gain**2 + play + tip + felt
+
+    def _unseen(self) -> float:
+        """Return the variance of the torch that nothing ahead of it measures [m^2]."""
+        if not self.bias.looked:
+            return self._belief.fixed_variance(self._settings)
+        return self._belief.arm_variance(self._settings) + self.bias.variance(self.torch)
+
+    def looked(self, profile: WeldProfile) -> None:
+        """Take in how far the bead lies from the joint, seen behind the torch."""
+        torch = self._trail.place_at(profile.time_ns * 1e-9)
+        if self._belief.behind is None or torch is None or self.phase in ("done", "stopped"):
+            return
+        place = torch - self._belief.behind
+        passed = self._trail.passing(place)
+        if passed is None:
+            return
+        raw, felt = passed
+        others = felt + self._belief.arm_variance(self._settings)
+        self.bias.look(place, profile.offset - raw, profile.sigma, others)
+        if self.bias.doubt:
+            self._stop(self.bias.doubt)
 
     # --- what the finger says -------------------------------------------------------------------
 
