@@ -122,6 +122,7 @@ PARTS = {
     "replay.tactile": "flangeye_plugins.replay.tactile:replay_tactile",
     "guide.tactile": "flangeye_plugins.guide.tactile:guide_tactile",
     "guide.tool": "flangeye_plugins.guide.tactile:guide_tool",
+    "profiler.tcp": "flangeye_plugins.profiler.tcp:profiler_tcp",
     "sensor.opencv": "flangeye_plugins.sensor.opencv:sensor_opencv",
     "sensor.image_folder": "flangeye_plugins.sensor.recorded:sensor_image_folder",
     "sensor.mcap": "flangeye_plugins.sensor.recorded:sensor_mcap",

@@ -11,12 +11,14 @@ from flangeye import Params, StageError, part, stage
 from flangeye import types as t
 from flangeye.devices import (
     DeviceError,
+    Profiler,
     Robot,
     Scan,
     Scanner,
     SensorFrame,
     StateSource,
     TactileSensor,
+    WeldProfile,
 )
 from flangeye.doctor.diagnosis import Finding, RecordedSession
 from flangeye.files.recording import Archive, Recording
@@ -366,6 +368,39 @@ def sensor(**methods):
     return sensor_bad
 
 
+class Looker:
+    """A profile sensor that is as it should be."""
+
+    name, behind = "looker", 0.03
+
+    def __init__(self):
+        self.count = 0
+
+    def profile(self):
+        self.count += 1
+        return WeldProfile(0.1e-3, 0.05e-3, self.count)
+
+    def close(self):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def profiler(**methods):
+    made = type("Bad", (Looker,), methods)
+
+    @part("profiler.bad")
+    def profiler_bad(robot: StateSource, sensor: TactileSensor, seed: t.Seed) -> Profiler:
+        """Look badly."""
+        return made()
+
+    return profiler_bad
+
+
 def controller(**methods):
     made = type("Bad", (Lead,), methods)
 
@@ -387,6 +422,11 @@ class Lead:
 def sleepy(self):
     time.sleep(0.3)
     return Eye.frame(self)
+
+
+def looks_sleepily(self):
+    time.sleep(0.3)
+    return Looker.profile(self)
 
 
 def gone(*_, **__):

@@ -10,7 +10,7 @@ import pytest
 
 from flangeye import StageError
 from flangeye import types as t
-from flangeye.devices import Scan, SensorFrame
+from flangeye.devices import Scan, SensorFrame, WeldProfile
 from flangeye.files.recording import Recording
 from flangeye.motion.seam_following import Command
 from flangeye.testing import KITS
@@ -707,6 +707,48 @@ CASES = [
         {},
     ),
     ("sensor", "test_asking_does_not_wait", bad.sensor(frame=bad.sleepy), "frame\\(\\) took", {}),
+    (
+        "profiler",
+        "test_its_looks_are_in_metres_with_a_time",
+        bad.profiler(profile=lambda self: WeldProfile(0.0, 1e-4, 7)),
+        "one came twice",
+        {},
+    ),
+    (
+        "profiler",
+        "test_its_looks_are_in_metres_with_a_time",
+        bad.profiler(profile=lambda self: replace(bad.Looker.profile(self), offset=0.3)),
+        "an offset is not in metres",
+        {},
+    ),
+    (
+        "profiler",
+        "test_its_looks_are_in_metres_with_a_time",
+        bad.profiler(profile=lambda self: replace(bad.Looker.profile(self), sigma=0.0)),
+        "a sigma is not in metres",
+        {},
+    ),
+    (
+        "profiler",
+        "test_its_looks_are_in_metres_with_a_time",
+        bad.profiler(profile=lambda self: None),
+        "0 looks",
+        {},
+    ),
+    (
+        "profiler",
+        "test_it_says_how_far_behind_it_looks",
+        bad.profiler(behind=30.0),
+        "it looks 30.0 m behind",
+        {},
+    ),
+    (
+        "profiler",
+        "test_asking_does_not_wait",
+        bad.profiler(profile=bad.looks_sleepily),
+        "profile\\(\\) took",
+        {},
+    ),
 ]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from flangeye.devices import Robot, Scanner, StateSource, TactileSensor
+from flangeye.devices import Profiler, Robot, Scanner, StateSource, TactileSensor
 from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.robots import RobotModel
@@ -70,4 +70,15 @@ class SensorPart(Protocol):
 
     def __call__(self, finger: Finger, robot: StateSource, seed: Seed) -> TactileSensor:
         """Return the open camera."""
+        ...
+
+
+class ProfilerPart(Protocol):
+    """``profiler``: opens a profile sensor behind the torch."""
+
+    def __call__(self, robot: StateSource, sensor: TactileSensor, seed: Seed) -> Profiler:
+        """Return the open profile sensor; ``sensor`` is the finger's, open, whose world it shares.
+
+        A real one needs nothing of the finger's sensor; a simulated one sees what that stands in.
+        """
         ...

@@ -151,6 +151,10 @@ PARTS: Mapping[str, PartKind] = {
     "sensor": PartKind(
         "a tactile sensor that weld.tactile can read", "flangeye.models.contracts:SensorPart"
     ),
+    "profiler": PartKind(
+        "a look at the bead behind the torch, for weld.tactile",
+        "flangeye.models.contracts:ProfilerPart",
+    ),
     "check": PartKind(
         "a mistake in recordings that flangeye doctor can name", "flangeye.doctor.diagnosis:Check"
     ),

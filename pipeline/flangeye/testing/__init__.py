@@ -8,7 +8,12 @@ fault raises AssertionError with one line that says what was expected.
 from flangeye.testing.afterwards import CheckConformance, GuideConformance, ReplayConformance
 from flangeye.testing.base import Conformance
 from flangeye.testing.costs import CostConformance, ErrorConformance
-from flangeye.testing.devices import RobotConformance, ScannerConformance, SensorConformance
+from flangeye.testing.devices import (
+    ProfilerConformance,
+    RobotConformance,
+    ScannerConformance,
+    SensorConformance,
+)
 from flangeye.testing.exporting import ExportConformance
 from flangeye.testing.percapture import FitConformance, SegmentConformance
 from flangeye.testing.solving import RefineConformance, SolveConformance, VerifyConformance
@@ -45,6 +50,7 @@ KITS = {
     "scanner": ScannerConformance,
     "controller": ControllerConformance,
     "sensor": SensorConformance,
+    "profiler": ProfilerConformance,
     "replay": ReplayConformance,
     "guide": GuideConformance,
     "check": CheckConformance,
@@ -64,6 +70,7 @@ __all__ = [
     "FitConformance",
     "GuideConformance",
     "PlanConformance",
+    "ProfilerConformance",
     "ReaderConformance",
     "RefineConformance",
     "ReplayConformance",

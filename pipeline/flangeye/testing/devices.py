@@ -1,4 +1,4 @@
-"""``robot``, ``scanner`` and ``sensor`` parts: drivers, with a device or its counterpart there."""
+"""Drivers (``robot``, ``scanner``, ``sensor``, ``profiler``), a device or its counterpart there."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from flangeye.devices import (
     PATIENCE,
     DeviceError,
     FrameDropped,
+    Profiler,
     Robot,
     RobotState,
     Scan,
@@ -22,6 +23,7 @@ from flangeye.devices import (
     SensorFrame,
     StateSource,
     TactileSensor,
+    WeldProfile,
 )
 from flangeye.files.bundled import bundled
 from flangeye.models.finger import Finger
@@ -50,7 +52,7 @@ LATE = 1.0
 
 
 class DriverConformance(Conformance):
-    """Base of the three.
+    """Base of the four.
 
     ``params`` say how to reach the device. Where something must be started first, or a test's own
     fixture gives the parameters, override :meth:`open`.
@@ -295,6 +297,52 @@ class SensorConformance(DriverConformance):
             self.frames(sensor, 1)
             longest = max(_seconds(sensor.frame) for _ in range(20))
         require(longest < 0.05 + LATE / 5, f"frame() took {longest:.3f} s")
+
+
+class ProfilerConformance(DriverConformance):
+    """A ``profiler`` part: a profile sensor that is on, with a bead below it."""
+
+    kind = "profiler"
+
+    def context(self) -> Mapping[Any, Any]:
+        """Return an arm that stands; there is no finger's sensor beside a profile sensor alone."""
+        return {StateSource: _Standing(), TactileSensor: None}
+
+    def looks(self, profiler: Profiler, count: int) -> list[WeldProfile]:
+        """Return the next looks."""
+        found: list[WeldProfile] = []
+        limit = time.monotonic() + PATIENCE + LATE
+        while len(found) < count and time.monotonic() < limit:
+            look = profiler.profile()
+            if look is None:
+                time.sleep(0.002)
+            else:
+                found.append(look)
+        require(len(found) == count, f"{len(found)} looks within {PATIENCE:g} s, not {count}")
+        return found
+
+    def test_its_looks_are_in_metres_with_a_time(self) -> None:
+        """One after the other, each given once, with how well it is known."""
+        with self.opened() as profiler:
+            require(isinstance(profiler, Profiler), "it lacks methods of devices.Profiler")
+            looks = self.looks(profiler, 5)
+        times = [look.time_ns for look in looks]
+        require(times == sorted(set(times)), "looks are not in order, or one came twice")
+        require(all(abs(look.offset) < 0.1 for look in looks), "an offset is not in metres")
+        require(all(0.0 < look.sigma < 0.01 for look in looks), "a sigma is not in metres")
+
+    def test_it_says_how_far_behind_it_looks(self) -> None:
+        """A fixed way, in metres, behind the torch."""
+        with self.opened() as profiler:
+            behind = profiler.behind
+        require(0.0 < behind < 0.5, f"it looks {behind} m behind the torch")
+
+    def test_asking_does_not_wait(self) -> None:
+        """The loop at 500 Hz asks in each of its cycles."""
+        with self.opened() as profiler:
+            self.looks(profiler, 1)
+            longest = max(_seconds(profiler.profile) for _ in range(20))
+        require(longest < 0.05 + LATE / 5, f"profile() took {longest:.3f} s")
 
 
 class _Standing:

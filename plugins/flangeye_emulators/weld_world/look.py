@@ -25,7 +25,9 @@ class LookBehind:
     def watch(self, time: float, world: WeldWorld) -> None:
         """See the world as it is now [s]: a bead is laid where the torch is beside the seam."""
         s = world.torch_s
-        if 0.0 < s < world.groove.root.length and not (self._along and s <= self._along[-1]):
+        if 0.0 < s < world.groove.root.length:
+            again = bisect.bisect_left(self._along, s)  # where it was before, it is molten again
+            del self._along[again:], self._off[again:]
             self._along.append(s)
             self._off.append(world.off)
         self._began = time if self._began is None else self._began
@@ -43,6 +45,6 @@ class LookBehind:
         return WeldProfile(seen.item, self._truth.noise, round(seen.stamp * 1e9))
 
     def _bead(self, s: float) -> float | None:
-        """Return how far the bead lies to the left of the joint at an arc length, if there is one."""
+        """Return how far the bead is to the left of the joint at an arc length, if there is one."""
         after = bisect.bisect_right(self._along, s)
         return None if after == 0 else self._off[after - 1]

@@ -17,8 +17,9 @@ from flangeye.run.replay import ReplayedStep
 from flangeye_plugins.sensor.recorded import piece_of
 from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import Reader
-from flangeye_plugins.weld.resuming import controller_from
+from flangeye_plugins.weld.resuming import controller_from, take_looks
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
+from flangeye_plugins.weld.weld_log import LoggedLooks
 
 SAME = 1e-9
 """Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise."""
@@ -50,6 +51,7 @@ class WeldReplay:
         self._reader = Reader(self._finger)
         self._pixels: Any = None
         self._feelings: dict[int, TipDisplacement | None] = {}
+        self._looks = LoggedLooks()
         self._newest = -1
         self._cycles = 0
         self._worst_feeling = self._worst_command = 0.0
@@ -62,6 +64,8 @@ class WeldReplay:
             self._see(note.value)
         elif note.name == "feeling":
             self._compare_feeling(note.value)
+        elif note.name == "look":
+            self._looks.take(note.value)
         elif note.name == "cycles":
             self._decide(note.value)
 
@@ -97,6 +101,7 @@ class WeldReplay:
         for i, time in enumerate(cycles["time"]):
             pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
             felt = [self._feelings.get(number) for number in cycles["touches"][i]]
+            take_looks(self._controller, self._looks.of(self._cycles))
             command = self._controller.step(pose, [touch_of(f) for f in felt if f is not None])
             decided = np.array([*command.velocity, command.turn])
             logged = np.array([*cycles["velocity"][i], cycles["turn"][i]])

@@ -1,21 +1,21 @@
 """What a look behind the torch says of the error that nothing else at the weld can measure.
 
 The torch is off the seam by what is measured of it and a bias: ``off = raw + b``. In b are the
-torch's place on the tool, its yaw, and how far heat has moved the seam since the tip felt it. All of
-it is in what the files state beforehand, one variance P0 about zero. A look at the bead gives z, how
-far the torch really was off where it passed; the measured part of it then is known, so z - raw is b
-there, with an error of variance R: of the look, of the arm and of what the tip felt. Such errors are
-alike over about a tool's length L (an arm that waves, a profile read askew), so a look that comes
-after a way d tells as much as d / L independent ones.
+torch's place on the tool, its yaw, and how far heat has moved the seam since the tip felt it. All
+of it is in what the files state beforehand, one variance P0 about zero. A look at the bead gives z,
+how far the torch really was off where it passed; the measured part of it then is known, so
+z - raw is b there, with an error of variance R: of the look, of the arm and of what the tip felt.
+Such errors are alike over about a tool's length L (an arm that waves, a profile read askew), so a
+look that comes after a way d tells as much as d / L independent ones.
 
-From place to place b is a random walk. The files state by how much heat moves the seam, D one sigma,
-while the torch goes on by L: D^2 / L per length. That is a Kalman filter of one state,
+From place to place b is a random walk. The files state by how much heat moves the seam, D one
+sigma, while the torch goes on by L: D^2 / L per length. That is a Kalman filter of one state,
 
     P <- P + d D^2 / L,   k = P / (P + R L / d),   b <- b + k (z - raw - b),   P <- (1 - k) P.
 
-Once there are looks the torch, by how far they lag behind it, is known to P + (that way) D^2 / L. Where
-there have been none for long, nothing is left but the files: about b these have P0 + b^2, the
-most that is stated.
+Once there are looks the torch, by how far they lag behind it, is known to P + (that way) D^2 / L.
+Where there have been none for long, nothing is left but the files: about b these have P0 + b^2,
+the most that is stated.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ class Bias:
         self._contradicted = self._contradicted + 1 if wrong else 0
         if self._contradicted >= CONTRADICTIONS:
             self.doubt = (
-                f"the look behind the torch sees the bead {bias * 1e3:+.2f} mm to the left of where "
-                f"the torch was taken to be; {self.value * 1e3:+.2f} mm were known, and the files "
-                f"allow {LIMIT * math.sqrt(before) * 1e3:.2f} mm: calibrate the tool "
+                f"the look behind the torch sees the bead {bias * 1e3:+.2f} mm to the left of "
+                f"where the torch was taken to be; {self.value * 1e3:+.2f} mm were known, and the "
+                f"files allow {LIMIT * math.sqrt(before) * 1e3:.2f} mm: calibrate the tool "
                 "(flangeye tactile calibrate), or state more 'distortion'"
             )
         return wrong

@@ -11,11 +11,18 @@ import multiprocessing
 import queue
 import signal
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-from flangeye.devices import PATIENCE, DeviceError, RobotState, TactileSensor
+from flangeye.devices import (
+    PATIENCE,
+    DeviceError,
+    Profiler,
+    RobotState,
+    TactileSensor,
+    WeldProfile,
+)
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import keep_current_folder_out
 from flangeye.files.load import busy
@@ -34,12 +41,44 @@ OPENING = 30.0
 POLLING = 2e-3
 """Between two looks for a new image [s]."""
 
-OPENED, TORCH = "opened", "torch"
-"""What the process says once the camera is open; what it is asked for where the torch was."""
+TORCH = "torch"
+"""What the process is asked for where the torch was."""
+
+
+class Opened(NamedTuple):
+    """What the process says once all is open.
+
+    Attributes:
+        behind: How far behind the torch the look is [m]; None where there is none.
+    """
+
+    behind: float | None
+
+
+class Seeing(NamedTuple):
+    """What is open in the process.
+
+    Attributes:
+        latest: Where the arm is.
+        reader: Reads the camera's images.
+        sensor: The camera.
+        look: Behind the torch, if there is one.
+    """
+
+    latest: LatestState
+    reader: Reader
+    sensor: TactileSensor
+    look: Profiler | None
 
 
 class CameraProcess:
-    """Reads a finger's camera in another process: the loop never waits for an image."""
+    """Reads a finger's camera in another process: the loop never waits for an image.
+
+    A look behind the torch is read there too.
+
+    Attributes:
+        behind: How far behind the torch that is [m], once it is open; None where there is none.
+    """
 
     def __init__(self, job: CameraJob) -> None:
         """Prepare for a camera; it is opened when the context begins."""
@@ -49,6 +88,8 @@ class CameraProcess:
         )
         self._state = job.state
         self._sights: queue.SimpleQueue[TagObservation] = queue.SimpleQueue()
+        self._looks: queue.SimpleQueue[WeldProfile] = queue.SimpleQueue()
+        self.behind: float | None = None
         self._ending = threading.Event()
         self._error: DeviceError | None = None
         self._thread = threading.Thread(target=self._watch, name="finger", daemon=True)
@@ -61,6 +102,13 @@ class CameraProcess:
         while not self._sights.empty():
             sights.append(self._sights.get())
         return sights
+
+    def looks(self) -> list[WeldProfile]:
+        """Return what has arrived from behind the torch."""
+        looks: list[WeldProfile] = []
+        while not self._looks.empty():
+            looks.append(self._looks.get())
+        return looks
 
     def tell(self, state: RobotState) -> None:
         """Take the arm's newest sample; the thread passes it on."""
@@ -108,6 +156,7 @@ class CameraProcess:
             ) from None
         if isinstance(answer, DeviceError):
             raise answer
+        self.behind = answer.behind
 
     def _watch(self) -> None:
         try:
@@ -119,6 +168,8 @@ class CameraProcess:
                     return
                 if answer is None:
                     self._ending.wait(POLLING)
+                elif isinstance(answer, WeldProfile):
+                    self._looks.put(answer)
                 else:
                     self._sights.put(answer)
         except (EOFError, OSError):
@@ -141,29 +192,43 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
     """Open the camera and answer until the program lets go; the main function of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program is told, and ends this
     latest = LatestState(job.state)
-    with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the program is gone
+    with (
+        suppress(EOFError, BrokenPipeError, ConnectionResetError),  # the program is gone
+        ExitStack() as opened,
+    ):
+        name = "the finger's camera"
         try:
-            reader, sensor = Reader(job.finger), job.camera(latest)
+            reader = Reader(job.finger)
+            sensor = opened.enter_context(job.camera(latest))
+            name = "the look behind the torch"
+            look = job.profiler(latest, sensor)
+            if look is not None:
+                opened.enter_context(look)
         except Exception as error:
-            wire.send(_told("the finger's camera", error))
+            wire.send(_told(name, error))
             return
-        with sensor:
-            wire.send(OPENED)
-            while True:
-                question = wire.recv()
-                wire.send(_answer(question, sensor, reader, latest))
+        wire.send(Opened(None if look is None else look.behind))
+        seeing = Seeing(latest, reader, sensor, look)
+        while True:
+            wire.send(_answer(wire.recv(), seeing))
 
 
-def _answer(question: Any, sensor: TactileSensor, reader: Reader, latest: LatestState) -> Any:
+def _answer(question: Any, seeing: Seeing) -> Any:
     """Return where the torch was; or, told where the arm is, what is seen, or why nothing is."""
     if question == TORCH:
-        return torch_of(sensor)
-    latest.tell(question)
+        return torch_of(seeing.sensor)
+    seeing.latest.tell(question)
+    name = seeing.sensor.name
     try:
-        frame = sensor.frame()
-        return None if frame is None else reader.read(frame)
+        frame = seeing.sensor.frame()
+        if frame is not None:
+            return seeing.reader.read(frame)
+        if seeing.look is None:
+            return None
+        name = seeing.look.name
+        return seeing.look.profile()
     except Exception as error:
-        return _told(sensor.name, error)
+        return _told(name, error)
 
 
 def _told(name: str, error: Exception) -> DeviceError:

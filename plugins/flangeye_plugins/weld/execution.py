@@ -14,6 +14,7 @@ from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.finger_camera import FingerCameraReader
+from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog
@@ -31,12 +32,14 @@ class Cell:
         eyes: Read the finger.
         tool: Translates between flange and plane.
         bounds: What the tip must keep to.
+        steered: What is told what a look behind the torch sees, where there is one.
     """
 
     drive: Executor
     eyes: FingerCameraReader
     tool: Tool
     bounds: Bounds
+    steered: Follower | None = None
 
 
 def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
@@ -132,6 +135,10 @@ def _turn(
     felt = [weld_log.felt[number] for number in used]
     pose = cell.tool.pose(state.base_T_flange, state.time_ns * 1e-9)
     cell.bounds.check(pose, controller.tip, felt)
+    if cell.steered is not None:
+        for profile in cell.eyes.looks():
+            weld_log.looked(profile)
+            cell.steered.looked(profile)
     command = controller.step(pose, [touch_of(feeling) for feeling in felt])
     twist = cell.tool.twist(command, state.base_T_flange)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol, Self
 
-from flangeye.devices import KnowsTorch, RobotState, SensorFrame, StateSource, TactileSensor
+from flangeye.devices import (
+    KnowsTorch,
+    Profiler,
+    RobotState,
+    SensorFrame,
+    StateSource,
+    TactileSensor,
+    WeldProfile,
+)
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seed
@@ -86,21 +94,40 @@ class CameraJob(NamedTuple):
         finger: The finger, calibrated.
         state: Of the arm, where it stands now.
         seed: For what is simulated.
+        look: Opens a profile sensor behind the torch, if there is one.
     """
 
     sensor: BoundPart
     finger: Finger
     state: RobotState
     seed: Seed
+    look: BoundPart | None = None
 
     def camera(self, robot: StateSource) -> TactileSensor:
         """Open the camera, which may ask ``robot`` where it is."""
         sensor: TactileSensor = self.sensor(self.finger, robot, self.seed)
         return sensor
 
+    def profiler(self, robot: StateSource, camera: TactileSensor) -> Profiler | None:
+        """Open the look behind the torch, if there is one, beside the open camera."""
+        return None if self.look is None else self.look(robot, camera, self.seed)
+
 
 class FingerCameraReader(Protocol):
     """Gives what was seen since the last cycle, oldest first."""
+
+    @property
+    def behind(self) -> float | None:
+        """How far behind the torch the look is [m]; None where there is none."""
+        ...
+
+    def looks(self) -> list[WeldProfile]:
+        """Return new looks at the bead; never waits.
+
+        Raises:
+            DeviceError: The profile sensor is lost.
+        """
+        ...
 
     def seen(self) -> list[TagObservation]:
         """Return new sights; never waits.
@@ -134,6 +161,21 @@ class SteppedReader:
         """
         self._latest = LatestState(job.state)
         self._reader, self._sensor = Reader(job.finger), job.camera(self._latest)
+        try:
+            self._look = job.profiler(self._latest, self._sensor)
+        except BaseException:
+            self._sensor.close()
+            raise
+
+    @property
+    def behind(self) -> float | None:
+        """How far behind the torch the look is [m]; None where there is none."""
+        return None if self._look is None else self._look.behind
+
+    def looks(self) -> list[WeldProfile]:
+        """Return the look that has arrived; raise DeviceError where the sensor is lost."""
+        profile = None if self._look is None else self._look.profile()
+        return [] if profile is None else [profile]
 
     def seen(self) -> list[TagObservation]:
         """Return what has arrived; raise DeviceError where the camera is lost."""
@@ -152,6 +194,8 @@ class SteppedReader:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._look is not None:
+            self._look.close()
         self._sensor.close()
 
 

@@ -143,9 +143,7 @@ class Follower:
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
         self._belief, self.learned = belief, Learned()
-        prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
-        self.bias = Bias(prior, settings.distortion, belief.distance)
-        self._trail = Trail()
+        self.bias, self._trail = _bias_of(belief, settings), Trail()
         self.sigma = self.bound = self.band = 0.0
         self.aim = self._offset = settings.offset_across
         self._weave = Weave(settings.weave_width, settings.weave_frequency)
@@ -165,9 +163,8 @@ class Follower:
         self._level = np.array(belief.level_R_tool)
         self._response = Response()
         self._elapsed = self._began = 0.0
-        self._period, self._climbs = math.inf, False
+        self._period, self._climbs, self._put_off = math.inf, False, False
         self._swept: list[tuple[ToolPose, Touch]] = []
-        self._put_off = False
 
     def kept(self) -> ResumePoint | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
@@ -630,6 +627,12 @@ class Follower:
         if self.phase in ("bridging", "ending") and not self.refined.empty:
             return SeamReading(self.refined.offset(self.tip), felt.height)
         return felt
+
+
+def _bias_of(belief: Belief, settings: Following) -> Bias:
+    """Return the bias before any look; what the arm is off by stays so, seen or not."""
+    prior = belief.fixed_variance(settings) - belief.arm_variance(settings)
+    return Bias(prior, settings.distortion, belief.distance)
 
 
 def _within(value: float, most: float) -> float:

@@ -6,13 +6,14 @@ far as the log goes, so nothing has to be saved when a weld is stopped, not even
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
+from flangeye.devices import WeldProfile
 from flangeye.errors import StageError
 from flangeye.log.read import Note, read_notes
 from flangeye.motion.seam_following import Controller, FollowingTask, ToolPose, Touch
@@ -25,6 +26,7 @@ from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+from flangeye_plugins.weld.weld_log import LoggedLooks
 
 SAME_PLAN = 1e-6
 """Plans that differ by less are the same [m]."""
@@ -73,6 +75,14 @@ def follower_of(controller: Controller) -> Follower | None:
     if isinstance(controller, Passes):
         return controller.root
     return controller if isinstance(controller, Follower) else None
+
+
+def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
+    """Tell a controller what was seen behind the torch."""
+    follower = follower_of(controller)
+    if follower is not None:
+        for profile in looks:
+            follower.looked(profile)
 
 
 def controller_from(start: Mapping[str, Any]) -> Controller:
@@ -127,6 +137,7 @@ class _Again:
         self.controller = controller
         self._felt: dict[int, Touch] = {}
         self._number = -1
+        self._looks, self._cycles = LoggedLooks(), 0
 
     def take(self, note: Note) -> None:
         if note.name == "sight":
@@ -134,10 +145,14 @@ class _Again:
         elif note.name == "feeling":
             felt = note.value
             self._felt[self._number] = Touch(felt["time_ns"] * 1e-9, np.array(felt["displacement"]))
+        elif note.name == "look":
+            self._looks.take(note.value)
         elif note.name == "cycles":
             cycles = note.value
             for i, time in enumerate(cycles["time"]):
                 pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
+                take_looks(self.controller, self._looks.of(self._cycles))
+                self._cycles += 1
                 self.controller.step(pose, [self._felt[n] for n in cycles["touches"][i]])
 
 

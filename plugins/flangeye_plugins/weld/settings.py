@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flangeye.files.paths import RecipePath
 from flangeye.models.finger import FingerPath
@@ -172,6 +172,12 @@ class WeldTactileParams(Following):
     sensor: Annotated[BoundPart, Choose("sensor")] = Field(
         description="What gives the finger's images, for example {opencv: {device: 0}}."
     )
+    look: Annotated[BoundPart, Choose("profiler")] | None = Field(
+        None,
+        description="A profile sensor that sees the bead behind the torch, for example {tcp: "
+        "{host: 192.168.1.20, port: 9000, behind: 30 mm}}: what it sees of heat, and of where the "
+        "torch really is, is made up for.",
+    )
     mode: Mode = Field(
         "tactile",
         description="tactile: follow the seam by touch. For comparison: vision follows the plan "
@@ -212,3 +218,15 @@ class WeldTactileParams(Following):
     start_angle: Angle = param(
         "0 deg", ge=-np.pi, le=np.pi, description="Angle of the tool to the seam at the start."
     )
+
+    @model_validator(mode="after")
+    def _look_has_one_pass(self) -> Self:
+        """Refuse a look behind the torch where what it sees cannot be made up for."""
+        if self.look is None:
+            return self
+        if self.mode != "tactile":
+            raise ValueError("'look' goes with mode: tactile only: leave out one of them")
+        for name in ("passes", "weave_width"):
+            if getattr(self, name):
+                raise ValueError(f"'look' is for one pass that does not weave: leave out '{name}'")
+        return self

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from flangeye.devices import MotionAllowed, Robot, RobotDriver
@@ -32,7 +32,13 @@ from flangeye_plugins.weld.frame import Tool, WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
-from flangeye_plugins.weld.resuming import controller_of, kept_value, resume_point_of, set_back
+from flangeye_plugins.weld.resuming import (
+    controller_of,
+    follower_of,
+    kept_value,
+    resume_point_of,
+    set_back,
+)
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -81,24 +87,33 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
         robot: Robot = opened.enter_context(led(driver, model, allowed))
-        job = CameraJob(params.sensor, finger, robot.state(), seed)
+        job = CameraJob(params.sensor, finger, robot.state(), seed, params.look)
         eyes = opened.enter_context(_tag_reader(job, simulated))
+        belief = replace(belief, behind=eyes.behind)
+        if eyes.behind is not None:
+            controller = controller_of(plan, belief, params, params.mode, kept)
         weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        drive = Executor(robot, model, allowed, eyes.tell)
-        cell = Cell(drive, eyes, tool, Bounds(finger, plan, params))
+        cell = Cell(
+            Executor(robot, model, allowed, eyes.tell), eyes, tool, Bounds(finger, plan, params),
+            None if params.look is None else follower_of(controller),
+        )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
-        passes = 1 + 2 * len(params.passes)  # there and back
-        longest = 60.0 + 3.0 * passes * (plan.length + body.distance) / params.speed
         if not simulated:
             opened.enter_context(precedence(LEADING))
-        reason = follow(cell, controller, weld_log, longest)
+        reason = follow(cell, controller, weld_log, _longest(plan.length + body.distance, params))
         truth = eyes.true_torch()
     return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
 
 
 def _tag_reader(job: CameraJob, simulated: bool) -> FingerCameraReader:
     return SteppedReader(job) if simulated else CameraProcess(job)
+
+
+def _longest(way: float, params: WeldTactileParams) -> float:
+    """Return the longest time that a weld may take whose tip goes a way [m] in each pass [s]."""
+    passes = 1 + 2 * len(params.passes)  # there and back
+    return 60.0 + 3.0 * passes * way / params.speed
 
 
 def _plan_text(plan: Path, params: WeldTactileParams) -> str:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, NamedTuple, Self
 
+from flangeye.devices import WeldProfile
 from flangeye.types import StageLog
 from flangeye_plugins.weld.finger_camera import TagObservation
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
@@ -119,6 +121,10 @@ class WeldLog:
         told = {"number": number, "time_ns": sight.time_ns, "corner": piece.corner}
         self.note("sight", {**told, "tag": sight.feeling is not None})
 
+    def looked(self, profile: WeldProfile) -> None:
+        """Write what was seen behind the torch, and that the cycle now under way takes it in."""
+        self.note("look", {"cycle": len(self.cycles), **asdict(profile)})
+
     def turned(self, cycle: Cycle) -> None:
         """Take in a cycle."""
         self.cycles.append(cycle)
@@ -137,6 +143,22 @@ class WeldLog:
 
     def _put(self, name: str, value: Any) -> None:
         self._log(name, columns(value) if name == "cycles" else value)
+
+
+class LoggedLooks:
+    """The looks of a log, for a weld that is decided again; each is noted before its cycle."""
+
+    def __init__(self) -> None:
+        self._by_cycle: dict[int, list[WeldProfile]] = {}
+
+    def take(self, look: Mapping[str, Any]) -> None:
+        """Take in one of them, as it was logged."""
+        told = dict(look)
+        self._by_cycle.setdefault(told.pop("cycle"), []).append(WeldProfile(**told))
+
+    def of(self, cycle: int) -> list[WeldProfile]:
+        """Return what a cycle took in, by its number."""
+        return self._by_cycle.pop(cycle, [])
 
 
 def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:

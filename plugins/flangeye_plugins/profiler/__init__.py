@@ -1,0 +1,1 @@
+"""``sensor.*``: cameras that watch a compliant finger."""

@@ -1,0 +1,160 @@
+"""Profile sensors with an evaluation of their own, which send what they measure as lines of text.
+
+Such a sensor is set up in its maker's program to find bead and joint in each profile, and sends how
+far one lies from the other over TCP, a line for each profile. Which of a line's columns that is, in
+which unit and to which side, the recipe says. A column that holds no number is no look.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from typing import Literal, Self
+
+from pydantic import Field
+
+from flangeye.devices import (
+    PATIENCE,
+    DeviceError,
+    Profiler,
+    StateSource,
+    TactileSensor,
+    WeldProfile,
+)
+from flangeye.plugin.stage import Params, part
+from flangeye.types import Seed
+from flangeye.units import Duration, Length, param
+
+LONGEST = 4096
+"""A line is no longer [bytes]."""
+
+WAITING = 0.2
+"""Longest wait for data, before it is looked whether to go on [s]."""
+
+UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+
+
+class TcpParams(Params):
+    """Parameters of ``profiler.tcp``."""
+
+    host: str = Field(min_length=1, description="Name or address of the sensor.")
+    port: int = Field(ge=1, le=65535, description="Its TCP port that sends what is measured.")
+    behind: Length = param(gt=0, le=0.2, description="How far behind the torch it looks.")
+    sigma: Length = param("0.05 mm", gt=0, description="Standard deviation of one look.")
+    column: int = Field(1, ge=1, description="Which column of a line is the bead's offset.")
+    separator: str = Field(",", min_length=1, max_length=1, description="Between two columns.")
+    unit: Literal["m", "mm", "um"] = Field("mm", description="Of that column.")
+    positive: Literal["left", "right"] = Field(
+        "left", description="To which side of the joint, along the weld, it is positive."
+    )
+    latency: Duration = param(
+        "10 ms", ge=0, description="Time from the exposure to the arrival of its line."
+    )
+
+
+class TcpProfiler:
+    """Reads lines in a thread of its own, and keeps the newest look.
+
+    Attributes:
+        name: For people.
+        behind: How far behind the torch it looks [m].
+    """
+
+    def __init__(self, params: TcpParams) -> None:
+        """Connect.
+
+        Raises:
+            DeviceError: Nothing answers there.
+        """
+        self.name, self.behind = f"profile sensor at {params.host}:{params.port}", params.behind
+        self._params = params
+        side = 1.0 if params.positive == "left" else -1.0
+        self._scale = side * UNITS[params.unit]
+        self._newest: WeldProfile | None = None
+        self._lost = ""
+        self._closing = False
+        self._lock = threading.Lock()
+        try:
+            self._socket = socket.create_connection((params.host, params.port), PATIENCE)
+        except OSError as error:
+            raise DeviceError(
+                f"{self.name}: cannot be reached ({error}); is it on, and does it send there?"
+            ) from None
+        self._socket.settimeout(WAITING)
+        self._thread = threading.Thread(target=self._read, name=self.name, daemon=True)
+        self._thread.start()
+
+    def profile(self) -> WeldProfile | None:
+        """Return the newest look not yet returned, or None.
+
+        Raises:
+            DeviceError: The sensor has ended the connection, or sends no lines.
+        """
+        with self._lock:
+            profile, self._newest = self._newest, None
+            lost = self._lost
+        if profile is None and lost:
+            raise DeviceError(f"{self.name}: {lost}")
+        return profile
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._closing = True
+        self._thread.join(PATIENCE)
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read(self) -> None:
+        begun = b""
+        while not self._closing:
+            try:
+                data = self._socket.recv(LONGEST)
+            except TimeoutError:
+                continue
+            except OSError as error:
+                self._lose(f"the connection is lost ({error})")
+                return
+            if not data:
+                self._lose("has ended the connection")
+                return
+            *lines, begun = (begun + data).split(b"\n")
+            for line in lines:
+                self._take(line)
+            if len(begun) > LONGEST:
+                self._lose(f"sends no lines: {LONGEST} bytes without an end of line")
+                return
+
+    def _lose(self, why: str) -> None:
+        with self._lock:
+            self._lost = why
+
+    def _take(self, line: bytes) -> None:
+        taken = time.time_ns() - round(self._params.latency * 1e9)
+        value = self._value(line)
+        if value is not None:
+            with self._lock:
+                self._newest = WeldProfile(self._scale * value, self._params.sigma, taken)
+
+    def _value(self, line: bytes) -> float | None:
+        """Return the number of the column; None where there is none."""
+        columns = line.decode("ascii", "replace").split(self._params.separator)
+        try:
+            value = float(columns[self._params.column - 1])
+        except (IndexError, ValueError):
+            return None
+        return value if math.isfinite(value) else None
+
+
+@part("profiler.tcp")
+def profiler_tcp(
+    robot: StateSource, sensor: TactileSensor, seed: Seed, params: TcpParams
+) -> Profiler:
+    """A profile sensor that sends the bead's offset as lines of text over TCP."""
+    return TcpProfiler(params)
