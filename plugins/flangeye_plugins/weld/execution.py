@@ -110,8 +110,8 @@ def _undisturbed() -> Iterator[None]:
     """Let nothing of this process hold up a cycle for long.
 
     Garbage is collected before and after, not in between: that takes tens of milliseconds. A cycle
-    waits several times, and each time the thread that reads images may keep the interpreter for
-    a switch interval: a short one.
+    waits several times, and each time the thread that writes the log, or takes what the camera's
+    process has seen, may keep the interpreter for a switch interval: a short one.
     """
     enabled, interval = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
