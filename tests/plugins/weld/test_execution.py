@@ -2,10 +2,17 @@
 
 import gc
 import time
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
-from flangeye_plugins.weld.execution import Clock, _undisturbed
+from flangeye.devices import DeviceError, WeldProfile
+from flangeye.motion.seam_following import Command, Controller, ToolPose
+from flangeye_plugins.weld.execution import Clock, _undisturbed, follow
+from flangeye_plugins.weld.tactile import _longest
+from flangeye_plugins.weld.weld_log import WeldLog
 
 
 def busy(seconds):
@@ -49,3 +56,123 @@ def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it() -> None:
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+class Desk:
+    """A cell of stand-ins: an arm whose cycles take a tenth of a second, and what it was told.
+
+    Attributes:
+        told: What happened, by name.
+    """
+
+    def __init__(self, lost_at: int | None = None) -> None:
+        self.told, self.cycles, self.lost_at = list[Any](), 0, lost_at
+        self.drive = self.robot = self.eyes = self.tool = self.bounds = self
+        self.limits, self.steered = SimpleNamespace(acceleration=0.7), None
+
+    def lead(self) -> None:
+        self.told.append("lead")
+
+    def stop(self) -> None:
+        self.told.append("stop")
+
+    def wait_cycle(self) -> None:
+        self.cycles += 1
+
+    def read(self) -> Any:
+        if self.cycles == self.lost_at:
+            raise DeviceError("the arm is lost")
+        return SimpleNamespace(time_ns=(5 * 10**9 + self.cycles * 10**8), base_T_flange="here")
+
+    def seen(self) -> list[Any]:
+        feeling = SimpleNamespace(
+            time_ns=self.cycles * 10**9, displacement=np.full(3, float(self.cycles))
+        )
+        felt = feeling if self.cycles % 2 else None
+        return [SimpleNamespace(feeling=felt, time_ns=7, piece=SimpleNamespace(corner=(0, 0)))]
+
+    def pose(self, flange: Any, seconds: float) -> ToolPose:
+        assert flange == "here"
+        return ToolPose(seconds, np.array([1.0, 2.0, 3.0]), 0.4)
+
+    def check(self, pose: Any, progress: float, felt: Any) -> None:
+        self.told.append(("checked", progress, len(felt)))
+
+    def twist(self, command: Command, flange: Any) -> Any:
+        return ("twist", command.turn, flange)
+
+    def move_velocity(self, twist: Any, acceleration: float) -> None:
+        self.told.append((twist, acceleration))
+
+
+class Ending:
+    """A controller that is done after so many cycles."""
+
+    def __init__(self, cycles: int) -> None:
+        self.cycles, self.touches, self.phase, self.reason = cycles, list[Any](), "following", ""
+        self.tip, self.torch, self.wanted = 0.11, 0.12, 0.13
+        self.sigma, self.bound, self.band = 0.14, 0.15, 0.16
+
+    def step(self, pose: ToolPose, touches: Any) -> Command:
+        self.touches.append((pose.time, [(touch.time, touch.displacement[0]) for touch in touches]))
+        if len(self.touches) == self.cycles:
+            self.phase, self.reason = "stopped", "enough"
+        return Command(np.array([1.0, -2.0, 0.5]), 0.3)
+
+
+def followed(cell: Any, controller: Any, longest: float = 60.0) -> Any:
+    given: Controller = controller
+    with WeldLog(lambda name, value: None, False, images=False) as log:
+        return follow(cell, given, log, longest), log.cycles
+
+
+def test_a_cycle_reads_decides_commands_and_is_logged() -> None:
+    desk, controller = Desk(), Ending(3)
+    reason, cycles = followed(desk, controller)
+    assert reason == "enough"
+    command = (("twist", 0.3, "here"), 0.7)
+    felt = [("checked", 0.11, 1), ("checked", 0.11, 0), ("checked", 0.11, 1)]
+    assert desk.told == ["lead", *(each for one in felt for each in (one, command)), "stop"]
+    assert controller.touches == [
+        (pytest.approx(5.1), [(1.0, 1.0)]), (pytest.approx(5.2), []),
+        (pytest.approx(5.3), [(pytest.approx(3.0), 3.0)]),
+    ]  # fmt: skip
+    assert [cycle.touches for cycle in cycles] == [(0,), (), (2,)]
+    last = cycles[-1]
+    assert last.position == (1.0, 2.0, 3.0) and last.velocity == (1.0, -2.0, 0.5)
+    assert (last.angle, last.turn, last.phase) == (0.4, 0.3, "stopped")
+    stated = (last.tip, last.torch, last.wanted, last.sigma, last.bound, last.band)
+    assert stated == (0.11, 0.12, 0.13, 0.14, 0.15, 0.16)
+
+
+def test_a_weld_that_takes_longer_than_it_may_ends_by_the_arm_s_clock_and_the_arm_is_stopped() -> (
+    None
+):
+    desk = Desk()
+    reason, cycles = followed(desk, Ending(99), longest=1.05)
+    assert reason == "it did not come to its end within 1 s"
+    assert len(cycles) == 11 and desk.told[-1] == "stop"  # a tenth of a second each
+
+
+def test_an_arm_that_is_lost_ends_the_weld_with_its_reason_and_is_told_to_stop() -> None:
+    desk = Desk(lost_at=4)
+    reason, cycles = followed(desk, Ending(99))
+    assert reason == "the arm is lost" and len(cycles) == 3 and desk.told[-1] == "stop"
+
+
+def test_what_is_seen_behind_the_torch_is_told_before_the_cycle_s_decision() -> None:
+    desk, controller = Desk(), Ending(2)
+    told = list[Any]()
+    cell: Any = desk
+    cell.looks = lambda: [WeldProfile(1e-4, 5e-5, 9)]
+    cell.steered = SimpleNamespace(looked=lambda profile: told.append(len(controller.touches)))
+    followed(cell, controller)
+    assert told == [0, 1]
+
+
+@pytest.mark.parametrize(("passes", "times"), [(0, 1), (2, 5)])
+def test_a_weld_may_take_a_minute_and_three_times_its_way_there_and_back_in_each_pass(
+    passes: int, times: int
+) -> None:
+    params: Any = SimpleNamespace(passes=[None] * passes, speed=5e-3)
+    assert _longest(0.1, params) == pytest.approx(60.0 + 3.0 * times * 20.0)

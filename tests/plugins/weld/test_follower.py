@@ -736,3 +736,37 @@ def test_what_is_kept_of_a_weld_is_what_it_felt_and_where_its_torch_is() -> None
     again = make(before=kept)
     assert again.refined.offset(0.05) == pytest.approx(1e-3, abs=1e-6)
     assert again.tip == following().inset and again.torch == following().inset - DISTANCE
+
+
+def test_a_follower_that_has_not_begun_states_nothing_and_presses_nothing() -> None:
+    found = make("seeking")
+    assert (found.sigma, found.bound, found.band, found.wanted, found.aim) == (0.0,) * 5
+    assert found.lit is None and found.reason == "" and found.kept() is None
+    assert (found._latency, found._elapsed, found._time) == (0.0, 0.0, None)
+
+
+def test_a_fast_torch_takes_an_error_back_within_eight_millimetres_of_its_way() -> None:
+    found = make(touch=False, speed="20 mm/s")
+    found.tip, found.torch, found._coming, found._time = 0.05, 0.01, 0.01, 0.0
+    turn = found.step(pose(0.05, 0.0, angle=-0.01, time=0.01), []).turn
+    assert turn == pytest.approx(20e-3 / 8e-3 * math.sin(0.01), rel=0.02)
+
+
+def test_two_cycles_at_the_same_time_tell_nothing_of_the_arm_s_period() -> None:
+    found = make("bridging")
+    for time in (3.0, 3.0, 3.008, 3.016):
+        found.step(pose(0.05, time=time), [])
+    assert found._period == pytest.approx(8e-3)
+
+
+@pytest.mark.parametrize("turn", [0.02, -0.02])
+def test_a_tool_s_length_before_the_seam_the_torch_is_led_to_where_the_plan_was_moved_to(
+    turn: float,
+) -> None:
+    found = make()
+    for s in np.arange(0.005, 0.1, 2e-4).tolist():
+        found.refined.add(0.0, s, 1e-3 + turn * s, 0.0)
+    found.refined.confirm(1.0)
+    found.refined.hurried = False
+    for s in (-DISTANCE, following().inset - DISTANCE, LENGTH + DISTANCE):
+        assert found.refined.offset(s) == pytest.approx(1e-3 + turn * s, abs=0.02e-3)

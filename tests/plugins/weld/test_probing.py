@@ -453,3 +453,41 @@ def test_a_sweep_in_which_the_tag_is_hardly_seen_comes_to_its_end_and_says_so(im
         if cycle < images:
             found.feel(cycle * PERIOD, -1e-3, 0.0, 0.0)
     assert found.over and "seen too seldom" in found.learned()
+
+
+@pytest.mark.parametrize("gain", [0.2, -0.2])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_where_a_tip_leaves_its_seat_is_found_with_a_finger_that_shows_more_or_less(
+    side: float, gain: float
+) -> None:
+    """By how far it is pressed from where the tip rests, which is not where the arm began."""
+    found = fitted(side=side, gain=gain, noise=2e-6)
+    felt, cycles = np.array(found._felt), np.array(found._cycles)
+    at = np.interp(felt[:, 0], cycles[:, 0], cycles[:, 2])
+    beyond = np.maximum((side * at / SETTINGS.deflection - 0.8) / (1.25 - 0.8), 0.0)
+    felt[:, 1] += side * FLAT * 0.2e-3 * beyond
+    felt[:, 2] += 0.2e-3 * beyond
+    known = Learned(gain=gain, noise=2e-6)
+    rise, sigma = found._knee(felt, at + 1.5e-3, known)
+    assert rise == pytest.approx(0.2e-3, abs=5 * sigma) and sigma < 0.01e-3
+
+
+def test_a_finger_that_is_not_probed_is_taken_as_its_file_says_to_a_twentieth() -> None:
+    known = Learned()
+    assert known.gain_sigma == 0.05 and known.noise == 10e-6
+    off = (known.gain, known.width, known.stamp, known.dead_time, known.lag, known.askew)
+    assert off == (0.0,) * 6 and known.unexplained == 0.0
+
+
+@pytest.mark.parametrize(("gain", "told"), [(-0.03, False), (-0.06, True)])
+def test_a_tip_that_goes_along_by_a_tenth_of_a_millimetre_is_in_the_stated_bound(
+    gain: float, told: bool
+) -> None:
+    """More than that, with heights too noisy to tell, and it may have climbed."""
+    found = fitted(noise=2e-6, gain=gain)
+    felt, cycles = np.array(found._felt), np.array(found._cycles)
+    felt[:, 2] = 1e-3 * np.random.default_rng(0).standard_normal(len(felt))
+    felt[:, 2] -= 0.3e-3 * (np.abs(np.interp(felt[:, 0], *cycles.T[[0, 2]])) > 1.5e-3)
+    found._noise = (2e-6, 1e-3)
+    said = str(found._climb(felt, cycles, Learned(gain=gain, noise=2e-6)))
+    assert ("less than its file says, or the tip climbs the wall" in said) == told

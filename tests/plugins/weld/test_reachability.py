@@ -168,6 +168,9 @@ def test_the_way_is_taken_to_the_posture_that_is_nearest_and_free() -> None:
     assert route is free and tried == [-1.0]
     route, tried = started({2.0: free, -1.0: Barred("a wall"), -3.0: other})
     assert route is free and tried == [-1.0, 2.0]
+    # Near is where the arm first comes to: it turns on from there whatever it has taken.
+    route, tried = started({-1.02: free, 1.0: other})
+    assert route is other and tried == [1.0]
     with pytest.raises(StageError) as told:
         started({2.0: Barred("the far one"), -1.0: Barred("the near one")})
     assert str(told.value) == (

@@ -152,7 +152,7 @@ def test_an_earlier_weld_is_recalled_as_it_was_believed() -> None:
     assert refined.doubt(0.061 - 4.9e-3) == refined.doubt(0.061 + 4.9e-3) == 0.0
 
 
-@pytest.mark.parametrize("length", [3e-3, 6e-3, 12e-3])
+@pytest.mark.parametrize("length", [1.5e-3, 3e-3, 6e-3, 12e-3])
 def test_the_length_of_a_field_is_that_which_makes_what_was_felt_likeliest(length: float) -> None:
     """Of samples of a field of that length, on a straight plan; each a bin of its own."""
     plan, wander = Path(np.array([[0.0, 0, 0], [0.1, 0, 0]])), 1e-5
@@ -187,3 +187,53 @@ def test_a_suspected_piece_is_doubted_four_millimetres_beyond_its_ends_and_no_fa
     refined.suspect(0.0301, 0.0501, 1e-3)
     for s, doubted in ((0.0261, True), (0.0256, False), (0.0541, True), (0.0546, False)):
         assert (refined.doubt(s) == 1e-3) == doubted
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_far_beyond_its_ends_a_plan_is_where_it_leads_to_at_the_end_of_what_is_kept(
+    way: float,
+) -> None:
+    refined, _, _ = felt_of((2e-3, -1e-3), 0.0)
+    last = {1.0: 0.12 + 0.05, -1.0: -0.05}[way]
+    for beyond in (0.1, 0.4):
+        far = last + way * beyond
+        assert refined.offset(far) == pytest.approx(refined.offset(last), abs=0.05e-3)
+        assert refined.variance(far) == pytest.approx(refined.variance(last), rel=0.1)
+        assert refined.doubt(far) == 0.0 and refined.frame(far)[0].shape == (2,)
+
+
+def felt_once(offset: float, along: Floats) -> RefinedPath:
+    """Return a path whose plan goes straight along a direction (2,), felt at 50 mm alone."""
+    plan = Path(np.linspace(0.0, 0.1, 200)[:, None] * [*along, 0.0])
+    refined = RefinedPath(plan, 0.05, 1e-6)
+    refined.add(0.0, 0.05, offset, 0.0)
+    refined.confirm(1.0)
+    return refined
+
+
+@pytest.mark.parametrize("along", [np.array([1.0, 0.0]), np.array([0.0, 1.0])])
+def test_a_plan_is_expected_to_be_off_by_five_millimetres_and_a_twentieth_of_a_radian(
+    along: Floats,
+) -> None:
+    """Felt at one place alone it may be turned, and that is taken for eleven times as much."""
+    near = felt_once(0.0, along)
+    for away in (0.02, -0.03):
+        turned = 11.0 * 0.05 * abs(away)
+        assert np.sqrt(near.variance(0.05 + away)) == pytest.approx(turned, rel=0.02)
+    far = felt_once(15e-3, along)  # three times what is expected
+    assert far.variance(0.07) == pytest.approx(9.0 * near.variance(0.07), rel=0.02)
+    assert felt_once(4e-3, along).variance(0.07) == pytest.approx(near.variance(0.07), rel=0.02)
+
+
+def test_a_place_that_is_felt_again_is_taken_in_at_once_and_far_from_it_nothing_changes() -> None:
+    once, _, _ = felt_of((0.0, 0.0), 0.0)
+    at, far = 0.0301, 0.012
+    before = {s: once.offset(s) for s in (at - 4e-3, at, at + 4e-3, far)}
+    assert before[at] == pytest.approx(0.0, abs=1e-6)
+    for _ in range(30):
+        once.add(200.0, at, 0.2e-3, 0.0)
+    once.confirm(200.0)
+    assert once.offset(at) > 0.01e-3
+    for s in (at - 4e-3, at + 4e-3):
+        assert abs(once.offset(s) - before[s]) > 1e-7
+    assert once.offset(far) == before[far]

@@ -121,3 +121,13 @@ def test_where_one_wall_alone_holds_the_tip_that_one_is_looked_for(side: str, si
     fed(search, 3, 0.0, PRELOAD)
     assert search.step(0.0) == pytest.approx(sign * REACH)
     assert search.step(sign * REACH) == 0.0 and search.over
+
+
+def test_on_a_face_without_friction_a_wall_is_felt_beyond_half_of_what_the_tip_probes_by() -> None:
+    settings = Following.model_validate({"friction": 0.0})
+    assert QUIET.sliding(settings) == 0.0
+    for share, found in ((0.48, False), (0.52, True), (-0.48, False), (-0.52, True)):
+        search = Search(settings, QUIET)
+        fed(search, 10, 0.0, 0.0)
+        fed(search, 3, 0.0, PRELOAD)
+        assert fed(search, 15, share * settings.probe, PRELOAD).found == found
