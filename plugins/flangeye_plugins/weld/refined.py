@@ -374,8 +374,7 @@ class RefinedPath:
 
         The field's length is that of the greatest marginal likelihood.
         """
-        middle = min(zone * ZONE + ZONE // 2, len(self._middles) - 1)
-        used = self._nearest(middle, SAYING)
+        used = self._nearest(zone * ZONE + ZONE // 2, SAYING)
         if not len(used):
             return None
         some = used[:: -(-len(used) // THINNED)]

@@ -2,6 +2,7 @@
 
 import os
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -141,3 +142,12 @@ def test_a_camera_that_fails_ends_the_weld_with_its_reason(sensor: Any, said: st
 def test_a_camera_that_does_not_open_is_told(sensor: Any, said: str) -> None:
     with pytest.raises(DeviceError, match=said), CameraProcess(job(sensor)):
         raise AssertionError("it opened")
+
+
+def test_a_camera_that_takes_more_than_half_a_minute_to_open_is_told() -> None:
+    asked, camera = list[float](), CameraProcess(job(Camera))
+    wire: Any = SimpleNamespace(poll=lambda seconds: asked.append(seconds))
+    camera._wire = wire
+    with pytest.raises(DeviceError, match=r"^the finger's camera does not open \(30 s\)"):
+        camera._check_opened()
+    assert asked == [30.0]

@@ -218,7 +218,7 @@ def test_where_the_tip_is_pressed_hardest_enough_is_felt() -> None:
 
 def fitted(
     gain=0.0, width=0.0, stamp=0.0, askew=0.0, noise=10e-6, side=1.0, seed=0, dead=0.0, waves=0.0,
-    climbs=0.0, two_walls=True,
+    climbs=0.0, two_walls=True, over=0.1e-3,
 ):  # fmt: skip
     """What is learned of a finger and arm that are off so: by a sweep of both [m, s].
 
@@ -234,6 +234,7 @@ def fitted(
         waves: Amplitude of something that no model explains.
         climbs: How far the tip rises per displacement.
         two_walls: Whether there is another wall.
+        over: Half of the way over which the play is gone through.
     """
     rng, found = np.random.default_rng(seed), going(two_walls=two_walls, side=side, noise=1e-6)
     d = SETTINGS.deflection
@@ -246,11 +247,11 @@ def fitted(
     where = np.interp(time - dead, time, told)
     dragged = where.copy()
     for i in range(1, len(where)):
-        dragged[i] = np.clip(dragged[i - 1], where[i] - 0.1e-3, where[i] + 0.1e-3)
+        dragged[i] = np.clip(dragged[i - 1], where[i] - over, where[i] + over)
     # A tip on walls that stand askew slides along them: what is left is across the wall.
     turned = math.atan(askew)
     along = (1.0 + gain) * math.sin(turned) * math.cos(turned) * where
-    shown = width * (dragged - where) / 0.1e-3 - (1.0 + gain) * math.cos(turned) ** 2 * where
+    shown = width * (dragged - where) / over - (1.0 + gain) * math.cos(turned) ** 2 * where
     for i, t in enumerate(time):
         found.note(t, np.gradient(told, PERIOD)[i], where[i])
         if i % IMAGES == 0:
@@ -491,3 +492,15 @@ def test_a_tip_that_goes_along_by_a_tenth_of_a_millimetre_is_in_the_stated_bound
     found._noise = (2e-6, 1e-3)
     said = str(found._climb(felt, cycles, Learned(gain=gain, noise=2e-6)))
     assert ("less than its file says, or the tip climbs the wall" in said) == told
+
+
+@pytest.mark.parametrize("over", [0.02e-3, 0.1e-3, 0.2e-3, 0.4e-3, 1e-3])
+def test_play_and_hysteresis_are_found_that_are_gone_through_over_so_much(over: float) -> None:
+    found = learned(width=0.04e-3, over=over, noise=1e-6)
+    assert found.width == pytest.approx(-0.04e-3, rel=0.02) and found.unexplained < 5e-6
+    assert found.gain == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("stamp", [-0.06, 0.12])
+def test_timestamps_are_found_that_are_early_by_60_ms_or_late_by_120(stamp: float) -> None:
+    assert learned(stamp=stamp, noise=1e-6).stamp == pytest.approx(stamp)

@@ -153,23 +153,7 @@ def test_a_weld_that_ended_before_its_first_cycle_says_why() -> None:
     assert report.time.shape == (0,) and report.tip.shape == report.torch.shape == (0, 3)
 
 
-def test_the_report_says_how_the_loop_kept_time_and_how_fast_the_tool_turned() -> None:
-    """The first cycle has no period."""
-    log = logged(101)
-    for i, cycle in enumerate(log.cycles):
-        cycle.computing, cycle.answering, cycle.period = 1e-3 * i, 2e-3 * i, 8e-3 + 1e-3 * i
-        cycle.turn = 0.01 * (i - 70)
-    log.cycles[0].period = 9.0
-    found = reported(log)
-    assert found.figures["turn_max"] == pytest.approx(0.7)
-    assert found.loop == {
-        "cycles": 101.0,
-        "computing_median": pytest.approx(50e-3), "computing_p99": pytest.approx(99e-3),
-        "answering_median": pytest.approx(100e-3), "answering_p99": pytest.approx(198e-3),
-        "period_median": pytest.approx(8e-3 + 50.5e-3),
-        "period_p99": pytest.approx(8e-3 + 99.01e-3),
-    }  # fmt: skip
-    alone = reported(logged(1)).loop
-    assert alone["cycles"] == 1.0 and alone["period_median"] == alone["period_p99"] == 0.0
-    none = reported(logged(0), reason="the arm is lost")
-    assert none.loop == {} and none.figures["turn_max"] == 0.0
+def test_a_weld_of_one_cycle_has_no_period() -> None:
+    loop = reported(logged(1)).loop
+    assert loop["cycles"] == 1.0 and loop["computing_p99"] == 1e-3
+    assert loop["period_median"] == loop["period_p99"] == 0.0
