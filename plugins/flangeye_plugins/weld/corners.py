@@ -162,9 +162,9 @@ def _at(at: Floats, along: Floats, rows: Floats) -> Floats:
 
 
 def _require_room(corner: Corner, seam: Seam, params: WeldTactileParams) -> None:
-    side = 1.0 if params.side == "left" else -1.0
+    outside = (params.side == "left") == (corner.turn > 0.0)
     one_wall = params.joint in ("fillet", "lap") and seam.half_angle is None
-    if not (one_wall and side * corner.turn > 0.0):
+    if not (one_wall and outside):
         raise StageError(
             f"weld.tactile: at the corner {_listed([corner])} the finger ahead of the torch would "
             "run into a wall: room is only round the outside of the upright plate of a fillet or "

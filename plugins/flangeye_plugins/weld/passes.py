@@ -100,7 +100,6 @@ class Passes:
         self._response = Response()
         self._path = plan
         self._began: float | None = None
-        self._over = self._start = 0.0
         self._take_over()
         if before is not None and before.number:
             self._go_on(before)

@@ -103,11 +103,11 @@ class Path:
         """Return the slope of the height along the path, zero beyond its ends."""
         if not 0.0 <= s <= self.length:
             return 0.0
-        return float(self._climb[min(round(s / self.step), len(self._climb) - 1)])
+        return float(self._climb[round(s / self.step)])
 
     def sharpest(self, start: float, end: float) -> float:
         """Return the largest curvature between two arc lengths [1/m]; none beyond the ends."""
-        low, high = max(int(start / self.step), 0), max(int(end / self.step) + 1, 1)
+        low, high = max(int(start / self.step), 0), max(int(end / self.step) + 1, 0)
         return float(np.abs(self._curvature[low:high]).max(initial=0.0))
 
     def bend(self, s: float) -> float:

@@ -97,3 +97,20 @@ def test_what_nothing_measures_adds_up_to_how_well_the_torch_is_known() -> None:
     walls = 2 * (asked.joint_sigma * uneven.joint.seat_slope(2e-3)) ** 2
     ball = (0.02e-3 * math.sin(0.3) / math.sin(0.6)) ** 2
     assert uneven.fixed_variance(asked) == pytest.approx(squares + walls + ball)
+    assert own.arm_variance(asked) == pytest.approx((2 * asked.arm_sigma) ** 2)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_tip_is_just_held_by_the_deflection_that_its_remedy_names(side: str) -> None:
+    """Whatever way the tool leans; a little more and it climbs."""
+    belief, asked = (
+        Belief(0.04, 900.0, 2100.0, 0.6, lean=0.1, level_R_tool=leant(0.3)),
+        settings(side=side),
+    )
+    deflection, preload = belief.remedy(asked, 1.0)
+    holding = belief.holding(asked)
+    assert holding @ [deflection, asked.preload] == pytest.approx(0.0, abs=1e-9)
+    assert holding @ [asked.deflection, preload] == pytest.approx(0.0, abs=1e-9)
+    assert holding @ [1.01 * deflection, asked.preload] < 0.0
+    just = settings(side=side, deflection=f"{deflection!r} m")
+    assert belief.seating(just) == pytest.approx(1.0)

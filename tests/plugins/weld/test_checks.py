@@ -316,3 +316,18 @@ def test_a_controller_for_simulated_arms_is_refused_with_any_other() -> None:
         check_controller(wild, real)
     object.__setattr__(wild, "part", SimpleNamespace(simulation_only=False, name="controller.own"))
     check_controller(wild, real)
+
+
+def test_a_plan_may_be_less_certain_beyond_its_start() -> None:
+    asked, points = following(), line(0.1)
+    for uncertain, told in ((slice(0, 1), True), (slice(1, None), False)):
+        seam = seam_of(points)
+        covariance = np.array(seam.covariance)
+        covariance[uncertain] *= 1e4
+        odd = Seam(points, seam.openings_in_base, covariance)
+        assert (float(tube_radii(odd)[0]) > asked.reach) == told
+        if told:
+            with pytest.raises(StageError, match="plan better, or raise 'reach'"):
+                check_seam(odd, Path(points), 0.04, asked)
+        else:
+            check_seam(odd, Path(points), 0.04, asked)

@@ -216,3 +216,20 @@ def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: 
     planned = (seam.points_in_base[leg] - start) @ along
     assert s[beside].max() == pytest.approx(min(planned, np.linalg.norm(end - start)), abs=0.3e-3)
     assert np.sqrt(np.mean(across[beside] ** 2)) < 0.1e-3
+
+
+@pytest.mark.parametrize(("last", "corners"), [(0.0049, 0), (0.0051, 1)])
+def test_a_corner_nearer_to_an_end_than_five_millimetres_is_none(last: float, corners: int) -> None:
+    points = np.array([[0.0, 0, 0], [0.06, 0, 0], [0.06, last, 0]])
+    for way in (points, points[::-1]):
+        assert len(corners_of(way)) == corners
+
+
+@pytest.mark.parametrize(("side", "turn"), [("left", 60.0), ("right", -60.0)])
+def test_round_the_outside_of_the_plate_that_is_pressed_the_finger_has_room(
+    side: str, turn: float
+) -> None:
+    leg = leg_of(seam_of(polyline(turn)), told(leg=1, side=side))
+    assert leg.points_in_base == pytest.approx(polyline(turn)[:2])
+    with pytest.raises(StageError, match="would run into a wall"):
+        leg_of(seam_of(polyline(-turn)), told(leg=1, side=side))

@@ -161,3 +161,25 @@ def test_a_leaning_tool_on_an_arm_and_a_fillet_on_an_inclined_plate() -> None:
 def _about(points, rotation):
     """Points (N, 3) turned about where the workpiece lies."""
     return (points - cell.HERE[:3, 3]) @ rotation.T + cell.HERE[:3, 3]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_finger_s_noise_is_that_across_and_along_it_and_a_plate_stands_on_the_pressed_side(
+    side: str,
+) -> None:
+    settings = following(joint="fillet", side=side)
+    known = {
+        "rest": ["0 mm"] * 3, "rotation": ["0 deg"] * 3, "gain": np.eye(3).tolist(),
+        "noise": ["0.01 mm", "0.02 mm", "0.06 mm"], "source": "a test",
+    }  # fmt: skip
+    finger = Finger.model_validate({**FINGER, "calibration": known})
+    belief = belief_of(finger, body_of(finger, settings), None, settings)
+    assert belief.noise == pytest.approx((0.02e-3, 0.06e-3))
+    bare = Finger.model_validate({k: v for k, v in FINGER.items() if k != "calibration"})
+    unknown = belief_of(bare, body_of(bare, settings), None, settings)
+    assert unknown.noise == (10e-6, 60e-6)
+    assert (unknown.lateral, unknown.axial) == (1000.0, 2000.0)
+    sign = 1.0 if side == "left" else -1.0
+    assert belief.joint is not None and not belief.two_walls
+    assert [belief.joint.left, belief.joint.right][:: int(sign)] == pytest.approx([0.0, np.pi / 2])
+    assert belief.flat(sign) == pytest.approx(np.tan(np.radians(1.0)))

@@ -80,3 +80,21 @@ def test_a_foot_is_found_forwards_and_back_and_progress_only_forwards() -> None:
     assert path.advance(aside, 0.032, 5e-3) == 0.032
     assert path.advance(aside, 0.028, 5e-3) == pytest.approx(0.03, abs=1.5e-4)
     assert path.advance(aside, 0.02, 5e-3) == pytest.approx(0.025)
+
+
+def test_at_its_very_end_a_path_is_at_its_last_point_and_climbs_as_it_does_there() -> None:
+    turn = np.linspace(0.0, 1.5, 300)
+    path = Path(0.05 * np.column_stack([np.sin(turn), 1 - np.cos(turn), turn**2]))
+    end = path.at(path.length)
+    assert end.point == pytest.approx(path.points[-1, :2], abs=1e-12)
+    assert end.tangent == pytest.approx(path.tangents[-1] / np.linalg.norm(path.tangents[-1]))
+    points, _ = path.evaluate(np.array([path.length]))
+    assert points[0] == pytest.approx(path.points[-1], abs=1e-12)
+    rise = float(path.points[-1, 2] - path.points[-2, 2])
+    assert path.climb(path.length) == pytest.approx(rise / path.step, abs=1e-3)
+
+
+def test_before_its_start_a_path_has_no_curve() -> None:
+    path = arc(0.05)
+    assert path.sharpest(-0.02, -0.01) == 0.0
+    assert path.sharpest(-0.02, 0.001) == pytest.approx(20.0, rel=0.02)

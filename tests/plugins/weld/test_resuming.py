@@ -14,9 +14,10 @@ from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simul
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower, ResumePoint
 from flangeye_plugins.weld.frame import WorkPlane
+from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.resuming import RUN_IN, resume_point_of, set_back
-from flangeye_plugins.weld.settings import WeldTactileParams
+from flangeye_plugins.weld.resuming import RUN_IN, controller_of, resume_point_of, set_back
+from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
 from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged
@@ -125,3 +126,53 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     World(line, line, follower, params).run()
     assert (follower.phase, follower.reason) == ("done", "")
     assert follower.lit == pytest.approx(0.14, abs=0.2e-3)
+
+
+def kept_at(torch: float, number: int = 0) -> ResumePoint:
+    return ResumePoint(np.zeros((0, 5)), torch, number=number)
+
+
+def test_a_weld_goes_on_no_nearer_to_its_end_than_the_tip_can_press() -> None:
+    plan = Path(straight(0.2))
+    release = PARAMS.speed * PARAMS.deflection / PARAMS.release
+    last = 0.2 - PARAMS.ending - release - 5e-3
+    params = set_back(PARAMS, plan, DISTANCE, kept_at(0.199))
+    assert params.inset == pytest.approx(last)
+    assert params.offset_along == pytest.approx(0.199 - PARAMS.overlap)
+    before = set_back(PARAMS, plan, DISTANCE, kept_at(0.1))
+    assert before.inset == pytest.approx(0.1 - PARAMS.overlap - RUN_IN + DISTANCE, abs=0.6e-3)
+    assert pytest.approx(16e-3) == RUN_IN
+    begun = set_back(PARAMS, plan, DISTANCE, kept_at(1e-3))
+    assert begun.inset == pytest.approx(PARAMS.inset, abs=0.5e-3) and begun.offset_along == 0.0
+    with pytest.raises(StageError, match="too short for the tip to press on"):
+        set_back(PARAMS, Path(straight(PARAMS.inset + 0.2 - last - 1e-3)), DISTANCE, kept_at(0.01))
+
+
+@pytest.mark.parametrize("heading", [0.0, 3.0, -3.0])
+def test_on_a_bend_the_tool_is_set_down_along_the_chord_from_torch_to_tip(heading: float) -> None:
+    radius, c, s = 0.06, np.cos(heading), np.sin(heading)
+    turn = np.linspace(0.0, 3.0, 900)
+    bend = radius * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
+    plan = Path(bend @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
+    half = np.arcsin(DISTANCE / 2 / radius)  # the chord's angle to the circle
+    for number, along in ((0, 0.0), (1, 0.09)):
+        params = PARAMS.model_copy(
+            update={"passes": (PassParams.model_validate({"along": f"{along} m"}),)}
+        )
+        params = set_back(params, plan, DISTANCE, kept_at(0.1, number))
+        assert params.start_angle == pytest.approx(-half, abs=0.02)
+        lit = 0.07 if not number else 0.09  # a pass is lit no sooner than it begins
+        assert params.offset_along == pytest.approx(lit)
+        run_in = RUN_IN if not number else 0.0
+        assert params.inset == pytest.approx(lit - run_in + 2 * half * radius, abs=1.1e-3)
+
+
+def test_later_passes_follow_a_weld_by_touch_alone() -> None:
+    plan, settings = Path(straight()), Following.model_validate({"passes": [{}]})
+    alone = Following.model_validate({})
+    for mode, asked, kind in (
+        ("tactile", settings, Passes), ("vision", settings, Follower), ("tactile", alone, Follower),
+    ):  # fmt: skip
+        given: Mode = mode
+        controller = controller_of(plan, Belief(DISTANCE), asked, given)
+        assert type(controller) is kind and controller.mode == mode
