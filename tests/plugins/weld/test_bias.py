@@ -143,3 +143,12 @@ def test_the_torch_s_places_are_remembered_every_fifth_of_a_millimetre() -> None
         trail.pass_by(1.0 + s, s, s, 0.0)
     for s, place in ((0.2e-3, 0.0), (0.3e-3, 0.21e-3), (0.41e-3, 0.21e-3), (0.5e-3, 0.42e-3)):
         assert trail.passing(s) == (place, 0.0)
+
+
+def test_what_a_look_contradicts_is_told_with_what_was_known_before() -> None:
+    bias = Bias(PRIOR, HEAT, LENGTH)
+    last = looked(bias, 0.4e-3)
+    for i in range(1, 6):
+        bias.look(last + i * 1e-4, -0.9e-3, SIGMA, 0.0)
+    known = f"{bias.value * 1e3:+.2f} mm were known"
+    assert bias.value > 0.3e-3 and known in bias.doubt and "bead -0.90 mm" in bias.doubt

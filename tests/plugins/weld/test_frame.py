@@ -36,7 +36,7 @@ def test_the_plane_goes_along_the_seam_and_out_of_the_work() -> None:
 def test_a_seam_that_ends_within_a_millimetre_of_its_start_begins_along_itself(
     gap: float, along: list[float]
 ) -> None:
-    loop = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0], [gap, 0, 0]])
+    loop = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0], [gap, 0, 0]]) + MIDDLE
     plane = WorkPlane(loop, np.tile([0, 0, 1.0], (4, 1)))
     assert plane.base_T_plane.rotation[:, 0] == pytest.approx(along)
 

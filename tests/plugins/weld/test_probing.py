@@ -256,10 +256,9 @@ def fitted(
         found.note(t, np.gradient(told, PERIOD)[i], where[i])
         if i % IMAGES == 0:
             odd = waves * math.sin(8.0 * t) + noise * rng.standard_normal()
-            height = (
-                climbs * max(side * where[i] - 0.9 * d, 0.0) + 6 * noise * rng.standard_normal()
-            )
-            found.feel(t + stamp, shown[i] + odd, height, along[i])
+            rise = climbs * max(side * where[i] - 0.9 * d, 0.0)
+            height = rise + 6 * noise * rng.standard_normal()
+            found.feel(t + stamp, shown[i] + odd, 1e-3 + height, along[i])  # the plan lies lower
     return found
 
 
@@ -504,3 +503,89 @@ def test_play_and_hysteresis_are_found_that_are_gone_through_over_so_much(over: 
 @pytest.mark.parametrize("stamp", [-0.06, 0.12])
 def test_timestamps_are_found_that_are_early_by_60_ms_or_late_by_120(stamp: float) -> None:
     assert learned(stamp=stamp, noise=1e-6).stamp == pytest.approx(stamp)
+
+
+def test_a_finger_scatters_across_as_its_file_says_at_least() -> None:
+    for seen, across in ((1e-6, 5e-6), (9e-6, 9e-6)):
+        found = going(noise=5e-6)
+        found.begin(seen)
+        assert found._noise == (across, 6e-5)  # in height as its file says
+
+
+@pytest.mark.parametrize(
+    ("aside", "rise_sigma", "aside_sigma", "told"),
+    [
+        (9.0, 0.51, 0.0, True), (9.0, 0.49, 0.0, False), (1.02, 0.6, 0.0, True),
+        (0.98, 0.6, 0.0, False), (0.0, 0.6, 0.51, True), (0.0, 0.6, 0.49, False),
+    ],
+)  # fmt: skip
+def test_a_stroke_cannot_tell_where_both_what_it_rose_and_went_aside_may_be_a_climb_s(
+    aside: float, rise_sigma: float, aside_sigma: float, told: bool
+) -> None:
+    """In shares of what a tip would do that is just held: it goes aside as its wall leans."""
+    found = going()
+    rise = found._just_held()
+    both = np.array([aside * FLAT * rise, 0.0]), np.array([aside_sigma * FLAT, rise_sigma]) * rise
+    found._sliding = type("Stroke", (), {"climbed": lambda self: both})()
+    assert (found._slid() is not None) == told
+
+
+@pytest.mark.parametrize(
+    ("rise", "sigma", "told"),
+    [
+        (0.12e-3, 0.02e-3, "the tip climbs the wall by 0.12 mm when it is pressed aside"),
+        (0.12e-3, 0.024e-3, None),
+        (0.0, 0.51, "whether the tip climbs the wall is known to {:.2f} mm only"),
+        (0.0, 0.49, None),
+    ],
+)
+def test_a_tip_that_is_hardly_held_or_may_be_is_refused(
+    rise: float, sigma: float, told: str | None
+) -> None:
+    """A sigma of half and more is a share of what a tip rises that is just held."""
+    found = going()
+    sigma *= found._just_held() if sigma > 0.1 else 1.0
+    found._knee = lambda felt, at, known: (rise, sigma)
+    nothing = np.zeros((0, 4))
+    said = found._hardly_held(nothing, nothing[:, 0], Learned())
+    if told is None:
+        assert said is None
+    else:
+        assert str(said).startswith(told.format(sigma * 1e3))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.98, False), (1.02, True)])
+def test_less_than_was_stated_is_a_climb_s_where_heights_do_not_say_otherwise(
+    share: float, told: bool
+) -> None:
+    """Two sigmas of the heights' means have to tell: of those pressed hard, and those hardly."""
+    found, gain = fitted(noise=1e-9, gain=-0.06), -0.06
+    felt, cycles = np.array(found._felt), np.array(found._cycles)
+    where = np.interp(felt[:, 0], *cycles.T[[0, 2]])
+    middle = (where.max() + where.min()) / 2
+    pressed = np.abs(where - middle) / np.abs(where - middle).max()
+    counts = np.count_nonzero(pressed > 0.85), np.count_nonzero(pressed < 0.5)
+    aside = 0.06 * 1.25 * SETTINGS.deflection
+    rise = 0.35 * aside / FLAT
+    noise = share * rise / 2 / math.sqrt(1 / counts[0] + 1 / counts[1])
+    found._noise = (1e-9, noise)
+    found._hardly_held = lambda felt, at, known: None
+    assert (found._climb(felt, cycles, Learned(gain=gain)) is not None) == told
+
+
+@pytest.mark.parametrize("two_walls", [True, False])
+@pytest.mark.parametrize(("climbs", "told"), [(0.15e-3, True), (0.04e-3, False)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_heights_of_a_tip_pressed_hard_and_hardly_tell_of_its_climb(
+    side: float, climbs: float, told: bool, two_walls: bool
+) -> None:
+    found = fitted(noise=1e-9, side=side, two_walls=two_walls)
+    felt, cycles = np.array(found._felt), np.array(found._cycles)
+    where = side * np.interp(felt[:, 0], *cycles.T[[0, 2]])
+    middle = (where.max() + where.min()) / 2 if two_walls else where.min()
+    felt[:, 2] += climbs * (np.abs(where - middle) > 0.7 * np.abs(where - middle).max())
+    found._noise, found._hardly_held = (1e-9, 1e-6), lambda felt, at, known: None
+    said = found._climb(felt, cycles, Learned())
+    assert (said is not None) == told
+    if told:
+        assert said.startswith("the tip climbs the wall by 0.15 mm when it is pressed aside")
