@@ -128,3 +128,24 @@ def test_a_tip_is_higher_for_long_when_it_was_so_for_two_centimetres_of_its_own_
     # What the plan may be tilted by to the middle of those two centimetres is not told.
     away, risen = felt[-1]
     assert risen == pytest.approx((2e-3 - 0.02 * (away - 0.01)) / 0.35, rel=0.01)
+
+
+@pytest.mark.parametrize(("count", "doubted"), [(9, False), (10, True)])
+def test_a_tip_is_doubted_against_ten_samples_behind_it(count: int, doubted: bool) -> None:
+    seating = Seating(1.0, 1.0)
+    for i in range(count):
+        seating.judge(1e-4 * i, 0.0, 0.0)
+    seating.judge(0.012, 0.2e-3, 0.2e-3)
+    assert (seating.doubt > 0.0) == doubted
+
+
+def test_after_a_gap_the_tip_is_held_against_what_was_felt_before_it() -> None:
+    """What is lifted and aside there may have climbed; how far behind it was seated matters not."""
+    for gap, doubted in ((0.03, True), (0.05, False)):
+        seating = Seating(1.0, 1.0)
+        for i in range(100):
+            seating.judge(1e-4 * i, 0.0, 0.0)
+        seating.forget()
+        for i in range(5):
+            assert seating.judge(0.01 + gap + 1e-4 * i, 0.2e-3, 0.2e-3) is None
+        assert (seating.doubt > 0.15e-3) == doubted
