@@ -233,3 +233,60 @@ def test_round_the_outside_of_the_plate_that_is_pressed_the_finger_has_room(
     assert leg.points_in_base == pytest.approx(polyline(turn)[:2])
     with pytest.raises(StageError, match="would run into a wall"):
         leg_of(seam_of(polyline(-turn)), told(leg=1, side=side))
+
+
+@pytest.mark.parametrize(("turn", "corners"), [(34.0, 0), (36.0, 1), (-34.0, 0), (-36.0, 1)])
+def test_a_plan_that_turns_by_more_than_35_degrees_within_ten_millimetres_has_a_corner(
+    turn: float, corners: int
+) -> None:
+    assert len(corners_of(polyline(turn))) == len(corners_of(dense(polyline(turn)))) == corners
+
+
+@pytest.mark.parametrize(
+    ("turn", "apart", "corners"),
+    [(30.0, 3e-3, 1), (30.0, 14e-3, 0), (60.0, 9e-3, 1), (60.0, 11e-3, 2)],
+)
+def test_bends_within_ten_millimetres_are_one_corner(
+    turn: float, apart: float, corners: int
+) -> None:
+    headings = np.radians([0.0, turn, 2 * turn])
+    steps = np.array([0.05, apart, 0.05])[:, None] * np.stack(
+        [np.cos(headings), np.sin(headings), 0 * headings], axis=1
+    )
+    assert len(corners_of(np.concatenate([[[0.0, 0, 0]], np.cumsum(steps, axis=0)]))) == corners
+
+
+@pytest.mark.parametrize(("radius", "room"), [(29.9e-3, True), (30.1e-3, False)])
+@pytest.mark.parametrize("turns", [(90.0,), (60.0, -90.0)])
+def test_an_arc_begins_beyond_the_middle_of_the_leg_before_it(
+    turns: tuple[float, ...], radius: float, room: bool
+) -> None:
+    asked = told(**{**ROUND, "corner_radius": radius})
+    if room:
+        leg_of(seam_of(polyline(*turns)), asked)
+        return
+    with pytest.raises(StageError, match=r"90 deg at (60|120) mm has no room .* at most 30 mm"):
+        leg_of(seam_of(polyline(*turns)), asked)
+
+
+def test_round_two_corners_the_plan_goes_on_in_order_and_keeps_what_is_known_of_it() -> None:
+    points = dense(polyline(60.0, -60.0))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    seam = seam_of(points)
+    lean = 0.3 * along
+    openings = np.column_stack([0 * lean, np.sin(lean), np.cos(lean)])
+    odd = Seam(points, openings, np.array(seam.covariance) * (1.0 + along[:, None, None]))
+    plan = leg_of(odd, told(**ROUND))
+    cut = 5e-3 * np.tan(np.radians(30.0))
+    steps = np.linalg.norm(np.diff(plan.points_in_base, axis=0), axis=1)
+    assert steps.max() < 1.8e-3
+    arcs = 2 * 5e-3 * np.radians(60.0)
+    assert steps.sum() == pytest.approx(0.18 - 4 * cut + arcs, abs=1e-5)
+    for corner, side in ((0.06, 1.0), (0.12, -1.0)):  # an arc's middle lies beside its corner
+        here = np.array([np.interp(corner, along, axis) for axis in points.T])
+        nearest = np.linalg.norm(plan.points_in_base - here, axis=1).min()
+        assert nearest == pytest.approx(5e-3 / np.cos(np.radians(30.0)) - 5e-3, abs=2e-5), side
+    leans = np.arctan2(plan.openings_in_base[:, 1], plan.openings_in_base[:, 2])
+    at = leans / 0.3  # what is told of a place is that of its arc length
+    assert (np.diff(at) > -1e-12).all() and at[-1] == pytest.approx(0.18)
+    assert plan.covariance[:, 0, 0] == pytest.approx(1e-8 * (1.0 + at), rel=1e-5)

@@ -118,6 +118,7 @@ def test_a_pass_goes_aside_of_what_was_found_and_higher_than_the_tool_was(points
         assert (there.point - place.point) @ place.normal == pytest.approx(2.5e-3, abs=2e-5)
         assert there.height == pytest.approx(-1e-3 + 4e-3)
     assert found.aim == 2e-3 and found.bound == found.sigma == found.wanted == 0.0
+    assert found.torch == found.band == 0.0 and found.tip == DISTANCE
 
 
 def test_between_passes_the_tool_is_lifted_crosses_and_comes_down_where_the_pass_begins() -> None:
