@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.devices import WeldProfile
 from flangeye.motion.seam_following import STILL, Command, ToolPose, Touch
 from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.follower import Follower, ResumePoint
@@ -770,3 +771,79 @@ def test_a_tool_s_length_before_the_seam_the_torch_is_led_to_where_the_plan_was_
     found.refined.hurried = False
     for s in (-DISTANCE, following().inset - DISTANCE, LENGTH + DISTANCE):
         assert found.refined.offset(s) == pytest.approx(1e-3 + turn * s, abs=0.02e-3)
+
+
+# --- what is seen behind the torch ----------------------------------------------------------------
+
+SEEING = Belief(DISTANCE, behind=9.5e-3)
+
+
+def passing_by(**given: Any) -> Any:
+    """A follower whose torch has gone 40 mm in four seconds, ever farther to the left."""
+    found = make(belief=SEEING, **given)
+    for i in range(41):
+        found._trail.pass_by(1.0 + 0.1 * i, 1e-3 * i, 1e-5 * i, 1e-10 * i)
+    return found
+
+
+def test_a_look_is_held_against_where_the_torch_was_when_it_passed_that_place() -> None:
+    found, asked = passing_by(), following()
+    prior = SEEING.fixed_variance(asked) - SEEING.arm_variance(asked)
+    assert found._unseen() == pytest.approx(prior + SEEING.arm_variance(asked))
+    found.looked(WeldProfile(0.35e-3, 0.05e-3, 4_050_000_000))  # the torch is at 30 mm
+    one = (0.05e-3) ** 2 + 20e-10 + SEEING.arm_variance(asked)
+    gain = prior / (prior + one)
+    assert found.bias.value == pytest.approx(gain * (0.35e-3 - 0.2e-3))
+    found.torch = 0.03
+    grown = asked.distortion**2 / DISTANCE * 9.5e-3
+    known = (1 - gain) * prior + grown + (0.05e-3) ** 2
+    assert found.bias.variance(0.03) == pytest.approx(known)
+    assert found._unseen() == pytest.approx(SEEING.arm_variance(asked) + known)
+
+
+def test_a_look_at_what_no_torch_has_passed_says_nothing_nor_does_one_after_the_end() -> None:
+    profile = WeldProfile(0.35e-3, 0.05e-3, 4_050_000_000)
+    for found in (passing_by(phase="done"), passing_by(phase="stopped"), make(belief=SEEING)):
+        found.looked(profile)
+        assert not found.bias.looked
+    early = passing_by()
+    early.looked(WeldProfile(0.35e-3, 0.05e-3, 1_950_000_000))  # the torch was 9 mm along
+    assert not early.bias.looked
+    blind = make()
+    blind._trail = passing_by()._trail
+    blind.looked(profile)
+    assert not blind.bias.looked
+
+
+def test_looks_that_contradict_all_that_is_stated_stop_the_weld() -> None:
+    found = passing_by()
+    for i in range(5):
+        assert found.phase == "following"
+        found.looked(WeldProfile(9e-3, 0.05e-3, 4_050_000_000 + i * 100_000_000))
+    assert found.phase == "stopped" and found.reason.startswith("the look behind the torch sees")
+
+
+def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:
+    found = make(offset_across="0.1 mm")
+    felt_along(found, 0.0)
+    found.bias.value, found.torch, found.lit = 0.25e-3, 0.05, 0.0
+    found._estimate(pose(0.05 + DISTANCE, 0.1e-3 - 0.25e-3, time=6.0))
+    assert found.bound == pytest.approx(4 * found.sigma, abs=1e-6)
+    (row,) = found._trail._rows
+    assert row[0] == pytest.approx(-0.15e-3, abs=1e-6)
+    assert row[1] == pytest.approx(found.sigma**2 - found._unseen())
+    assert found._trail.place_at(6.0) == 0.05
+    led = make(touch=False, offset_across="0.1 mm")
+    led.bias.value, led._time = 0.25e-3, 0.0
+    led.tip, led.torch, led._coming = 0.05, 0.01, 0.01
+    right = pose(0.05, 0.0, angle=0.15e-3 / DISTANCE, time=0.01)
+    assert led.step(right, []).turn == pytest.approx(0.0, abs=1e-4)
+
+
+def test_where_the_torch_passes_is_remembered_once_it_is_lit() -> None:
+    for lit, count in ((None, 0), (0.0, 1)):
+        found = make()
+        felt_along(found, 0.0)
+        found.torch, found.lit = 0.05, lit
+        found._estimate(pose(0.05 + DISTANCE, 0.0, time=6.0))
+        assert len(found._trail._rows) == count and found.lit is not None

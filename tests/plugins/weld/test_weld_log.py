@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from flangeye_plugins.weld.weld_log import Cycle, WeldLog, columns
+from flangeye.devices import WeldProfile
+from flangeye_plugins.weld.weld_log import Cycle, LoggedLooks, WeldLog, columns
 
 
 def cycle(i: int) -> Any:
@@ -61,3 +62,20 @@ def test_images_are_numbered_from_when_the_weld_begins_and_kept_where_a_tag_was_
 def test_cycles_are_kept_column_by_column() -> None:
     table = columns([cycle(1), cycle(2)])
     assert list(table) == list(Cycle._fields) and table["turn"] == [1.0, 2.0]
+
+
+def test_a_look_is_logged_with_the_cycle_that_takes_it_in_and_given_back_to_that_one() -> None:
+    written, looks = list[Any](), [WeldProfile(1e-4 * i, 5e-5, 7 + i) for i in range(3)]
+    with WeldLog(lambda name, value: written.append((name, value)), False) as log:
+        log.looked(looks[0])
+        log.turned(cycle(0))
+        log.turned(cycle(1))
+        log.looked(looks[1])
+        log.looked(looks[2])
+    told = [value for name, value in written if name == "look"]
+    assert [each["cycle"] for each in told] == [0, 2, 2]
+    again = LoggedLooks()
+    for each in told:
+        again.take(each)
+    assert [again.of(i) for i in range(4)] == [[looks[0]], [], looks[1:], []]
+    assert again.of(2) == [] and told[0]["cycle"] == 0  # given once; the log stays as it is
