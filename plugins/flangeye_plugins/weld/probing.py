@@ -274,7 +274,9 @@ class Probing:
         """Say that the tip rises where it is pressed hard, or that it may."""
         at = np.interp(felt[:, 0] - found.stamp, cycles[:, 0], cycles[:, 2])
         from_wall = self._side * at
-        middle = from_wall.min() if not self._two_walls else (at.max() + at.min()) / 2 * self._side
+        middle = from_wall.min()
+        if self._two_walls:
+            middle = (middle + from_wall.max()) / 2
         pressed = np.abs(from_wall - middle) / max(float(np.abs(from_wall - middle).max()), 1e-9)
         hard, soft = felt[pressed > 0.85, 2], felt[pressed < 0.5, 2]
         if min(len(hard), len(soft)) < 3:
@@ -330,7 +332,7 @@ class Probing:
         for width in REVERSALS:
             reversal = (_dragged(at[None], np.array([width]))[0] - at) / width
             aside = self._side * self._flat * share
-            across = np.column_stack([one, -at, reversal, 0.0 * one, 0.0 * one, aside]) / noise
+            across = np.column_stack([one, -at, reversal, none[:, :2], aside]) / noise
             rows = np.vstack([across, heights])
             said = np.concatenate([felt[:, 1] / noise, felt[:, 2] / high])
             solved = np.linalg.lstsq(rows, said, rcond=None)[0]

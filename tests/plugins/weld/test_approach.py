@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye_plugins.weld.approach import _watch
+from flangeye_plugins.weld.approach import _watch, approach
 
 
 def watched(displacements: list[Any], seen: int = 1, period: float = 0.05) -> tuple[int, int]:
@@ -57,3 +57,25 @@ def test_a_finger_is_watched_for_two_seconds_or_ten_measurements() -> None:
         watched([None] * 99)
     with pytest.raises(StageError, match="the camera gives no images; is the finger's light on"):
         watched([], seen=0)
+
+
+@pytest.mark.parametrize(("mode", "watched_first"), [("tactile", True), ("vision", False)])
+def test_the_finger_is_watched_before_the_arm_moves_where_it_is_needed(
+    mode: Any, watched_first: bool
+) -> None:
+    """What is seen on the way is logged, and is no news to the controller."""
+    told, cycles = list[Any](), [0]
+
+    def tick() -> Any:
+        cycles[0] += 1
+        return SimpleNamespace(time_ns=cycles[0] * 10**8, joints=[0.1, 0.2])
+
+    free = SimpleNamespace(feeling=SimpleNamespace(displacement=np.zeros(3)))
+    eyes = SimpleNamespace(seen=lambda: [free])
+    drive = SimpleNamespace(tick=tick, follow=lambda route: told.append(route))
+    passage: Any = SimpleNamespace(to_start=lambda here: ("way from", *here.tolist()))
+    log: Any = SimpleNamespace(before=lambda sight: told.append("seen"))
+    cell: Any = SimpleNamespace(drive=drive, eyes=eyes)
+    approach(cell, passage, log, mode)
+    before = ["seen"] * 10 if watched_first else []
+    assert told == [*before, ("way from", 0.1, 0.2), "seen"]

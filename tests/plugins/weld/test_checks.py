@@ -52,6 +52,7 @@ def following(**given: Any) -> Following:
     ("given", "told"),
     [
         ({"deflection": "5.9 mm"}, None),
+        ({"deflection": "6 mm"}, None),
         ({"deflection": "6.1 mm"}, "a deflection of 6.1 mm is more than finger bench stands, 6 mm"),
         ({"preload": "6.1 mm"}, "a deflection of 6.1 mm is more than finger bench stands, 6 mm"),
     ],
@@ -168,6 +169,8 @@ def test_the_nearest_posture_is_that_whose_farthest_joint_turns_least() -> None:
     ("off", "displaced", "told"),
     [
         (19e-3, 5.9e-3, None),
+        (20e-3, 0.0, None),
+        (0.0, 6e-3, None),
         (-21e-3, 0.0, "the tip is 21 mm away from the plan, allowed are 20 mm"),
         (0.0, 6.1e-3, "the tip is displaced by 6.1 mm, finger bench stands 6 mm"),
     ],
@@ -331,3 +334,25 @@ def test_a_plan_may_be_less_certain_beyond_its_start() -> None:
                 check_seam(odd, Path(points), 0.04, asked)
         else:
             check_seam(odd, Path(points), 0.04, asked)
+
+
+def test_what_is_allowed_is_allowed_to_the_last_digit() -> None:
+    asked = following()
+    stiff = finger(calibration=STIFF)
+    force = stiff.force(np.array([0.0, asked.deflection, asked.preload]))
+    assert force is not None
+    check_finger(stiff, asked.model_copy(update={"force": force}))
+    felt: Any = SimpleNamespace(displacement=np.array([0.0, asked.deflection, asked.preload]))
+    pose: Any = SimpleNamespace(position=np.array([0.05, 0.0, 0.0]))
+    pressed = asked.model_copy(update={"force": force})
+    Bounds(stiff, Path(line(0.1)), pressed).check(pose, 0.03, [felt])
+    limits: Any = SimpleNamespace(speed=flange_speed(finger(), asked))
+    check_speeds(finger(), asked, limits)
+    fault = float(tube_radii(seam_of(line(0.1)))[0])
+    certain = asked.model_copy(update={"reach": fault})
+    check_seam(seam_of(line(0.1)), Path(line(0.1)), 0.04, certain)
+    belief = Belief(0.04)
+    known = 4.0 * float(np.sqrt(belief.fixed_variance(asked)))
+    check_belief(belief, asked.model_copy(update={"max_error": known}))
+    body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, 8e-3]))
+    check_body(body, belief, asked.model_copy(update={"torch_height": 8e-3}))

@@ -543,11 +543,12 @@ def refused(found: Any, at: Any = None, **state: Any) -> str:
 
 
 def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
-    assert refused(make(), _seen=0.501) == ""
+    assert refused(make(), _seen=0.501) == refused(make(), _seen=0.5) == ""
     assert refused(make(), _seen=0.499) == "no tag was seen for 500 ms"
     assert refused(make("ending"), _seen=0.0) == ""
     assert refused(make(touch=False), _seen=0.0) == ""
     assert refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0599) == ""
+    assert refused(make("bridging"), _seen=1.0, _bridge=0.0, tip=0.04) == ""
     told = refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0601)
     assert told == "no contact for 40 mm of the seam"
     bent = make("seeking")
@@ -556,7 +557,11 @@ def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
     over = make("seeking")
     over._search.over = True
     assert refused(over, _seen=1.0) == "no groove within 8 mm of the plan's start"
-    for z, told in ((-7.9e-3, ""), (-8.1e-3, "no groove within 8 mm of the plan's start")):
+    for z, told in (
+        (-7.9e-3, ""),
+        (-8e-3, ""),
+        (-8.1e-3, "no groove within 8 mm of the plan's start"),
+    ):
         assert refused(make("seeking"), pose(0.05, z=z, time=1.0), _seen=1.0) == told
     for phase in ("done", "stopped"):
         assert refused(make(phase), _seen=0.0) == ""
