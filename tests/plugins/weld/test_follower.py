@@ -17,6 +17,7 @@ from flangeye_plugins.weld.motion import SeamReading
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
 from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.weave import Sway
 from tests.plugins.weld.bench import straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05
@@ -244,6 +245,9 @@ def test_the_tip_slows_down_while_no_image_comes() -> None:
         assert found._pace(pose(0.05, time=7.0), along) == pytest.approx(
             share * asked.speed, abs=1e-9
         )
+    found._heard, found.contact.deflection = 7.0 - 0.11, 0.35 * asked.deflection  # half as firm
+    assert found._pace(pose(0.05, time=7.0), along) == pytest.approx(0.4 * asked.speed, abs=1e-9)
+    found._heard = 7.0 - 0.149
     found.phase = "seeking"
     assert found._pace(pose(0.05, time=7.0), along) == 0.0
     assert found._silence(7.0) == pytest.approx(0.149)
@@ -468,11 +472,11 @@ def test_a_wall_that_is_gone_while_the_tip_is_let_go_of_is_noticed() -> None:
     """By where the arm is, and where the seam was felt before."""
     for lags, loose in ((1.0, False), (0.2, True)):
         found = make("ending", side="right")
-        felt_along(found, 0.0)
-        found.refined.add(2.0, 0.09, 0.0, 0.0)
+        felt_along(found, 1e-3)
+        found.refined.add(2.0, 0.09, 1e-3, 0.0)
         for _ in range(6):  # the arm presses by 2 mm; a tip that goes along stays aside of the seam
             deflection = lags * 2e-3
-            aside = -(2e-3 - deflection)
+            aside = 1e-3 - (2e-3 - deflection)
             found._notice_loss(0.09, SeamReading(aside, 0.0), deflection)
         assert found._release.loose == loose
         assert bool(found.refined._pending) != loose
@@ -852,3 +856,34 @@ def test_where_the_torch_passes_is_remembered_once_it_is_lit() -> None:
         found.torch, found.lit = 0.05, lit
         found._estimate(pose(0.05 + DISTANCE, 0.0, time=6.0))
         assert len(found._trail._rows) == count and found.lit is not None
+
+
+@pytest.mark.parametrize("aside", [0.3e-3, -0.3e-3])
+def test_a_torch_that_is_where_its_swing_is_stays_there_and_turns_as_it_goes(aside: float) -> None:
+    for rate in (0.0, 1e-3):
+        found = make(touch=False)
+        found.tip, found.torch, found._coming, found._time = 0.05, 0.01, 0.01, 0.0
+        found._swayed = lambda now, rate=rate: Sway(aside, rate, 0.0)
+        turn = found.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
+        on_line = make(touch=False)
+        on_line.tip, on_line.torch, on_line._coming, on_line._time = 0.05, 0.01, 0.01, 0.0
+        on_line._offset = aside
+        held = on_line.step(pose(0.05, 0.0, angle=-aside / DISTANCE, time=0.01), []).turn
+        # The tip ahead stays on its way, so the torch goes to the left by a turn to the right.
+        assert turn - held == pytest.approx(-rate / DISTANCE, rel=0.01, abs=1e-9)
+
+
+def test_where_a_tip_has_been_higher_for_long_the_last_two_centimetres_are_doubted() -> None:
+    found = make()
+    found._seating = SimpleNamespace(judge=lambda s, offset, height: None, risen=0.3e-3)
+    found._watch(0.06, SeamReading(0.0, 0.0))
+    for s, doubt in ((0.035, 0.0), (0.041, 0.3e-3), (0.05, 0.3e-3), (0.06, 0.3e-3), (0.065, 0.0)):
+        assert found.refined.doubt(s) == doubt
+    assert found.phase == "following"
+    for phase, stopped in (("following", True), ("ending", False)):
+        wrong = make(phase)
+        wrong.refined.add(1.0, 0.05, 0.0, 0.0)
+        wrong._seating = SimpleNamespace(judge=lambda s, offset, height: "it climbs", risen=0.0)
+        wrong._watch(0.06, SeamReading(0.0, 0.0))
+        assert (wrong.phase == "stopped") == stopped == (wrong.reason == "it climbs")
+        assert bool(wrong.refined._pending) != stopped
