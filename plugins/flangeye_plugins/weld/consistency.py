@@ -11,8 +11,11 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import STEEP
 
-NEWEST = 5
-"""Samples that are judged together: never one alone."""
+NEWEST, MANY = 5, 25
+"""Samples that are judged together: never one alone; and so many where five say too little."""
+
+NOISY = 0.05e-3
+"""Five say too little of how high the tip is when it is not known to this, one sigma [m]."""
 
 BEFORE = (8e-3, 45e-3)
 """How far behind the tip the seam that it is held against lies [m]."""
@@ -96,7 +99,7 @@ class Seating:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
         self._side, self.doubt, self.risen = side, 0.0, 0.0
         self._flat = flat
-        self._newest: deque[tuple[float, float, float]] = deque(maxlen=NEWEST)
+        self._newest: deque[tuple[float, float, float]] = deque(maxlen=MANY)
         self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
         self._sweep = _Sweep(0, 0.0, 0.0, 0.0)
 
@@ -124,11 +127,15 @@ class Seating:
         """
         self._newest.append((s, offset, height))
         self._samples.add(s, offset, height)
-        newest, before = np.array(self._newest), self._samples.behind(s)
+        many, before = np.array(self._newest), self._samples.behind(s)
+        newest = many[-NEWEST:]
         self._seated.add(s, offset, height)
         known = self._seated.behind(s)
         if len(known) >= 2 * NEWEST:
-            self._doubt_newest(*_newest_from(known, newest, PLANNED))
+            aside, lifted = _newest_from(known, newest, PLANNED)
+            self._doubt_newest(aside, lifted)
+            if lifted[1] > NOISY:
+                self._doubt_newest(aside, _newest_from(known, many, PLANNED)[1], self.doubt)
         self.risen = self._risen(s) * self._flat / STEEP
         if len(before) < 2 * NEWEST:
             return None
@@ -155,11 +162,19 @@ class Seating:
         sigma = math.hypot(float(heights.std()) / math.sqrt(len(heights)), self._sweep.sigma)
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
-    def _doubt_newest(self, aside: tuple[float, float], lifted: tuple[float, float]) -> None:
-        """Note how far the tip may have climbed; later ones are held against an unlifted tip."""
+    def _doubt_newest(
+        self, aside: tuple[float, float], lifted: tuple[float, float], before: float = 0.0
+    ) -> None:
+        """Note how far the tip may have climbed; later ones are held against an unlifted tip.
+
+        Args:
+            aside: How far the newest are aside, and its sigma [m].
+            lifted: How far up they are [m].
+            before: What is doubted already, on fewer samples [m].
+        """
         towards, up = self._side * aside[0], lifted[0]
         likely = towards > LIKELY * aside[1] and up > LIKELY * lifted[1]
-        self.doubt = min(towards, up * self._flat / STEEP) if likely else 0.0
+        self.doubt = max(before, min(towards, up * self._flat / STEEP) if likely else 0.0)
         if up > SURE * lifted[1]:  # lower ones would bend the line by their noise alone
             self._seated.rows[-1] -= 0.0, self._side * self.doubt, up
 

@@ -16,7 +16,7 @@ from flangeye_plugins.weld.settings import Following
 NEAR = 0.2e-3
 """A turning point of the sweep is reached when it is this close [m]."""
 
-SEATED = 0.3
+SEATED = 0.1
 """The tip bears on the groove when its preload is right to this share."""
 
 SURE = 4.0
