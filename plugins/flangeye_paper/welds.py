@@ -64,10 +64,15 @@ class SeenWeld:
 
     @property
     def end_step(self) -> float:
-        """Largest step across the seam of torch, tip and robot, near the end and after it [m]."""
+        """Largest step across the seam of torch, tip and robot, near the end and after it [m].
+
+        A weld that never came there has none.
+        """
         along, _ = self._seen(self.report.robot)
         leaving = along > _arc_length(self.truth)[-1] - LEAVING
         time = self.report.time[leaving]
+        if not len(time):
+            return 0.0
         both = time + STEP <= time[-1]
         paths = (self.torch, self.report.tip, self.report.robot)
         laterals = [self._seen(path)[1][leaving] for path in paths]

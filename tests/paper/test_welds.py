@@ -72,6 +72,11 @@ def test_a_step_counts_at_the_end_and_a_ramp_by_what_it_does_in_a_tenth_of_a_sec
     assert SeenWeld(weld(robot_off=ramp), TRUTH).end_step == pytest.approx(0.08e-3)
 
 
+def test_a_weld_that_never_came_to_the_end_of_its_seam_has_no_step_there() -> None:
+    longer = np.vstack([TRUTH, [0.5, 0.0, 0.0]])
+    assert SeenWeld(weld(), longer).end_step == 0.0
+
+
 # --- from batches to the table --------------------------------------------------------------------
 
 
