@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from flangeye.cli.app import complete_recipe
 from flangeye.cli.commands import app
+from flangeye.errors import FlangeyeError
 from flangeye.models.loading import load_model, model_names
 from flangeye.plugin.registry import PluginNotFoundError, load_registry
 from flangeye.recipe.load import load_recipe
@@ -29,6 +30,26 @@ def test_the_lists_name_every_model() -> None:
     assert "ISO 9409-1-50-4-M6      outer 63, pitch circle 50, centring 31.5 mm" in flangeye(
         "standards"
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("new-robot", "mine"), "joint 1: was not answered; give --joint or --urdf"),
+        (("new-scanner", "acme"),
+         "nearest it sees, for example 300 mm: was not answered; give --near"),
+        (("new-scanner", "acme", "--near", "300 mm"),
+         "farthest it sees, for example 900 mm: was not answered; give --far"),
+    ],
+)  # fmt: skip
+def test_who_asks_where_nobody_answers_says_what_to_give_instead(
+    words: tuple[str, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FlangeyeError) as refused:
+        flangeye(*words)
+    assert str(refused.value) == told
+    assert not list(tmp_path.iterdir())
 
 
 RECIPE = "title: T\nrobot: mine.yaml\nscanner: acme.yaml\nsteps: [acquire.archive, segment.flange, fit.rim, solve.svd]\n"

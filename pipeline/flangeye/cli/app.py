@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.saying import say, say_notes
+from flangeye.errors import FlangeyeError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,3 +86,16 @@ def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None =
     recipe = load_recipe(find_recipe(name), registry, overrides or ())
     say_notes(registry.notes())
     return recipe
+
+
+def ask(question: str, instead: str, default: str | None = None) -> str:
+    """Return what a person answers; ``default`` for an empty line.
+
+    Raises:
+        FlangeyeError: There is nobody to answer; says what to give ``instead``.
+    """
+    shown = bool(default)  # an empty default is only what Enter says
+    try:
+        return str(typer.prompt(question, default=default, show_default=shown))
+    except typer.Abort:
+        raise FlangeyeError(f"{question}: was not answered; {instead}") from None

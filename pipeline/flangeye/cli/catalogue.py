@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import app
+from flangeye.cli.app import app, ask
 from flangeye.cli.saying import say
 
 
@@ -94,7 +94,7 @@ def _ask_joints() -> list[str]:
         "One joint a line, base first, an empty line ends; for example: d: 89.159 mm, alpha: 90 deg"
     )
     joints: list[str] = []
-    while text := typer.prompt(f"joint {len(joints) + 1}", default="", show_default=False):
+    while text := ask(f"joint {len(joints) + 1}", "give --joint or --urdf", default=""):
         joints.append(text)
     return joints
 
@@ -133,8 +133,8 @@ def new_scanner(  # noqa: PLR0913  one for each option
     columns, rows = pixels or (None, None)
     values = {
         "model": name,
-        "near": near or typer.prompt("nearest it sees, for example 300 mm"),
-        "far": far or typer.prompt("farthest it sees, for example 900 mm"),
+        "near": near or ask("nearest it sees, for example 300 mm", "give --near"),
+        "far": far or ask("farthest it sees, for example 900 mm", "give --far"),
         "principle": principle, "columns": columns, "rows": rows,
         "field_of_view": list(field) if field else None,
         "temporal_noise": noise, "calibration_error": error,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import app, load_plugins
+from flangeye.cli.app import app, ask, load_plugins
 from flangeye.cli.saying import say
 from flangeye.errors import RecipeError
 
@@ -118,9 +118,4 @@ def init(  # noqa: PLR0913  one for each option
 
 
 def _prompt(question: str, default: str | None) -> str:
-    try:
-        return str(typer.prompt(question, default=default))
-    except typer.Abort:
-        raise RecipeError(
-            f"{question}: was not answered; give the option, or --yes for the defaults"
-        ) from None
+    return ask(question, "give the option, or --yes for the defaults", default)

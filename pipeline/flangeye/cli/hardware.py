@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
+from flangeye.cli.app import Overrides, RecipeName, app, ask, load_plugins, read_recipe
 from flangeye.cli.saying import say
 
 tactile = typer.Typer(no_args_is_help=True, help="Calibrate tactile fingers.")
@@ -52,12 +52,12 @@ def tactile_calibrate(
 def _asker(yes: bool) -> Callable[[str], None]:
     """Return what says a text and, unless everything is confirmed, waits for Enter."""
 
-    def ask(text: str) -> None:
+    def wait(text: str) -> None:
         say(text)
         if not yes:
-            typer.prompt("then press Enter", default="", show_default=False)
+            ask("then press Enter", "--yes waits for nobody", default="")
 
-    return ask
+    return wait
 
 
 @app.command()
@@ -88,8 +88,8 @@ def touch(  # noqa: PLR0913  one for each option
     from flangeye.cli.touching import touch_points
 
     registry = load_plugins()
-    given, ask = (seen, tip), _asker(yes)
-    for line in touch_points(run, registry, given, move, ask, out, overrides or ()):
+    given, wait = (seen, tip), _asker(yes)
+    for line in touch_points(run, registry, given, move, wait, out, overrides or ()):
         say(line)
 
 
