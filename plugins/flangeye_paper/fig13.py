@@ -61,7 +61,8 @@ def _rows(workpiece: str, welds: Welds) -> Iterable[Row]:
 def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
     """Return the figures over all welds that were followed in one way."""
     part = PARTS.get(name, (0.0, np.inf))
-    found = [weld.deviation(part) for weld in welds]
+    # A weld that was stopped before its torch came there has none.
+    found = [off for weld in welds if len(off := weld.deviation(part))]
     every = np.concatenate(found)
     touched = name not in (PLAN, PRINTED)
     return {

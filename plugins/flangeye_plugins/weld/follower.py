@@ -321,7 +321,8 @@ class Follower:
         s, felt, deflection = self._located(pose, touch)
         self._touched = s
         if self.phase != "seeking" or self._search.found:  # friction on a face is no contact
-            self.contact.update(touch.time, deflection, max(self.wanted, self._settings.probe))
+            wanted = self._settings.probe if self.phase == "bridging" else self.wanted
+            self.contact.update(touch.time, deflection, max(wanted, self._settings.probe))
         if self.phase == "seeking":
             self._felt = felt
             compression = float(touch.displacement[2] - self._search.rest[2])
@@ -534,7 +535,7 @@ class Follower:
     def _ramp(self, elapsed: float) -> None:
         """Move the wanted deflection towards what the phase asks for."""
         settings = self._settings
-        target = {"bridging": settings.probe, "ending": 0.0}.get(self.phase, settings.deflection)
+        target = {"bridging": self._feeler(), "ending": 0.0}.get(self.phase, settings.deflection)
         if not self._touching:
             target = 0.0
         if self.phase == "seeking" and not self._search.found:
@@ -542,6 +543,17 @@ class Follower:
         rate = settings.release if self.phase == "ending" else settings.ramp
         step = rate * elapsed
         self.wanted += _within(target - self.wanted, step)
+
+    def _feeler(self) -> float:
+        """Return by how much the tip goes beyond where a wall is expected that has ended [m].
+
+        The less is known of where the seam leads there the farther, but never so far that it
+        would meet the end of the wall head on.
+        """
+        if self.phase != "bridging":
+            return 0.0
+        probe = self._settings.probe
+        return probe + min(BAND * math.sqrt(self.refined.variance(self.tip)), probe)
 
     def _progress(self, pose: ToolPose, coming: ToolPose) -> None:
         advance, reach = self._plan.advance, self._settings.speed * 0.1

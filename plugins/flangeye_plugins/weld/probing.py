@@ -67,7 +67,10 @@ KNEE = 0.8
 """A tip that leaves its seat does so beyond this share of the deflection, or shows less anyway."""
 
 RESTS = 0.4
-"""After so long the tip has come to rest where it met the wall [s]."""
+"""No sooner the tip has come to rest where it met the wall [s]."""
+
+STANDING, STANDS = 0.2, 0.02e-3
+"""An arm stands that for so long [s] was nowhere farther aside than this [m]."""
 
 TOLD = 0.03e-3
 """So well the mean of what is felt where the tip is pressed hardest is to be known [m]."""
@@ -168,10 +171,26 @@ class Probing:
 
     def _rested(self) -> float | None:
         """Return by how much the tip is pressed where the sweep begins [m]; None before."""
-        rested = [-self._side * sample[1] for sample in self._felt[len(self._felt) // 2 :]]
-        if self._time < RESTS or (len(rested) < self._enough and self._time < LONGEST):
+        since = self._standing_since()
+        felt = [-self._side * across for time, across, *_ in self._felt if time >= since]
+        rested = felt[len(felt) // 2 :]
+        told = bool(rested) and len(rested) >= self._enough
+        if self._time < RESTS or (not told and self._time < LONGEST):
             return None
         return float(np.mean(rested)) if rested else self._deflection
+
+    def _standing_since(self) -> float:
+        """Return since when the arm stands [s], infinity where it still moves.
+
+        It does for a while after it was told to stop, longest where it turned as well.
+        """
+        now, _, here = self._cycles[-1] if self._cycles else (0.0, 0.0, 0.0)
+        since = math.inf
+        for time, _, lateral in reversed(self._cycles):
+            if abs(lateral - here) > STANDS:
+                break
+            since = time
+        return since if now - since >= STANDING else math.inf
 
     def _settled(self) -> bool:
         """Return whether enough was felt where the tip is pressed hardest; later ends say less."""

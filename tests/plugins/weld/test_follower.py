@@ -149,23 +149,36 @@ def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> No
 
 
 @pytest.mark.parametrize(
-    ("phase", "first", "goal", "rate"),
+    ("phase", "first", "target", "rate"),
     [
-        ("following", 0.0, "deflection", "ramp"),
-        ("bridging", 2e-3, "probe", "ramp"),
-        ("ending", 2e-3, None, "release"),
+        ("following", 0.0, following().deflection, "ramp"),
+        ("bridging", 2e-3, 2 * following().probe, "ramp"),  # nothing was felt before
+        ("ending", 2e-3, 0.0, "release"),
     ],
 )
 def test_the_wanted_deflection_goes_to_what_the_phase_asks_for_at_its_rate(
-    phase: str, first: float, goal: str | None, rate: str
+    phase: str, first: float, target: float, rate: str
 ) -> None:
     found, asked = make(phase), following()
-    found.wanted, target = first, 0.0 if goal is None else getattr(asked, goal)
+    found.wanted = first
     found._ramp(0.1)
     step = 0.1 * getattr(asked, rate)
     assert found.wanted == pytest.approx(first + math.copysign(step, target - first))
     found._ramp(60.0)
     assert found.wanted == pytest.approx(target)
+
+
+def test_a_lost_wall_is_felt_for_as_far_aside_as_the_seam_is_unknown_at_the_tip() -> None:
+    found, probe = make("bridging"), following().probe
+    for i in range(120):
+        found.refined.add(0.0, 3e-4 * i, 0.0, 0.0)
+    found.refined.confirm(0.0)
+    aside = []
+    for found.tip in (0.03, 0.045, 0.055, 0.1):
+        found._ramp(60.0)
+        aside.append(found.wanted - probe)
+    assert aside[0] == pytest.approx(2 * math.sqrt(found.refined.variance(0.03)))
+    assert 0.0 < aside[0] < aside[1] < aside[2] < aside[3] == pytest.approx(probe)
 
 
 def test_nothing_is_pressed_before_a_wall_was_found_nor_without_touch() -> None:

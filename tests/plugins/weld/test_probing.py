@@ -178,6 +178,7 @@ def test_a_sweep_begins_where_the_tip_has_come_to_rest() -> None:
         assert found.velocity(PERIOD) == 0.0
         if found._wanted is not None:
             break
+        found.note(cycle * PERIOD, 0.0, 0.0)
         found.feel(cycle * PERIOD, -(3e-3 if cycle < 12 else 1e-3), 0.0, 0.0)
     assert found._wanted == pytest.approx(1e-3)
     assert cycle * PERIOD > 0.4 - 2 * PERIOD and cycle >= enough
@@ -188,6 +189,21 @@ def test_a_sweep_begins_where_the_tip_has_come_to_rest() -> None:
         waited += PERIOD
     assert unseen._wanted == SETTINGS.deflection  # nothing says otherwise
     assert waited == pytest.approx(4.0, abs=2 * PERIOD)
+
+
+@pytest.mark.parametrize("stops", [0.0, 1.0, 1.7])
+def test_a_sweep_begins_when_the_arm_stands_and_by_what_is_felt_since(stops: float) -> None:
+    """An arm goes on for a while when it is told to stop, longest where it turned as well."""
+    found = going()
+    for cycle in range(2000):
+        found.velocity(PERIOD)
+        if found._wanted is not None:
+            break
+        short = max(stops - cycle * PERIOD, 0.0) * 0.4e-3
+        found.note(cycle * PERIOD, 0.0, short)
+        found.feel(cycle * PERIOD, -(1e-3 + short), 0.0, 0.0)
+    assert found._wanted == pytest.approx(1e-3, abs=0.02e-3)
+    assert max(stops, 0.4) - 0.1 < cycle * PERIOD < max(stops + 0.2, 0.4) + 2 * PERIOD
 
 
 def test_a_standing_loop_commands_nothing() -> None:
