@@ -35,8 +35,9 @@ LASTING = 20e-3
 UNEVEN, TILTED = 0.5e-3, 0.02
 """Joints are wider or narrower, and so heights differ, by this [m]; plans are tilted by this."""
 
-LIKELY, SURE = 2.0, 5.0
-"""Standard deviations of what is judged, to reckon with it and to stop for it."""
+LIKELY, CLEAR, SURE = 2.0, 3.0, 5.0
+"""Standard deviations of what is judged: to reckon with it, to hold what comes later against the
+seam without it, where many samples say it, and to stop for it."""
 
 
 class _Sweep(NamedTuple):
@@ -135,7 +136,8 @@ class Seating:
             aside, lifted = _newest_from(known, newest, PLANNED)
             self._doubt_newest(aside, lifted)
             if lifted[1] > NOISY:
-                self._doubt_newest(aside, _newest_from(known, many, PLANNED)[1], self.doubt)
+                lifted = _newest_from(known, many, PLANNED)[1]
+                self._doubt_newest(aside, lifted, self.doubt, CLEAR)
         self.risen = self._risen(s) * self._flat / STEEP
         if len(before) < 2 * NEWEST:
             return None
@@ -163,7 +165,11 @@ class Seating:
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
     def _doubt_newest(
-        self, aside: tuple[float, float], lifted: tuple[float, float], before: float = 0.0
+        self,
+        aside: tuple[float, float],
+        lifted: tuple[float, float],
+        before: float = 0.0,
+        clear: float = SURE,
     ) -> None:
         """Note how far the tip may have climbed; later ones are held against an unlifted tip.
 
@@ -171,11 +177,13 @@ class Seating:
             aside: How far the newest are aside, and its sigma [m].
             lifted: How far up they are [m].
             before: What is doubted already, on fewer samples [m].
+            clear: Standard deviations by which they are lifted for later ones to be held against
+                the seam without that.
         """
         towards, up = self._side * aside[0], lifted[0]
         likely = towards > LIKELY * aside[1] and up > LIKELY * lifted[1]
         self.doubt = max(before, min(towards, up * self._flat / STEEP) if likely else 0.0)
-        if up > SURE * lifted[1]:  # lower ones would bend the line by their noise alone
+        if up > clear * lifted[1]:  # lower ones would bend the line by their noise alone
             self._seated.rows[-1] -= 0.0, self._side * self.doubt, up
 
 

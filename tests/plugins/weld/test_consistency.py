@@ -149,3 +149,28 @@ def test_after_a_gap_the_tip_is_held_against_what_was_felt_before_it() -> None:
         for i in range(5):
             assert seating.judge(0.01 + gap + 1e-4 * i, 0.2e-3, 0.2e-3) is None
         assert (seating.doubt > 0.15e-3) == doubted
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_a_noisy_tip_many_samples_say_that_it_climbs(seed: int) -> None:
+    """Five of them do not: their mean height is known to 0.15 mm, and it has risen by 0.5 mm."""
+    rng = np.random.default_rng(seed)
+    seating, doubts = Seating(1.0, 0.84), []
+    for i in range(375):
+        s = i * 0.16e-3
+        off = (0.85e-3, 0.5e-3) if s > 0.036 else (0.0, 0.0)
+        seating.judge(s, *(off + rng.normal(0.0, [0.05e-3, 0.33e-3])))
+        if s > 0.040:  # once many were felt there
+            doubts.append(seating.doubt)
+    assert np.mean(np.array(doubts) > 0.3e-3) > 0.95
+
+
+def test_a_noisy_tip_that_goes_aside_at_its_height_is_hardly_doubted() -> None:
+    rng = np.random.default_rng(4)
+    seating, doubts = Seating(1.0, 0.84), []
+    for i in range(600):
+        s = i * 0.16e-3
+        seating.judge(s, (0.4e-3 if s > 0.036 else 0.0) + rng.normal(0.0, 0.05e-3),
+                      rng.normal(0.0, 0.33e-3))  # fmt: skip
+        doubts.append(seating.doubt)
+    assert np.mean(np.array(doubts) > 0.2e-3) < 0.1
