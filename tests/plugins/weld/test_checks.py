@@ -356,3 +356,23 @@ def test_what_is_allowed_is_allowed_to_the_last_digit() -> None:
     check_belief(belief, asked.model_copy(update={"max_error": known}))
     body: Any = SimpleNamespace(torch=np.array([-0.04, 0.0, 8e-3]))
     check_body(body, belief, asked.model_copy(update={"torch_height": 8e-3}))
+
+
+@pytest.mark.parametrize(
+    ("off", "told"), [(19e-3, False), (-19e-3, False), (21e-3, True), (-21e-3, True)]
+)
+def test_how_far_a_tip_is_astray_is_told_across_the_plan_wherever_that_lies(
+    off: float, told: bool
+) -> None:
+    """On a slope to the axes, half a metre away from their origin."""
+    along, left, start = np.array([0.6, 0.8]), np.array([-0.8, 0.6]), np.array([0.5, -0.3])
+    ends = np.array([[*start, 0.0], [*(start + 0.1 * along), 0.0]])
+    bounds = Bounds(finger(), Path(ends), following())
+    for ahead in (0.0, 5e-3):  # what it is ahead of its progress by is not astray
+        place = start + (0.05 + ahead) * along + off * left
+        pose: Any = SimpleNamespace(position=np.array([*place, 0.0]))
+        if told:
+            with pytest.raises(DeviceError, match="the tip is 21 mm away from the plan"):
+                bounds.check(pose, 0.05, [])
+        else:
+            bounds.check(pose, 0.05, [])

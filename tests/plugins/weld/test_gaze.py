@@ -1,12 +1,16 @@
 """Only the part of an image that holds the tag is read, with the same result."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from flangeye.devices import SensorFrame
-from flangeye.types import Image
-from flangeye_plugins.weld.finger_camera import Reader
+from flangeye.devices import DeviceError, SensorFrame
+from flangeye.types import Image, Seed
+from flangeye_plugins.weld.finger_camera import CameraJob, Reader, SteppedReader
 from flangeye_plugins.weld.touch.region_of_interest import MARGIN, Piece, RegionOfInterest, cut
+from tests.plugins.weld.test_camera_process import Camera, state
+from tests.plugins.weld.test_look import Looker, nobody
 from tests.plugins.weld.test_touch import FINGER, Eye, displacements
 
 CORNERS = np.array([[100.0, 60.5], [180.0, 60.0], [180.2, 140.0], [100.0, 140.0]])
@@ -82,3 +86,50 @@ def test_a_piece_is_read_again_as_it_was_read() -> None:
             assert redone.feeling is None
         else:
             np.testing.assert_array_equal(redone.feeling.displacement, sight.feeling.displacement)
+
+
+class Closing(Camera):
+    """Notes that it was closed."""
+
+    closed: list[str] = []
+
+    def close(self) -> None:
+        self.closed.append("camera")
+
+
+class ClosingLook(Looker):
+    """Notes that it was closed."""
+
+    def profile(self):
+        return None if self._robot.state().time_ns == 1 else super().profile()
+
+    def close(self) -> None:
+        Closing.closed.append("look")
+
+
+def closing(look: Any = None) -> CameraJob:
+    camera: Any = Closing
+    return CameraJob(camera, FINGER, state(1), Seed(0), look)
+
+
+def test_in_the_loop_the_camera_sees_what_the_arm_was_told_last_and_is_closed() -> None:
+    Closing.closed.clear()
+    with SteppedReader(closing()) as reader:
+        assert reader.behind is None and reader.looks() == [] and reader.seen() == []
+        reader.tell(state(5))
+        assert [sight.time_ns for sight in reader.seen()] == [5]
+        assert reader.seen() == [] and reader.true_torch() is None
+    assert Closing.closed == ["camera"]
+
+
+def test_in_the_loop_a_look_behind_the_torch_is_taken_too_and_closed_first() -> None:
+    Closing.closed.clear()
+    with SteppedReader(closing(ClosingLook)) as reader:
+        assert reader.behind == 0.02 and reader.looks() == []
+        reader.tell(state(5))
+        assert [look.time_ns for look in reader.looks()] == [5]
+    assert Closing.closed == ["look", "camera"]
+    Closing.closed.clear()
+    with pytest.raises(DeviceError, match="cannot be reached"):
+        SteppedReader(closing(nobody))
+    assert Closing.closed == ["camera"]  # it was open already
