@@ -61,7 +61,10 @@ class Following(Params):
         "8 mm", ge=0, description="How far before the planned end the tip stops pressing."
     )
     probe: Length = param(
-        "0.5 mm", gt=0, description="Deflection with which lost contact is felt for."
+        "0.5 mm",
+        gt=0,
+        description="Deflection with which lost contact is felt for; twice it where little is "
+        "known of where the seam leads.",
     )
     reach: Length = param(
         "8 mm", gt=0, description="How far from the plan the wall is sought at the start."
