@@ -24,6 +24,7 @@ from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_plugins.weld.corners import corners_of
 from flangeye_plugins.weld.frame import Tool, WorkPlane
+from flangeye_plugins.weld.path import Path
 
 
 class SectionParams(Params):
@@ -97,7 +98,7 @@ class SimulatedFinger:
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._plane, nominal = _as_planned(finger, params)
         truth = _truth(params)
-        self.world = WeldWorld(nominal, truth, [seed, 12])
+        self.world, self._planned = WeldWorld(nominal, truth, [seed, 12]), Path(nominal.seam)
         self.tool = Tool(finger, self._plane)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
@@ -123,7 +124,7 @@ class SimulatedFinger:
             raise DeviceError(f"{self.name}: the camera is lost")
         pose = self.tool.pose(room.true_flange(state), now)
         shown = self._shown(pose, room.true_flange(state))
-        self._torch.append((now, self.world.torch))
+        self._torch.append((now, self._beside_plan()))
         if self._shutter.due(age):
             # A tag that something covers: it is as if it were far out of the image.
             hidden = self._shutter.hidden(age)
@@ -134,11 +135,25 @@ class SimulatedFinger:
         )
 
     def true_torch(self) -> tuple[Floats, Floats]:
-        """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
+        """Return times (K,) [s] and where the torch really was then (K, 3), in base [m].
+
+        It lies beside the planned seam as it lay beside the true one, which wanders and which heat
+        moves: what scores it knows the planned one.
+        """
         known = list(self._torch)  # in one go: a thread that reads images may add to it
         times = np.array([time for time, _ in known])
         torch = np.array([place for _, place in known]).reshape(-1, 3)
         return times, self._plane.base_T_plane.apply(torch)
+
+    def _beside_plan(self) -> Floats:
+        """Return the torch (3,) less what the true seam is off the planned one beside it [m]."""
+        world = self.world
+        true = world.groove.root.at(world.torch_s)
+        across = float((world.torch[:2] - true.point) @ true.normal)
+        seam = true.point + (across - world.off) * true.normal  # heat has moved it there
+        planned = self._planned.at(self._planned.foot(seam, world.torch_s))
+        off = np.array([*(seam - planned.point), true.height - planned.height])
+        return np.asarray(world.torch - off)
 
     def close(self) -> None:
         """Nothing to let go of."""
