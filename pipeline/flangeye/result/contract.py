@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 PARTLY = 0.01
 """An axis with a larger share in a direction that was not measured has no deviation of its own."""
@@ -30,6 +31,19 @@ class TransformResult(_Part):
         description="Directions (rotation, translation), about the same point, along which the "
         "estimate is arbitrary and the covariance says nothing.",
     )
+
+    @model_validator(mode="after")
+    def _are_of_a_transform(self) -> Self:
+        """Check the sizes, which JSON leaves open."""
+        sizes = {"matrix": (self.matrix, 4, 4), "covariance": (self.covariance, 6, 6)}
+        for name, (rows, count, columns) in sizes.items():
+            if len(rows) != count or any(len(row) != columns for row in rows):
+                raise ValueError(f"'{name}' is not {count}x{columns}")
+        if len(self.about) != 3:
+            raise ValueError("'about' has not 3 coordinates")
+        if any(len(direction) != 6 for direction in self.unobservable or []):
+            raise ValueError("a direction of 'unobservable' has not 6 components")
+        return self
 
     @property
     def sigma(self) -> list[float | None]:
