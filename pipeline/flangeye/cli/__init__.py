@@ -8,6 +8,7 @@ import os
 import sys
 
 from flangeye.cli.saying import end_in_words
+from flangeye.files.collector import collector_paused
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Captures are worked on side by side and matrices are small: more threads in one product only
@@ -25,7 +26,8 @@ def _command() -> None:
     from flangeye.cli.unparsed import answered
 
     words = sys.argv[1:]
-    if not answered(words):
+    with collector_paused(keep=True):
+        if answered(words):
+            return
         from flangeye.cli.commands import app, named_in
-
-        (named_in(words) if words else app)()  # a shell that completes a line gives no words
+    (named_in(words) if words else app)()  # a shell that completes a line gives no words

@@ -9,6 +9,7 @@ import typer
 
 from flangeye.cli.saying import say, say_notes
 from flangeye.errors import FlangeyeError
+from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,17 +74,19 @@ def _options(
 
 def load_plugins() -> Registry:
     """Find every installed plugin."""
-    from flangeye.plugin.registry import load_registry
+    with collector_paused(keep=True):
+        from flangeye.plugin.registry import load_registry
 
-    return load_registry()
+        return load_registry()
 
 
 def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None = None) -> Recipe:
     """Return a checked recipe by path or name; say which names in it are outdated."""
-    from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.load import load_recipe
+    with collector_paused(keep=True):
+        from flangeye.recipe.find import find_recipe
+        from flangeye.recipe.load import load_recipe
 
-    recipe = load_recipe(find_recipe(name), registry, overrides or ())
+        recipe = load_recipe(find_recipe(name), registry, overrides or ())
     say_notes(registry.notes())
     return recipe
 

@@ -12,6 +12,7 @@ import typer
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.saying import say, say_notes
 from flangeye.errors import RecipeError
+from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
     from flangeye.log.read import RunLog
@@ -59,6 +60,14 @@ def report(
     ] = None,
 ) -> None:
     """Write the HTML report of a run from its log."""
+    with collector_paused(keep=True):
+        read, path = _reported(log, out)
+    say(path)
+    _name_damage(read)
+
+
+def _reported(log: Path, out: Path | None) -> tuple[RunLog, Path]:
+    """Write a report; return what it was made of, and where it is."""
     from flangeye.log.read import read_run
     from flangeye.report import write_report
 
@@ -68,8 +77,7 @@ def report(
     exports = load_plugins().exports()
     with of_foreign(read.path, "no report can be made of it"):
         write_report(read, path, exports)
-    say(path)
-    _name_damage(read)
+    return read, path
 
 
 @app.command()

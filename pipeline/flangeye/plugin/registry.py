@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import gc
 import importlib
 from collections.abc import Iterator, Mapping, MutableMapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any, TypeVar
 import pluggy
 
 from flangeye.errors import FlangeyeError
+from flangeye.files.collector import collector_paused
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
 from flangeye.plugin.installed import installed_plugins
@@ -73,7 +72,7 @@ class Offered(MutableMapping[str, Kind]):
     def _imported(self, name: str, place: str) -> Kind:
         module, _, attribute = place.partition(":")
         try:
-            with _collector_paused():
+            with collector_paused():
                 found = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a vendor's import may fail in any way
             raise PluginNotFoundError(
@@ -257,7 +256,7 @@ def load_registry() -> Registry:
     hooks = pluggy.PluginManager(hookspecs.NAME)
     hooks.add_hookspecs(hookspecs)
     registry = Registry(hooks)
-    with _collector_paused():
+    with collector_paused():
         for entry_point in sorted(installed_plugins(), key=_builtin_first):
             _load(registry, entry_point)
     return registry
@@ -272,18 +271,6 @@ def _load(registry: Registry, entry_point: EntryPoint) -> None:
         raise
     except Exception as error:  # a vendor's import may fail in any way
         registry.broken[entry_point.name] = error
-
-
-@contextmanager
-def _collector_paused() -> Iterator[None]:
-    """Leave the garbage collector off: modules stay, so looking through them finds nothing."""
-    running = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if running:
-            gc.enable()
 
 
 def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,11 +48,17 @@ class Panel:
 
 @dataclass(frozen=True)
 class FittedFeature:
-    """One capture's cloud in the axes of its circle: z along the normal, (N, 3) [m]."""
+    """One capture's cloud, its circle, and (3, 3) the circle's axes, z along the normal."""
 
     id: str
-    xyz: Floats
+    cloud: t.PointCloud
     circle: t.CircleFeature
+    axes: Floats
+
+    @cached_property
+    def xyz(self) -> Floats:
+        """(N, 3) the cloud in these axes, from the circle's centre [m]; few are asked for."""
+        return (self.cloud.xyz.astype(np.float64) - self.circle.centre) @ self.axes.T
 
     @property
     def plane_rms(self) -> float:
@@ -63,11 +70,12 @@ def cloud_panels(facts: Facts) -> list[Panel]:
     """Return the captures with the smallest, the median and the largest error."""
     fits = fits_of(facts)
     residuals = facts.residuals
-    name = "residual" if residuals else "distance from the plane"
     if residuals:
-        fits = [fit for fit in fits if fit.id in residuals]
-    ranked = sorted(fits, key=lambda fit: residuals.get(fit.id, fit.plane_rms))
-    chosen = _telling(ranked, name)
+        seen = [fit for fit in fits if fit.id in residuals]
+        chosen = _telling(sorted(seen, key=lambda fit: residuals[fit.id]), "residual")
+    else:
+        ranked = sorted(fits, key=lambda fit: fit.plane_rms)
+        chosen = _telling(ranked, "distance from the plane")
     if not chosen:
         return []
     limit = _colour_limit([fit for fit, _ in chosen])
@@ -95,8 +103,7 @@ def fits_of(facts: Facts) -> list[FittedFeature]:
             if circle.normal is None or len(flange.cloud.xyz) == 0:
                 continue
             axes = basis_of_plane(circle.normal)
-            xyz = (flange.cloud.xyz.astype(np.float64) - circle.centre) @ axes.T
-            fits.append(FittedFeature(str(entry.capture), xyz, circle))
+            fits.append(FittedFeature(str(entry.capture), flange.cloud, circle, axes))
     return fits
 
 
@@ -130,8 +137,7 @@ def _cloud(xyz: Floats, limit: float) -> Trace:
 
 
 def _fitted(fit: FittedFeature) -> list[Trace]:
-    axes = basis_of_plane(fit.circle.normal)  # type: ignore[arg-type]
-    drawn = [(line - fit.circle.centre) @ axes.T for line in circle_lines(fit.circle)]
+    drawn = [(line - fit.circle.centre) @ fit.axes.T for line in circle_lines(fit.circle)]
     return [lines(drawn, CIRCLE, 5, name="fitted circles and normal")]
 
 

@@ -106,6 +106,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_HERE),
         autoescape=True,
+        optimized=False,  # a page is rendered once
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
