@@ -43,6 +43,7 @@ from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
 from flangeye.handeye.wander import with_walk
 from flangeye.maths.statistics import covariance_inflation, f_quantile
+from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
     FLANGE,
     CorrectedArm,
@@ -132,14 +133,15 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
     )
     stated = _stated(reported, cell, options, weak)
-    camera, *others = _estimates(reported, cell, options, weak, stated.covariance)
+    distortion = _distortion(reported, cell, options, weak)
+    camera, *others = _estimates(reported, cell, weak, stated.covariance, distortion)
     scatter, told = _scatter(model.found), stated.notes
     if cell.configuration.is_default and stated.of_scatter is not stated.covariance:
-        alone = _estimates(reported, cell, options, weak, stated.of_scatter)[0]
+        alone = _estimates(reported, cell, weak, stated.of_scatter, distortion)[0]
         scatter = replace(scatter, pose=alone.covariance)
     notes = (*_noise_notes(model, cell, weak), *told, *_note_of_shared(_shared_of(reported)))
-    if not weak.shape[1]:
-        notes = (*notes, *_note_of_distortion(model, cell, options))
+    if cell.scanner is not None and distortion is not None:
+        notes = (*notes, _note_of_distortion(cell.scanner))
     if options.certify:
         notes = (*notes, certificate_note(reported.problem, reported.found))
     return HandEye(
@@ -313,7 +315,8 @@ def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> Corr
     """Return the answer for the arm with its joint offsets corrected, if they were found."""
     if model.correction is None or not model.corrects_joints:
         return None
-    camera, *others = _estimates(model, cell, options, weak, _covariance(model))
+    distortion = _distortion(model, cell, options, weak)
+    camera, *others = _estimates(model, cell, weak, _covariance(model), distortion)
     return CorrectedArm(camera, model.correction, tuple(others), shared=_shared_of(model))
 
 
@@ -391,13 +394,12 @@ def _note_of_unknown_arm(cell: Cell) -> str:
 
 
 def _estimates(
-    model: Model, cell: Cell, options: Options, weak: Floats, covariance: Floats
+    model: Model, cell: Cell, weak: Floats, covariance: Floats, distortion: Nuisance | None
 ) -> list[TransformEstimate]:
     """Return the transforms with their covariances, begun at the (18, 18) given."""
     configuration, at = cell.configuration, model.found.at
     transforms = transforms_of(configuration, at.x, at.y, at.z)
     points = points_of_interest(configuration, transforms, _agreeing(model, cell), cell.arm)
-    distortion = None if weak.shape[1] else _distortion(model, cell, options)
     if distortion is not None:
         covariance = covariance + considered(model, distortion)
     clock = cell.unknown_delay() if cell.clock_deviation else None
@@ -418,26 +420,26 @@ def _estimates(
     ]
 
 
-def _distortion(model: Model, cell: Cell, options: Options) -> Nuisance | None:
+def _distortion(model: Model, cell: Cell, options: Options, weak: Floats) -> Nuisance | None:
     """Return the scanner's distortion; None where nothing is known of it, or none is seen.
 
-    With what it does to edges, where a circle's place is unknown: elsewhere that is a few percent.
+    None too where moves are not observable, which is worse. With what it does to edges, where a
+    circle's place is unknown: elsewhere that is a few percent.
     """
     seen = np.array([by_depth(o.feature) for o in cell.observations])
-    if cell.scanner is None or not options.scanner_distortion or not seen.any():
+    asked = options.scanner_distortion and not weak.shape[1]
+    if cell.scanner is None or not asked or not seen.any():
         return None
     s = model.problem.measurements
     distortion = distortion_of(cell.scanner, s, seen)
     return distortion.and_also(edges_of(s, seen)) if model.problem.loop.z else distortion
 
 
-def _note_of_distortion(model: Model, cell: Cell, options: Options) -> tuple[str, ...]:
-    if cell.scanner is None or _distortion(model, cell, options) is None:
-        return ()
+def _note_of_distortion(scanner: ScannerModel) -> str:
     return (
-        f"the scanner's smooth distortion ({cell.scanner.calibration_error * 1e3:g} mm rms over "
+        f"the scanner's smooth distortion ({scanner.calibration_error * 1e3:g} mm rms over "
         "its volume, by its file) is in the covariance: it is the same at every pose, which "
-        "held-out errors do not show",
+        "held-out errors do not show"
     )
 
 

@@ -54,7 +54,10 @@ def effects(field: SmoothField, places: Floats) -> Floats:
 def features(scaled: Floats, powers: Sequence[tuple[int, ...]]) -> Floats:
     """Return (..., K) values of the kernel's features at (..., 3) places in units of its length."""
     bell = np.exp(-0.5 * (scaled**2).sum(axis=-1))
-    return np.asarray(np.stack([_power(scaled, p) for p in powers], axis=-1) * bell[..., None])
+    norms, each = np.sqrt([prod(map(factorial, p)) for p in powers]), np.array(powers)
+    raised = scaled[..., None] ** np.arange(each.max() + 1)  # which few powers share
+    of_place = raised[..., np.arange(scaled.shape[-1]), each].prod(axis=-1)
+    return np.asarray(of_place / norms * bell[..., None])
 
 
 def displacement(field: SmoothField, places: Floats) -> Floats:
@@ -74,11 +77,6 @@ def displacement_covariance(field: SmoothField, places: Floats, corrected: bool)
     if corrected:
         return np.asarray(moved @ field.covariance @ np.swapaxes(moved, -1, -2))
     return np.asarray(field.size**2 * moved @ np.swapaxes(moved, -1, -2))
-
-
-def _power(scaled: Floats, powers: tuple[int, ...]) -> Floats:
-    norm = np.sqrt(prod(factorial(p) for p in powers))
-    return np.asarray(np.prod(scaled ** np.array(powers), axis=-1) / norm)
 
 
 def _motions(field: SmoothField, places: Floats) -> Floats:
