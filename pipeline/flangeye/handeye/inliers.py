@@ -106,8 +106,8 @@ def _fit_sets(centres: Floats, tcps: Floats) -> Motions:
 def _squares_of(centres: Floats, tcps: Floats, motions: Motions) -> Floats:
     """Return the (T, N) squared residuals of N pairs under T motions."""
     rotations, shifts = motions
-    errors = centres @ rotations.transpose(0, 2, 1) + (shifts[:, None] - tcps)
-    return np.asarray((errors**2).sum(axis=2))
+    errors = rotations @ centres.T + (shifts[:, :, None] - tcps.T)
+    return np.asarray((errors**2).sum(axis=1))
 
 
 def _concentrate(
