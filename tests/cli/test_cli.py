@@ -382,7 +382,9 @@ def test_a_runs_folder_is_as_good_as_its_log(
     assert flangeye("show", "here")[1] == flangeye("show", "here/run.mcap")[1]
     (tmp_path / "here" / "report.html").unlink()
     assert flangeye("report", "here") == (0, "here/report.html\n", "")
-    assert (tmp_path / "here" / "report.html").exists()
+    page = (tmp_path / "here" / "report.html").read_bytes()
+    assert flangeye("report", "here", "--out", "other.html") == (0, "other.html\n", "")
+    assert (tmp_path / "other.html").read_bytes() == page
     assert flangeye("replay", "here") == flangeye("replay", "here/run.mcap")
     assert flangeye("doctor", "here") == flangeye("doctor", "here/run.mcap")
     assert flangeye("show", "here/calibration.yaml") == flangeye("show", "here")

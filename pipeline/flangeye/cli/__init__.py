@@ -1,7 +1,7 @@
 """The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
 
-Modules are imported inside the commands, so that ``--help`` answers at once; ``check RECIPE`` and
-``stages`` need no parser.
+Modules are imported inside the commands, so that ``--help`` answers at once; ``check RECIPE``,
+``report LOG`` and ``stages`` need no parser.
 """
 
 import os

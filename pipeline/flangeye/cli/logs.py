@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
+from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
 from flangeye.cli.saying import say, say_notes
+from flangeye.cli.unparsed import say_report
 from flangeye.errors import RecipeError
 from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
-    from flangeye.log.read import RunLog
     from flangeye.recipe.load import Recipe
 
 
@@ -29,7 +28,7 @@ def show(log: LogFile) -> None:
 
     read = read_run(log)
     print_log(Console(), read)
-    _name_damage(read)
+    name_damage(read)
 
 
 @app.command()
@@ -42,7 +41,7 @@ def outlook(log: LogFile) -> None:
     from flangeye.run.outlook import outlook_of_log
 
     read = read_run(log)
-    _require_gathered(read)
+    require_gathered(read)
     registry = load_plugins()
     with of_foreign(read.path, "it cannot be judged"):
         found = outlook_of_log(read, registry)
@@ -61,23 +60,7 @@ def report(
 ) -> None:
     """Write the HTML report of a run from its log."""
     with collector_paused(keep=True):
-        read, path = _reported(log, out)
-    say(path)
-    _name_damage(read)
-
-
-def _reported(log: Path, out: Path | None) -> tuple[RunLog, Path]:
-    """Write a report; return what it was made of, and where it is."""
-    from flangeye.log.read import read_run
-    from flangeye.report import write_report
-
-    read = read_run(log)
-    path = out or read.path.parent / "report.html"
-    _require_gathered(read)
-    exports = load_plugins().exports()
-    with of_foreign(read.path, "no report can be made of it"):
-        write_report(read, path, exports)
-    return read, path
+        say_report(log, out)
 
 
 @app.command()
@@ -112,35 +95,6 @@ def certificate(  # noqa: PLR0913  one argument an option
     say(page)
     if pdf and (printed := print_pdf(page)):
         say(printed)
-
-
-def _name_damage(log: RunLog) -> None:
-    """Name every damaged part, and end as for bad input."""
-    for note in log.notes:
-        say(f"note: {note}", err=True)
-    log.require_sound()
-
-
-def _require_gathered(log: RunLog) -> None:
-    from flangeye.errors import StageError
-
-    if not log.gathered:
-        log.require_sound()
-        raise StageError(f"{log.path}: the run ended early; nothing was gathered yet")
-
-
-@contextmanager
-def of_foreign(path: Path, what: str) -> Iterator[None]:
-    """Take any failure for the fault of a log that others may have written."""
-    from flangeye.errors import FlangeyeError, StageError
-    from flangeye.log.records import reason_of
-
-    try:
-        yield
-    except FlangeyeError:
-        raise
-    except Exception as error:
-        raise StageError(f"{path}: {what}: {reason_of(error)}") from error
 
 
 @app.command()

@@ -160,7 +160,7 @@ def _refuse(options: object, why: str) -> None:
 
 def _advise(log: Path, registry: Registry) -> None:
     """Say what to do about a refusal: the doctor's command, and what it finds first."""
-    from flangeye.cli.logs import of_foreign
+    from flangeye.cli.foreign import of_foreign
     from flangeye.doctor import examine, examine_cell, fix_lines, open_cell, open_session
     from flangeye.files.elsewhere import with_urls
 

@@ -1,27 +1,33 @@
-"""The two commands that need no parser, in the form in which they are mostly asked.
+"""The commands that need no parser, in the form in which they are mostly asked.
 
-Parsing a command line takes twice as long as looking up what was answered before.
+Parsing a command line takes twice as long as looking up what was answered before; a report waits
+for it for a twentieth of its time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from flangeye.cli.saying import say, say_notes
 
 
 def answered(words: Sequence[str]) -> bool:
-    """Answer ``stages``, if it is remembered, or ``check RECIPE``; return whether it was asked.
+    """Answer ``stages`` from memory, ``check RECIPE`` or ``report LOG``; return if it was asked.
 
     Raises:
         RecipeError: There is no such recipe, or it has mistakes.
+        StageError: There is no such log, or it is damaged.
     """
     if words == ["stages"]:
         return _say_stages()
-    if len(words) == 2 and words[0] == "check" and not words[1].startswith("-"):
+    if len(words) != 2 or words[1].startswith("-"):
+        return False
+    if words[0] == "check":
         say_verdict(words[1])
-        return True
-    return False
+    elif words[0] == "report":
+        say_report(Path(words[1]))
+    return words[0] in ("check", "report")
 
 
 def _say_stages() -> bool:
@@ -52,3 +58,28 @@ def say_verdict(name: str, overrides: Sequence[str] = ()) -> None:
     registry = load_registry()
     say(verdict(path, registry, overrides))
     say_notes(registry.notes())
+
+
+def say_report(log: Path, out: Path | None = None) -> None:
+    """Write the report of a run from its log; say where it is, and what of the log is damaged.
+
+    Args:
+        log: A run's folder, or a file in it.
+        out: File to write; ``report.html`` beside the log if not given.
+
+    Raises:
+        StageError: There is no such log, or it is damaged.
+    """
+    from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
+    from flangeye.log.read import read_run
+    from flangeye.plugin.registry import load_registry
+    from flangeye.report import write_report
+
+    read = read_run(log)
+    path = out or read.path.parent / "report.html"
+    require_gathered(read)
+    exports = load_registry().exports()
+    with of_foreign(read.path, "no report can be made of it"):
+        write_report(read, path, exports)
+    say(path)
+    name_damage(read)
