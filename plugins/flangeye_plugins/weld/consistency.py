@@ -36,8 +36,8 @@ UNEVEN, TILTED = 0.5e-3, 0.02
 """Joints are wider or narrower, and so heights differ, by this [m]; plans are tilted by this."""
 
 LIKELY, CLEAR, SURE = 2.0, 3.0, 5.0
-"""Standard deviations of what is judged: to reckon with it, to hold what comes later against the
-seam without it, where many samples say it, and to stop for it."""
+"""Standard deviations of what is judged: to reckon with it, or with its opposite where the tip is
+noisy; to hold what comes later against the seam without it, of a noisy tip; and to stop for it."""
 
 
 class _Sweep(NamedTuple):
@@ -74,10 +74,11 @@ class _Trail:
         while s - self._rows[self._first, 0] > self._longest:
             self._first += 1
 
-    def behind(self, s: float) -> Floats:
-        """Return the samples (K, 3) that lie behind the tip."""
-        away = s - self.rows[:, 0]
-        return self.rows[(BEFORE[0] < away) & (away < BEFORE[1])]
+    def behind(self, s: float, sure: float = -math.inf) -> Floats:
+        """Return the samples (K, 3) that lie behind the tip; those up to ``sure`` beside it too."""
+        along = self.rows[:, 0]
+        away = s - along
+        return self.rows[((BEFORE[0] < away) | (along <= sure)) & (away < BEFORE[1])]
 
     def clear(self) -> None:
         """Let go of all."""
@@ -90,6 +91,8 @@ class Seating:
     A seated tip may wander aside with the seam, or be lifted by a tack weld; both at once, towards
     the wall that it presses, is climbing. Where the plan is far off, what the seam wanders aside by
     hides that: a tip that stays higher than in the sweep at the start may climb all the same.
+    A noisy tip that goes aside may have climbed as far as its height does not rule it out. Nothing
+    that is felt then says where the seam is; until it is ruled out, what was felt before does.
 
     Attributes:
         doubt: How far aside the tip may have climbed, too little to be sure of it [m].
@@ -99,14 +102,14 @@ class Seating:
     def __init__(self, side: float, flat: float) -> None:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
         self._side, self.doubt, self.risen = side, 0.0, 0.0
-        self._flat = flat
+        self._flat, self._unsure = flat, 0
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=MANY)
         self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
-        self._sweep = _Sweep(0, 0.0, 0.0, 0.0)
+        self._sweep, self._swept = _Sweep(0, 0.0, 0.0, 0.0), -math.inf
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
-        self.doubt = 0.0
+        self.doubt, self._unsure = 0.0, 0
         self._samples.clear()
         self._newest.clear()
 
@@ -114,6 +117,7 @@ class Seating:
         """Take samples (K, 3) of a tip that is known to be seated; see :meth:`judge`."""
         for s, offset, height in samples.tolist():
             self._seated.add(s, offset, height)
+        self._swept = float(samples[:, 0].max())
         at, _, height = samples.mean(axis=0).tolist()
         sigma = float(samples[:, 2].std()) / math.sqrt(len(samples))
         self._sweep = _Sweep(len(samples), at, height, sigma)
@@ -128,20 +132,12 @@ class Seating:
         """
         self._newest.append((s, offset, height))
         self._samples.add(s, offset, height)
-        many, before = np.array(self._newest), self._samples.behind(s)
-        newest = many[-NEWEST:]
-        self._seated.add(s, offset, height)
-        known = self._seated.behind(s)
-        if len(known) >= 2 * NEWEST:
-            aside, lifted = _newest_from(known, newest, PLANNED)
-            self._doubt_newest(aside, lifted)
-            if lifted[1] > NOISY:
-                lifted = _newest_from(known, many, PLANNED)[1]
-                self._doubt_newest(aside, lifted, self.doubt, CLEAR)
+        newest, before = np.array(self._newest), self._samples.behind(s)
+        self._doubt_newest(newest)
         self.risen = self._risen(s) * self._flat / STEEP
         if len(before) < 2 * NEWEST:
             return None
-        aside, lifted = _newest_from(before, newest)
+        aside, lifted = _newest_from(before, newest[-NEWEST:])
         if lifted[0] > LIFTED + SURE * lifted[1]:
             return f"the tip is lifted out of the groove by {lifted[0] * 1e3:.1f} mm"
         climbed = max(STEEP * abs(aside[0]) / self._flat, SURE * lifted[1])
@@ -164,27 +160,47 @@ class Seating:
         sigma = math.hypot(float(heights.std()) / math.sqrt(len(heights)), self._sweep.sigma)
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
-    def _doubt_newest(
-        self,
-        aside: tuple[float, float],
-        lifted: tuple[float, float],
-        before: float = 0.0,
-        clear: float = SURE,
-    ) -> None:
-        """Note how far the tip may have climbed; later ones are held against an unlifted tip.
+    def _doubt_newest(self, newest: Floats) -> None:
+        """Note how far the tip may have climbed; later ones are held against a seated tip.
+
+        Args:
+            newest: (K, 3) samples, the one to judge last.
+        """
+        s, offset, height = newest[-1].tolist()
+        known = self._seated.behind(s, self._swept)
+        if len(known) >= 2 * NEWEST:
+            aside, lifted = _newest_from(known, newest[-NEWEST:], PLANNED)
+            noisy = lifted[1] > NOISY
+            if noisy:
+                lifted = _newest_from(known, newest, PLANNED)[1]
+            self.doubt = self._climbed(aside, lifted, noisy)
+            self._unsure = MANY if noisy and self.doubt else max(self._unsure - 1, 0)
+            if lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:
+                # Lower ones would bend the line by their noise alone.
+                offset, height = offset - self._side * self.doubt, height - lifted[0]
+                self._unsure = 0
+        if not self._unsure:
+            self._seated.add(s, offset, height)
+
+    def _climbed(
+        self, aside: tuple[float, float], lifted: tuple[float, float], noisy: bool
+    ) -> float:
+        """Return how far aside the tip may have climbed: no farther than it rose for that [m].
 
         Args:
             aside: How far the newest are aside, and its sigma [m].
             lifted: How far up they are [m].
-            before: What is doubted already, on fewer samples [m].
-            clear: Standard deviations by which they are lifted for later ones to be held against
-                the seam without that.
+            noisy: Whether it may have risen wherever its height does not rule that out; otherwise
+                where its height says so.
         """
         towards, up = self._side * aside[0], lifted[0]
-        likely = towards > LIKELY * aside[1] and up > LIKELY * lifted[1]
-        self.doubt = max(before, min(towards, up * self._flat / STEEP) if likely else 0.0)
-        if up > clear * lifted[1]:  # lower ones would bend the line by their noise alone
-            self._seated.rows[-1] -= 0.0, self._side * self.doubt, up
+        if noisy:
+            up += LIKELY * lifted[1]
+        elif up <= LIKELY * lifted[1]:
+            up = 0.0
+        return (
+            max(min(towards, up * self._flat / STEEP), 0.0) if towards > LIKELY * aside[1] else 0.0
+        )
 
 
 def _newest_from(
