@@ -198,9 +198,9 @@ class Seating:
             up += LIKELY * lifted[1]
         elif up <= LIKELY * lifted[1]:
             up = 0.0
-        return (
-            max(min(towards, up * self._flat / STEEP), 0.0) if towards > LIKELY * aside[1] else 0.0
-        )
+        if towards <= LIKELY * aside[1]:
+            return 0.0
+        return min(towards, max(up, 0.0) * self._flat / STEEP)
 
 
 def _newest_from(
