@@ -36,8 +36,8 @@ UNEVEN, TILTED = 0.5e-3, 0.02
 """Joints are wider or narrower, and so heights differ, by this [m]; plans are tilted by this."""
 
 LIKELY, CLEAR, SURE = 2.0, 3.0, 5.0
-"""Standard deviations of what is judged: to reckon with it, or with its opposite where the tip is
-noisy; to hold what comes later against the seam without it, of a noisy tip; and to stop for it."""
+"""Standard deviations of what is judged: to reckon with it; to hold what comes later against the
+seam without it, of a noisy tip; and to stop for it."""
 
 
 class _Sweep(NamedTuple):
@@ -91,8 +91,8 @@ class Seating:
     A seated tip may wander aside with the seam, or be lifted by a tack weld; both at once, towards
     the wall that it presses, is climbing. Where the plan is far off, what the seam wanders aside by
     hides that: a tip that stays higher than in the sweep at the start may climb all the same.
-    A noisy tip that goes aside may have climbed as far as its height does not rule it out. Nothing
-    that is felt then says where the seam is; until it is ruled out, what was felt before does.
+    A noisy tip that goes aside is taken to climb unless its height rules that out. While it may
+    have left the seam by that, the line goes through what was felt before.
 
     Attributes:
         doubt: How far aside the tip may have climbed, too little to be sure of it [m].
@@ -174,7 +174,8 @@ class Seating:
             if noisy:
                 lifted = _newest_from(known, newest, PLANNED)[1]
             self.doubt = self._climbed(aside, lifted, noisy)
-            self._unsure = MANY if noisy and self.doubt else max(self._unsure - 1, 0)
+            left = noisy and self.doubt > ASIDE
+            self._unsure = MANY if left else max(self._unsure - 1, 0)
             if lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:
                 # Lower ones would bend the line by their noise alone.
                 offset, height = offset - self._side * self.doubt, height - lifted[0]
@@ -185,22 +186,20 @@ class Seating:
     def _climbed(
         self, aside: tuple[float, float], lifted: tuple[float, float], noisy: bool
     ) -> float:
-        """Return how far aside the tip may have climbed: no farther than it rose for that [m].
+        """Return how far aside the tip may have climbed [m].
 
         Args:
             aside: How far the newest are aside, and its sigma [m].
             lifted: How far up they are [m].
-            noisy: Whether it may have risen wherever its height does not rule that out; otherwise
-                where its height says so.
+            noisy: Whether all of it may be climbing unless their height rules that out; otherwise
+                what their height says is.
         """
         towards, up = self._side * aside[0], lifted[0]
-        if noisy:
-            up += LIKELY * lifted[1]
-        elif up <= LIKELY * lifted[1]:
-            up = 0.0
         if towards <= LIKELY * aside[1]:
             return 0.0
-        return min(towards, max(up, 0.0) * self._flat / STEEP)
+        if noisy and towards * STEEP / self._flat < up + LIKELY * lifted[1]:
+            return towards
+        return min(towards, up * self._flat / STEEP) if up > LIKELY * lifted[1] else 0.0
 
 
 def _newest_from(
