@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from flangeye.models.model import read_model
 from flangeye.testing.base import Conformance
 from flangeye.testing.judge import require, require_close, require_one_line, require_round_trip
 from flangeye.testing.sources import logged
+
+_One = TypeVar("_One")
 
 OVERSHOOT = 1.05
 """A speed that is asked for may be exceeded by this much, for a cycle."""
@@ -263,16 +265,7 @@ class SensorConformance(DriverConformance):
 
     def frames(self, sensor: TactileSensor, count: int) -> list[SensorFrame]:
         """Return the next frames."""
-        found: list[SensorFrame] = []
-        limit = time.monotonic() + PATIENCE + LATE
-        while len(found) < count and time.monotonic() < limit:
-            frame = sensor.frame()
-            if frame is None:
-                time.sleep(0.002)
-            else:
-                found.append(frame)
-        require(len(found) == count, f"{len(found)} frames within {PATIENCE:g} s, not {count}")
-        return found
+        return _given(sensor.frame, count, "frames")
 
     def test_its_frames_are_images_with_a_time(self) -> None:
         """One after the other, each given once."""
@@ -310,16 +303,7 @@ class ProfilerConformance(DriverConformance):
 
     def looks(self, profiler: Profiler, count: int) -> list[WeldProfile]:
         """Return the next looks."""
-        found: list[WeldProfile] = []
-        limit = time.monotonic() + PATIENCE + LATE
-        while len(found) < count and time.monotonic() < limit:
-            look = profiler.profile()
-            if look is None:
-                time.sleep(0.002)
-            else:
-                found.append(look)
-        require(len(found) == count, f"{len(found)} looks within {PATIENCE:g} s, not {count}")
-        return found
+        return _given(profiler.profile, count, "looks")
 
     def test_its_looks_are_in_metres_with_a_time(self) -> None:
         """One after the other, each given once, with how well it is known."""
@@ -343,6 +327,20 @@ class ProfilerConformance(DriverConformance):
             self.looks(profiler, 1)
             longest = max(_seconds(profiler.profile) for _ in range(20))
         require(longest < 0.05 + LATE / 5, f"profile() took {longest:.3f} s")
+
+
+def _given(ask: Callable[[], _One | None], count: int, things: str) -> list[_One]:
+    """Ask until so many have come; there is none for as long as no new one has."""
+    found: list[_One] = []
+    limit = time.monotonic() + PATIENCE + LATE
+    while len(found) < count and time.monotonic() < limit:
+        one = ask()
+        if one is None:
+            time.sleep(0.002)
+        else:
+            found.append(one)
+    require(len(found) == count, f"{len(found)} {things} within {PATIENCE:g} s, not {count}")
+    return found
 
 
 class _Standing:
