@@ -124,14 +124,14 @@ class Belief:
         aside, into = self.pressing(settings) @ [settings.deflection, settings.preload]
         return float(into / max(aside * self._steepness(settings), 1e-9))
 
-    def holding(self, settings: Following) -> Floats:
+    def holding(self, settings: Following, share: float = 1.0) -> Floats:
         """Return (2,) what holds the tip in its joint per deflection and compression [N/m].
 
         The same as :meth:`seating`, for what is measured: where both come to less than nothing the
-        tip climbs its wall.
+        seating is below ``share``, and a tip below one climbs its wall.
         """
         forces = self.pressing(settings)
-        return np.asarray(forces[1] - self._steepness(settings) * forces[0])
+        return np.asarray(forces[1] - share * self._steepness(settings) * forces[0])
 
     def sliding(self, settings: Following) -> float:
         """Return the deflection that friction alone can give on a face [m]."""

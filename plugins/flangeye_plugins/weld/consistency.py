@@ -169,11 +169,14 @@ class Seating:
         s, offset, height = newest[-1].tolist()
         known = self._seated.behind(s, self._swept)
         if len(known) >= 2 * NEWEST:
-            aside, lifted = _newest_from(known, newest[-NEWEST:], PLANNED)
-            noisy = lifted[1] > NOISY
+            few = newest[-NEWEST:]
+            aside, lifted = _newest_from(known, few, PLANNED)
+            asides, noisy = [aside], lifted[1] > NOISY
             if noisy:
+                # A plan that is off by more hides how far aside it goes, and noise how far up.
+                asides.append(_newest_from(known, few)[0])
                 lifted = _newest_from(known, newest, PLANNED)[1]
-            self.doubt = self._climbed(aside, lifted, noisy)
+            self.doubt = max(self._climbed(aside, lifted, noisy) for aside in asides)
             left = noisy and self.doubt > ASIDE
             self._unsure = MANY if left else max(self._unsure - 1, 0)
             if lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:

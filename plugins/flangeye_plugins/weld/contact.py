@@ -124,14 +124,16 @@ class Release:
 class Hold:
     """Whether the tip is pressed into its joint enough to stay there, on several measurements.
 
-    Where a joint gets wider faster than the tool comes down, hardly anything presses the tip into
-    it, and what presses it aside moves it up its wall.
+    Where a joint gets wider faster than the tool comes down, or the seam turns away faster than
+    the arm follows, what presses the tip aside moves it up its wall. There it stays until it is
+    pressed down by clearly more: what is up a wall is held there by as much as pushes it.
     """
 
-    def __init__(self, holding: Floats) -> None:
-        """Begin; see :meth:`Belief.holding`."""
-        self._holding = holding
-        self._forces: deque[float] = deque(maxlen=HELD)
+    def __init__(self, holding: Floats, reseating: Floats) -> None:
+        """Begin; see :meth:`Belief.holding`, of a tip in its joint and of one that left it."""
+        self._holding, self._reseating = holding, reseating
+        self._newest: deque[tuple[float, float]] = deque(maxlen=HELD)
+        self._failed = False
 
     def fails(self, deflection: float, compression: float, sigma: Floats) -> bool:
         """Take a measurement; return whether the newest ones do not hold the tip.
@@ -141,6 +143,13 @@ class Hold:
             compression: Into the joint [m].
             sigma: (2,) standard deviations of one measurement of both [m].
         """
-        self._forces.append(float(self._holding @ (deflection, compression)))
-        scatter = float(np.hypot(*(self._holding * sigma))) / math.sqrt(HELD)
-        return len(self._forces) == HELD and sum(self._forces) / HELD < -UNHELD * scatter
+        self._newest.append((deflection, compression))
+        if len(self._newest) < HELD:
+            return False
+        mean = [sum(column) / HELD for column in zip(*self._newest, strict=True)]
+        if self._failed:
+            self._failed = bool(self._reseating @ mean < 0.0)
+        else:
+            scatter = float(np.hypot(*(self._holding * sigma))) / math.sqrt(HELD)
+            self._failed = bool(self._holding @ mean < -UNHELD * scatter)
+        return self._failed

@@ -13,6 +13,7 @@ from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touc
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
 from flangeye_plugins.weld.bias import Bias, Trail
+from flangeye_plugins.weld.checks import SEATING
 from flangeye_plugins.weld.consistency import LASTING, Seating
 from flangeye_plugins.weld.contact import Contact, Hold, Release
 from flangeye_plugins.weld.motion import SeamReading, Track
@@ -155,7 +156,7 @@ class Follower:
         self._time: float | None = None
         self._seen = self._heard = self._bridge = self._latency = 0.0
         self._release = Release(belief.two_walls, STEEPER * belief.sliding(settings))
-        self._hold = Hold(belief.holding(settings))
+        self._hold = Hold(belief.holding(settings), belief.holding(settings, SEATING))
         self._place, self._touched = plan.at(self.tip), self.tip
         self._search = Search(settings, belief)
         self._probing = Probing(settings, belief, self.side)

@@ -173,6 +173,10 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
         pytest.param(960445, id="the same, before a wall that is missing"),
         pytest.param(960268, id="tip that leaves the groove over the other wall, let go of"),
         pytest.param(970674, id="off a seam whose waves are narrower than that, in the air"),
+        pytest.param(972008, id="noisy tip left up its wall by a tack weld"),
+        pytest.param(974793, id="noisy tip that climbs right after the sweep"),
+        pytest.param(976309, id="the same at a tack weld, plan turned by 3 deg"),
+        pytest.param(976705, id="pressed up its wall by a wave at speed, and held there"),
         pytest.param(910752, id="curved walls askew in the sweep taken for a finger's gain"),
     ],
 )

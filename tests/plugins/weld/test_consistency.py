@@ -214,6 +214,18 @@ def test_a_noisy_tip_that_is_a_little_aside_is_followed() -> None:
     assert np.median(rows[rows[:, 0] > 0.09, 1]) < 0.1e-3
 
 
+@pytest.mark.parametrize("slope", [-0.06, 0.0, 0.06])
+def test_a_noisy_tip_that_climbs_is_doubted_however_the_plan_is_turned(slope: float) -> None:
+    """Away from the wall by more than plans are off, the seam would hide how far aside it went."""
+    rng, seating = np.random.default_rng(4), Seating(1.0, 0.84)
+    doubts = []
+    for s in np.arange(0.0, 0.045, 0.16e-3).tolist():
+        off = (0.85e-3, 0.4e-3) if s > 0.036 else (0.0, 0.0)
+        seating.judge(s, *(off + rng.normal([slope * s, 0.0], [0.05e-3, 0.33e-3])))
+        doubts.append(seating.doubt)
+    assert np.mean(np.array(doubts[-40:]) > 0.6e-3) > 0.9
+
+
 def test_a_quiet_tip_that_goes_aside_at_its_height_is_hardly_doubted() -> None:
     rows = doubts_after(0.4e-3, 0.0, 0.05e-3)
     assert np.mean(rows[:, 1] > 0.1e-3) < 0.05

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.checks import SEATING
 from flangeye_plugins.weld.contact import HELD, Contact, Hold, Release
 from flangeye_plugins.weld.settings import Following
 
@@ -134,6 +135,10 @@ AXES = Belief(40e-3, lateral=1000.0, axial=2000.0, half_angle=np.pi / 4)
 SIGMA = np.array([0.01e-3, 0.06e-3])
 
 
+def held(belief=AXES):
+    return Hold(belief.holding(Following()), belief.holding(Following(), SEATING))
+
+
 def fails(hold, compression, times=1, deflection=2e-3, sigma=SIGMA):
     return [hold.fails(deflection, compression, sigma) for _ in range(times)]
 
@@ -149,21 +154,31 @@ def test_what_holds_a_tip_is_what_the_seating_weighs() -> None:
 
 
 def test_a_tip_that_is_pressed_aside_more_than_down_is_not_held_once_several_say_so() -> None:
-    hold = Hold(AXES.holding(Following()))
+    hold = held()
     assert fails(hold, 0.5e-3, HELD) == [False] * (HELD - 1) + [True]  # half of what holds it
-    # Held again when the mean is: each of the newest outweighs one of those before.
-    assert fails(hold, 1.6e-3, HELD) == [True] * 3 + [False] * (HELD - 3)
+    # Held again when the mean is by as much as is asked for: each of the newest outweighs one.
+    assert fails(hold, 2.0e-3, HELD) == [True] * 4 + [False] * (HELD - 4)
     assert not any(fails(hold, 1.01e-3, 3 * HELD))
+
+
+@pytest.mark.parametrize(("compression", "again"), [(1.3e-3, False), (1.5e-3, True)])
+def test_a_tip_that_was_pressed_up_its_wall_comes_back_when_pressed_down_by_clearly_more(
+    compression: float, again: bool
+) -> None:
+    """What holds it is 1.4 times what pushes it then, as before a weld may begin."""
+    hold = held()
+    assert fails(hold, 0.5e-3, HELD)[-1]
+    assert fails(hold, compression, 3 * HELD)[-1] != again
 
 
 @pytest.mark.parametrize(("below", "failed"), [(1.9, False), (2.1, True)])
 def test_who_is_not_held_is_below_what_holds_it_by_two_sigmas(below: float, failed: bool) -> None:
     sigma = np.array([0.3e-3, 0.2e-3])  # 0.5 N of scatter, 0.3 N and 0.4 N of its parts
-    hold = Hold(AXES.holding(Following()))
+    hold = held()
     less = below * 0.5 / np.sqrt(HELD) / 2000.0
     assert fails(hold, 1e-3 - less, HELD, sigma=sigma)[-1] == failed
 
 
 def test_on_walls_that_are_not_known_a_tip_that_is_pressed_down_at_all_is_held() -> None:
     unknown = Belief(40e-3, lateral=1000.0, axial=2000.0)
-    assert not any(fails(Hold(unknown.holding(Following())), 0.01e-3, HELD, deflection=5e-3))
+    assert not any(fails(held(unknown), 0.01e-3, HELD, deflection=5e-3))
