@@ -56,6 +56,10 @@ SMALLEST = 0.02e-3
 SCANTY = 10
 """With so many bins the standard deviation is taken for twice of what they say."""
 
+GUESSED = 1.3
+"""Where nothing was felt the field's variance is larger by this: its size and length are guessed
+from what was felt elsewhere."""
+
 SAYING, THINNED = 120, 60
 """Filled bins to either side that have a say in how the plan is moved; so many are looked at."""
 
@@ -364,7 +368,7 @@ class RefinedPath:
         offsets = there @ motion.shift + weights @ residual
         free = there[SPAN] - weights[SPAN] @ rows
         held = float(weights[SPAN] @ kernel[SPAN])
-        left = motion.excess * max(field.variance + field.wander - held, 0.0)
+        left = GUESSED * motion.excess * max(field.variance + field.wander - held, 0.0)
         variance = left + float(free @ motion.covariance @ free)
         nearest = int(near[np.abs(near - index).argmin()])
         return _Fit(index, offsets.tolist(), variance, float(self._angle[nearest]))
