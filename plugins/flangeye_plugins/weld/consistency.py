@@ -117,10 +117,11 @@ class Seating:
         """Take samples (K, 3) of a tip that is known to be seated; see :meth:`judge`."""
         for s, offset, height in samples.tolist():
             self._seated.add(s, offset, height)
-        self._swept = float(samples[:, 0].max())
         at, _, height = samples.mean(axis=0).tolist()
-        sigma = float(samples[:, 2].std()) / math.sqrt(len(samples))
-        self._sweep = _Sweep(len(samples), at, height, sigma)
+        scatter = float(samples[:, 2].std())
+        self._sweep = _Sweep(len(samples), at, height, scatter / math.sqrt(len(samples)))
+        if scatter > NOISY * math.sqrt(NEWEST):  # a quiet one tells how it came to rest there
+            self._swept = float(samples[:, 0].max())
 
     def judge(self, s: float, offset: float, height: float) -> str | None:
         """Take a sample; return what is wrong.
