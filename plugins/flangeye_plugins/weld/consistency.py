@@ -103,13 +103,14 @@ class Seating:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
         self._side, self.doubt, self.risen = side, 0.0, 0.0
         self._flat, self._unsure = flat, 0
+        self._up = 0.0, -math.inf
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=MANY)
         self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
         self._sweep, self._swept = _Sweep(0, 0.0, 0.0, 0.0), -math.inf
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
-        self.doubt, self._unsure = 0.0, 0
+        self.doubt, self._unsure, self._up = 0.0, 0, (0.0, -math.inf)
         self._samples.clear()
         self._newest.clear()
 
@@ -180,12 +181,26 @@ class Seating:
             self.doubt = max(self._climbed(aside, lifted, noisy) for aside in asides)
             left = noisy and self.doubt > ASIDE
             self._unsure = MANY if left else max(self._unsure - 1, 0)
+            if noisy:
+                self._keep_up(newest, lifted)
             if lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:
                 # Lower ones would bend the line by their noise alone.
                 offset, height = offset - self._side * self.doubt, height - lifted[0]
                 self._unsure = 0
         if not self._unsure:
             self._seated.add(s, offset, height)
+
+    def _keep_up(self, newest: Floats, lifted: tuple[float, float]) -> None:
+        """Keep a doubt for as long as the tip stays as high as when it climbed for certain.
+
+        What was felt since says ever less of how far it did: it is up its wall itself.
+        """
+        height = float(newest[:, 2].mean())
+        if height < self._up[1]:
+            self._up = 0.0, -math.inf
+        if self.doubt > max(ASIDE, self._up[0]) and lifted[0] > CLEAR * lifted[1]:
+            self._up = self.doubt, height - lifted[0] / 2.0
+        self.doubt = max(self.doubt, self._up[0])
 
     def _climbed(
         self, aside: tuple[float, float], lifted: tuple[float, float], noisy: bool

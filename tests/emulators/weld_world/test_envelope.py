@@ -176,6 +176,7 @@ def test_nothing_of_the_world_is_reachable_from_the_controller(
         pytest.param(972008, id="noisy tip left up its wall by a tack weld"),
         pytest.param(974793, id="noisy tip that climbs right after the sweep"),
         pytest.param(976309, id="the same at a tack weld, plan turned by 3 deg"),
+        pytest.param(980285, id="noisy tip that stays up its wall for 60 mm of waves"),
         pytest.param(976705, id="pressed up its wall by a wave at speed, and held there"),
         pytest.param(910752, id="curved walls askew in the sweep taken for a finger's gain"),
     ],

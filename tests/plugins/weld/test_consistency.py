@@ -214,6 +214,22 @@ def test_a_noisy_tip_that_is_a_little_aside_is_followed() -> None:
     assert np.median(rows[rows[:, 0] > 0.09, 1]) < 0.1e-3
 
 
+@pytest.mark.parametrize("back", [False, True])
+def test_a_noisy_tip_that_rose_for_certain_is_doubted_until_it_comes_down(back: bool) -> None:
+    """However long that lasts, and wherever the seam leads meanwhile."""
+    rng, seating, doubts = np.random.default_rng(4), Seating(1.0, 0.84), []
+    for s in np.arange(0.0, 0.14, 0.16e-3).tolist():
+        up = 0.036 < s < (0.1 if back else 1.0)
+        wave = 0.0 if back or s < 0.05 else 1.5e-3 * np.sin(s / 8e-3)
+        off = (0.85e-3 * up + wave, 0.8e-3 * up)
+        seating.judge(s, *(off + rng.normal(0.0, [0.05e-3, 0.33e-3])))
+        doubts.append(seating.doubt)
+    if back:
+        assert np.median(doubts[-100:]) < 0.1e-3
+    else:
+        assert min(doubts[-100:]) > 0.6e-3
+
+
 @pytest.mark.parametrize("slope", [-0.06, 0.0, 0.06])
 def test_a_noisy_tip_that_climbs_is_doubted_however_the_plan_is_turned(slope: float) -> None:
     """Away from the wall by more than plans are off, the seam would hide how far aside it went."""
