@@ -49,6 +49,18 @@ class _Sweep(NamedTuple):
     sigma: float
 
 
+class _Up(NamedTuple):
+    """A tip that rose for certain: how far aside and up, and how high it is there [m]."""
+
+    aside: float
+    rise: float
+    height: float
+
+
+LEVEL = _Up(0.0, 0.0, -math.inf)
+"""It did not."""
+
+
 class _Trail:
     """Samples (K, 3) in the order in which they came; those far behind are let go of."""
 
@@ -103,14 +115,14 @@ class Seating:
         """Begin; ``side`` is pressed, and a tip that climbs goes aside by ``flat`` per height."""
         self._side, self.doubt, self.risen = side, 0.0, 0.0
         self._flat, self._unsure = flat, 0
-        self._up = 0.0, -math.inf
+        self._up = LEVEL
         self._newest: deque[tuple[float, float, float]] = deque(maxlen=MANY)
         self._samples, self._seated = _Trail(BEFORE[1]), _Trail(2 * BEFORE[1])
         self._sweep, self._swept = _Sweep(0, 0.0, 0.0, 0.0), -math.inf
 
     def forget(self) -> None:
         """Begin again, where contact was lost."""
-        self.doubt, self._unsure, self._up = 0.0, 0, (0.0, -math.inf)
+        self.doubt, self._unsure, self._up = 0.0, 0, LEVEL
         self._samples.clear()
         self._newest.clear()
 
@@ -183,7 +195,10 @@ class Seating:
             self._unsure = MANY if left else max(self._unsure - 1, 0)
             if noisy:
                 self._keep_up(newest, lifted)
-            if lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:
+            if self._up.aside:
+                offset, height = offset - self._side * self._up.aside, height - self._up.rise
+                self._unsure = 0
+            elif lifted[0] > (CLEAR if noisy else SURE) * lifted[1]:
                 # Lower ones would bend the line by their noise alone.
                 offset, height = offset - self._side * self.doubt, height - lifted[0]
                 self._unsure = 0
@@ -196,11 +211,11 @@ class Seating:
         What was felt since says ever less of how far it did: it is up its wall itself.
         """
         height = float(newest[:, 2].mean())
-        if height < self._up[1]:
-            self._up = 0.0, -math.inf
-        if self.doubt > max(ASIDE, self._up[0]) and lifted[0] > CLEAR * lifted[1]:
-            self._up = self.doubt, height - lifted[0] / 2.0
-        self.doubt = max(self.doubt, self._up[0])
+        if height < self._up.height - self._up.rise / 2.0:
+            self._up = LEVEL
+        if self.doubt > max(ASIDE, self._up.aside) and lifted[0] > CLEAR * lifted[1]:
+            self._up = _Up(self.doubt, lifted[0], height)
+        self.doubt = max(self.doubt, self._up.aside)
 
     def _climbed(
         self, aside: tuple[float, float], lifted: tuple[float, float], noisy: bool
