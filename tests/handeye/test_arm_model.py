@@ -186,3 +186,5 @@ def test_further_poses_are_those_after_which_the_parameters_are_known_best() -> 
         information = information + each[best]
     scale = np.sqrt(np.outer(*[np.diag(information) + 1.0] * 2))
     assert after.information / scale == pytest.approx(information / scale, abs=1e-6)
+    two = candidates.where(np.arange(15) < 2)
+    assert sorted(most_telling(ARM, two, fit, PRIOR, 3)[0]) == [0, 1]  # none is chosen twice

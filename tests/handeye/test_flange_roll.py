@@ -36,7 +36,7 @@ def test_the_roll_is_the_patterns_angle_about_the_flanges_z() -> None:
     assert roll_of(without, CAMERA) == pytest.approx(angles[[1, 3]])
 
 
-@pytest.mark.parametrize("middle", [12.0, 177.5])
+@pytest.mark.parametrize("middle", [12.0, 177.5, 179.5, 180.0])
 @pytest.mark.parametrize("rotation", [0.0, 2.0])
 def test_the_middle_one_is_told_with_its_deviation(middle: float, rotation: float) -> None:
     """Of five that scatter by 1.4826 times 1 deg, and the last by far more."""

@@ -218,10 +218,11 @@ def most_telling(
     known = _loosely(fit, prior)
     noise = float(np.median(candidates.noise)) + fit.scatter
     chosen: list[int] = []
-    for _ in range(count):
+    for _ in range(min(count, len(rows))):
         gain = known @ np.swapaxes(rows, 1, 2)
         inner = np.linalg.inv(rows @ gain + noise * np.eye(3))
         worth = np.einsum("nki,nij,nkj->n", gain[:, 6:], inner, gain[:, 6:])
+        worth[chosen] = -np.inf
         best = int(np.argmax(worth))
         chosen.append(best)
         known = known - gain[best] @ inner[best] @ gain[best].T

@@ -37,13 +37,14 @@ def roll_note(
         )
     mean = np.angle(np.exp(1j * turns).mean())  # the angles may lie about half a turn
     off = np.angle(np.exp(1j * (turns - mean)))
-    middle = mean + np.median(off)
+    degrees = round(float(np.degrees(mean + np.median(off))), 2)
+    middle = 180 - (180 - degrees) % 360  # within (-180, 180]
     of_one = SIGMA_OF_MAD * float(np.median(np.abs(off - np.median(off))))
     rotation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     # A median's standard deviation is 1.25 times a mean's.
     deviation = np.hypot(1.25 * of_one / np.sqrt(len(turns)), rotation)
     return (
-        f"the plate is turned by {np.degrees(middle):.2f} +- {np.degrees(deviation):.2f} deg about "
+        f"the plate is turned by {middle:.2f} +- {np.degrees(deviation):.2f} deg about "
         f"its own axis against the controller's frame (flange roll, from the bolt pattern in "
         f"{len(turns)} poses): the camera's pose does not depend on it"
     )
