@@ -102,17 +102,7 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
 
     The reported poses are the nominal kinematics of the commanded joints; the arm that is scanned
     has joint zeros of its own. Captures for verification come first. Each scan is made when it is
-    asked for.
-
-    Args:
-        robot: The arm.
-        scanner: What looks at it.
-        flange: What to look for; a robot that is asked for its wrist circle carries its own plate.
-        seed: Decides poses, errors and noise.
-        params: See :class:`SimulatedParams`.
-        sphere: A calibration sphere on the flange, where the recipe's feature has one.
-        stage_log: Hears what a plan that chooses its poses expects of the next one.
-        motion: Whether only the plan is asked for.
+    asked for. A robot that is asked for its wrist circle carries its own plate.
 
     Raises:
         StageError: Fewer than three poses are possible.
@@ -123,33 +113,19 @@ def acquire_simulated(  # noqa: PLR0913  what it asks the runner for
     base_T_camera = params.camera.base_T_camera
     reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
     site = _site(reach, scanner, base_T_camera)
-    plan: Plan = params.poses(site, _rng(planning))
-    poses = list(plan.poses)
-    _refuse_too_few(len(poses), plan.wanted, reach, robot, scanner)
-    checks = _checks(plan, site, params.verification, _rng(checking))
+    names = f"{robot.model} can show its flange to {scanner.model}"
+    stops = _stops(reach, site, params, (planning, checking), names)
     if motion and motion.plan_only:
-        raise _plan_alone(checks, poses, plan.wanted, reach, site)
-    others = [] if params.arm.is_default else _unseen(plan, site, _rng(checking.spawn(1)[0]))
-    of_arm, of_scanner = errors.spawn(2)
-    arm = ImperfectArm(robot, params.robot_errors, _rng(of_arm), params.arm)
-    visited = np.array([*(pose.joints for pose in [*checks, *poses]), *others])
-    angles, count = arm.angles(visited), len(checks) + len(poses)
-    session = _Session(
-        Cell(robot, plate, plan.centre, plan.size, sphere), scanner, base_T_camera, arm,
-        visited[:count], angles[:count], len(checks), params, of_scanner,
-    )  # fmt: skip
-    unseen = _exactly(arm, visited[count:], angles[count:], base_T_camera)
-    source = Source(
-        fingerprint=_fingerprint(seed, robot, scanner, flange, params, sphere),
-        notes=_notes(len(poses), plan.wanted, robot, scanner),
-        workspace=Box(plan.centre, plan.size),
-        truth=Truth(Transform(BASE, CAMERA, base_T_camera), unseen=unseen),
-    )
-    look = partial(session.look, rng=_rng(later))
-    whys = [pose.why for pose in [*checks, *poses]]
+        raise _plan_alone(stops, reach, site)
+    unseen = [] if params.arm.is_default else _unseen(stops.plan, site, _rng(checking.spawn(1)[0]))
+    cell = Cell(robot, plate, stops.plan.centre, stops.plan.size, sphere)
+    session = _session(cell, scanner, stops, unseen, params, errors)
+    source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere))
+    whys = [pose.why for pose in stops.all]
     captures = _explained(session.captures(noise), whys, stage_log)
+    look = partial(session.look, rng=_rng(later))
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
-    return Captures(captures, source, len(session.joints), look, recorded=not any(whys))
+    return Captures(captures, source, len(whys), look, recorded=not any(whys))
 
 
 def _explained(
@@ -167,34 +143,47 @@ def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
     return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
 
 
-def _refuse_too_few(
-    found: int, wanted: int, reach: Reach, robot: RobotModel, scanner: ScannerModel
-) -> None:
-    if found >= FEWEST:
-        return
-    raise StageError(
-        f"acquire.simulated: {robot.model} can show its flange to {scanner.model} at "
-        f"{found} of {wanted} planned poses, {FEWEST} are needed ({reach.why_refused()}); "
-        "move camera.position, or the plan's centre, or make its size or tilt smaller"
-    )
+@dataclass(frozen=True, eq=False)
+class _Stops:
+    """Where the arm stops: for the captures that verify, then for those that calibrate."""
+
+    plan: Plan
+    checks: list[PlannedPose]
+    poses: list[PlannedPose]
+
+    @property
+    def all(self) -> list[PlannedPose]:
+        return [*self.checks, *self.poses]
 
 
-def _plan_alone(
-    checks: Sequence[PlannedPose],
-    poses: Sequence[PlannedPose],
-    wanted: int,
+def _stops(
     reach: Reach,
     site: Site,
-) -> NothingMoved:
+    params: SimulatedParams,
+    seeds: tuple[np.random.SeedSequence, np.random.SeedSequence],
+    names: str,
+) -> _Stops:
+    plan: Plan = params.poses(site, _rng(seeds[0]))
+    poses = list(plan.poses)
+    if len(poses) < FEWEST:
+        raise StageError(
+            f"acquire.simulated: {names} at {len(poses)} of {plan.wanted} planned poses, "
+            f"{FEWEST} are needed ({reach.why_refused()}); "
+            "move camera.position, or the plan's centre, or make its size or tilt smaller"
+        )
+    return _Stops(plan, _checks(plan, site, params.verification, _rng(seeds[1])), poses)
+
+
+def _plan_alone(stops: _Stops, reach: Reach, site: Site) -> NothingMoved:
     """Return the plan that is shown instead of a session."""
-    roles = [*(["verification"] * len(checks)), *(["calibration"] * len(poses))]
-    stops = [*checks, *poses]
+    roles = ["verification"] * len(stops.checks) + ["calibration"] * len(stops.poses)
     rows = [
         row_at(f"{i:04d}", role, pose, site.eye)
-        for i, (role, pose) in enumerate(zip(roles, stops, strict=True))
+        for i, (role, pose) in enumerate(zip(roles, stops.all, strict=True))
     ]
-    head = f"{len(stops)} stops of a simulated arm, {wanted} requested; paths are not simulated"
-    return NothingMoved(*as_plan(head, rows, left_out(reach.refusals, stops)))
+    wanted = stops.plan.wanted
+    head = f"{len(rows)} stops of a simulated arm, {wanted} requested; paths are not simulated"
+    return NothingMoved(*as_plan(head, rows, left_out(reach.refusals, stops.all)))
 
 
 def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[PlannedPose]:
@@ -214,21 +203,6 @@ def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
 
 
-def _exactly(
-    arm: ImperfectArm, joints: Floats, angles: Floats, base_T_camera: Floats
-) -> tuple[Observation, ...]:
-    """Return what a scanner without noise sees at those poses."""
-    reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in arm.reported(joints)]
-    seen = invert(base_T_camera) @ arm.flange(angles)
-    return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
-
-
-def _notes(found: int, wanted: int, robot: RobotModel, scanner: ScannerModel) -> tuple[str, ...]:
-    left_out = wanted - found
-    note = f"simulated: {robot.model} before {scanner.model}, {found} poses"
-    return (note + (f"; {left_out} more were planned and are not possible" if left_out else ""),)
-
-
 def _fingerprint(seed: int, *models: BaseModel | None) -> str:
     given = [model.model_dump(mode="json") for model in models if model is not None]
     text = json.dumps([VERSION, seed, given], sort_keys=True)
@@ -237,31 +211,56 @@ def _fingerprint(seed: int, *models: BaseModel | None) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Session:
-    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled."""
+    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled.
+
+    The joints, (N, n) as reported and as they are, go on with those of poses that take no part.
+    """
 
     cell: Cell
     scanner: ScannerModel
-    base_T_camera: Floats
+    stops: _Stops
+    params: SimulatedParams
     arm: ImperfectArm
     joints: Floats
     angles: Floats
-    checks: int
-    params: SimulatedParams
     of_scanner: np.random.SeedSequence
+
+    @property
+    def base_T_camera(self) -> Floats:
+        return self.params.camera.base_T_camera
+
+    @property
+    def count(self) -> int:
+        return len(self.stops.all)
+
+    def source(self, fingerprint: str) -> Source:
+        """Return where the captures come from, with the truth."""
+        plan, found = self.stops.plan, len(self.stops.poses)
+        note = f"simulated: {self.cell.robot.model} before {self.scanner.model}, {found} poses"
+        if left := plan.wanted - found:
+            note += f"; {left} more were planned and are not possible"
+        truth = Truth(Transform(BASE, CAMERA, self.base_T_camera), unseen=self._unseen())
+        return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth)
+
+    def _unseen(self) -> tuple[Observation, ...]:
+        """Return what a scanner without noise sees at the poses that take no part."""
+        joints, angles = self.joints[self.count :], self.angles[self.count :]
+        reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in self.arm.reported(joints)]
+        seen = invert(self.base_T_camera) @ self.arm.flange(angles)
+        return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
 
     def captures(self, noise: np.random.SeedSequence) -> Iterator[Capture]:
         """Make the captures, each when it is asked for."""
-        of_covers, *of_captures = noise.spawn(1 + len(self.joints))
+        of_covers, *of_captures = noise.spawn(1 + self.count)
         eye = self._eye()
         covered = self._covered(_rng(of_covers))
         around = self.cell.around()
-        for index, joints in enumerate(self.joints):
-            rng = _rng(of_captures[index])
+        for index, rng in enumerate(map(_rng, of_captures)):
             frames, flange = self.arm.stand(self.angles[index], rng)
             cover = [self.cell.board(flange)] if index in covered else []
             bodies = around + self.cell.arm(frames, flange) + cover
             xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
-            yield self._capture(index, xyz, self.arm.reported(joints))
+            yield self._capture(index, xyz, self.arm.reported(self.joints[index]))
 
     def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
         """Scan other bodies, given in ``base``, with the same scanner from the same place."""
@@ -274,12 +273,12 @@ class _Session:
 
     def _covered(self, rng: np.random.Generator) -> set[int]:
         """Draw the calibration captures in which a board hides the flange."""
-        calibration = np.arange(self.checks, len(self.joints))
+        calibration = np.arange(len(self.stops.checks), self.count)
         count = round(self.params.outliers * len(calibration))
         return set(rng.permutation(calibration)[:count].tolist())
 
     def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
-        role: Role = "verification" if index < self.checks else "calibration"
+        role: Role = "verification" if index < len(self.stops.checks) else "calibration"
         return Capture(
             id=f"{index:04d}",
             cloud=PointCloud(CAMERA, xyz),
@@ -288,6 +287,20 @@ class _Session:
             time_ns=EPOCH_NS + (index + 1) * INTERVAL_NS,
             role=role,
         )
+
+
+def _session(
+    cell: Cell,
+    scanner: ScannerModel,
+    stops: _Stops,
+    unseen: Sequence[Floats],
+    params: SimulatedParams,
+    errors: np.random.SeedSequence,
+) -> _Session:
+    of_arm, of_scanner = errors.spawn(2)
+    arm = ImperfectArm(cell.robot, params.robot_errors, _rng(of_arm), params.arm)
+    joints = np.array([*(pose.joints for pose in stops.all), *unseen])
+    return _Session(cell, scanner, stops, params, arm, joints, arm.angles(joints), of_scanner)
 
 
 def _rng(sequence: np.random.SeedSequence) -> np.random.Generator:
