@@ -12,10 +12,13 @@ Change = Callable[[str, bytes], tuple[str, bytes]]
 """Takes a topic, or an attachment's name, and its bytes; gives both as they shall be."""
 
 
-def rewritten(source: Path, target: Path, change: Change, library: str = "flangeye") -> Path:
+def rewritten(
+    source: Path, target: Path, change: Change, library: str = "flangeye", codec: str = "zstd"
+) -> Path:
     """Copy a log with every CRC valid again, each message and attachment as `change` has it."""
     with source.open("rb") as stream, target.open("wb") as out:
-        reader, writer = make_reader(stream), Writer(out, compression=CompressionType.ZSTD)
+        reader = make_reader(stream)
+        writer = Writer(out, compression=CompressionType[codec.upper()])
         known: dict[str, int] = {}
         writer.start(library=library)
         for schema, channel, message in reader.iter_messages():

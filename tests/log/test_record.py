@@ -19,6 +19,7 @@ from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder, adapter
+from tests.crafted import rewritten
 
 CIRCLE = t.CircleFeature(
     np.array([0.1, 0.2, 0.7]), np.array([0, 0, -1.0]), {"rim": 0.03}, np.eye(3), np.eye(3), 0.9
@@ -59,6 +60,16 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         "2.fit.toy", "fit.toy", "fit", "a",
     )  # fmt: skip
     assert np.array_equal(entry.value.centre, CIRCLE.centre)
+
+
+@pytest.mark.parametrize("codec", ["lz4", "zstd"])
+def test_a_log_whose_chunks_were_packed_is_read_alike(tmp_path: Path, codec: str) -> None:
+    recorded(tmp_path / "r.mcap").flangeye_run_finished({"status": "verified"})
+    same = rewritten(tmp_path / "r.mcap", tmp_path / "p.mcap", lambda n, d: (n, d), codec=codec)
+    log = read_run(same)
+    assert (log.complete, log.damage, log.result) == (True, [], {"status": "verified"})
+    (capture,) = log.captures()
+    assert np.array_equal(capture.cloud.xyz, CAPTURE.cloud.xyz)
 
 
 @pytest.mark.parametrize("shape", [(30, 40), (30, 40, 3)])

@@ -113,9 +113,10 @@ class Recorder:
         try:
             self._file = path.open("wb")
             # One message, one chunk: what was written survives the death of the process. Scans and
-            # images come packed; what is left is small, and LZ4 passes over the others.
+            # images come packed, and the other points are noise to a codec: LZ4 won 0.3 % of a
+            # calibration's log, 7 % of a weld's, and cost a third of writing a whole scan.
             self._writer = Writer(
-                self._file, chunk_size=1, compression=CompressionType.LZ4, enable_data_crcs=True
+                self._file, chunk_size=1, compression=CompressionType.NONE, enable_data_crcs=True
             )
             self._writer.start(profile="", library=f"flangeye {VERSION}")
             for name, text in recipe.items():

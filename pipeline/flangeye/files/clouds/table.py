@@ -19,6 +19,9 @@ from flangeye.files.clouds.lzf import MAX_EXPANSION, LzfError, decompress
 Shape = tuple[int, ...]
 Points = NDArray[np.float32]
 
+PLAIN = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+"""The record of points and nothing else: its bytes are the array's."""
+
 
 class PointTable(Protocol):
     """Where a file keeps its points, as its header says."""
@@ -130,6 +133,8 @@ class BinaryTable:
         records = np.fromfile(self.path, self.record, count=n, offset=self.offset)
         if len(records) != n:
             refuse(self.path, f"changed while it was read: {len(records)} of {n} points are left")
+        if self.record == PLAIN:
+            return records.view("<f4").reshape(n, 3)
         return _stack(*(records[axis] for axis in "xyz"))
 
 
