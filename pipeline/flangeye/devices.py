@@ -59,8 +59,22 @@ class RobotState:
     message: str = ""
 
 
+class Device(Protocol):
+    """What is open and used as a context; a driver's class may inherit from it."""
+
+    def close(self) -> None:
+        """Let go of the device; safe to call twice."""
+        ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 @runtime_checkable
-class Robot(Protocol):
+class Robot(Device, Protocol):
     """An arm. Opened by its driver, used as a context, closed for good at the end.
 
     Every method but close raises DeviceError when the arm is lost, and a command also when the
@@ -111,10 +125,6 @@ class Robot(Protocol):
         """Stop and let go of the controller; safe to call twice and after the device was lost."""
         ...
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
 
 @runtime_checkable
 class MovedByHand(Protocol):
@@ -148,7 +158,7 @@ class Scan:
 
 
 @runtime_checkable
-class Scanner(Protocol):
+class Scanner(Device, Protocol):
     """A 3D scanner. Opened by its driver, used as a context.
 
     Attributes:
@@ -172,14 +182,6 @@ class Scanner(Protocol):
             DeviceError: The scanner is lost, or gave nothing in time.
         """
         ...
-
-    def close(self) -> None:
-        """Let go of the device; safe to call twice."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
 
 
 @runtime_checkable
@@ -235,7 +237,7 @@ class SensorFrame:
 
 
 @runtime_checkable
-class TactileSensor(Protocol):
+class TactileSensor(Device, Protocol):
     """A camera that watches a tag on a compliant finger.
 
     Attributes:
@@ -256,14 +258,6 @@ class TactileSensor(Protocol):
         """
         ...
 
-    def close(self) -> None:
-        """Let go of the camera; safe to call twice."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
 
 @dataclass(frozen=True)
 class WeldProfile:
@@ -281,7 +275,7 @@ class WeldProfile:
 
 
 @runtime_checkable
-class Profiler(Protocol):
+class Profiler(Device, Protocol):
     """A profile sensor on the tool that looks at the bead, a fixed way behind the torch.
 
     Attributes:
@@ -301,14 +295,6 @@ class Profiler(Protocol):
             DeviceError: The sensor is lost.
         """
         ...
-
-    def close(self) -> None:
-        """Let go of the sensor; safe to call twice."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Self
 
 import numpy as np
 
-from flangeye.devices import Robot, RobotDriver, RobotState
+from flangeye.devices import Device, Robot, RobotDriver, RobotState
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits
@@ -41,7 +40,7 @@ def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterato
         yield LedArm(arm)
 
 
-class LedArm:
+class LedArm(Device):
     """The program's side of an arm that it leads; see :class:`flangeye.devices.Robot`.
 
     A safety fault raises DeviceError where the next cycle is waited for, a stop by the operator
@@ -87,9 +86,3 @@ class LedArm:
     def close(self) -> None:
         """Stop; the guard lets go of the arm when its own context ends."""
         self._arm.stop()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -6,10 +6,11 @@ import ipaddress
 import json
 import socket
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from flangeye.devices import Device
 from flangeye.errors import StageError
 from flangeye.motion.arm import run_number
 from flangeye.types import Floats
@@ -49,7 +50,7 @@ class EmulatorTruth(NamedTuple):
     time: float
 
 
-class EmulatorControl:
+class EmulatorControl(Device):
     """A connection to the control channel of a controller on loopback.
 
     ``with LoopbackControl("127.0.0.5") as control: control.fault("freeze=3 s")``
@@ -155,9 +156,3 @@ class EmulatorControl:
         """End the connection."""
         self._lines.close()
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
 
-from flangeye.devices import Profiler, StateSource, TactileSensor, WeldProfile
+from flangeye.devices import Device, Profiler, StateSource, TactileSensor, WeldProfile
 from flangeye.errors import StageError
 from flangeye.plugin.stage import part
 from flangeye.types import Seed
@@ -15,7 +13,7 @@ from flangeye_emulators.weld_world.look import LookBehind
 from flangeye_emulators.weld_world.settings import LookTruth
 
 
-class SimulatedProfiler:
+class SimulatedProfiler(Device):
     """Looks at the world that the finger stands in, wherever the torch truly is in it.
 
     Attributes:
@@ -39,12 +37,6 @@ class SimulatedProfiler:
 
     def close(self) -> None:
         """Nothing to let go of."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 @part("profiler.simulated")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import DeviceError, SensorFrame, StateSource, TactileSensor
+from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger
@@ -79,7 +77,7 @@ class SimulatedFingerParams(Params):
     fails: Duration | None = param(None, description="When the camera is lost.")
 
 
-class SimulatedFinger:
+class SimulatedFinger(Device):
     """A finger on an arm, over a workpiece, in a world of its own.
 
     Attributes:
@@ -157,12 +155,6 @@ class SimulatedFinger:
 
     def close(self) -> None:
         """Nothing to let go of."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _shown(self, pose: ToolPose, base_T_flange: Transform) -> Floats:
         """Return what the tag shows of the tip's displacement (3,), along the tool's axes."""

@@ -6,11 +6,11 @@ import subprocess
 import time
 from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated, Any, Self
+from typing import Annotated
 
 from pydantic import Field
 
-from flangeye.devices import DeviceError, Robot, RobotState
+from flangeye.devices import Device, DeviceError, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command
 from flangeye.files.load import busy
@@ -130,7 +130,7 @@ def _end(controller: subprocess.Popen[str] | None) -> None:
         controller.wait()
 
 
-class OnEmulator:
+class OnEmulator(Device):
     """An arm whose controller ends with it; everything else is the arm's own driver."""
 
     def __init__(self, robot: Robot, controller: subprocess.Popen[str] | None) -> None:
@@ -169,9 +169,3 @@ class OnEmulator:
             self._robot.close()
         finally:
             _end(self._controller)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()

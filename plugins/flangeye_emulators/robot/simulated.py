@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
 
-from flangeye.devices import GRACE, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
@@ -35,7 +33,7 @@ class SimulatedParams(Params):
     )
 
 
-class SimulatedRobot:
+class SimulatedRobot(Device):
     """An arm whose time passes in :meth:`wait_cycle` and nowhere else.
 
     It keeps to what the controllers on loopback keep to: a move begins at rest, goes with limited
@@ -118,12 +116,6 @@ class SimulatedRobot:
     def close(self) -> None:
         """Stop; its time passes only in :meth:`wait_cycle`, so it does not run on."""
         self.stop()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _begin(self, plan: Plan) -> None:
         self._require_ready()

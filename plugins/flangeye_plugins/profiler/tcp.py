@@ -11,12 +11,13 @@ import math
 import socket
 import threading
 import time
-from typing import Literal, Self
+from typing import Literal
 
 from pydantic import Field
 
 from flangeye.devices import (
     PATIENCE,
+    Device,
     DeviceError,
     Profiler,
     StateSource,
@@ -54,7 +55,7 @@ class TcpParams(Params):
     )
 
 
-class TcpProfiler:
+class TcpProfiler(Device):
     """Reads lines in a thread of its own, and keeps the newest look.
 
     Attributes:
@@ -104,12 +105,6 @@ class TcpProfiler:
         self._closing = True
         self._thread.join(PATIENCE)
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _read(self) -> None:
         begun = b""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Self
+
+from flangeye.devices import Device
 
 
-class OpenScanner:
+class OpenScanner(Device):
     """A scanner that is in use; a driver adds ``expose``, and ``close`` where there is a device."""
 
     def __init__(self, name: str, facts: Mapping[str, str]) -> None:
@@ -16,9 +17,3 @@ class OpenScanner:
 
     def close(self) -> None:
         """Let go of the device; safe to call twice."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from flangeye.devices import DeviceError, SensorFrame, StateSource, TactileSensor
+from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Image, Seed
@@ -31,7 +31,7 @@ class OpenCVParams(Params):
     )
 
 
-class OpenCVCamera:
+class OpenCVCamera(Device):
     """Reads images in a thread of its own, and keeps the newest.
 
     Attributes:
@@ -85,12 +85,6 @@ class OpenCVCamera:
         if self._thread.is_alive():
             self._thread.join(timeout=1.0)
         self._capture.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check(self, finger: Finger) -> None:
         good, pixels = self._capture.read()

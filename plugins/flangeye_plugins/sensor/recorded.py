@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.devices import DeviceError, SensorFrame, StateSource, TactileSensor
+from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
 from flangeye.files.paths import RecipePath
@@ -38,7 +37,7 @@ class McapParams(Params):
     path: RecipePath = param(description="The run.mcap of a weld; its images, at their times.")
 
 
-class RecordedImages:
+class RecordedImages(Device):
     """Gives recorded images when the robot's clock has come to them.
 
     Attributes:
@@ -75,12 +74,6 @@ class RecordedImages:
 
     def close(self) -> None:
         """Nothing to let go of."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 @part("sensor.image_folder")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import time
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import GRACE, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
@@ -103,7 +103,7 @@ def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) 
     return robot
 
 
-class AuboRobot:
+class AuboRobot(Device):
     """An arm of AUBO; see :class:`flangeye.devices.Robot`.
 
     A state is read in several questions, one after the other. They take a millisecond together:
@@ -214,12 +214,6 @@ class AuboRobot:
                 self.stop()
         self._closed = True
         self._client.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _ask(self, what: str, question: Any) -> Any:
         if self._closed:

@@ -8,12 +8,12 @@ against a stand-in for the connection alone; see the README of the drivers.
 from __future__ import annotations
 
 import time
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import GRACE, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
@@ -97,7 +97,7 @@ def opened(robot: FrankyRobot, model: RobotModel, params: FrankyParams) -> Frank
     return robot
 
 
-class FrankyRobot:
+class FrankyRobot(Device):
     """An arm of Franka Robotics; see :class:`flangeye.devices.Robot`.
 
     Attributes:
@@ -199,12 +199,6 @@ class FrankyRobot:
             self.stop()
         finally:
             self._closed, self._robot = True, None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _start(self, motion: Any, stopping: Any) -> None:
         state = self.state()

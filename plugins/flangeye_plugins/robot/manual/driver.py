@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from typing import Self
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from flangeye.devices import DeviceError, Mode, Robot, RobotState
+from flangeye.devices import Device, DeviceError, Mode, Robot, RobotState
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_formats import CONVENTIONS, LengthUnit
 from flangeye.models.robots import RobotModel
@@ -72,7 +71,7 @@ def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
     return ManualRobot(model, params, OperatorConsole())
 
 
-class ManualRobot:
+class ManualRobot(Device):
     """An arm that a person moves; see :class:`flangeye.devices.Robot`.
 
     No method waits for the person: an arm that was sent somewhere is ``moving`` until they have
@@ -144,12 +143,6 @@ class ManualRobot:
 
     def close(self) -> None:
         """Do nothing; the arm is the person's."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _mode(self) -> Mode:
         if self._stopped:

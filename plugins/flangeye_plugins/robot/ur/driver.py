@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import time
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import DeviceError, Robot, RobotState
+from flangeye.devices import Device, DeviceError, Robot, RobotState
 from flangeye.files.load import busy
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
@@ -82,7 +82,7 @@ def robot_ur_rtde(model: RobotModel, params: UrRtdeParams, reads_only: bool = Fa
     return robot
 
 
-class UrRobot:
+class UrRobot(Device):
     """An arm of Universal Robots; see :class:`flangeye.devices.Robot`.
 
     Every call ends within three seconds: connecting within two and a half, commands within one
@@ -163,12 +163,6 @@ class UrRobot:
         except DeviceError:
             self._link.close(hopeless=True)
         self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _base_T_tool(self, sample: Sample) -> Floats:
         """Return the tool's pose (4, 4); a cycle asks twice for that of one sample."""
