@@ -24,7 +24,6 @@ from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param
-from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
 from flangeye_plugins.scanner.kinect_view import DepthView
 from flangeye_plugins.scanner.opened import OpenScanner
 from flangeye_plugins.scanner.pipe import Pipe, PipeEndedError
@@ -139,8 +138,8 @@ class AzureKinect(OpenScanner):
     ) -> None:
         """Take over the process that holds the camera."""
         what = params.recording.name if params.recording else facts["serial"]
-        super().__init__(f"Azure Kinect {what}", {"unit": "mm", **facts})
-        self._pipe, self._model, self._params = pipe, model, params
+        super().__init__(f"Azure Kinect {what}", {"unit": "mm", **facts}, model)
+        self._pipe, self._params = pipe, params
 
     def expose(self) -> Callable[[], Scan]:
         """Take the next capture; the arm waits until it is here."""
@@ -150,15 +149,13 @@ class AzureKinect(OpenScanner):
         answer = _answer(self._pipe, self._params.timeout + 0.5)
         depth = self._array(answer["depth"], np.uint16)
         colour = self._array(answer["colour"], np.uint8) if "colour" in answer else None
-        ended = time.time_ns()
+        times = started, time.time_ns()
 
         def decode() -> Scan:
             view = DepthView(**answer["calibration"])
             xyz = view.points(depth)
-            cloud = cloud_of(xyz, PER_METRE)
-            require_in_range(self.name, cloud, self._model)
             image = None if colour is None else view.coloured(xyz, colour)
-            return Scan(cloud, started, ended, image)
+            return self._scan(xyz, PER_METRE, times, image)
 
         return decode
 

@@ -19,7 +19,6 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param
-from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
 from flangeye_plugins.scanner.genicam_nodes import Layout, configure, has_node
 from flangeye_plugins.scanner.opened import OpenScanner
 
@@ -134,10 +133,9 @@ class GenicamScanner(OpenScanner):
         """Take over an open and configured device."""
         device = acquirer.device
         name = f"{device.vendor} {device.model} {device.serial_number}"
-        super().__init__(name, {"transport": device.tl_type, **layout.facts})
+        super().__init__(name, {"transport": device.tl_type, **layout.facts}, model)
         self._harvester, self._acquirer, self._layout = harvester, acquirer, layout
-        self._model, self._params = model, params
-        self._closed = False
+        self._params, self._closed = params, False
 
     def expose(self) -> Callable[[], Scan]:
         """Scan once; the arm waits until the frame is here, for devices say no earlier."""
@@ -145,14 +143,9 @@ class GenicamScanner(OpenScanner):
             raise DeviceError(f"{self.name}: is closed")
         started = time.time_ns()
         parts = self._fetch()
-        ended = time.time_ns()
-
-        def decode() -> Scan:
-            cloud = cloud_of(self._layout.coordinates(parts), self._layout.per_metre)
-            require_in_range(self.name, cloud, self._model)
-            return Scan(cloud, started, ended)
-
-        return decode
+        times = started, time.time_ns()
+        layout = self._layout
+        return lambda: self._scan(layout.coordinates(parts), layout.per_metre, times)
 
     def close(self) -> None:
         """Let go of the device and the producer."""

@@ -13,7 +13,6 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param
-from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.mech_eye"
@@ -77,8 +76,8 @@ class MechEye(OpenScanner):
         self, api: Any, camera: Any, model: ScannerModel | None, params: MechEyeParams
     ) -> None:
         """Take over a connected camera."""
-        super().__init__(NAME, {"unit": "m", "layout": "organised"})
-        self._api, self._camera, self._model, self._params = api, camera, model, params
+        super().__init__(NAME, {"unit": "m", "layout": "organised"}, model)
+        self._api, self._camera, self._params = api, camera, params
 
     def prepare(self) -> None:
         """Ask the camera who it is, and for metres.
@@ -101,15 +100,13 @@ class MechEye(OpenScanner):
         frame, patience = self._api.Frame3D(), round(self._params.timeout * 1e3)
         started = time.time_ns()
         _require(self._camera.capture_3d(frame, patience), self.name)
-        ended = time.time_ns()
+        times = started, time.time_ns()
 
         def decode() -> Scan:
             xyz = frame.get_untextured_point_cloud().data()
             if xyz.ndim != 3:
                 raise DeviceError(f"{self.name}: a frame without points")
-            cloud = cloud_of(xyz, 1.0)
-            require_in_range(self.name, cloud, self._model)
-            return Scan(cloud, started, ended)
+            return self._scan(xyz, 1.0, times)
 
         return decode
 

@@ -17,7 +17,6 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param
-from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.realsense"
@@ -102,13 +101,14 @@ class Realsense(OpenScanner):
     ) -> None:
         """Take over a started pipeline."""
         device = profile.get_device()
-        self._rs, self._pipeline, self._model, self._params = rs, pipeline, model, params
+        self._rs, self._pipeline, self._params = rs, pipeline, params
         self._unit = float(device.first_depth_sensor().get_depth_scale())
         self._points = rs.pointcloud()
         self._closed = False
         if params.recording is not None:
             device.as_playback().set_real_time(False)
-        super().__init__(f"RealSense {_who(rs, device, params.recording)}", self._facts(profile))
+        name = f"RealSense {_who(rs, device, params.recording)}"
+        super().__init__(name, self._facts(profile), model)
 
     def expose(self) -> Callable[[], Scan]:
         """Take a new frame; the arm waits until it is here."""
@@ -116,14 +116,8 @@ class Realsense(OpenScanner):
         for _ in range(0 if self._params.recording else STALE):
             self._frames()
         frames = self._frames()
-        ended = time.time_ns()
-
-        def decode() -> Scan:
-            cloud = cloud_of(self._coordinates(frames.get_depth_frame()), 1.0)
-            require_in_range(self.name, cloud, self._model)
-            return Scan(cloud, started, ended)
-
-        return decode
+        times = started, time.time_ns()
+        return lambda: self._scan(self._coordinates(frames.get_depth_frame()), 1.0, times)
 
     def close(self) -> None:
         """Stop the camera."""

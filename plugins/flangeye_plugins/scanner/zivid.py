@@ -14,7 +14,6 @@ from flangeye.files.paths import RecipePath
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
-from flangeye_plugins.scanner.clouds import cloud_of, require_in_range
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.zivid"
@@ -80,9 +79,8 @@ class ZividScanner(OpenScanner):
         """Take over a connected camera."""
         info = camera.info
         facts = {"unit": "mm", "firmware": str(info.firmware_version), "layout": "organised"}
-        super().__init__(f"{info.model_name} {info.serial_number}", facts)
-        self._application, self._camera = application, camera
-        self._settings, self._model = settings, model
+        super().__init__(f"{info.model_name} {info.serial_number}", facts, model)
+        self._application, self._camera, self._settings = application, camera, settings
 
     def expose(self) -> Callable[[], Scan]:
         """Capture; the SDK returns when the images are taken, and computes points when asked."""
@@ -95,7 +93,7 @@ class ZividScanner(OpenScanner):
             frame = capture(self._settings)
         except RuntimeError as error:
             raise DeviceError(f"{self.name}: {_line(error)}") from None
-        ended = time.time_ns()
+        times = started, time.time_ns()
 
         def transfer() -> Scan:
             try:
@@ -105,9 +103,7 @@ class ZividScanner(OpenScanner):
                 raise DeviceError(f"{self.name}: {_line(error)}") from None
             if xyz.ndim != 3:
                 raise DeviceError(f"{self.name}: points of shape {xyz.shape}, not organised")
-            cloud = cloud_of(xyz, PER_METRE)
-            require_in_range(self.name, cloud, self._model)
-            return Scan(cloud, started, ended)
+            return self._scan(xyz, PER_METRE, times)
 
         return transfer
 
