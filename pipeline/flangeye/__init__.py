@@ -1,7 +1,13 @@
 """flangeye: hand-eye calibration from the robot's own flange.
 
-The names a plugin needs are here; everything else is internal. Each is imported when it is asked
-for: a command that answers at once must not wait for what it does not use.
+The names every plugin needs are here. Public are also the rooms ``types``, ``units``,
+``devices``, ``errors``, ``maths``, ``handeye``, ``models``, ``files``, ``motion``, ``plugin`` and
+``testing``, the modules ``log.read``, ``recipe.header`` and ``result``, and those that hold
+contracts of parts; the rest may change without notice. The last contract in pyproject.toml holds
+plugins to it.
+
+A name is imported when it is asked for: a command that answers at once must not wait for what it
+does not use.
 """
 
 import importlib

@@ -9,6 +9,8 @@ from typing import Protocol
 from flangeye.devices import MotionAllowed
 from flangeye.recipe.load import Recipe
 
+__all__ = ["Guide", "Recipe"]
+
 
 class Guide(Protocol):
     """How a ``guide`` part is called."""

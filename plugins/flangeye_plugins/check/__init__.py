@@ -1,4 +1,4 @@
-"""Checks: mistakes in recordings that ``flangeye doctor`` can name."""
+"""``check.*``: mistakes in recordings that ``flangeye doctor`` names. Add one: a new module."""
 
 from flangeye_plugins.check.changes import moved, tool
 from flangeye_plugins.check.motion import motion

@@ -1,1 +1,1 @@
-"""Costs: what solve.iterative minimises."""
+"""``cost.*``: what solve.iterative minimises. Add a cost: a function in ``costs``."""

@@ -1,1 +1,1 @@
-"""``error.*``: how solve.iterative measures a candidate. Add one: a new module here."""
+"""``error.*``: how solve.iterative measures a candidate. Add one: a function in ``errors``."""

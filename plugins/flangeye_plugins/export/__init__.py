@@ -1,4 +1,4 @@
-"""The kind ``export``: the camera's pose as another program takes it, one module a format."""
+"""``export.*``: the camera pose as another program takes it. Add a format: a new module here."""
 
 from flangeye_plugins.export.abb import export_abb
 from flangeye_plugins.export.doosan import export_doosan

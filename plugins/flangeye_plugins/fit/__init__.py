@@ -1,1 +1,1 @@
-"""``fit.*``: circle centre or marker pose with covariance."""
+"""``fit.*``: circle centre or marker pose, with covariance. Add a fit: a new module here."""

@@ -1,1 +1,1 @@
-"""``guide.*``: procedures that guide a person through a measurement."""
+"""``guide.*``: procedures that guide a person in measuring. Add one: a new module here."""

@@ -21,8 +21,8 @@ from flangeye.motion.executor import Executor
 from flangeye.motion.leading import led
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.plugin.stage import part
+from flangeye.recipe.guide import Recipe
 from flangeye.recipe.header import LimitsSection
-from flangeye.recipe.load import Recipe
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.guide.pivoting import Hand, Pivoted, summary_lines, with_body
 from flangeye_plugins.weld.finger_camera import LatestState

@@ -1,1 +1,1 @@
-"""Where to send the arm: plans of poses, and what is guessed of the scanner before the first."""
+"""``plan.*``: where the arm is sent to be scanned. Add a plan: a new module here."""

@@ -1,1 +1,1 @@
-"""``sensor.*``: cameras that watch a compliant finger."""
+"""``profiler.*``: sensors that look at the bead behind the torch. Add one: a new module."""

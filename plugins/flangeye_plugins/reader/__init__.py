@@ -1,1 +1,1 @@
-"""Readers: the archive layouts that ``acquire.archive`` and ``acquire.centres`` can read."""
+"""``reader.*``: layouts of archives and tables of poses. Add a layout: a new module here."""

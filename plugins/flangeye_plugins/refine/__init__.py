@@ -1,1 +1,1 @@
-"""``refine.*``: change a calibration after solving."""
+"""``refine.*``: change a calibration after solving. Add a refinement: a new module here."""

@@ -1,1 +1,1 @@
-"""``replay.*``: decisions of a step repeated from its log."""
+"""``replay.*``: decisions of a step repeated from its log. Add a step: a new module here."""

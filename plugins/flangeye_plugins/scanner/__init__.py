@@ -1,1 +1,1 @@
-"""Scanners: one module each, which imports its SDK only when it opens a device."""
+"""``scanner.*``: scanners, a module each, which imports its SDK when it opens a device."""

@@ -1,1 +1,1 @@
-"""``seam.*``: where to weld, from CAD or from the groove in a scan."""
+"""``seam.*``: where to weld, by CAD or by the groove in a scan. Add a source: a new module."""

@@ -1,1 +1,1 @@
-"""``view.*``: first guesses of the scanner pose, for planning."""
+"""``view.*``: first guesses of the scanner pose, for planning. Add one: here, in ``guess``."""

@@ -1,1 +1,1 @@
-"""Tactile welding: following a seam with a compliant finger, the torch behind it."""
+"""``weld.*``: following a seam by touch, torch behind; what leads it is a ``controller.*``."""
