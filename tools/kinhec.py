@@ -9,8 +9,10 @@ not know how far it sees, as in the monocular track, with `target_size: unknown`
 the motion track turn about one axis exactly: no solver can know the translation along it, and what
 the references leave there is what they guess.
 
-One draw of the noise says little of a solver, and the best of eleven by the truth is the luckiest. So
-where ours was worse, and the noise is independent and normal, it is drawn again (`--redraws`).
+One draw of the noise says little of a solver, and the best of eleven by the truth is the luckiest: to
+be within 1.05 of it on every sequence is no property that a single solver can have, and the page counts
+how often each one is. Where ours is not, and the noise is independent and normal, it is drawn again
+(`--redraws`), and held against the one reference that is best over all draws.
 """
 
 from collections import defaultdict
@@ -27,6 +29,8 @@ from flangeye_plugins.solve.robust import RobustParams, solve_poses
 
 ANGLE_NOISE, POSITION_NOISE = np.radians(0.2), 0.5e-3
 """The defaults of acquire.samples [rad, m]."""
+WITHIN = 1.05
+"""Times the least error of all reference solvers that count as being as good."""
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "kinhec.md"
 
 
@@ -97,14 +101,35 @@ def redrawn(sequence, seed):
 
 
 def compared_again(name, sequence, redraws):
-    """Return the line of medians over draws: ours, and that of the reference with the least."""
+    """Return the line of medians and rms over draws: ours, and those of the references' least."""
     draws = [redrawn(sequence, seed) for seed in range(redraws)]
-    ours = [error(draw) for draw in draws]
+    found = [each for each in map(error, draws) if not isinstance(each, str)]
     theirs = [references(draw) for draw in draws]
-    medians = {k: np.median([each[k] for each in theirs]) for k in theirs[0]}
-    best = min(medians, key=medians.__getitem__)
-    found = [each for each in ours if not isinstance(each, str)]
-    return f"| {name} | {np.median(found):.2f} | {medians[best]:.2f} | {best} |"
+    told = [name]
+    for size in (np.median, rms):
+        sizes = {k: size([each[k] for each in theirs]) for k in theirs[0]}
+        best = min(sizes, key=sizes.__getitem__)
+        told += [f"{size(found):.2f}", f"{sizes[best]:.2f}", best]
+    return f"| {' | '.join(told)} |"
+
+
+def rms(errors):
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def least_of(theirs):
+    """Return the least of the references' errors."""
+    return np.nanmin(list(theirs.values()))
+
+
+def as_good(tracks):
+    """Return on how many sequences each solver is as good as the best of eleven, most first."""
+    found = [each for track in tracks.values() for each in track]
+    good = {"flangeye": sum(ours <= WITHIN * least_of(theirs) for ours, theirs in found)}
+    for k in found[0][1]:
+        good[k] = sum(theirs[k] <= WITHIN * least_of(theirs) for _, theirs in found)
+    return sorted(good.items(), key=lambda each: -each[1]), len(found)
 
 
 def main(data: Path, redraws: int = 20) -> None:
@@ -124,7 +149,7 @@ def main(data: Path, redraws: int = 20) -> None:
         told = "refused" if np.isnan(ours) else f"{ours:.2f}"
         lines.append(f"| {name} | {told} | {theirs[best]:.2f} | {best} |")
         print(lines[-1], flush=True)
-        if ours > 1.05 * theirs[best] and is_normal(sequence):
+        if ours > WITHIN * theirs[best] and is_normal(sequence):
             again.append(compared_again(name, sequence, redraws))
             print(again[-1], flush=True)
     PAGE.write_text("\n".join(page(tracks, lines, refusals, again)) + "\n")
@@ -145,8 +170,14 @@ def page(tracks, lines, refusals, again):
     yield "\nEach sequence [mm]; the reference is the best of eleven on that sequence, by the truth.\n"
     yield "| sequence | flangeye | best reference | which |\n|---|---|---|---|"
     yield from lines
-    yield "\nMedian over other draws of the same noise, of those where ours was worse [mm]:\n"
-    yield "| sequence | flangeye | best reference | which |\n|---|---|---|---|"
+    yield "\nOn how many sequences each solver is within 1.05 of the best of eleven by the truth:\n"
+    good, count = as_good(tracks)
+    yield "| solver | sequences |\n|---|---|"
+    yield from (f"| {solver} | {n} of {count} |" for solver, n in good)
+    yield "\nOver other draws of the same noise, of those where ours was not [mm]; each reference is the"
+    yield "one solver of which that is least over all draws:\n"
+    yield "| sequence | flangeye, median | reference | which | flangeye, rms | reference | which |"
+    yield "|---|---|---|---|---|---|---|"
     yield from again
     yield "\nWhat was refused, and why:\n"
     yield from refusals
