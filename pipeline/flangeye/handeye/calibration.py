@@ -18,7 +18,7 @@ from flangeye.handeye.arm import (
 )
 from flangeye.handeye.arm_errors import evidence, with_arm_errors
 from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
-from flangeye.handeye.certificate import certificate_note
+from flangeye.handeye.certified import answer_of, certificate_note
 from flangeye.handeye.consensus import find_consensus
 from flangeye.handeye.distortion import distortion_of, edges_of
 from flangeye.handeye.estimates import (
@@ -143,7 +143,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     if cell.scanner is not None and distortion is not None:
         notes = (*notes, _note_of_distortion(cell.scanner))
     if options.certify:
-        notes = (*notes, certificate_note(reported.problem, reported.found))
+        notes = (*notes, certificate_note(answer_of(reported.problem, reported.found)))
     return HandEye(
         camera,
         _pairs(reported, model, cell),

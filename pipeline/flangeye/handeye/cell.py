@@ -20,6 +20,7 @@ from flangeye.handeye.cell_arms import (
     correcting_zeros,
 )
 from flangeye.handeye.cell_clock import on_one_clock
+from flangeye.handeye.certified import Answer, certificate_note
 from flangeye.handeye.estimates import estimate_at
 from flangeye.handeye.graph import Sighting, Solved
 from flangeye.handeye.measurements import measured
@@ -45,6 +46,7 @@ def calibrate_cell(
     limits: tuple[float, float],
     method: str,
     joint_offsets: bool = True,
+    certify: bool = False,
 ) -> HandEye:
     """Return every unknown of a cell with its covariance; the first camera's pose comes first.
 
@@ -58,6 +60,7 @@ def calibrate_cell(
         method: Stage that solves it.
         joint_offsets: Whether to look for the zeros of the arms' joints, and to give the answer
             for arms so corrected, where that helps on sightings held out.
+        certify: Whether to say if the answer is the best of all.
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
@@ -76,6 +79,8 @@ def calibrate_cell(
     if sizes and joint_offsets:
         corrected, told = correcting_zeros(found, sighted, branches, sizes)
         notes = (*notes, told)
+    if certify:
+        notes = (*notes, certificate_note(answer_of(sighted, found)))
     camera, *others = _estimates(known, observations, cell)
     return HandEye(
         camera,
@@ -142,6 +147,22 @@ def sighting_of(i: int, observation: Observation) -> Sighting:
     rotation, covariance, projector = measured(observation, normals=True)
     pose = rigid(rotation, observation.feature.centre)
     return Sighting(i, observation.camera, observation.target, pose, covariance, projector)
+
+
+def answer_of(sighted: Sighted, found: Solved) -> Answer:
+    """Return the answer for the sightings that agree, as certificates take it."""
+    seen = [s for s, kept in zip(sighted.sightings, found.inliers, strict=True) if kept]
+    whiteners = sighted.linear(found).whiteners[found.inliers]
+    return Answer(
+        sighted.frames,
+        [(s.camera, s.target) for s in seen],
+        np.array([s.time for s in seen]),
+        found.places,
+        found.covariances,
+        -found.residuals[found.inliers],
+        whiteners @ whiteners,
+        np.array([np.trace(s.projector).round() for s in seen]),
+    )
 
 
 def _require_agreement(found: Solved, count: int) -> None:

@@ -32,6 +32,12 @@ class CellParams(Params):
         description="Estimate the offsets of the arms' joints too, if that helps on sightings held "
         "out: the result then has a second answer, for arms with these offsets corrected.",
     )
+    certify: bool = Field(
+        False,
+        description="Say whether the answer is certified as globally optimal, by a dual "
+        "certificate, or not; or that it cannot be, as where a sighting leads over three unknown "
+        "places.",
+    )
     required: Length | None = param(
         None,
         gt=0,
@@ -67,7 +73,8 @@ def solve_cell(
         pulled = list(observations)
     else:
         pulled = _pull(observations, cell, params, params.required, stage_log)
-    return calibrate_cell(pulled, cell, params.limits, "solve.cell", params.joint_offsets == "auto")
+    corrects, certify = params.joint_offsets == "auto", params.certify
+    return calibrate_cell(pulled, cell, params.limits, "solve.cell", corrects, certify)
 
 
 def _pull(

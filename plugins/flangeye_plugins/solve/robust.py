@@ -122,8 +122,8 @@ class RobustParams(Params):
     )
     certify: bool = Field(
         False,
-        description="Say whether the answer is globally optimal, of whole poses and two unknown "
-        "places: shown by a dual certificate, or not shown.",
+        description="Say whether the answer is certified as globally optimal, by a dual "
+        "certificate, or not; or that it cannot be, as of three unknown places.",
     )
     required: Length | None = param(
         None,

@@ -1,0 +1,191 @@
+"""Certificates of answers for graphs of frames: which can be written as such, and what they say."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.handeye import certified
+from flangeye.handeye.cell import answer_of
+from flangeye.handeye.cell_arms import Sighted
+from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, Answer, _sightings, certificate_note
+from flangeye.handeye.graph import LIMITS, Sighting, Solved, linear_of, solve_graph
+from flangeye.maths.frame_graph import Frame, composed
+from flangeye.maths.geometry import basis_of_plane, invert, rigid, rotation_exp
+from flangeye.types import Floats, Observations, Source
+from flangeye_plugins.solve.cell import CellParams, solve_cell
+from tests.handeye.test_cell_clock import CELL, seen
+from tests.handeye.test_certificate import anywhere, squares_of
+
+NOISE = np.repeat([2e-3, 5e-4], 3) * [1.0, 3.0, 1.0, 1.0, 1.0, 4.0]
+"""Of a sighting, about and along the camera's axes [rad, m]."""
+GRAPHS: dict[str, tuple[list[tuple[str, str]], dict[str, bool]]] = {
+    "two cameras, two targets": (
+        [
+            ("wall", "tool"),
+            ("left", "tool"),
+            ("left", "table"),
+            ("hand", "table"),
+            ("wall", "spare"),
+        ],
+        {"wall": True, "left": True, "hand": True, "tool": True, "spare": True, "table": True},
+    ),
+    "a camera alone": ([("wall", "tool")], {"wall": True}),
+    "two on one way": (
+        [("wall", "other_tool"), ("wall", "other_spare")],
+        {"other_base": True, "other_tool": True},
+    ),
+    "two on one way, and its first alone": (
+        [("wall", "other_tool"), ("left", "other_spare"), ("other_hand", "table")],
+        {"other_base": True, "other_tool": True},
+    ),
+    "two on the camera's way": (
+        [("other_hand", "table"), ("other_hand", "tool")],
+        {"other_base": True, "other_hand": True},
+    ),
+    "what stands on both ways": (
+        [("other_hand", "other_wall")],
+        {"other_base": False, "other_hand": True, "other_wall": True},
+    ),
+}
+"""Who sees what, and what is to be found; what is false drops out."""
+
+
+def made(
+    name: str, seed: int = 0, kind: str = "pose", n: int = 12, noise: Any = NOISE
+) -> tuple[dict[str, Frame], list[Sighting], dict[str, Floats]]:
+    """Return frames, sightings and the places of the unknowns."""
+    rng = np.random.default_rng(seed)
+    pairs, unknown = GRAPHS[name]
+    moved = [np.array([rigid(rotation_exp(rng.uniform(-0.8, 0.8, 3)), rng.uniform(-0.4, 0.4, 3))
+                       for _ in range(n * len(pairs))]) for _ in range(2)]  # fmt: skip
+    stands = {"wall": "base", "left": "base", "table": "base", "hand": "arm", "tool": "arm",
+              "spare": "arm", "other_base": "base", "other_wall": "other_base",
+              "other_hand": "other", "other_tool": "other", "other_spare": "other"}  # fmt: skip
+    true = {n: Frame(parent, anywhere(rng)) for n, parent in stands.items()}
+    true |= {"arm": Frame("base", moved[0]), "other": Frame("other_base", moved[1])}
+    sightings = []
+    for time in range(n * len(pairs)):
+        camera, target = pairs[time % len(pairs)]
+        at = {n: replace(f, place=np.broadcast_to(np.asarray(f.place), (len(moved[0]), 4, 4))[time])
+              for n, f in true.items()}  # fmt: skip
+        exact = invert(composed(at, camera)) @ composed(at, target)
+        sightings.append(_sighting(time, (camera, target), exact, kind, rng, noise))
+    frames = {n: replace(f, place=None if unknown.get(n) else f.place) for n, f in true.items()}
+    return frames, sightings, {n: np.asarray(true[n].place) for n, is_ in unknown.items() if is_}
+
+
+def _sighting(
+    time: int, ends: tuple[str, str], exact: Floats, kind: str, rng: np.random.Generator, noise: Any
+) -> Sighting:
+    off = noise * rng.standard_normal(6)
+    seen = rigid(rotation_exp(off[:3]) @ exact[:3, :3], exact[:3, 3] + off[3:])
+    covariance, projector = np.diag(np.square(noise)), np.eye(6)
+    if kind != "pose":
+        axis = seen[:3, 2]
+        seen[:3, :3] = basis_of_plane(axis).T
+        projector[:3, :3] = np.eye(3) - np.outer(axis, axis) if kind == "normal" else 0.0
+        covariance = projector @ covariance @ projector
+    return Sighting(time, *ends, seen, covariance, projector)
+
+
+def answered(
+    given: tuple[dict[str, Frame], list[Sighting], dict[str, Floats]], start: Any = None
+) -> tuple[Solved, Answer]:
+    frames, sightings, true = given
+    found = solve_graph(frames, sightings, start=start or true)
+    return found, answer_of(Sighted(frames, sightings, {}, LIMITS), found)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_the_best_answer_of_a_graph_is_certified(name: str) -> None:
+    for seed in range(3):
+        assert certificate_note(answered(made(name, seed))[1]) == OPTIMAL
+
+
+@pytest.mark.parametrize("kind", ["normal", "centre"])
+def test_circles_and_centres_are_certified_as_well(kind: str) -> None:
+    for name in ("a camera alone", "two on the camera's way"):
+        assert certificate_note(answered(made(name, 1, kind, n=20))[1]) == OPTIMAL
+
+
+@pytest.mark.parametrize("kind", ["pose", "normal", "centre"])
+@pytest.mark.parametrize("name", GRAPHS)
+def test_what_is_certified_are_the_squares_that_the_graph_made_small(name: str, kind: str) -> None:
+    given = made(name, 2, kind)
+    found, answer = answered(given) if kind == "pose" else _as_it_is(given)
+    inverse = certified._inverse_in(answer)
+    places = np.array([invert(x) if n in inverse else x for n, x in answer.places.items()])
+    told = squares_of(_sightings(answer, inverse), places)
+    assert told == pytest.approx(found.squares.sum(), rel=1e-6)
+
+
+def _as_it_is(given: Any) -> tuple[Any, Answer]:
+    """Return the true places as an answer: circles do not tell every place."""
+    frames, sightings, true = given
+    residuals, _, whiteners = linear_of(frames, sightings, true, {})
+    squares = ((whiteners @ residuals[..., None])[..., 0] ** 2).sum(axis=1)
+    every = np.ones(len(sightings), bool)
+    found = Solved(true, {n: np.eye(6) for n in true}, np.eye(1), residuals, squares, every, 1.0)
+    return found, answer_of(Sighted(frames, sightings, {}, LIMITS), found)
+
+
+def test_another_valley_is_not_certified() -> None:
+    """Descents that begin anywhere end in the answer, or in a valley that is not certified."""
+    rng, wrong = np.random.default_rng(5), 0
+    given = made("two cameras, two targets", 0, n=5)
+    best = answered(given)[0].squares.sum()
+    for _ in range(8):
+        found, answer = answered(given, {n: anywhere(rng) for n in given[2]})
+        note = certificate_note(answer)
+        if found.squares.sum() < 1.001 * best:
+            assert note == OPTIMAL
+        else:
+            wrong += 1
+            assert re.fullmatch(
+                NOT_CERTIFIED + ": with its weights the best .* 1.* deg from it", note
+            )
+    assert wrong >= 2
+
+
+def test_noise_that_hides_the_answer_is_told_with_its_gap() -> None:
+    noise, limits = np.repeat([2.0, 0.3], 3), (10.0, 10.0)
+    told = []
+    for seed in range(4):
+        frames, sightings, true = made("two on one way", seed, n=4, noise=noise)
+        found = solve_graph(frames, sightings, limits=limits, start=true)
+        told.append(certificate_note(answer_of(Sighted(frames, sightings, {}, limits), found)))
+    less = "another answer may leave squared errors less by so much"
+    wanted = re.compile(rf"{NOT_CERTIFIED} \(gap \d+\.\d%\): {less}")
+    assert [note for note in told if wanted.fullmatch(note)]
+    assert all(note == OPTIMAL or wanted.fullmatch(note) for note in told)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "unknown", "named"),
+    [
+        ([("hand", "other_tool")], ["hand", "other_base", "other_tool"],
+         "hand saw other_tool, squared errors are no quadratic of the 3 unknown places between "
+         "them: hand, other_base, other_tool"),
+        # Its inverse in the one, itself in the other.
+        ([("wall", "other_tool"), ("hand", "other_spare")], ["hand", "other_base", "other_tool"],
+         "hand saw other_spare, squared errors are no quadratic of the 2 unknown places between "
+         "them: hand, other_base"),
+    ],
+)  # fmt: skip
+def test_what_is_no_quadratic_is_named(
+    pairs: Any, unknown: list[str], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(GRAPHS, "this", (pairs, dict.fromkeys(unknown, True)))
+    _, answer = _as_it_is(made("this"))
+    assert certificate_note(answer) == f"not certifiable: where {named}"
+
+
+@pytest.mark.parametrize("certify", [True, False])
+def test_solve_cell_says_so_where_it_is_asked(certify: bool) -> None:
+    observations = seen({"left": 0.0, "right": 0.0})
+    stream = Observations(observations, Source("cells"), len(observations))
+    notes = solve_cell(stream, CELL, CellParams(certify=certify)).notes
+    assert [note for note in notes if "globally optimal" in note] == [OPTIMAL] * certify
