@@ -4,8 +4,13 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # Commands are started some hundred times: their bytecode is kept, whatever the shell says of it.
 export PYTHONDONTWRITEBYTECODE :=
-# Tests in real time share the machine with whatever runs beside them: what fails is tried once more.
-REALTIME := $(BIN)/python -m pytest -q
+PYTEST := $(BIN)/python -m pytest -q
+TWO := $(PYTEST) -n 2 --dist worksteal
+# Tests in real time share the machine with whatever runs beside them: what fails is tried once more,
+# with nothing of ours beside it.
+BESIDE := -m "realtime and not (slow or alone)"
+ALONE := -m "realtime and alone and not slow"
+ALONE_ALL := -m "realtime and (slow or alone)"
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: help demo test test-all check docs bench flame clean
@@ -23,12 +28,14 @@ demo: $(VENV)/.run
 	$(BIN)/flangeye run ur5_phoxi-m_simulated
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow and not realtime"
-	$(REALTIME) -m "not slow and realtime" || $(REALTIME) -m "not slow and realtime" --last-failed
+	$(TWO) -m "not slow and not realtime"
+	$(TWO) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
+	$(PYTEST) $(ALONE) || $(PYTEST) $(ALONE) --last-failed
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not realtime" --hypothesis-profile=search
-	$(REALTIME) -m realtime || $(REALTIME) -m realtime --last-failed
+	$(TWO) -m "not realtime" --hypothesis-profile=search
+	$(TWO) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
+	$(PYTEST) $(ALONE_ALL) || $(PYTEST) $(ALONE_ALL) --last-failed
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

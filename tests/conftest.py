@@ -5,6 +5,7 @@ import os
 # Two workers on two cores: a second thread of BLAS only spins, which doubles what the tests cost.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
 
+import re
 import signal
 import sys
 import tempfile
@@ -38,11 +39,24 @@ settings.load_profile("same")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def _speaks_of_real_time(path: Path) -> bool:
+    return re.search(r"\b(realtime|browser)\b", path.read_text(encoding="utf-8")) is not None
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only tests in real time are asked for, import no others: that takes 8 s."""
+    asked = config.option.markexpr.replace("not realtime", "")
+    named = "realtime" in asked and collection_path.match("test_*.py")
+    return True if named and not _speaks_of_real_time(collection_path) else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let what waits for a browser run with the real clients: after the others, one at a time."""
+    """Let what waits for a browser run with the real clients, after the others."""
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.realtime)
+        if item.get_closest_marker("realtime") and not _speaks_of_real_time(item.path):
+            raise pytest.UsageError(f"{item.path} must name realtime or browser: see conftest.py")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -251,6 +251,7 @@ def a_job(folder: Path, software: Software) -> Job:
 
 
 @pytest.mark.realtime
+@pytest.mark.alone
 def test_two_workers_are_at_work_nearly_all_the_time(
     recipe: Path, registry: Any, tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ import pytest
 from tests.emulators.controllers.process import Process
 from tests.plugins.robot.cell import until
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.alone]
 
 pytest.importorskip("rtde_control")
 

@@ -208,8 +208,7 @@ class Follower:
         if self._put_off:
             return
         here = (self.torch, self._coming, self.tip, self._touched)
-        for _ in range(shares):
-            self.refined.renew((*here, *(s + BIN for s in here)))
+        self.refined.renew((*here, *(s + BIN for s in here)), shares)
 
     def _lead(self, pose: ToolPose, coming: ToolPose) -> Command:
         """Return the command that leads the tip along the seam and the torch behind it.

@@ -55,6 +55,7 @@ class Path:
         self._climb = slopes[:, 2]
         self._curvature = self._curvatures()
         self._rows = np.column_stack([self.points, self.tangents]).tolist()
+        self._last = len(self._rows) - 2
 
     def _curvatures(self) -> Floats:
         """Return the curvature (M,) by chords, to the left positive.
@@ -75,15 +76,15 @@ class Path:
     def _at(self, s: float) -> tuple[float, float, float, float, float]:
         """Return point, tangent and height at an arc length."""
         # Called several times a cycle: plain floats are ten times faster than arrays of one.
-        inside = min(max(s, 0.0), self.length)
-        index = min(int(inside / self.step), len(self._rows) - 2)
-        share = inside / self.step - index
-        before, after = self._rows[index], self._rows[index + 1]
-        x = before[0] + share * (after[0] - before[0])
-        y = before[1] + share * (after[1] - before[1])
-        z = before[2] + share * (after[2] - before[2])
-        tx = before[3] + share * (after[3] - before[3])
-        ty = before[4] + share * (after[4] - before[4])
+        inside = 0.0 if s < 0.0 else self.length if s > self.length else s
+        share = inside / self.step
+        index = int(share)
+        if index > self._last:
+            index = self._last
+        share -= index
+        (x, y, z, tx, ty), (x1, y1, z1, tx1, ty1) = self._rows[index], self._rows[index + 1]
+        x, y, z = x + share * (x1 - x), y + share * (y1 - y), z + share * (z1 - z)
+        tx, ty = tx + share * (tx1 - tx), ty + share * (ty1 - ty)
         norm, beyond = math.hypot(tx, ty), s - inside
         tx, ty = tx / norm, ty / norm
         return x + beyond * tx, y + beyond * ty, tx, ty, z

@@ -216,10 +216,10 @@ class RefinedPath:
         near = BESIDE + SPAN
         self._sound.difference_update(range(index - near, index + near + 1))
 
-    def renew(self, places: Iterable[float]) -> None:
-        """Find one thing again, at the first of these arc lengths where that is due.
+    def renew(self, places: Iterable[float], shares: int = 1) -> None:
+        """Find one thing again for each share, at the first of these arc lengths where that is due.
 
-        A control cycle has time for one, or for one length of the field in a zone's motion; a few
+        Two milliseconds have time for one, or for one length of the field in a zone's motion; a few
         cycles later all are renewed. Where nothing was found yet comes first: who asks there would
         have to wait for all of it. What is due at other places is forgotten: it would be old when
         the torch comes there.
@@ -230,12 +230,18 @@ class RefinedPath:
             self._fits = {i: fit for i, fit in self._fits.items() if i in used}
             zones = self._sound_zones.union(index // ZONE for index in bins)
             self._motions = {i: motion for i, motion in self._motions.items() if i in zones}
+        while shares > 0 and self._renewed(bins):
+            shares -= 1
+
+    def _renewed(self, bins: list[int]) -> bool:
+        """Find one thing again at the first of the bins where that is due; whether any was."""
         new = next((index for index in bins if index not in self._fits), None)
         due = next((index for index in bins if index not in self._sound), None)
         if new is not None and (zone := self._known_zone(new)) is not None:
             self._fits[new] = self._fitted(new, zone)
         elif (first := due if new is None else new) is not None:
             self._find(first)
+        return new is not None or due is not None
 
     def _find(self, index: int) -> None:
         """Find the fit around a bin again; a piece of its zone's motion, where that is due."""
@@ -324,7 +330,8 @@ class RefinedPath:
         return offsets
 
     def _index(self, s: float) -> int:
-        return min(max(int((s - self._start) / BIN), SPAN), len(self._count) - SPAN - 1)
+        index, last = int((s - self._start) / BIN), len(self._count) - SPAN - 1
+        return SPAN if index < SPAN else last if index > last else index
 
     def _fit(self, s: float) -> _Fit | None:
         """Return how the seam lies about ``s``; kept until something new is believed there.

@@ -637,18 +637,19 @@ def test_a_cycle_finds_the_seam_again_by_a_share_for_each_two_milliseconds(
 ) -> None:
     found, renewed = make(), list[Any]()
     found._period = period
-    found.refined = SimpleNamespace(renew=lambda places: renewed.append(places))
+    found.refined = SimpleNamespace(renew=lambda *asked: renewed.append(asked))
     found.torch, found._coming, found.tip, found._touched = 0.01, 0.011, 0.05, 0.049
     found._renew(touched)
-    assert len(renewed) == shares
+    ((places, done),) = renewed
+    assert done == shares
     here = [0.01, 0.011, 0.05, 0.049]
-    assert renewed[0] == pytest.approx([*here, *(s + 0.5e-3 for s in here)])
+    assert places == pytest.approx([*here, *(s + 0.5e-3 for s in here)])
 
 
 def test_a_short_cycle_with_a_touch_leaves_its_share_to_the_next_one() -> None:
     found, renewed = make(), list[Any]()
     found._period = 2e-3
-    found.refined = SimpleNamespace(renew=lambda places: renewed.append(places))
+    found.refined = SimpleNamespace(renew=lambda *asked: renewed.append(asked))
     counts = []
     for touched in (True, True, True, False, True):
         found._renew(touched)
