@@ -78,10 +78,9 @@ def try_condition(
 
 def built_for(settings: Following) -> Body:
     """Return a tool whose torch's end is as high as its tip when it leans as it is told to."""
-    side = 1.0 if settings.side == "left" else -1.0
     up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
     torch = np.array([-DISTANCE, 0.0, float(up)])
-    return body_from(torch, side * settings.work_angle, settings.travel_angle)
+    return body_from(torch, settings.sign * settings.work_angle, settings.travel_angle)
 
 
 def known(condition: Condition, body: Body, settings: Following) -> tuple[Section, Belief]:

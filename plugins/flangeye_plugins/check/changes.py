@@ -67,7 +67,7 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
         "way from there on: the samples before and after fit two calibrations"
     )
     kept = session.without(shorter)
-    return Finding("moved target", what, kept.step(), (session.ids[start],), *evidence[1:], kept)
+    return evidence.finding("moved target", what, kept, samples=(session.ids[start],))
 
 
 @part("check.tool")
@@ -95,8 +95,7 @@ def tool(session: RecordedSession) -> Findings:
         "both" if session.seconds is None else "second",
         target_offset=listed,
     )
-    yield Finding("tool offset", what, corrected_session.step(), (), evidence.before,
-                  evidence.after, p, evidence.gain, corrected_session)  # fmt: skip
+    yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
 
 
 def _require_known_place(session: RecordedSession) -> None:

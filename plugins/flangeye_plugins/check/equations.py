@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.doctor.diagnosis import RecordedSession
+from flangeye.maths.geometry import invert
 from flangeye.types import Floats, Mask
-from flangeye_plugins.check.rotations import inverse_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ def _carriers(session: RecordedSession) -> tuple[Floats, Floats]:
     """
     eye = np.broadcast_to(np.eye(4), session.poses.shape)
     camera = eye if session.carried == "target" else session.poses
-    bases = inverse_of(camera if session.links is None else session.links)
+    bases = invert(camera if session.links is None else session.links)
     if session.seconds is not None:
         return bases, np.asarray(session.seconds @ session.place)
     target = session.poses if session.carried == "target" else eye

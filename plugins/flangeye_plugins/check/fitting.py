@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.doctor.diagnosis import Misfit
-from flangeye.maths.geometry import hat
+from flangeye.maths.geometry import hat, rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import Equations
-from flangeye_plugins.check.rotations import exp_of, log_of
+from flangeye_plugins.check.rotations import log_of
 from flangeye_plugins.check.starts import VariantUnknowns, start_of
 
 TAILS = 4.0
@@ -210,12 +210,12 @@ def _solved(information: Floats, gradient: Floats) -> Floats:
 
 
 def _moved(unknowns: VariantUnknowns, step: Floats) -> VariantUnknowns:
-    turned = exp_of(step[:, :3]) @ unknowns.rotation
+    turned = rotation_exp(step[:, :3]) @ unknowns.rotation
     place, turn = unknowns.place, unknowns.turn
     if unknowns.free_place:
         place = place + step[:, None, 6:9]
     if unknowns.free_turn:
-        turn = exp_of(step[:, 9:12]) @ turn
+        turn = rotation_exp(step[:, 9:12]) @ turn
     other = _moved_base(unknowns.other, step[:, -6:]) if unknowns.free_other else unknowns.other
     return unknowns._replace(
         rotation=turned,
@@ -228,7 +228,7 @@ def _moved(unknowns: VariantUnknowns, step: Floats) -> VariantUnknowns:
 
 def _moved_base(other: Floats, step: Floats) -> Floats:
     out = np.array(np.broadcast_to(other, (len(step), 4, 4)))
-    out[:, :3, :3] = exp_of(step[:, :3]) @ out[:, :3, :3]
+    out[:, :3, :3] = rotation_exp(step[:, :3]) @ out[:, :3, :3]
     out[:, :3, 3] += step[:, 3:]
     return out
 

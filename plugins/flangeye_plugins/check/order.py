@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Arms, Finding, Findings, NotApplicable, RecordedSession
+from flangeye.doctor.diagnosis import Arms, Findings, NotApplicable, RecordedSession
 from flangeye.maths.pose_corrections import delayed, shifted
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Mask
@@ -54,9 +54,7 @@ def order(session: RecordedSession) -> Findings:
     corrected_session = others[evidence.which].session.where(others[evidence.which].known)
     if not helps(session.where(others[evidence.which].known), corrected_session):
         return
-    yield Finding(
-        "shifted poses", what, corrected_session.step(), (), *evidence[1:], corrected_session
-    )
+    yield evidence.finding("shifted poses", what, corrected_session)
 
 
 _OF: dict[Arms, str] = {
@@ -119,7 +117,7 @@ def clock(session: RecordedSession) -> Findings:
     corrected_session = others[finer.which].session.where(others[finer.which].known)
     if not helps(session.where(others[finer.which].known), corrected_session):
         return
-    yield Finding("time offset", what, corrected_session.step(), (), *finer[1:], corrected_session)
+    yield finer.finding("time offset", what, corrected_session)
 
 
 def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[Alternative]:

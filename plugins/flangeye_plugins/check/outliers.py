@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
+from flangeye.doctor.diagnosis import Findings, NotApplicable, RecordedSession
 from flangeye.maths.geometry import rotation_exp
 from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of
@@ -42,9 +42,7 @@ def outlier(session: RecordedSession) -> Findings:
     distance = float(null.lengths[0, index, 0])
     what = f"'{name}' is {distance * 1e3:.1f} mm off where the others agree"
     corrected_session = session.without(np.arange(len(session)) == index)
-    yield Finding(
-        "outlier", what, corrected_session.step(), (name,), *evidence[1:], corrected_session
-    )
+    yield evidence.finding("outlier", what, corrected_session, samples=(name,))
 
 
 def _without(session: RecordedSession, null: VariantFits, index: int) -> Significance:
@@ -94,7 +92,7 @@ def flips(session: RecordedSession) -> Findings:
     what = f"{changed} of {len(session)} targets were seen with {kinds}"
     kept = session.without(which >= 0)
     fix = f"{kept.step()}  # or a target without that symmetry"
-    yield Finding("target flips", what, fix, names, *evidence[1:], kept)
+    yield evidence.finding("target flips", what, kept, fix, names)
 
 
 def _flipped(

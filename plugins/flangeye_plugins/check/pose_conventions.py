@@ -41,10 +41,7 @@ def convention(session: RecordedSession) -> Findings:
         arms, read_as, written_as = tried[evidence.which]
         whose = "the" if session.seconds is None else named(arms, session)
         what = f"{whose} rotations were read as {_name(read_as)}, and fit as {_name(written_as)}"
-        corrected_session = others[evidence.which]
-        yield Finding(
-            "pose convention", what, corrected_session.step(), (), *evidence[1:], corrected_session
-        )
+        yield evidence.finding("pose convention", what, others[evidence.which])
 
 
 def _reread(session: RecordedSession, arms: Arms, read_as: str, written_as: str) -> RecordedSession:
@@ -100,7 +97,7 @@ def direction(session: RecordedSession) -> Findings:
     what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
         what, fix = _of_exchanged(session, fix)
-    yield Finding("pose direction", what, fix, (), *evidence[1:], corrected_session)
+    yield evidence.finding("pose direction", what, corrected_session, fix)
 
 
 LENS = np.radians(35)
@@ -150,14 +147,11 @@ def _marker_inverted(session: RecordedSession) -> RecordedSession:
 
 
 def _inverted_marker(session: RecordedSession, evidence: Significance) -> Finding:
-    corrected_session = _marker_inverted(session)
     what = (
         f"the markers' poses are target_T_camera: as they are read, one is "
         f"{np.degrees(_off_axis(session)):.0f} deg from the camera's axis"
     )
-    return Finding(
-        "inverted marker", what, corrected_session.step(), (), *evidence[1:], corrected_session
-    )
+    return evidence.finding("inverted marker", what, _marker_inverted(session))
 
 
 _WAYS: Mapping[str, tuple[Change, str]] = {

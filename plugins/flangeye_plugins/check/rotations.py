@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flangeye.maths.geometry import hat
 from flangeye.types import Floats
-
-
-def exp_of(vectors: Floats) -> Floats:
-    """Return the rotations (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    k = hat(vectors)
-    a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
 
 
 def log_of(rotations: Floats) -> Floats:
@@ -36,20 +27,3 @@ def log_of(rotations: Floats) -> Floats:
     direction = np.where(length > 1e-9, twice_sine_axis / np.maximum(length, 1e-9), away)
     small = 0.5 * twice_sine_axis
     return np.asarray(np.where(angle < 1e-6, small, angle * direction))
-
-
-def nearest_rotation(matrices: Floats) -> Floats:
-    """Return the proper rotations (..., 3, 3) nearest to matrices (..., 3, 3)."""
-    u, _, vt = np.linalg.svd(matrices)
-    u[..., :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]
-    return np.asarray(u @ vt)
-
-
-def inverse_of(poses: Floats) -> Floats:
-    """Return the inverses of rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(poses)
-    turned = poses[..., :3, :3].swapaxes(-1, -2)
-    out[..., :3, :3] = turned
-    out[..., :3, 3] = -(turned @ poses[..., :3, 3, None])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.doctor.diagnosis import Misfit
+from flangeye.doctor.diagnosis import Finding, Misfit, RecordedSession
 from flangeye.types import Floats, Indices
 from flangeye_plugins.check.fitting import VariantFits
 
@@ -42,6 +42,17 @@ class Significance(NamedTuple):
     after: Misfit
     probability: float
     gain: float
+
+    def finding(
+        self,
+        name: str,
+        what: str,
+        corrected: RecordedSession,
+        fix: str | None = None,
+        samples: tuple[str, ...] = (),
+    ) -> Finding:
+        """Return the mistake that the alternative is without; see :class:`Finding`."""
+        return Finding(name, what, fix or corrected.step(), samples, *self[1:], corrected)
 
 
 def best_of(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
+from flangeye.doctor.diagnosis import Findings, NotApplicable, RecordedSession
 from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import VariantFits
@@ -36,8 +36,8 @@ def size(session: RecordedSession) -> Findings:
     if p < 1:
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
-        yield Finding("target size", what, fix, (), evidence.before, evidence.after, p,
-                      evidence.gain, corrected_session)  # fmt: skip
+        evidence = evidence._replace(probability=p)
+        yield evidence.finding("target size", what, corrected_session, fix)
 
 
 def _factor(session: RecordedSession, null: VariantFits) -> float:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flangeye.maths.geometry import nearest_rotation
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import Equations
-from flangeye_plugins.check.rotations import nearest_rotation
 from flangeye_plugins.check.two_arms import (
     positions,
     rotations_of_circles,

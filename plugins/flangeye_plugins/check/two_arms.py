@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from flangeye.maths.geometry import nearest_rotation
 from flangeye.types import Floats
 from flangeye_plugins.check.equations import Equations
-from flangeye_plugins.check.rotations import nearest_rotation
 
 STARTS = 2
 """Random rotations to start from: from one, 99 % of sessions converge."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import Arms, Finding, Findings, RecordedSession
+from flangeye.doctor.diagnosis import CERTAIN, Arms, Finding, Findings, RecordedSession
 from flangeye.maths.pose_corrections import scaled
 from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of, named
@@ -103,10 +103,7 @@ def _finding(session: RecordedSession, found: Alternative, evidence: Significanc
     whose = named(found.arms, session)
     factor = _METRES[meant] / _METRES[said]
     what = f"{whose} positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
-    corrected_session = found.session
-    after = fit_of(corrected_session).misfit()
-    return Finding("unit", what, corrected_session.step(), (), evidence.before, after,
-                   evidence.probability, evidence.gain, corrected_session)  # fmt: skip
+    return _refitted(what, found.session, evidence)
 
 
 def _of_targets_unit(
@@ -117,12 +114,15 @@ def _of_targets_unit(
     if found.arms is not None:
         said, meant = meant, said
     factor = _METRES[meant] / _METRES[said]
-    corrected_session = _of_target(session, factor, meant)
-    what = f"the target's positions were read in {said} and are in {meant}"
-    after = fit_of(corrected_session).misfit()
-    return Finding("unit", f"{what} (a factor of {factor:.6g})", corrected_session.step(), (),
-                   evidence.before, after, evidence.probability, evidence.gain,
-                   corrected_session)  # fmt: skip
+    what = (
+        f"the target's positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
+    )
+    return _refitted(what, _of_target(session, factor, meant), evidence)
+
+
+def _refitted(what: str, corrected: RecordedSession, evidence: Significance) -> Finding:
+    after = fit_of(corrected).misfit()
+    return evidence._replace(after=after).finding("unit", what, corrected)
 
 
 def _rather_target(session: RecordedSession, said: str, meant: str) -> bool:
@@ -167,15 +167,7 @@ def _both(session: RecordedSession) -> Finding | None:
         f"{target:.4g} m from the camera: both are in {unit}"
     )
     before, after = fit_of(session).misfit(), fit_of(corrected_session).misfit()
-    return Finding(
-        "unit",
-        what,
-        corrected_session.step(),
-        (),
-        before,
-        after,
-        corrected_session=corrected_session,
-    )
+    return Significance(0, before, after, 0.0, CERTAIN).finding("unit", what, corrected_session)
 
 
 def _distance_of_arm(session: RecordedSession) -> float:

@@ -91,19 +91,17 @@ class Belief:
 
         Where one wall alone stands upright it comes down on the other side of the seam.
         """
-        side = 1.0 if settings.side == "left" else -1.0
-        return 0.0 if self.two_walls else self.beside - side * settings.reach / 2.0
+        return 0.0 if self.two_walls else self.beside - settings.sign * settings.reach / 2.0
 
     def pressing(self, settings: Following) -> Floats:
         """Return the forces per deflection and preload (2, 2) [N/m].
 
         Rows: towards the pressed wall, into the joint. The tip is free to slide along the seam.
         """
-        side = 1.0 if settings.side == "left" else -1.0
         axes = np.array(self.level_R_tool)
         stiff = axes @ np.diag([self.lateral, self.lateral, self.axial]) @ axes.T
         free = stiff[1:, 1:] - np.outer(stiff[1:, 0], stiff[0, 1:]) / stiff[0, 0]
-        facing = np.diag([side, -1.0])
+        facing = np.diag([settings.sign, -1.0])
         return np.asarray(facing @ free @ facing)
 
     def flat(self, side: float) -> float:
@@ -174,8 +172,9 @@ class Belief:
 
     def _steepness(self, settings: Following) -> float:
         """Return the tangent of the pressed wall's angle from the plane's normal; 0 if unknown."""
-        lean = self.lean if settings.side == "left" else -self.lean
-        return 0.0 if self.half_angle is None else max(math.tan(self.half_angle + lean), 0.0)
+        if self.half_angle is None:
+            return 0.0
+        return max(math.tan(self.half_angle + settings.sign * self.lean), 0.0)
 
 
 def belief_of(finger: Finger, body: Body, half_angle: float | None, settings: Following) -> Belief:
@@ -186,9 +185,8 @@ def belief_of(finger: Finger, body: Body, half_angle: float | None, settings: Fo
         lateral, axial = known.lateral, known.axial
     noise = (10e-6, 60e-6) if known is None else (known.noise[1], known.noise[2])
     radius = settings.tip_radius or finger.radius
-    side = 1.0 if settings.side == "left" else -1.0
-    joint = joint_of(settings.joint, half_angle, side, radius, settings.root_gap)
-    other = None if joint is None else joint.right if side > 0 else joint.left
+    joint = joint_of(settings.joint, half_angle, settings.sign, radius, settings.root_gap)
+    other = None if joint is None else joint.right if settings.side == "left" else joint.left
     return Belief(
         body.distance, lateral, axial, None if joint is None else joint.half_angle, noise,
         finger.torch_sigma, finger.along_sigma, finger.tip_sigma,

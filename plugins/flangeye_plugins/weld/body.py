@@ -45,8 +45,8 @@ def leaning(work: float, travel: float) -> Floats:
 
 def body_of(finger: Finger, settings: Following) -> Body:
     """Return the finger's tool as it stands while the seam is followed."""
-    side = 1.0 if settings.side == "left" else -1.0
-    return body_from(finger.torch_from_tip, side * settings.work_angle, settings.travel_angle)
+    work = settings.sign * settings.work_angle
+    return body_from(finger.torch_from_tip, work, settings.travel_angle)
 
 
 def body_from(torch: Floats, work: float, travel: float) -> Body:

@@ -45,16 +45,6 @@ TORCH = "torch"
 """What the process is asked for where the torch was."""
 
 
-class Opened(NamedTuple):
-    """What the process says once all is open.
-
-    Attributes:
-        behind: How far behind the torch the look is [m]; None where there is none.
-    """
-
-    behind: float | None
-
-
 class Seeing(NamedTuple):
     """What is open in the process.
 
@@ -156,7 +146,7 @@ class CameraProcess:
             ) from None
         if isinstance(answer, DeviceError):
             raise answer
-        self.behind = answer.behind
+        self.behind = answer
 
     def _watch(self) -> None:
         try:
@@ -207,7 +197,7 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
         except Exception as error:
             wire.send(_told(name, error))
             return
-        wire.send(Opened(None if look is None else look.behind))
+        wire.send(None if look is None else look.behind)
         seeing = Seeing(latest, reader, sensor, look)
         while True:
             wire.send(_answer(wire.recv(), seeing))

@@ -150,7 +150,7 @@ class Follower:
         self._weave = Weave(settings.weave_width, settings.weave_frequency)
         self._swings: float | None = None
         self.lit: float | None = None
-        self.side = 1.0 if settings.side == "left" else -1.0
+        self.side = settings.sign
         self._track = Track()
         self._felt: SeamReading | None = None if touch else SeamReading(0.0, 0.0)
         self._time: float | None = None
@@ -542,7 +542,7 @@ class Follower:
             target = 0.0
         rate = settings.release if self.phase == "ending" else settings.ramp
         step = rate * elapsed
-        self.wanted += _within(target - self.wanted, step)
+        self.wanted += within(target - self.wanted, step)
 
     def _feeler(self) -> float:
         """Return by how much the tip goes beyond where a wall is expected that has ended [m].
@@ -616,15 +616,15 @@ class Follower:
         preload = settings.preload if self._touching else 0.0
         up = -settings.height_gain * (height + preload)
         across += pace * self._drifting()
-        planar = pace * place.tangent + _within(across, most) * place.normal
+        planar = pace * place.tangent + within(across, most) * place.normal
         climb = pace * self._plan.climb(self.tip)
-        return np.array([*planar, climb + _within(up, most)])
+        return np.array([*planar, climb + within(up, most)])
 
     def _drifting(self) -> float:
         """Return how fast the seam leaves the plan to the left, per length of it, at the tip."""
         if self.phase != "following" or self.refined.empty:
             return 0.0
-        return _within(self.refined.slope(self.tip), 1.0)
+        return within(self.refined.slope(self.tip), 1.0)
 
     def _lateral(self, pose: ToolPose) -> float:
         """Return how far the end point is to the left of where a seated tip is planned [m]."""
@@ -647,6 +647,6 @@ def _bias_of(belief: Belief, settings: Following) -> Bias:
     return Bias(prior, settings.distortion, belief.distance)
 
 
-def _within(value: float, most: float) -> float:
+def within(value: float, most: float) -> float:
     """Return a value, at most so large to both sides; NumPy's clip takes ten times as long."""
     return min(max(value, -most), most)

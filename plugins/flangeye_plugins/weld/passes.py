@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
-from flangeye_plugins.weld.follower import Follower, ResumePoint
+from flangeye_plugins.weld.follower import Follower, ResumePoint, within
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams
@@ -182,7 +182,8 @@ class Passes:
     def _return(self, pose: ToolPose) -> Command:
         """Up, across to where the pass begins, down."""
         start = self._path.at(self._start)
-        aside = self._tool_at(start)[:2] - pose.position[:2]
+        # The torch is to be there, the tool along the path.
+        aside = start.point + self._belief.distance * start.tangent - pose.position[:2]
         turn = _nearest(_heading(start) - pose.angle)
         there = float(np.hypot(*aside)) < THERE and abs(turn) < TURNED
         goal = start.height if there else self._over
@@ -193,13 +194,9 @@ class Passes:
         away = 0.0 if up > OVER / 3 else 1.0  # lifted first
         speed = self._settings.return_speed
         return Command(
-            np.array([*(away * _towards(aside, speed)), _within(GAIN * up, speed)]),
-            away * _within(GAIN * turn, self._settings.turn_rate),
+            np.array([*(away * _towards(aside, speed)), within(GAIN * up, speed)]),
+            away * within(GAIN * turn, self._settings.turn_rate),
         )
-
-    def _tool_at(self, place: Place) -> Floats:
-        """Return where the end point is (3,) with the torch at a place, the tool along the path."""
-        return np.array([*(place.point + self._belief.distance * place.tangent), place.height])
 
     # --- along the refined path ------------------------------------------------------------------
 
@@ -221,7 +218,7 @@ class Passes:
         across = sway.rate - GAIN * error
         torch_speed = settings.speed * place.tangent + across * place.normal
         turning = GAIN * _nearest(_heading(place) - pose.angle) + settings.speed * self._bend()
-        turn = _within(turning, settings.turn_rate)
+        turn = within(turning, settings.turn_rate)
         planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])
         up = settings.height_gain * (place.height - float(pose.position[2]))
         up += settings.speed * self._path.climb(self.torch)
@@ -265,7 +262,3 @@ def _towards(way: Floats, speed: float) -> Floats:
     """Return the velocity (2,) towards a place: slower near to it."""
     far = float(np.hypot(*way))
     return way * (min(GAIN * far, speed) / max(far, 1e-9))
-
-
-def _within(value: float, most: float) -> float:
-    return min(max(value, -most), most)

@@ -44,7 +44,8 @@ class Path:
 
     def __init__(self, points: Floats) -> None:
         """Resample (N, 3) points: two coordinates in the plane, and the height above it."""
-        along = np.concatenate([[0.0], np.cumsum(_chords(points))])
+        chords = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(chords)])
         self.length = float(along[-1])
         ticks = np.linspace(0.0, self.length, max(2, round(self.length / STEP)) + 1)
         self.points = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
@@ -134,7 +135,3 @@ class Path:
         x, y, tx, ty, _ = self._at(s)
         px, py = point.tolist()
         return float((px - x) * tx + (py - y) * ty)
-
-
-def _chords(points: Floats) -> Floats:
-    return np.asarray(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))

@@ -240,11 +240,8 @@ class Probing:
         if climbed is None:
             return None
         (aside, rise), (aside_sigma, rise_sigma) = climbed[0].tolist(), climbed[1].tolist()
-        if rise > CLIMBED + 3 * rise_sigma:
-            return (
-                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it slides along it, pressed "
-                "aside; lower 'deflection' or raise 'preload'"
-            )
+        if climbs := _climbs(rise, rise_sigma, "slides along it, pressed aside"):
+            return climbs
         least = self._just_held()
         if rise + 2 * rise_sigma > least and aside + 2 * aside_sigma > least * self._flat:
             return (
@@ -303,11 +300,8 @@ class Probing:
         rise = float(hard.mean() - soft.mean())
         scatter = max(_scatter(felt[:, 2]), self._noise[1])
         sigma = scatter * float(np.sqrt(1 / len(hard) + 1 / len(soft)))
-        if rise > CLIMBED + 3 * sigma:
-            return (
-                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
-                "'deflection' or raise 'preload'"
-            )
+        if climbs := _climbs(rise, sigma):
+            return climbs
         # A tip that climbs goes along with the arm, and so looks like a finger that shows less.
         aside = -found.gain * MARGIN * self._deflection
         if aside > UNSEEN and rise + 2 * sigma > STEEP * aside / self._flat:
@@ -320,11 +314,8 @@ class Probing:
     def _hardly_held(self, felt: Floats, at: Floats, found: Learned) -> str | None:
         """Say that the tip leaves its seat where it is pressed hardest, or that it may."""
         rise, sigma = self._knee(felt, at, found)
-        if rise > CLIMBED + 3 * sigma:
-            return (
-                f"the tip climbs the wall by {rise * 1e3:.2f} mm when it is pressed aside; lower "
-                "'deflection' or raise 'preload'"
-            )
+        if climbs := _climbs(rise, sigma):
+            return climbs
         if rise + 2 * sigma > self._just_held():
             return (
                 f"whether the tip climbs the wall is known to {sigma * 1e3:.2f} mm only; raise "
@@ -359,6 +350,16 @@ class Probing:
             sigma = math.sqrt(float(np.linalg.pinv(rows.T @ rows)[-1, -1]))
             best = min(best, (left, float(solved[-1]), sigma))
         return best[1:]
+
+
+def _climbs(rise: float, sigma: float, when: str = "is pressed aside") -> str | None:
+    """Say that the tip climbs its wall, where it rises for certain."""
+    if rise <= CLIMBED + 3 * sigma:
+        return None
+    return (
+        f"the tip climbs the wall by {rise * 1e3:.2f} mm when it {when}; lower "
+        "'deflection' or raise 'preload'"
+    )
 
 
 def _scatter(values: Floats) -> float:

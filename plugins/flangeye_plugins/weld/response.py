@@ -94,7 +94,7 @@ def identify(cycles: Floats) -> tuple[float, float]:
     command, where = (np.interp(grid, clock, column) for column in cycles.T[1:])
     best, found = math.inf, (0.0, 0.0)
     for lag in LAGS:
-        followed = _lagged(command, GRID, float(lag))
+        followed = _lagged(command, float(lag))
         for dead in DEAD_TIMES:
             late = np.concatenate([np.zeros(round(dead / GRID)), followed])[: len(grid)]
             spread = float(np.var(where - np.cumsum(late) * GRID))
@@ -103,6 +103,6 @@ def identify(cycles: Floats) -> tuple[float, float]:
     return found
 
 
-def _lagged(command: Floats, period: float, lag: float) -> Floats:
-    share = 1.0 - math.exp(-period / lag)
+def _lagged(command: Floats, lag: float) -> Floats:
+    share = 1.0 - math.exp(-GRID / lag)
     return np.asarray(lfilter([share], [1.0, share - 1.0], command))

@@ -6,6 +6,7 @@ far as the log goes, so nothing has to be saved when a weld is stopped, not even
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path as FilePath
@@ -55,7 +56,7 @@ def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
     """Return what a plugin's controller is asked to do, the torch ``distance`` behind the tip."""
     return FollowingTask(
         plan.points, plan.tangents, plan.step, distance,
-        side=1.0 if settings.side == "left" else -1.0,
+        side=settings.sign,
         **settings.model_dump(include=set(FollowingTask.__dataclass_fields__) - {"side"}),
     )  # fmt: skip
 
@@ -177,13 +178,13 @@ def set_back(
     """
     if kept.number:
         lit = max(kept.torch - params.overlap, params.passes[kept.number - 1].along)
-        return _standing(params, plan, distance, lit, _ahead(plan, lit, distance))
+        return _standing(params, plan, distance, lit, _away(plan, lit, distance))
     release = params.speed * params.deflection / params.release
     last = plan.length - params.ending - release - PRESSING
     lit = kept.torch - params.overlap
     if last < params.inset:
         raise StageError("weld.tactile: the rest of the seam is too short for the tip to press on")
-    tip = min(_ahead(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
+    tip = min(_away(plan, max(lit - RUN_IN, params.inset - distance), distance), last)
     return _standing(params, plan, distance, max(lit, params.offset_along), tip)
 
 
@@ -192,24 +193,18 @@ def _standing(
 ) -> WeldTactileParams:
     """Return the parameters with which tip and torch stand on the plan, lit there."""
     place = plan.at(tip)
-    torch = plan.at(_behind(plan, tip, distance)).point
+    torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
     return params.model_copy(update={"inset": tip, "start_angle": angle, "offset_along": lit})
 
 
-def _ahead(plan: Path, torch: float, distance: float) -> float:
-    """Return where the tip is with the torch at an arc length and both on the plan."""
-    point = plan.at(torch).point
-    tip = torch + distance
-    while float(np.hypot(*(plan.at(tip).point - point))) < distance:
-        tip += 0.5e-3
-    return tip
+def _away(plan: Path, s: float, distance: float) -> float:
+    """Return where the tool's other end is with one at an arc length and both on the plan.
 
-
-def _behind(plan: Path, tip: float, distance: float) -> float:
-    point = plan.at(tip).point
-    torch = tip - distance
-    while float(np.hypot(*(plan.at(torch).point - point))) < distance:
-        torch -= 0.5e-3
-    return torch
+    The tip is ahead of the torch by a distance, the torch ahead of the tip by its negative.
+    """
+    point, other = plan.at(s).point, s + distance
+    while float(np.hypot(*(plan.at(other).point - point))) < abs(distance):
+        other += math.copysign(0.5e-3, distance)
+    return other

@@ -60,9 +60,8 @@ class Search:
         self.sigma = np.array([belief.noise[0], belief.noise[0], belief.noise[1]])
         self._settings = settings
         self._wall = max(STEEPER * belief.sliding(settings), settings.probe / 2)
-        toward = 1.0 if settings.side == "left" else -1.0
         both = [settings.reach, -settings.reach]
-        self._turns = both if belief.two_walls else [toward * settings.reach]
+        self._turns = both if belief.two_walls else [settings.sign * settings.reach]
         self._free: list[Floats] = []
         self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
 

@@ -165,6 +165,11 @@ class Following(Params):
         "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
     )
 
+    @property
+    def sign(self) -> float:
+        """1 where the left wall is pressed, -1 for the right one."""
+        return 1.0 if self.side == "left" else -1.0
+
 
 class WeldTactileParams(Following):
     """Parameters of ``weld.tactile``."""

@@ -88,7 +88,8 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     with ExitStack() as opened:
         robot: Robot = opened.enter_context(led(driver, model, allowed))
         job = CameraJob(params.sensor, finger, robot.state(), seed, params.look)
-        eyes = opened.enter_context(_tag_reader(job, simulated))
+        reader: FingerCameraReader = SteppedReader(job) if simulated else CameraProcess(job)
+        eyes = opened.enter_context(reader)
         belief = replace(belief, behind=eyes.behind)
         if eyes.behind is not None:
             controller = controller_of(plan, belief, params, params.mode, kept)
@@ -104,10 +105,6 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         reason = follow(cell, controller, weld_log, _longest(plan.length + body.distance, params))
         truth = eyes.true_torch()
     return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
-
-
-def _tag_reader(job: CameraJob, simulated: bool) -> FingerCameraReader:
-    return SteppedReader(job) if simulated else CameraProcess(job)
 
 
 def _longest(way: float, params: WeldTactileParams) -> float:

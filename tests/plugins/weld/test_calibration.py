@@ -11,7 +11,7 @@ import pytest
 from flangeye.devices import SensorFrame
 from flangeye.errors import StageError
 from flangeye.files.bundled import bundled
-from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Floats, Image
@@ -19,7 +19,7 @@ from flangeye_plugins.weld.finger_camera import Reader
 from flangeye_plugins.weld.touch.calibration import Held, calibrate
 from flangeye_plugins.weld.touch.pivot import pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
-from flangeye_plugins.weld.touch.tip_displacement import Interpreter, nearest_rotation
+from flangeye_plugins.weld.touch.tip_displacement import Interpreter
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 GAIN = np.array([[1.2, 0.1, 0.0], [-0.1, 1.1, 0.05], [0.0, 0.1, 1.4]])

@@ -24,8 +24,7 @@ from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import (
-    _ahead,
-    _behind,
+    _away,
     _require_same,
     controller_of,
     set_back,
@@ -326,6 +325,6 @@ def test_tip_and_torch_are_set_down_a_tool_s_length_apart_to_half_a_millimetre(
     plan = Path(0.06 * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn]))
     for place in (0.05, 0.09, 0.1303):
         here = plan.at(place).point
-        for found in (_ahead(plan, place, distance), _behind(plan, place, distance)):
+        for found in (_away(plan, place, distance), _away(plan, place, -distance)):
             apart = np.linalg.norm(plan.at(found).point - here)
             assert distance - 1e-12 <= apart < distance + 0.5e-3

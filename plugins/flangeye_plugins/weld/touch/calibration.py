@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye.models.finger import Calibration
 from flangeye.types import Floats
 from flangeye.units import SI
 from flangeye_plugins.weld.touch.tag_observation import TagReading
-from flangeye_plugins.weld.touch.tip_displacement import nearest_rotation
 
 FEWEST = 10
 """Readings at rest, and again with the tip held, without which nothing is estimated."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye.models.finger import Finger
 from flangeye.types import Array, Floats
 from flangeye_plugins.weld.touch.tag_observation import TagReading
@@ -70,9 +70,3 @@ class Interpreter:
             self._gain @ reading.covariance @ self._gain.T,
             reading.confidence,
         )
-
-
-def nearest_rotation(matrix: Floats) -> Floats:
-    """Return the rotation (3, 3) nearest to a matrix, by its polar decomposition."""
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
