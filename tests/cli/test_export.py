@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.export.kuka import export_kuka
-from flangeye_plugins.export.matrix import export_matrix
-from flangeye_plugins.export.zivid import export_zivid
+from flangeye_plugins.export.controllers import export_kuka
+from flangeye_plugins.export.programs import export_matrix, export_zivid
 from tests.conftest import TOY_RECIPE
 
 REFUSED = TOY_RECIPE.replace("max_rms: 2 mm", "max_rms: 0.001 mm")

@@ -1,4 +1,8 @@
-"""A ROS 2 static transform: metres, quaternion xyzw; tf2_ros, ``static_transform_publisher``."""
+"""A ROS 2 static transform: metres, quaternion xyzw; tf2_ros, ``static_transform_publisher``.
+
+MoveIt's hand-eye panel saves a launch file of one; ``sensors_3d.yaml`` holds topics and no pose,
+and MoveIt takes the camera's pose from tf.
+"""
 
 from __future__ import annotations
 
@@ -65,3 +69,13 @@ def export_ros2_launch(pose: CalibratedPose, params: FramesParams) -> ExportedFi
     text = launch_file(pose, params, "The camera's pose, as a static transform.")
     name = f"{params.name}.launch.py"
     return ExportedFile(name, text, f"ros2 launch ./{name}")
+
+
+@stage("export.moveit")
+def export_moveit(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
+    """Write the launch file that MoveIt's hand-eye calibration panel would save."""
+    sort = "EYE-TO-HAND" if pose.stands else "EYE-IN-HAND"
+    title = f"Static transform publisher, {sort}: {params.carrier(pose)} -> {params.carried(pose)}."
+    name = f"{params.name}_moveit.launch.py"
+    use = "include it in your MoveIt launch file; sensors_3d.yaml then needs the topic only"
+    return ExportedFile(name, launch_file(pose, params, title), use)
