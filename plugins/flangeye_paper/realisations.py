@@ -10,6 +10,7 @@ from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
 from flangeye.maths.geometry import kabsch, rigid, rpy_from_rotation
+from flangeye.maths.statistics import rms
 from flangeye.types import Box, Floats, HandEye, Observations, Solver, Verification
 from flangeye_paper.paper_cell import (
     BASE_T_CAMERA,
@@ -109,21 +110,17 @@ def outcome_of(base_T_camera: Floats, drawn: Realisation, noise: float) -> Reali
 def _figures(outcomes: list[RealisationOutcome], asked: int) -> dict[str, float]:
     errors = np.array([o.error for o in outcomes])
     centre = np.array([o.at_centre for o in outcomes])
-    bounds = {name: _rms([o.bound[name] for o in outcomes]) for name in outcomes[0].bound}
+    bounds = {name: rms([o.bound[name] for o in outcomes]) for name in outcomes[0].bound}
     return {
         **{f"{axis}_std": float(errors[:, i].std()) for i, axis in enumerate(AXES)},
         **{f"{axis}_mean": float(errors[:, i].mean()) for i, axis in enumerate(AXES)},
         **{f"centre_{axis}_std": float(centre[:, i].std()) for i, axis in enumerate("xyz")},
-        "workspace_rms": _rms([o.rms for o in outcomes]),
-        "inliers_alone_rms": _rms([o.alone for o in outcomes]),
+        "workspace_rms": rms([o.rms for o in outcomes]),
+        "inliers_alone_rms": rms([o.alone for o in outcomes]),
         **{f"bound_{name}": value for name, value in bounds.items()},
         "realisations": float(len(outcomes)),
         "refused": float(asked - len(outcomes)),
     }
-
-
-def _rms(values: list[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _summary(figures: dict[str, float]) -> str:

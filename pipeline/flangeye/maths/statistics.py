@@ -6,7 +6,7 @@ from itertools import product
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flangeye.maths.geometry import hat
 from flangeye.types import Floats
@@ -29,6 +29,11 @@ def median(values: NDArray[T]) -> NDArray[T]:
     parted = np.partition(values, half, axis=-1)
     above = parted[..., half]
     return above if values.shape[-1] % 2 else (parted[..., :half].max(axis=-1) + above) / 2
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of numbers of any shape."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def chi2_quantile(probability: float, freedom: int) -> float:

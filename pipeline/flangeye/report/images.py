@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye import types as t
+from flangeye.maths.statistics import rms
 from flangeye.report.facts import Facts
 from flangeye.report.plot import round_up
 from flangeye.types import Floats
@@ -80,12 +81,12 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
     sizes = np.hypot(*misses.T)
     scale = round_up(LONGEST * width / max(float(sizes.max()), 1e-6)) / 2
     ends = at + scale * misses
-    rms = [float(np.sqrt((f.corners[:, 2:] ** 2).mean())) for f in found.values()]
+    of_each = [rms(f.corners[:, 2:]) for f in found.values()]
     summary = (
-        f"Capture {name}: {len(at)} corners; where the pose has them is {_rms(misses):.3f} px off "
+        f"Capture {name}: {len(at)} corners; where the pose has them is {rms(misses):.3f} px off "
         f"(rms of a coordinate, the lines are {scale:g} times too long), at most "
-        f"{sizes.max():.3f} px. Over the {len(rms)} images: {np.median(rms):.3f} px in the median, "
-        f"at most {max(rms):.3f} px."
+        f"{sizes.max():.3f} px. Over the {len(of_each)} images: {np.median(of_each):.3f} px in the "
+        f"median, at most {max(of_each):.3f} px."
     )
     # The middle of the first pixel is (0, 0), and its corner that of the picture.
     return ImageView(
@@ -97,10 +98,6 @@ def _view(name: str, image: t.Image, found: dict[str, t.PoseFeature]) -> ImageVi
         width / 110,
         summary,
     )
-
-
-def _rms(misses: Floats) -> float:
-    return float(np.sqrt((misses**2).mean()))
 
 
 def _around(at: Floats, image: t.Image) -> tuple[int, int, int, int]:

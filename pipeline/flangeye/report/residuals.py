@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flangeye import result as r
+from flangeye.maths.statistics import rms
 from flangeye.report.facts import Facts
 from flangeye.report.plot import HELD_OUT, UNUSED, USED, Figure, Trace, plain
 from flangeye.report.units import millimetres
@@ -63,7 +64,7 @@ class Errors:
             return "No pose was used in an estimate."
         worst, lengths = max(used, key=lambda i: used[i]), np.array(list(used.values()))
         text = (
-            f"Used poses: {millimetres(float(np.sqrt(np.mean(lengths**2))))} mm rms, "
+            f"Used poses: {millimetres(rms(lengths))} mm rms, "
             f"{millimetres(float(np.median(lengths)))} mm median, "
             f"largest {millimetres(used[worst])} mm ({worst})."
         )

@@ -6,6 +6,7 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.maths.seam_geometry import errors_from, torch_deviation, tube_radii
+from flangeye.maths.statistics import rms
 from flangeye.result.contract import SeamResult, SeamTruthResult, WeldResult, WeldTruthResult
 
 
@@ -32,7 +33,7 @@ def _seam_truth(seam: t.Seam, true_seams: list[t.Array]) -> SeamTruthResult:
     """Compare with the true seam that is nearest: a workpiece may have several."""
     errors = min((errors_from(seam, truth) for truth in true_seams), key=lambda e: float(e.max()))
     return SeamTruthResult(
-        rms=float(np.sqrt(np.mean(errors**2))),
+        rms=rms(errors),
         max=float(errors.max()),
         inside=float(np.mean(errors <= tube_radii(seam))),
     )
@@ -50,7 +51,7 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
         completed=weld.completed,
         reason=weld.reason,
         seconds=float(weld.time[-1]) if len(weld.time) else 0.0,
-        correction_rms=_rms(correction) if len(correction) else None,
+        correction_rms=rms(correction) if len(correction) else None,
         phases={name: float(ticks[names == name].sum()) for name in dict.fromkeys(weld.phases)},
         figures=dict(weld.figures),
         truth=_weld_truth(weld, list(scan.truth.values())) if scan and scan.truth else None,
@@ -69,8 +70,4 @@ def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResul
     torch = torch[welds & (weld.along >= weld.figures.get("lit_from", 0.0) - 1e-9)]
     found = [torch_deviation(torch, truth, weld.opening) for truth in true_seams]
     errors = min((e for e in found if len(e)), key=lambda e: float(e.max()), default=None)
-    return None if errors is None else WeldTruthResult(rms=_rms(errors), max=float(errors.max()))
-
-
-def _rms(values: t.Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return None if errors is None else WeldTruthResult(rms=rms(errors), max=float(errors.max()))

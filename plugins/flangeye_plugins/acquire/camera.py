@@ -12,6 +12,7 @@ from flangeye import Params, StageError
 from flangeye.files.elsewhere import at_hand
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
 from flangeye.files.regular import read_regular
+from flangeye.maths.statistics import rms
 from flangeye.types import Image, PointCloud
 
 Grey = NDArray[np.uint8]
@@ -66,7 +67,7 @@ def _line(rays: NDArray[np.float32], pixels: NDArray[np.intp]) -> tuple[tuple[fl
     rows = np.stack([rays.astype(np.float64), np.ones(len(rays))], axis=1)
     found = np.linalg.lstsq(rows, pixels.astype(np.float64), rcond=None)[0]
     miss = rows @ found - pixels
-    return (float(found[0]), float(found[1])), float(np.sqrt(np.mean(miss**2)))
+    return (float(found[0]), float(found[1])), rms(miss)
 
 
 def read_image(path: Path) -> Grey:

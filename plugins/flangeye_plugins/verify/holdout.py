@@ -18,6 +18,7 @@ from flangeye.maths.statistics import (
     corners_of,
     excess_variance,
     largest_error_quantile,
+    rms,
     squared_distances,
 )
 from flangeye.models.cell import Cell
@@ -243,27 +244,18 @@ def _figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, float]:
     figures = {
         "poses": float(len(norms)),
         "outliers": float(outlying.sum()),
-        "rms": _rms(norms),
+        "rms": rms(norms),
         "median": float(np.median(norms)),
         "p95": float(np.quantile(norms, 0.95)),
         "max": float(norms.max()),
-        "rms_inliers": _rms(norms[~outlying]),
+        "rms_inliers": rms(norms[~outlying]),
     }
-    return {**figures, "tilt_rms": _rms(tilts)} if len(tilts) else figures
+    return {**figures, "tilt_rms": rms(tilts)} if len(tilts) else figures
 
 
 def _corrected_figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, float]:
-    norms = np.linalg.norm(held.errors, axis=1)
-    return {
-        "corrected_rms": _rms(norms),
-        "corrected_median": float(np.median(norms)),
-        "corrected_p95": float(np.quantile(norms, 0.95)),
-        "corrected_rms_inliers": _rms(norms[~outlying]),
-    }
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    found = _figures(held, outlying)
+    return {f"corrected_{name}": found[name] for name in ("rms", "median", "p95", "rms_inliers")}
 
 
 def _predicted_worst_p95(

@@ -10,6 +10,7 @@ from pydantic import Field
 from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import rms
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Length, param
@@ -121,7 +122,7 @@ def _figures(errors: Floats, measured: Floats, lengths: Floats) -> dict[str, flo
     sizes = np.abs(errors)
     return {
         "pairs": float(len(errors)),
-        "rms": float(np.sqrt(np.mean(errors**2))),
+        "rms": rms(errors),
         "mean": float(errors.mean()),
         "p95": float(np.quantile(sizes, 0.95)),
         "max": float(sizes.max()),

@@ -9,6 +9,7 @@ from pydantic import Field
 from flangeye import Params, StageError, stage
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import rms
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats, HandEye, Image, StageLog, Verification, Views
 from flangeye.units import Length, param
@@ -60,10 +61,10 @@ def verify_stitch(
     slides = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
     figures = {
         "views": float(len(views)),
-        "spread": float(np.sqrt(np.mean(seen**2))),
+        "spread": rms(seen),
         "p95": float(np.quantile(seen, 0.95)),
         "max": float(seen.max()),
-        "slide": float(np.sqrt(np.mean(slides**2))),
+        "slide": rms(slides),
     }
     if stage_log:
         stage_log("spread", _picture(spread, params.max_spread))

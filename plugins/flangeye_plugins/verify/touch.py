@@ -7,7 +7,7 @@ from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.maths.geometry import covariance_at, rigid, rotation_from_rpy
-from flangeye.maths.statistics import chi2_quantile
+from flangeye.maths.statistics import chi2_quantile, rms
 from flangeye.types import Floats, HandEye, StageLog, Verification
 from flangeye.units import Angle, Length, param
 
@@ -67,7 +67,7 @@ def verify_touch(
     lengths = np.linalg.norm(errors, axis=1)
     figures = {
         "points": float(len(errors)),
-        "rms": float(np.sqrt(np.mean(lengths**2))),
+        "rms": rms(lengths),
         "max": float(lengths.max()),
         **dict(zip("xyz", errors.mean(axis=0).tolist(), strict=True)),
         "explained": float(np.mean(squares <= chi2_quantile(0.95, 3))),

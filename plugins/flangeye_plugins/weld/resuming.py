@@ -17,7 +17,7 @@ import numpy as np
 from flangeye.devices import WeldProfile
 from flangeye.errors import StageError
 from flangeye.log.read import Note, read_notes
-from flangeye.motion.seam_following import Controller, FollowingTask, ToolPose, Touch
+from flangeye.motion.seam_following import Command, Controller, FollowingTask, ToolPose, Touch
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats
@@ -116,11 +116,11 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
     Raises:
         StageError: The log holds no weld by touch, or one that has ended or had another plan.
     """
-    again: _Again | None = None
+    again: LoggedWeld | None = None
     for note in read_notes(log):
         if note.name == "start":
             _require_same(log, points, np.array(note.value["points"]))
-            again = _Again(controller_from(note.value))
+            again = LoggedWeld(note.value)
         elif again is not None:
             again.take(note)
     controller = None if again is None else again.controller
@@ -131,30 +131,52 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
     return controller.kept()
 
 
-class _Again:
-    """Steps a controller through the log of its weld."""
+class LoggedWeld:
+    """Steps a controller through the log of its weld.
 
-    def __init__(self, controller: Controller) -> None:
-        self.controller = controller
-        self._felt: dict[int, Touch] = {}
-        self._number = -1
-        self._looks, self._cycles = LoggedLooks(), 0
+    Attributes:
+        controller: As it was at the start, and decides again.
+        felt: What was felt in an image, by its number; None where nothing was.
+        newest: Number of the newest image.
+        cycles: How many were decided.
+    """
+
+    def __init__(self, start: Mapping[str, Any]) -> None:
+        self.controller = controller_from(start)
+        self.felt: dict[int, Touch | None] = {}
+        self.newest, self.cycles = -1, 0
+        self._looks = LoggedLooks()
 
     def take(self, note: Note) -> None:
+        """Take in the next line of the log."""
         if note.name == "sight":
-            self._number = note.value["number"]
+            self.see(note.value)
         elif note.name == "feeling":
-            felt = note.value
-            self._felt[self._number] = Touch(felt["time_ns"] * 1e-9, np.array(felt["displacement"]))
+            self.feel(note.value)
         elif note.name == "look":
             self._looks.take(note.value)
         elif note.name == "cycles":
-            cycles = note.value
-            for i, time in enumerate(cycles["time"]):
-                pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
-                take_looks(self.controller, self._looks.of(self._cycles))
-                self._cycles += 1
-                self.controller.step(pose, [self._felt[n] for n in cycles["touches"][i]])
+            self._decide(note.value)
+
+    def see(self, sight: Mapping[str, Any]) -> None:
+        """Take in that an image was read."""
+        self.newest = sight["number"]
+
+    def feel(self, logged: Mapping[str, Any]) -> None:
+        """Take in what was felt in the newest image."""
+        self.felt[self.newest] = Touch(logged["time_ns"] * 1e-9, np.array(logged["displacement"]))
+
+    def decided(self, command: Command, cycles: Mapping[str, list[Any]], i: int) -> None:
+        """Hear what the controller decides in a cycle, the ``i``-th of its block."""
+
+    def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
+        for i, time in enumerate(cycles["time"]):
+            pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
+            take_looks(self.controller, self._looks.of(self.cycles))
+            self.cycles += 1
+            felt = [self.felt[number] for number in cycles["touches"][i]]
+            command = self.controller.step(pose, [touch for touch in felt if touch is not None])
+            self.decided(command, cycles, i)
 
 
 def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
