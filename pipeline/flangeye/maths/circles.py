@@ -79,10 +79,10 @@ def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: f
         circle = radius / cell * np.stack([np.cos(angle), np.sin(angle)])
         near = (points - start).T / cell + half
         x, y = (
-            np.rint(np.add.outer(*each)).astype(np.intp) for each in zip(near, circle, strict=True)
+            np.rint(np.add.outer(*each)).astype(np.int32) for each in zip(near, circle, strict=True)
         )
         # Seen without a sign, what lies before the first cell lies beyond the last as well.
-        inside = np.maximum(x.view(np.uintp), y.view(np.uintp)) < size
+        inside = np.maximum(x.view(np.uint32), y.view(np.uint32)) < size
         votes += np.bincount((x * size + y)[inside], minlength=size * size)
     return start + cell * (_peak(votes.reshape(size, size)) - half)
 
@@ -93,7 +93,8 @@ def _peak(votes: Floats) -> Floats:
 
     sums = cv2.boxFilter(votes, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
     row, column = divmod(int(np.argmax(sums)), len(votes))
-    mass = np.pad(votes, 2)[row : row + 5, column : column + 5]
+    framed = cv2.copyMakeBorder(votes, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    mass = framed[row : row + 5, column : column + 5]
     if mass.sum() == 0:
         return np.array([row, column], dtype=np.float64)
     ticks = np.arange(-2, 3)

@@ -210,10 +210,10 @@ def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
     for _ in range(ROUNDS):
         off = slabs.off(rows, going)
         gates = slabs.gates[going]
-        half = _medians(off, rows.there & (off <= gates[:, None]))
+        half = _medians(off, rows.there & _within(off, gates))
         slabs.halves[going] = halves = np.where(np.isnan(half), gates, half)
-        nearest = rows.there & (off <= halves[:, None])
-        counts = nearest.sum(axis=1)
+        nearest = rows.there & _within(off, halves)
+        counts = _counts(nearest)
         changed = (counts >= 3) & _differ(nearest, chosen, restless * counts)
         if not changed.any():
             break
@@ -231,8 +231,8 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
         rows = rows.some(slabs.found)
     chosen, off = np.zeros_like(rows.there), slabs.off(rows, going)
     for _ in range(ROUNDS):
-        near = rows.there & (off <= np.maximum(slabs.halves[going], THINNEST)[:, None])
-        counts = near.sum(axis=1)
+        near = rows.there & _within(off, np.maximum(slabs.halves[going], THINNEST))
+        counts = _counts(near)
         slabs.found[going] = enough = counts >= 3
         changed = enough & _differ(near, chosen, restless * counts)
         if not changed.any():
@@ -247,19 +247,31 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
         slabs.halves[going] = np.minimum(slabs.gates[going], sigmas * noise)
 
 
-def _differ(chosen: Mask, before: Mask, few: Floats) -> Mask:
+def _differ(chosen: Mask, before: Mask, few: NDArray[np.floating]) -> Mask:
     """Return (P,) whether more than a few (P,) of the points that a plane has chosen are new."""
-    return np.asarray((chosen != before).sum(axis=1) > few)
+    return np.asarray(_counts(chosen != before) > few)
+
+
+def _within(off: Floats, halves: Floats) -> Mask:
+    # In their own precision distances are compared twice as fast.
+    return np.asarray(off <= halves.astype(off.dtype)[:, None])
+
+
+def _counts(chosen: Mask) -> Indices:
+    """Return how many are chosen in each row; as bytes they add up in half the time."""
+    return np.asarray(np.add.reduce(chosen.view(np.uint8), axis=1, dtype=np.uint32), dtype=np.intp)
 
 
 def _medians(values: Floats, which: Mask, count: Indices | None = None) -> Floats:
     """Return the (P,) medians of the values chosen in each of P rows, NaN where none is."""
     if len(values) == 1:
         return np.array([median(values[which]) if which.any() else np.nan])
-    # What is not chosen sorts to the end.
-    ordered = np.where(which, values, values.dtype.type(np.inf))
+    # What is not chosen sorts to the end: infinite, or no number. A division makes it so in a
+    # tenth of the time of a choice, which the processor cannot foresee.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ordered = values / which
     ordered.sort(axis=1)
-    count = which.sum(axis=1) if count is None else count
+    count = _counts(which) if count is None else count
     row = np.arange(len(values))
     middle = (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2]) / 2
     return np.where(count > 0, middle, np.nan)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.maths.circles import distances, edge_points, vote_centre
-from flangeye.maths.planes import Plane, thinned
+from flangeye.maths.planes import Plane
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
 from flangeye_plugins.segment.parts import Part
@@ -68,8 +68,7 @@ def of_size(part: Part, cell: tuple[int, int], pitch: float, flange: Flange) -> 
         pitch: Typical distance of neighbours there [m].
         flange: What to look for.
     """
-    # A table has a hundred times the points its width needs.
-    points = thinned(part.points).astype(np.float64)
+    points = part.points.astype(np.float64)
     across = width(part.plane.flatten(points))
     fits = SMALLEST * flange.rim < across < 2 * flange.outer + 4 * pitch
     flaw = None if fits else f"{across * 1e3:.0f} mm across"
@@ -145,8 +144,8 @@ def _too_steep(disc: Disc, limits: DiscLimits) -> str | None:
 def width(flat: Floats) -> float:
     """Return the largest width of (N, 2) points over all directions, in steps of 10 degrees."""
     angle = np.arange(18) * np.pi / 18
-    along = flat @ np.stack([np.cos(angle), np.sin(angle)])
-    return float(np.ptp(along, axis=0).max())
+    along = np.column_stack([np.cos(angle), np.sin(angle)]) @ flat.T
+    return float(np.ptp(along, axis=1).max())
 
 
 def incidence(centre: Floats, normal: Floats) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from flangeye.maths.planes import Plane, fit_plane, robust_planes, thinned
 from flangeye.types import Floats, Indices, Singles
+from flangeye_plugins.segment.grid import cells
 
 FLAT_ENOUGH = 0.7
 """Share of a piece's points on one plane above which the piece is flat as a whole."""
@@ -30,12 +31,19 @@ class Piece(NamedTuple):
     Attributes:
         points: (n, 3) [m].
         at: (n,) where in the view each point is.
-        patch: (n,) which patch, some ten points wide, each point lies in.
+        columns: How many the view has.
+        side: Points along the side of a square patch, some ten.
     """
 
     points: Singles
     at: Indices
-    patch: Indices
+    columns: int
+    side: int
+
+    def patches(self, which: Indices) -> Indices:
+        """Return which patch each of some points lies in."""
+        rows, columns = cells(self.at.take(which), self.columns)
+        return np.asarray(rows // self.side * self.columns + columns // self.side)
 
 
 class Part(NamedTuple):
@@ -43,13 +51,20 @@ class Part(NamedTuple):
 
     Attributes:
         plane: The plane, its normal towards the scanner.
-        points: (m, 3) what lies on it [m].
-        at: (m,) where in the view.
+        points: (k, 3) what lies on it, thinned: a table has a hundred times the points its width
+            needs [m].
+        at: (m,) where in the view all of it is.
     """
 
     plane: Plane
     points: Singles
     at: Indices
+
+    @classmethod
+    def of(cls, piece: Piece, plane: Plane, members: Indices) -> Part:
+        """Return the members of a piece that lie on a plane."""
+        points = piece.points.take(thinned(members), axis=0)
+        return cls(plane, points, piece.at.take(members))
 
 
 class Patch(NamedTuple):
@@ -94,14 +109,14 @@ def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -
     parts, bent = _whole(pieces, scatter)
     searched = [(p, r) for p, r in zip(pieces, bent, strict=True) if len(r) >= fewest]
     patches = [patch for piece, rest in searched for patch in _flattest(piece, rest)]
-    samples = [patch.piece.points[patch.around(reach, AROUND)] for patch in patches]
+    samples = [patch.piece.points.take(patch.around(reach, AROUND), axis=0) for patch in patches]
     planes = _planes(samples, [patch.rough for patch in patches], scatter)
     taken = np.zeros(1 + max((int(p.at.max()) for p in pieces), default=0), dtype=bool)
     for patch, plane in zip(patches, planes, strict=True):
         if plane is not None and taken[patch.piece.at[patch.members]].mean() <= 0.5:
             around = patch.around(reach)
-            members = around[_off(plane, patch.piece.points[around]) <= _thickness(plane)]
-            parts.append(Part(plane, patch.piece.points[members], patch.piece.at[members]))
+            off = _off(plane, patch.piece.points.take(around, axis=0))
+            parts.append(Part.of(patch.piece, plane, around[off <= _thickness(plane)]))
             taken[parts[-1].at] = True
     return parts
 
@@ -117,7 +132,7 @@ def _whole(pieces: list[Piece], scatter: float) -> tuple[list[Part], list[Indice
             off = _off(plane, piece.points)
             members = np.flatnonzero(off <= _thickness(plane))
             if len(members) > FLAT_ENOUGH * len(rest):
-                parts.append(Part(plane, piece.points[members], piece.at[members]))
+                parts.append(Part.of(piece, plane, members))
                 rest = np.flatnonzero(off > 3 * scatter + SEARCHED)
         bent.append(rest)
     return parts, bent
@@ -145,11 +160,14 @@ def _off(plane: Plane, points: Singles) -> Singles:
 
 def _flattest(piece: Piece, rest: Indices) -> Iterator[Patch]:
     """Yield the flattest patches of ``rest``, flattest first."""
-    order = rest[np.argsort(piece.patch[rest], kind="stable")]
-    starts = np.flatnonzero(np.diff(piece.patch[order], prepend=-1))
+    patches = piece.patches(rest)
+    sort = np.argsort(patches, kind="stable")
+    order = rest.take(sort)
+    starts = np.flatnonzero(np.diff(patches.take(sort), prepend=-1))
     sizes = np.diff(starts, append=len(order))
-    middle = piece.points[rest].mean(axis=0, dtype=np.float64)
-    means, variances, normals = _principal(piece.points[order] - middle, starts, sizes)
+    middle = piece.points.take(rest, axis=0).mean(axis=0, dtype=np.float64)
+    points = piece.points.take(order, axis=0) - middle
+    means, variances, normals = _principal(points, starts, sizes)
     full = np.flatnonzero(sizes >= max(np.median(sizes) / 2, 6))
     for k in full[np.argsort(variances[full], kind="stable")][:PATCHES]:
         place = means[k] + middle

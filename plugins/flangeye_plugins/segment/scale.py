@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import StageError
+from flangeye.maths.statistics import median
 
 FARTHEST, NEAREST = 30.0, 0.01
 """No scanner for such work sees farther than 30 m or nearer than 10 mm."""
@@ -24,7 +25,8 @@ def check_scale(xyz: NDArray[np.float32], where: str) -> None:
     Raises:
         StageError: Says which unit it looks like.
     """
-    depth = float(np.nanmedian(np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // SAMPLE])))
+    depths = np.abs(xyz[..., 2].ravel()[:: 1 + xyz.size // SAMPLE])
+    depth = float(median(depths[~np.isnan(depths)]))
     if NEAREST <= depth <= FARTHEST:
         return
     looks = (

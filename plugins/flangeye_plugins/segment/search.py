@@ -10,7 +10,7 @@ from flangeye.models.targets import Flange
 from flangeye.types import Indices, Singles
 from flangeye_plugins.segment.crop import in_box
 from flangeye_plugins.segment.discs import Disc, DiscLimits, compare, of_size
-from flangeye_plugins.segment.grid import Grid
+from flangeye_plugins.segment.grid import Grid, cells
 from flangeye_plugins.segment.parts import Part, Piece, flat_parts
 from flangeye_plugins.segment.surfaces import NOISE_GATE, connected_pieces, smooth_surface
 
@@ -24,7 +24,8 @@ UNEVEN = 3e-4
 def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
     """Return every flat part of the scene as a disc, with what keeps it from being the flange."""
     smooth, noise = smooth_surface(view, limits.crease)
-    pitch = view.angle * float(median(view.xyz[..., 2][smooth][::7])) if smooth.any() else np.inf
+    some = view.xyz.reshape(-1, 3)[:, 2].take(np.flatnonzero(smooth)[::7])
+    pitch = view.angle * float(median(some)) if len(some) else np.inf
     fewest = max(25, int(0.02 * np.pi * flange.rim**2 / pitch**2))
     pieces = [_piece(view, index, flange) for index in connected_pieces(smooth, fewest)]
     parts = flat_parts(pieces, 2.5 * flange.outer, _scatter(flange, noise), fewest)
@@ -34,15 +35,15 @@ def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
 
 def _piece(view: Grid, index: Indices, flange: Flange) -> Piece:
     points = view.xyz.reshape(-1, 3).take(index, axis=0)
-    return Piece(
-        points, index, _patches(index, view, 0.5 * flange.rim / (view.angle * points[0, 2]))
-    )
+    side = 0.5 * flange.rim / (view.angle * points[0, 2])
+    return Piece(points, index, view.xyz.shape[1], max(3, round(side)))
 
 
 def _disc(part: Part, view: Grid, flange: Flange) -> Disc:
     pitch = view.angle * float(part.plane.point[2])
-    rows, columns = np.divmod(thinned(part.at), view.xyz.shape[1])
-    return of_size(part, (int(np.median(rows)), int(np.median(columns))), pitch, flange)
+    rows, columns = cells(thinned(part.at), view.xyz.shape[1])
+    middle = int(median(rows.astype(float))), int(median(columns.astype(float)))
+    return of_size(part, middle, pitch, flange)
 
 
 def _scatter(flange: Flange, noise: float) -> float:
@@ -53,13 +54,6 @@ def _scatter(flange: Flange, noise: float) -> float:
     """
     hidden = flange.bore is None and flange.details.thickness < NOISE_GATE * np.sqrt(6) * noise
     return max(3 * noise, UNEVEN) + (flange.details.thickness if hidden else 0.0)
-
-
-def _patches(piece: Indices, view: Grid, side: float) -> Indices:
-    """Return which square patch, ``side`` points wide, each point of a piece lies in."""
-    rows, columns = np.divmod(piece, view.xyz.shape[1])
-    side_points = max(3, round(side))
-    return np.asarray(rows // side_points * view.xyz.shape[1] + columns // side_points)
 
 
 def _compared(discs: list[Disc], view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.maths.statistics import SIGMA_OF_MAD, median
 from flangeye.types import Indices, Mask, Singles
-from flangeye_plugins.segment.grid import Grid
+from flangeye_plugins.segment.grid import Grid, cells
 
 NOISE_GATE = 5.0
 """Robust standard deviations of the grid's own bending above which a point is not smooth."""
@@ -42,10 +42,12 @@ def smooth_surface(grid: Grid, bend: float) -> tuple[Mask, float]:
         wide = _bending(depth, axis, 2)
         limit = max(bend, NOISE_GATE * _typical(wide))
         # A crease of little slope, or one softened by the scanner, shows over two points.
-        smooth &= ~(np.abs(near) > limit) & ~(np.abs(wide) > limit)
+        for bending in (near, wide):
+            smooth &= ~(np.abs(bending, out=bending) > limit)
         # Beside a missing point only the step to the other neighbour can be judged.
-        steep = _step(depth, axis) > limit + STEEPEST * grid.angle * depth
-        smooth &= ~(np.isnan(near) & steep)
+        lone = np.flatnonzero(smooth & np.isnan(near))
+        here, step = depth.ravel().take(lone), _step(depth, lone, axis)
+        smooth.ravel()[lone] = step <= limit + STEEPEST * grid.angle * here
     return smooth, noise
 
 
@@ -63,18 +65,19 @@ def _bending(depth: Singles, axis: int, reach: int) -> Singles:
     """Return the second difference of depth over ``reach`` points, NaN where one is missing."""
     out = np.full_like(depth, np.nan)
     view, target = np.moveaxis(depth, axis, 0), np.moveaxis(out, axis, 0)
-    target[reach:-reach] = view[2 * reach :] + view[: -2 * reach] - 2 * view[reach:-reach]
+    inner = target[reach:-reach]
+    np.add(view[2 * reach :], view[: -2 * reach], out=inner)
+    inner -= 2 * view[reach:-reach]
     return out
 
 
-def _step(depth: Singles, axis: int) -> Singles:
+def _step(depth: Singles, at: Indices, axis: int) -> Singles:
     """Return the larger step of depth to the neighbours along an axis; missing ones are none."""
-    out = np.zeros_like(depth)
-    target = np.moveaxis(out, axis, 0)
-    step = np.fmax(np.abs(np.diff(np.moveaxis(depth, axis, 0), axis=0)), np.float32(0))
-    target[:-1] = step
-    target[1:] = np.maximum(target[1:], step)
-    return out
+    flat, along = depth.ravel(), cells(at, depth.shape[1])[axis]
+    to_next = (depth.shape[1], 1)[axis]
+    before, after = at - to_next * (along > 0), at + to_next * (along < depth.shape[axis] - 1)
+    steps = [np.abs(flat.take(beside) - flat.take(at)) for beside in (before, after)]
+    return np.asarray(np.fmax(np.fmax(*steps), np.float32(0)))
 
 
 def _typical(values: Singles) -> float:
@@ -91,12 +94,10 @@ def connected_pieces(mask: Mask, fewest: int) -> Iterator[Indices]:
     """
     import cv2
 
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        mask.astype(np.uint8), connectivity=4
-    )
-    sizes = stats[:, cv2.CC_STAT_AREA]
+    # OpenCV's own statistics take three times as long as the components.
+    count, image = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
+    labels = image.ravel()
+    sizes = np.bincount(labels, minlength=count)
     large = [k for k in range(1, count) if sizes[k] >= fewest]
     for piece in sorted(large, key=lambda k: (-sizes[k], k)):
-        left, top, width, height = stats[piece, : cv2.CC_STAT_AREA]
-        rows, columns = np.nonzero(labels[top : top + height, left : left + width] == piece)
-        yield (rows + top) * mask.shape[1] + columns + left
+        yield np.flatnonzero(labels == piece)

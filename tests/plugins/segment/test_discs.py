@@ -26,7 +26,7 @@ from flangeye_plugins.segment.flange import SegmentParams
 from flangeye_plugins.segment.grid import Grid
 from flangeye_plugins.segment.parts import Part
 from flangeye_plugins.segment.scale import check_scale
-from flangeye_plugins.segment.search import _patches, _scatter
+from flangeye_plugins.segment.search import _piece, _scatter
 from tests.plugins.bounds import check_bound
 from tests.plugins.segment.test_choice import BORE, UR5
 
@@ -260,8 +260,9 @@ def test_what_is_flat_scatters_by_noise_and_a_plate_whose_step_noise_hides() -> 
 
 @pytest.mark.parametrize(("side", "points"), [(4.6, 5), (1.0, 3)])
 def test_patches_are_squares_of_three_points_at_least(side: float, points: int) -> None:
-    view = Grid(np.zeros((20, 30, 3), np.float32), 1e-3, None)
-    patch = _patches(np.arange(600), view, side).reshape(20, 30)
+    depth = 0.5 * UR5.rim / (1e-3 * side)
+    view = Grid(np.full((20, 30, 3), depth, np.float32), 1e-3, None)
+    patch = _piece(view, np.arange(600), UR5).patches(np.arange(600)).reshape(20, 30)
     rows, columns = np.indices((20, 30)) // points
     assert len(np.unique(patch)) == len(np.unique(rows)) * len(np.unique(columns))
     for r, c in ((0, 0), (1, 2)):

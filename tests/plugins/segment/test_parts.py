@@ -17,8 +17,7 @@ def piece(height, rows=60, columns=60, first=0) -> Piece:
     """Return a piece whose height over a plane 0.7 m away is a function of place."""
     y, x = (PITCH * a.ravel() for a in np.indices((rows, columns)))
     points = np.stack([x, y, 0.7 - height(x, y)], axis=1).astype(np.float32)
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    return Piece(points, first + np.arange(rows * columns), row // 10 * 100 + column // 10)
+    return Piece(points, first + np.arange(rows * columns), columns, 10)
 
 
 def flat(x, y):
@@ -32,7 +31,7 @@ def roof(x, y):
 def test_a_piece_that_is_flat_is_one_part_with_its_plane() -> None:
     both = [piece(flat), piece(lambda x, y: 0.02 + 0 * x, first=5000)]
     parts = flat_parts(both, 0.1, SCATTER, 50)
-    assert [len(part.points) for part in parts] == [3600, 3600]
+    assert [len(part.at) for part in parts] == [3600, 3600]
     assert parts[1].at.tolist() == list(range(5000, 8600))
     normal = np.array([-0.1, 0, -1]) / np.hypot(0.1, 1)
     assert parts[0].plane.normal == pytest.approx(normal, abs=1e-6)
@@ -43,7 +42,7 @@ def test_a_few_points_off_its_plane_are_no_part_of_it() -> None:
     wall = piece(lambda x, y: np.where(x + y < 0.03, 0.01, 0.0))
     (part,) = flat_parts([wall], 0.1, SCATTER, 500)
     assert (part.points[:, 2] == np.float32(0.7)).all()
-    assert len(part.points) == (wall.points[:, 2] == np.float32(0.7)).sum()
+    assert len(part.at) == (wall.points[:, 2] == np.float32(0.7)).sum()
 
 
 def test_what_stands_on_a_flat_piece_is_a_part_of_its_own_if_it_is_large_enough() -> None:
@@ -55,10 +54,10 @@ def test_what_stands_on_a_flat_piece_is_a_part_of_its_own_if_it_is_large_enough(
 
 def test_a_bent_piece_has_a_part_for_each_side() -> None:
     parts = flat_parts([piece(roof)], 0.2, SCATTER, 50)
-    found = sorted(part.plane.normal[0] for part in parts if len(part.points) > 1500)
+    found = sorted(part.plane.normal[0] for part in parts if len(part.at) > 1500)
     slope = 0.5 / np.hypot(0.5, 1)
     assert found == pytest.approx([-slope, slope], abs=1e-4)
-    assert sum(len(part.points) for part in parts) <= 3660  # few belong to both
+    assert sum(len(part.at) for part in parts) <= 3660  # few belong to both
 
 
 def test_a_part_of_a_bent_piece_reaches_no_farther_than_it_may() -> None:
@@ -70,7 +69,7 @@ def test_a_part_of_a_bent_piece_reaches_no_farther_than_it_may() -> None:
 
 def test_what_is_nowhere_flat_has_no_part_and_little_is_not_searched() -> None:
     ball = piece(lambda x, y: np.sqrt(0.1**2 - (x - 0.06) ** 2 - (y - 0.06) ** 2))
-    assert all(len(part.points) < 50 for part in flat_parts([ball], 0.1, 5e-5, 50))
+    assert all(len(part.at) < 50 for part in flat_parts([ball], 0.1, 5e-5, 50))
     assert not flat_parts([piece(roof)], 0.2, SCATTER, 3601)
     assert not flat_parts([], 0.2, SCATTER, 50)
 
@@ -102,7 +101,7 @@ def test_sixty_patches_are_tried_the_flattest_first() -> None:
     """Of 100, each of which is rougher than the one before; a patch of a few points is none."""
     rng = np.random.default_rng(0)
     bumpy = piece(flat, rows=100, columns=100)
-    which = np.unique(bumpy.patch, return_inverse=True)[1]
+    which = np.unique(bumpy.patches(np.arange(10000)), return_inverse=True)[1]
     rough = 1e-5 * (1 + np.argsort(rng.permutation(100)))
     noise = np.where(np.indices((100, 100)).sum(axis=0).ravel() % 2, 1.0, -1.0)
     points = bumpy.points.astype(np.float64)

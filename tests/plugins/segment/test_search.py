@@ -60,6 +60,7 @@ def test_a_pieces_patches_are_half_a_rims_radius_wide() -> None:
     wall = view(0.0, 1.0)
     piece = _piece(wall, np.arange(101 * 101), UR5)
     side = round(0.5 * UR5.rim / 1e-3)
-    assert len(np.unique(piece.patch)) == np.ceil(101 / side) ** 2
-    assert np.bincount(piece.patch).max() == side**2
+    patch = piece.patches(np.arange(101 * 101))
+    assert len(np.unique(patch)) == np.ceil(101 / side) ** 2
+    assert np.bincount(patch).max() == side**2
     assert np.array_equal(piece.points, wall.xyz.reshape(-1, 3))
