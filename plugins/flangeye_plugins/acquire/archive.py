@@ -17,7 +17,6 @@ from flangeye.files.recording import (
     Recording,
     check_distinct_clouds,
     digests_of,
-    fingerprint_of,
 )
 from flangeye.log.read import is_log, read_run
 from flangeye.log.record import adapter
@@ -37,19 +36,18 @@ from flangeye.types import (
     Captures,
     Image,
     PointCloud,
-    Source,
     Transform,
 )
 from flangeye_plugins.acquire.camera import CameraParams, image_of_cloud, read_image
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
-    archive_note,
     archive_path,
     check_usable,
     log_source,
     open_archive,
     poses_of,
     skipped_note,
+    source_of,
 )
 
 StatedUnit = Literal["auto", "m", "mm", "in"]
@@ -100,16 +98,8 @@ def acquire_archive(
     unit, unit_told = _unit(recorded, usable, params.unit, scanner)
     images = [r.image for r in usable if r.image]
     digests |= digests_of([*recorded.files, *images])
-    source = Source(
-        fingerprint_of(recorded.root, digests),
-        (
-            archive_note(recorded),
-            *recorded.notes,
-            *notes,
-            unit_told,
-            *_camera_note(usable, params.camera),
-        ),
-    )
+    told = [*notes, unit_told, *_camera_note(usable, params.camera)]
+    source = source_of(recorded, told, digests)
     return Captures(
         _captures(usable, unit, scanner, params.camera, cell),
         source,

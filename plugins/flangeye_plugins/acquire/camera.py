@@ -13,7 +13,7 @@ from flangeye.files.elsewhere import at_hand
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
 from flangeye.files.regular import read_regular
 from flangeye.maths.statistics import rms
-from flangeye.types import Image, PointCloud
+from flangeye.types import Floats, Image, PointCloud
 
 Grey = NDArray[np.uint8]
 
@@ -32,9 +32,14 @@ class CameraParams(Params):
 
     def image(self, pixels: Grey) -> Image:
         """Return the pixels with the camera that took them."""
-        (fx, fy), (cx, cy) = self.focal_length, self.principal_point
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        matrix = pinhole(self.focal_length, self.principal_point)
         return Image(pixels, matrix, np.array(self.distortion))
+
+
+def pinhole(focal: tuple[float, float], principal: tuple[float, float]) -> Floats:
+    """Return the camera matrix (3, 3) of focal lengths and principal point [px]."""
+    (fx, fy), (cx, cy) = focal, principal
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
@@ -57,7 +62,7 @@ def image_of_cloud(pixels: Grey, cloud: PointCloud) -> Image | None:
     (fy, cy), miss_v = _line(rays[:, 1], np.nonzero(known)[0])
     if not np.hypot(miss_u, miss_v) <= PINHOLE:
         return None
-    return Image(pixels, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    return Image(pixels, pinhole((fx, fy), (cx, cy)))
 
 
 def _line(rays: NDArray[np.float32], pixels: NDArray[np.intp]) -> tuple[tuple[float, float], float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.recording import Archive, Recording, digests_of, fingerprint_of
+from flangeye.files.recording import Archive, Recording
 from flangeye.log.read import is_log, read_run
 from flangeye.models.cell import Cell
 from flangeye.models.targets import Flange
@@ -14,18 +14,17 @@ from flangeye.types import (
     CircleFeature,
     Floats,
     Observations,
-    Source,
 )
 from flangeye.units import Length, param
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
-    archive_note,
     archive_path,
     check_usable,
     log_source,
     observation_of,
     open_archive,
     skipped_note,
+    source_of,
 )
 
 
@@ -67,9 +66,8 @@ def acquire_centres(
     recorded = open_archive(path, params)
     usable = _usable(recorded)
     check_usable(recorded.root, usable, cell)
-    fingerprint = fingerprint_of(recorded.root, digests_of(recorded.files))
     behind = flange.behind if flange else 0.0
-    source = Source(fingerprint, _notes(recorded, len(usable), params.centre_noise, behind))
+    source = source_of(recorded, _notes(recorded, len(usable), params.centre_noise, behind))
     circles = (
         (r, _circle(r.centre_in_camera, params.centre_noise, behind))
         for r in usable
@@ -93,8 +91,6 @@ def _usable(archive: Archive) -> list[Recording]:
 def _notes(archive: Archive, used: int, noise: float, behind: float) -> tuple[str, ...]:
     where = f"; they lie {behind * 1e3:g} mm behind the flange" if behind else ""
     return (
-        archive_note(archive),
-        *archive.notes,
         *skipped_note(archive, lambda r: r.centre_in_camera is not None, "ready-made centre"),
         f"{used} ready-made centres, each taken to be good to {noise * 1e3:g} mm along each axis"
         + where,

@@ -10,17 +10,17 @@ from pydantic import Field
 
 from flangeye import StageError, stage
 from flangeye.files.clouds import LengthUnit, read_cloud
-from flangeye.files.recording import Recording, check_poses, digests_of, fingerprint_of
-from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image, PointCloud, Source
-from flangeye_plugins.acquire.camera import read_image
+from flangeye.files.recording import Recording, check_poses, digests_of
+from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image, PointCloud
+from flangeye_plugins.acquire.camera import pinhole, read_image
 from flangeye_plugins.acquire.intrinsics import SeenBoardParams, lens_of
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
-    archive_note,
     archive_path,
     open_archive,
     poses_of,
     skipped_note,
+    source_of,
 )
 
 Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
@@ -52,9 +52,7 @@ class ImagesParams(OpeningParams):
         """Return the camera matrix (3, 3) [px] and distortion: as given, or the archive's own."""
         if self.focal_length is None or self.principal_point is None:
             return recording.camera
-        (fx, fy), (cx, cy) = self.focal_length, self.principal_point
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return matrix, np.array(self.distortion)
+        return pinhole(self.focal_length, self.principal_point), np.array(self.distortion)
 
 
 @stage("acquire.images")
@@ -71,14 +69,8 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
     check_poses(recorded.root, usable, whole=True)
     cameras, told = _cameras(recorded.root, usable, params)
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
-    digests = digests_of([*files, *recorded.files])
-    notes = (
-        archive_note(recorded),
-        *recorded.notes,
-        *skipped_note(recorded, lambda r: r.image is not None, "image"),
-        *told,
-    )
-    source = Source(fingerprint_of(recorded.root, digests), notes)
+    skipped = skipped_note(recorded, lambda r: r.image is not None, "image")
+    source = source_of(recorded, [*skipped, *told], digests_of([*files, *recorded.files]))
     unit = recorded.cloud_unit or params.cloud_unit
     return Captures(_captures(usable, cameras, unit), source, total=len(usable), recorded=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -89,9 +89,19 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     return replace(archive, recordings=kept, notes=(*archive.notes, note))
 
 
-def archive_note(archive: Archive) -> str:
-    """Return the note that says which archive it is."""
-    return with_urls(f"archive: {archive.layout}, {archive.root}")
+def source_of(
+    archive: Archive, told: Iterable[str], digests: dict[Path, str] | None = None
+) -> Source:
+    """Return where what is taken from an archive comes from.
+
+    Args:
+        archive: The archive; its notes come first.
+        told: What else to tell.
+        digests: Of all files that are used; of the archive's own if not given.
+    """
+    notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
+    used = digests_of(archive.files) if digests is None else digests
+    return Source(fingerprint_of(archive.root, used), notes)
 
 
 def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.recording import Recording, digests_of, fingerprint_of
+from flangeye.files.recording import Recording
 from flangeye.models.cell import Cell
 from flangeye.types import (
     CAMERA,
@@ -16,18 +16,17 @@ from flangeye.types import (
     Observation,
     Observations,
     PoseFeature,
-    Source,
     Transform,
 )
 from flangeye.units import Angle, Length, param
 from flangeye_plugins.acquire.opening import (
     OpeningParams,
-    archive_note,
     archive_path,
     check_usable,
     observation_of,
     open_archive,
     skipped_note,
+    source_of,
 )
 
 
@@ -58,12 +57,8 @@ def acquire_samples(
     if not usable:
         raise StageError(f"{recorded.root}: holds no poses of a marker ({recorded.layout})")
     check_usable(recorded.root, usable, cell, whole=True)
-    notes = (
-        archive_note(recorded),
-        *recorded.notes,
-        *skipped_note(recorded, lambda r: r.camera_T_target is not None, "marker"),
-    )
-    source = Source(fingerprint_of(recorded.root, digests_of(recorded.files)), notes)
+    skipped = skipped_note(recorded, lambda r: r.camera_T_target is not None, "marker")
+    source = source_of(recorded, skipped)
     return Observations(_observations(usable, params, cell), source, total=len(usable))
 
 
