@@ -10,7 +10,13 @@ import numpy as np
 from flangeye import types as t
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.testing.base import Conformance
-from flangeye.testing.judge import plain, require, require_close, require_refusal
+from flangeye.testing.judge import (
+    require,
+    require_close,
+    require_refusal,
+    require_repeats,
+    require_type,
+)
 from flangeye.testing.solving import CAMERA, observed, work_points
 from flangeye.types import Floats
 
@@ -31,14 +37,12 @@ class CostConformance(Conformance):
 
     def cost(self, error: t.PoseError) -> float:
         """Return the part's number."""
-        value = self.call(None, error)
-        require(isinstance(value, float), f"gave {type(value).__name__}, not a float")
-        return float(value)
+        return require_type(self.call(None, error), float)
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal errors, equal costs, to the last bit."""
         error = pose_error(np.array([1e-3, 2e-3, -1e-3]), np.array([1e-3, 0, 2e-3]))
-        require(self.cost(error) == self.cost(error), "two calls with equal input differ")
+        require_repeats(lambda: self.cost(error))
 
     def test_no_error_costs_nothing(self) -> None:
         """Zero at zero."""
@@ -78,9 +82,7 @@ class ErrorConformance(Conformance):
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal input, equal output, to the last bit."""
-        kept = observed(work_points())
-        first, again = self.measured(CAMERA, kept), self.measured(CAMERA, kept)
-        require(plain(first) == plain(again), "two calls with equal input differ")
+        require_repeats(lambda: self.measured(CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
         """What is left is the noise."""

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -14,11 +14,24 @@ from flangeye.errors import FlangeyeError
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder, adapter, clouds_of
 
+T = TypeVar("T")
+
 
 def require(holds: object, message: str) -> None:
     """Raise AssertionError with ``message`` unless ``holds``."""
     if not holds:
         raise AssertionError(message)
+
+
+def require_type(value: Any, kind: type[T]) -> T:
+    """Return a plugin's answer; raise AssertionError unless it is of a type."""
+    require(isinstance(value, kind), f"gave {type(value).__name__}, not a {kind.__name__}")
+    return cast("T", value)
+
+
+def require_repeats(call: Callable[[], Any]) -> None:
+    """Raise AssertionError unless two calls give the same, to the last bit."""
+    require(plain(call()) == plain(call()), "two calls with equal input differ")
 
 
 def require_close(got: Any, expected: Any, within: float, what: str) -> None:

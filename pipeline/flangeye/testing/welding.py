@@ -9,7 +9,13 @@ import numpy as np
 from flangeye import types as t
 from flangeye.motion.seam_following import Command, FollowingTask, Phase, ToolPose, Touch
 from flangeye.testing.base import Conformance
-from flangeye.testing.judge import plain, require, require_covariance, require_round_trip
+from flangeye.testing.judge import (
+    require,
+    require_covariance,
+    require_repeats,
+    require_round_trip,
+    require_type,
+)
 from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
 
 
@@ -34,15 +40,11 @@ class OnceConformance(Conformance):
     def answer(self) -> Any:
         """Return what the stage gives."""
         value = self.call({t.VerifiedHandEye: verified(), t.Seam: straight_seam()})
-        require(
-            isinstance(value, self.gives),
-            f"gave {type(value).__name__}, not a {self.gives.__name__}",
-        )
-        return value
+        return require_type(value, self.gives)
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal input and seed, equal output, to the last bit."""
-        require(plain(self.answer()) == plain(self.answer()), "two calls with equal input differ")
+        require_repeats(self.answer)
 
     def test_its_answer_survives_the_log(self) -> None:
         """Written to MCAP and read back, it is the same."""
