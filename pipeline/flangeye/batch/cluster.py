@@ -13,7 +13,6 @@ from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from itertools import groupby, islice
 from multiprocessing import resource_tracker
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,11 +72,7 @@ _LOCAL = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
-
-
-def _local(folder: Path) -> dict[str, Any]:
-    """Return dask's settings for workers of this machine, whose files are in a folder."""
-    return {**_LOCAL, "temporary-directory": str(folder)}
+"""Dask's settings for workers of this machine."""
 
 
 def check_installed() -> None:
@@ -106,8 +101,9 @@ def local_client(workers: int) -> Iterator[Client]:
     from distributed import Client, LocalCluster, Security
 
     keep_current_folder_out()
-
-    with scratch() as folder, dask.config.set(_local(folder)), ExitStack() as stack:
+    with ExitStack() as stack:
+        files = {"temporary-directory": str(stack.enter_context(scratch()))}
+        stack.enter_context(dask.config.set({**_LOCAL, **files}))
         with _interrupts_kept_here():
             cluster = LocalCluster(
                 n_workers=workers,

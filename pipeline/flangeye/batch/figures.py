@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -124,7 +124,7 @@ def _medians(places: Sequence[Any], values: Sequence[float]) -> list[Drawing]:
         by_place.setdefault(place, []).append(value)
     if len(by_place) < 2 or len(values) < 2 * len(by_place):
         return []
-    ordered = sorted(by_place) if _all_numbers(by_place) else list(by_place)
+    ordered = sorted(by_place) if all(isinstance(p, float) for p in by_place) else list(by_place)
     return [
         {
             "type": "scatter", "mode": "lines", "x": ordered, "showlegend": False,
@@ -142,10 +142,6 @@ def _places(values: Sequence[Any]) -> tuple[list[Any], str | None]:
     if len(found) < len(values) or len(units) != 1:
         return [str(value) for value in values], None
     return [float(number) for number, _ in found], units.pop()
-
-
-def _all_numbers(values: Iterable[Any]) -> bool:
-    return all(isinstance(value, float) for value in values)
 
 
 def _short(path: str) -> str:

@@ -10,7 +10,7 @@ from flangeye.errors import StageError
 from flangeye.log.read import Note, read_notes
 from flangeye.report.facts import Facts
 from flangeye.report.images import data_uri
-from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, plain
+from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, layout2d, plain
 
 COLOURS = (*AXES, USED, HELD_OUT)
 
@@ -64,11 +64,6 @@ def _figure(note: Note) -> Figure:
         }
         for (name, points), colour in zip(value["series"].items(), COLOURS, strict=False)
     ]  # fmt: skip
-    layout = {
-        "xaxis": {"title": {"text": plain(value["x"])}},
-        "yaxis": {"title": {"text": plain(value["y"])}, "automargin": True, "zeroline": True},
-        "legend": {"orientation": "h", "x": 0, "y": 1.08, "yanchor": "bottom"},
-        "margin": {"l": 56, "r": 8, "t": 24, "b": 44},
-        "showlegend": len(traces) > 1,
-    }
+    layout = {**layout2d(plain(value["x"]), plain(value["y"])), "showlegend": len(traces) > 1}
+    layout["yaxis"]["zeroline"] = True
     return {"data": traces, "layout": layout}

@@ -11,6 +11,7 @@ import numpy as np
 from flangeye import types as t
 from flangeye.log.foxglove import circle_lines
 from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.statistics import rms
 from flangeye.report.facts import Facts
 from flangeye.report.plot import (
     CIRCLE,
@@ -63,7 +64,7 @@ class FittedFeature:
     @property
     def plane_rms(self) -> float:
         """Root mean square distance of the points from the fitted plane [m]."""
-        return float(np.sqrt(np.mean(self.xyz[:, 2] ** 2)))
+        return rms(self.xyz[:, 2])
 
 
 def cloud_panels(facts: Facts) -> list[Panel]:

@@ -96,7 +96,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
         observations=r.observations_result(pairs, log.rejections),
         workspace=r.workspace_result(calibration.camera, box) if calibration and box else None,
         holdout=r.holdout_result(verifications),
-        verifications={step: _verification(found) for step, found in verifications.items()},
+        verifications=r.verifications_result(verifications),
         truth=_truth(source, calibration, box),
         notes=list(calibration.notes) if calibration else [],
         timing=_timing(log),
@@ -115,15 +115,6 @@ def _box(header: dict[str, Any]) -> t.Box | None:
         return None
     centre, size = ([parse_quantity(x, "length") for x in section[k]] for k in ("centre", "size"))
     return t.Box(np.array(centre), np.array(size))
-
-
-def _verification(found: t.Verification) -> r.VerificationResult:
-    return r.VerificationResult(
-        passed=found.passed,
-        reason=found.reason,
-        figures=dict(found.figures),
-        errors=dict(found.errors),
-    )
 
 
 def _truth(

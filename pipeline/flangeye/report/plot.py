@@ -138,3 +138,21 @@ def round_up(value: float) -> float:
     """Return the next of 1, 2, 5, 10, … that is not below ``value`` > 0."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value * 0.999999))
+
+
+def curve(x: Floats, y: Floats, name: str, colour: str, **line: Any) -> Trace:
+    """Return a line through points (N,), (N,) of the plane."""
+    drawn = {"color": colour, "width": 1.5, **line}
+    trace = {"type": "scatter", "mode": "lines", "name": name, "line": drawn}
+    return {**trace, "x": packed(x), "y": packed(y)}
+
+
+def layout2d(x: str, y: str) -> dict[str, Any]:
+    """Return the layout of a figure in the plane by the titles of its axes."""
+    return {
+        "xaxis": {"title": {"text": x}},
+        "yaxis": {"title": {"text": y}, "automargin": True},
+        "legend": {"orientation": "h", "x": 0, "y": 1.08, "yanchor": "bottom"},
+        "margin": {"l": 56, "r": 8, "t": 24, "b": 44},
+        "showlegend": True,
+    }

@@ -16,9 +16,9 @@ from flangeye.report.plot import (
     TRUTH,
     USED,
     Trace,
+    curve,
     figure3d,
     lines,
-    packed,
     points,
     round_up,
     scatter3d,
@@ -65,11 +65,9 @@ def seam_view(facts: Facts) -> SeamView | None:
         f"the true seam passes within {millimetres(widest)} mm of every point of the plan: the "
         "registration and the hand-eye pose together."
     )
-    return SeamView(_space(seam, truth), _profile(seam, truth), summary, _facts(seam, facts))
-
-
-def _space(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
-    return figure3d([*_cloud(seam), *_drawn(seam), *_true_seams(truth)], eye=(0.9, -1.0, 1.1))
+    true_seams = [lines(truth, TRUTH, 3, name="true seam")] if truth else []
+    space = figure3d([*_cloud(seam), *_drawn(seam), *true_seams], eye=(0.9, -1.0, 1.1))
+    return SeamView(space, _profile(seam, truth), summary, _facts(seam, facts))
 
 
 def _cloud(seam: t.Seam) -> list[Trace]:
@@ -101,18 +99,14 @@ def _widened(seam: t.Seam, scale: float) -> list[Floats]:
     return list(middles + scale * (rings - middles))
 
 
-def _true_seams(truth: list[Floats]) -> list[Trace]:
-    return [lines(truth, TRUTH, 3, name="true seam")] if truth else []
-
-
 def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
     """Return the tube's radius along the seam, and the true error where it is known."""
-    along = packed(seam.arc_length * 1e3)
-    traces = [_curve(along, tube_radii(seam), USED, "tube, 95 %")]
+    along = seam.arc_length * 1e3
+    traces = [curve(along, tube_radii(seam) * 1e3, USED, "tube, 95 %", width=2)]
     if truth:
         errors = [distances_to_line(seam.points_in_base, line) for line in truth]
         nearest = min(errors, key=lambda each: float(each.max()))
-        traces.append(_curve(along, nearest, TRUTH, "true error"))
+        traces.append(curve(along, nearest * 1e3, TRUTH, "true error", width=2))
     layout = {
         "xaxis": {"title": {"text": "along the seam [mm]"}},
         "yaxis": {"title": {"text": "across it [mm]"}, "rangemode": "tozero"},
@@ -121,13 +115,6 @@ def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
         "showlegend": True,
     }
     return {"data": traces, "layout": layout}
-
-
-def _curve(along: Any, metres: Floats, colour: str, name: str) -> Trace:
-    return {
-        "type": "scatter", "mode": "lines", "name": name, "x": along, "y": packed(metres * 1e3),
-        "line": {"color": colour, "width": 2},
-    }  # fmt: skip
 
 
 def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:

@@ -27,8 +27,6 @@ from flangeye.report.plot import (
 from flangeye.report.units import millimetres
 from flangeye.types import Floats
 
-FLANGE_POINTS = 3_000
-SCAN_POINTS = 3_000
 GRID = 5
 """Points along each edge of the workspace box."""
 

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.report.facts import Facts
-from flangeye.report.plot import CIRCLE, HELD_OUT, TRUTH, UNUSED, USED, Figure, Trace, packed
+from flangeye.report.plot import (
+    CIRCLE,
+    HELD_OUT,
+    TRUTH,
+    UNUSED,
+    USED,
+    Figure,
+    curve,
+    layout2d,
+)
 from flangeye.report.units import millimetres
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 
@@ -76,10 +85,10 @@ class _View:
 
     def off_plan(self, points: Floats) -> tuple[Floats, Floats]:
         """Return where along the plan points are, and how far to its left [m]."""
-        return off_line(self.planned, self.flat(points))
+        return offcurve(self.planned, self.flat(points))
 
 
-def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
+def offcurve(line: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return where along a line (M, 2) points (N, 2) are, and how far to its left [m].
 
     The line goes on straight beyond its ends.
@@ -118,12 +127,6 @@ def _summary(facts: Facts, weld: WeldReport) -> str:
     return text if weld.completed else f"{text} It was stopped: {weld.reason}."
 
 
-def _line(x: Floats, y: Floats, name: str, colour: str, **rest: Any) -> Trace:
-    line = {"color": colour, "width": 1.5, **rest}
-    trace = {"type": "scatter", "mode": "lines", "name": name, "line": line}
-    return {**trace, "x": packed(x), "y": packed(y)}
-
-
 def _paths(view: _View) -> Figure:
     weld = view.weld
     named: tuple[tuple[str, Floats, str, dict[str, Any]], ...] = (
@@ -136,8 +139,8 @@ def _paths(view: _View) -> Figure:
     traces = []
     for name, points, colour, rest in named:
         at = view.flat(points) * 1e3
-        traces.append(_line(at[:, 0], at[:, 1], name, colour, **rest))
-    layout = _layout("along the seam [mm]", "across [mm]")
+        traces.append(curve(at[:, 0], at[:, 1], name, colour, **rest))
+    layout = layout2d("along the seam [mm]", "across [mm]")
     layout["yaxis"]["scaleanchor"] = "x"
     return {"data": traces, "layout": layout}
 
@@ -152,8 +155,8 @@ def _offsets(view: _View) -> Figure:
         ("robot", weld.robot, UNUSED),
     ):
         along, across = view.off_plan(points) if len(points) else (np.zeros(0), np.zeros(0))
-        traces.append(_line(along * 1e3, across * 1e3, name, colour))
-    layout = _layout("along the plan [mm]", "left of the plan [mm]")
+        traces.append(curve(along * 1e3, across * 1e3, name, colour))
+    layout = layout2d("along the plan [mm]", "left of the plan [mm]")
     return {"data": traces, "layout": layout}
 
 
@@ -168,30 +171,30 @@ def _deviation(view: _View, truth: Floats | None) -> Figure:
     ):
         if line is not None and len(line) > 1:
             along, across, _ = _beside(view, line, torch)
-            traces.append(_line(along * 1e3, across * 1e3, name, colour))
+            traces.append(curve(along * 1e3, across * 1e3, name, colour))
     if len(weld.refined) > 1 and len(weld.band) == len(weld.torch):
         along, _, beside = _beside(view, weld.refined, weld.torch)
         for sign, name in ((1.0, "95 % band"), (-1.0, "95 % band, right")):
             edge = sign * np.minimum(weld.band[beside], LARGEST_BAND) * 1e3
-            traces.append(_line(along * 1e3, edge, name, UNUSED, dash="dot"))
-    return {"data": traces, "layout": _layout("along the seam [mm]", "torch to the left [mm]")}
+            traces.append(curve(along * 1e3, edge, name, UNUSED, dash="dot"))
+    return {"data": traces, "layout": layout2d("along the seam [mm]", "torch to the left [mm]")}
 
 
 def _beside(view: _View, line: Floats, torch: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return where a torch (N, 3) is along a seam and to its left [m], and the (N,) beside it."""
     seam = view.flat(line)
     length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
-    along, across = off_line(seam, view.flat(torch))
+    along, across = offcurve(seam, view.flat(torch))
     beside = (along >= 0.0) & (along <= length)
     return along[beside], across[beside], beside
 
 
 def _contact(weld: WeldReport) -> Figure:
     traces = [
-        _line(weld.time, weld.deflection * 1e3, "deflection", USED),
-        _line(weld.time, weld.wanted * 1e3, "wanted", CIRCLE, dash="dot"),
+        curve(weld.time, weld.deflection * 1e3, "deflection", USED),
+        curve(weld.time, weld.wanted * 1e3, "wanted", CIRCLE, dash="dot"),
     ]
-    layout = _layout("time [s]", "deflection [mm]")
+    layout = layout2d("time [s]", "deflection [mm]")
     layout["shapes"] = [_band(*span) for span in _spans(weld) if span[2] in BANDS]
     layout["annotations"] = [_label(*span) for span in _spans(weld) if span[2] in BANDS]
     return {"data": traces, "layout": layout}
@@ -199,10 +202,10 @@ def _contact(weld: WeldReport) -> Figure:
 
 def _speeds(weld: WeldReport) -> Figure:
     traces = [
-        _line(weld.time, weld.speed * 1e3, "robot [mm/s]", USED),
-        _line(weld.time, np.degrees(weld.turn), "turning [deg/s]", CIRCLE),
+        curve(weld.time, weld.speed * 1e3, "robot [mm/s]", USED),
+        curve(weld.time, np.degrees(weld.turn), "turning [deg/s]", CIRCLE),
     ]
-    return {"data": traces, "layout": _layout("time [s]", "mm/s, deg/s")}
+    return {"data": traces, "layout": layout2d("time [s]", "mm/s, deg/s")}
 
 
 def _spans(weld: WeldReport) -> list[tuple[float, float, str]]:
@@ -226,16 +229,6 @@ def _band(start: float, end: float, phase: str) -> dict[str, Any]:
 def _label(start: float, end: float, phase: str) -> dict[str, Any]:
     return {"x": (start + end) / 2, "y": 1, "yref": "paper", "yanchor": "bottom", "text": phase,
             "showarrow": False}  # fmt: skip
-
-
-def _layout(x: str, y: str) -> dict[str, Any]:
-    return {
-        "xaxis": {"title": {"text": x}},
-        "yaxis": {"title": {"text": y}, "automargin": True},
-        "legend": {"orientation": "h", "x": 0, "y": 1.08, "yanchor": "bottom"},
-        "margin": {"l": 56, "r": 8, "t": 24, "b": 44},
-        "showlegend": True,
-    }
 
 
 def _loop(weld: WeldReport) -> list[tuple[str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
@@ -15,14 +16,9 @@ def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def library_versions() -> dict[str, str]:
-    """Return the versions of everything that computes."""
-    return dict(_library_versions())
-
-
 @cache
-def _library_versions() -> tuple[tuple[str, str], ...]:
-    """Read them once: each is a file to find and to parse, 5 ms together."""
+def library_versions() -> Mapping[str, str]:
+    """Return the versions of everything that computes, read once: 5 ms to find and to parse."""
     names = ("numpy", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "pydantic", "mcap")
     found = {"flangeye": VERSION, "python": platform.python_version()}
     for name in names:
@@ -30,4 +26,4 @@ def _library_versions() -> tuple[tuple[str, str], ...]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return tuple(found.items())
+    return found

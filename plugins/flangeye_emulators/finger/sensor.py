@@ -173,10 +173,6 @@ class SimulatedFinger(Device):
         return self._camera.image(*self._compliance.tag(displacement))
 
 
-CLOCK = ("rate", "latency", "jitter", "dropped", "hidden")
-"""Parameters of the sensor that its world's clock takes over."""
-
-
 def _truth(params: SimulatedFingerParams) -> WorldParams:
     """Return the world with what the sensor's own parameters say of clock and workpiece."""
     own = {

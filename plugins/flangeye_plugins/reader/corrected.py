@@ -34,8 +34,6 @@ from flangeye.units import Duration, Length, param
 
 ROTATIONS = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
 
-Selected = tuple[Sequence[Recording], Floats, Mask]
-
 
 class CorrectedParams(Params):
     """What was wrong; one level undoes it in the order of this list."""
@@ -143,11 +141,7 @@ def _shift(
         raise StageError(f"{archive.root}: shift_from: there is no pose '{params.shift_from}'")
     start = names.index(params.shift_from) if params.shift_from else 0
     source, kept = sources(len(names), params.shift, start)
-
-    def at_source(rows: Floats) -> Floats:
-        return rows[source]
-
-    return _replaced(recordings, at_source, kept, params.arms)
+    return _replaced(recordings, lambda rows: rows[source], kept, params.arms)
 
 
 def _delay(

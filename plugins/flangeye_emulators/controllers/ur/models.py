@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from flangeye.models.robots import RobotModel
 
-MAKER = "Universal Robots"
-
 
 @dataclass(frozen=True)
 class ControlBox:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,44 +16,14 @@ if TYPE_CHECKING:
     from flangeye_emulators.controllers.ur.script import ControlScript
 
 
-def step_time(script: ControlScript) -> None:
-    """26, getStepTime."""
-    script.give_numbers(np.array([script.box.box.cycle]))
-
-
-def joint_history(script: ControlScript) -> None:
-    """27, getActualJointPositionsHistory: joint angles some cycles ago."""
+def joint_history(script: ControlScript) -> Floats:
+    """Return joint angles some cycles ago."""
     history = script.arm.history
     steps = min(max(script.integer(1), 0), len(history) - 1)
-    script.give_numbers(history[-1 - steps][0])
+    return history[-1 - steps][0]
 
 
-def inverse_kinematics_near(script: ControlScript) -> None:
-    """30, getInverseKinematics with joint angles to be near to."""
-    script.give_numbers(joints_at(script.arm, script.numbers(0), script.numbers(6)))
-
-
-def inverse_kinematics(script: ControlScript) -> None:
-    """46, getInverseKinematics near the present joint angles."""
-    script.give_numbers(joints_at(script.arm, script.numbers(0)))
-
-
-def has_inverse_kinematics_near(script: ControlScript) -> None:
-    """61, getInverseKinematicsHasSolution with joint angles to be near to."""
-    script.give_integer(_reaches(script, script.numbers(6)))
-
-
-def has_inverse_kinematics(script: ControlScript) -> None:
-    """60, getInverseKinematicsHasSolution."""
-    script.give_integer(_reaches(script, None))
-
-
-def pose_is_safe(script: ControlScript) -> None:
-    """36, isPoseWithinSafetyLimits: here, whether the arm reaches it."""
-    script.give_integer(_reaches(script, None))
-
-
-def _reaches(script: ControlScript, near: Floats | None) -> bool:
+def _reaches(script: ControlScript, near: Floats | None = None) -> bool:
     try:
         joints_at(script.arm, script.numbers(0), near)
     except ProgramError:
@@ -60,66 +31,50 @@ def _reaches(script: ControlScript, near: Floats | None) -> bool:
     return True
 
 
-def joints_are_safe(script: ControlScript) -> None:
-    """37, isJointsWithinSafetyLimits."""
+def _inside(script: ControlScript) -> bool:
+    """Return whether joint angles are within the limits."""
     joints, chain = script.numbers(0), script.arm.chain
-    script.give_integer(bool(((joints >= chain.lower) & (joints <= chain.upper)).all()))
+    return bool(((joints >= chain.lower) & (joints <= chain.upper)).all())
 
 
-def joint_torques(script: ControlScript) -> None:
-    """38, getJointTorques: those that hold against what is touched; the arm has no weight."""
-    script.give_numbers(script.arm.stance.jacobian.T @ script.arm.wrench)
+NUMBERS: Mapping[int, Callable[[ControlScript], Floats]] = {
+    26: lambda s: np.array([s.box.box.cycle]),  # getStepTime
+    27: joint_history,  # getActualJointPositionsHistory
+    # getInverseKinematics with joint angles to be near to; without, near the present ones
+    30: lambda s: joints_at(s.arm, s.numbers(0), s.numbers(6)),
+    46: lambda s: joints_at(s.arm, s.numbers(0)),
+    # getJointTorques: those that hold against what is touched; the arm has no weight
+    38: lambda s: s.arm.stance.jacobian.T @ s.arm.wrench,
+    39: lambda s: pose_vector(pose_matrix(s.numbers(0)) @ pose_matrix(s.numbers(6))),  # poseTrans
+    40: lambda s: pose_vector(s.arm.chain.flange_T_tcp),  # getTCPOffset
+    43: lambda s: s.box.tcp_pose(),  # getForwardKinematics of the present joint angles and tool
+    # getForwardKinematics of joint angles and a tool, registers 6 to 11: a client that gives no
+    # tool does not write them, so they hold what was there before.
+    44: lambda s: pose_vector(s.arm.chain.flange(s.numbers(0)) @ pose_matrix(s.numbers(6))),
+    # getActualToolFlangePose
+    58: lambda s: pose_vector(s.arm.chain.flange(s.arm.stance.joints)),
+}
+"""Questions that are answered with numbers."""
+
+INTEGERS: Mapping[int, Callable[[ControlScript], int]] = {
+    36: _reaches,  # isPoseWithinSafetyLimits: here, whether the arm reaches it
+    37: _inside,  # isJointsWithinSafetyLimits
+    47: lambda s: s.arm.standing,  # isSteady
+    60: _reaches,  # getInverseKinematicsHasSolution; with joint angles to be near to:
+    61: lambda s: _reaches(s, s.numbers(6)),
+}
+"""Questions that are answered with an integer."""
 
 
-def transformed_pose(script: ControlScript) -> None:
-    """39, poseTrans."""
-    product = pose_matrix(script.numbers(0)) @ pose_matrix(script.numbers(6))
-    script.give_numbers(pose_vector(product))
+def _numbers(ask: Callable[[ControlScript], Floats]) -> Callable[[ControlScript], None]:
+    return lambda script: script.give_numbers(ask(script))
 
 
-def tool_offset(script: ControlScript) -> None:
-    """40, getTCPOffset."""
-    script.give_numbers(pose_vector(script.arm.chain.flange_T_tcp))
-
-
-def forward_kinematics(script: ControlScript) -> None:
-    """43, getForwardKinematics of the present joint angles and tool."""
-    script.give_numbers(script.box.tcp_pose())
-
-
-def forward_kinematics_of(script: ControlScript) -> None:
-    """44, getForwardKinematics of joint angles and a tool, registers 6 to 11.
-
-    A client that gives no tool does not write them, so they hold what was there before.
-    """
-    flange = script.arm.chain.flange(script.numbers(0))
-    script.give_numbers(pose_vector(flange @ pose_matrix(script.numbers(6))))
-
-
-def is_steady(script: ControlScript) -> None:
-    """47, isSteady."""
-    script.give_integer(script.arm.standing)
-
-
-def flange_pose(script: ControlScript) -> None:
-    """58, getActualToolFlangePose."""
-    script.give_numbers(pose_vector(script.arm.chain.flange(script.arm.stance.joints)))
+def _integer(ask: Callable[[ControlScript], int]) -> Callable[[ControlScript], None]:
+    return lambda script: script.give_integer(ask(script))
 
 
 COMMANDS = {
-    26: step_time,
-    27: joint_history,
-    30: inverse_kinematics_near,
-    36: pose_is_safe,
-    37: joints_are_safe,
-    38: joint_torques,
-    39: transformed_pose,
-    40: tool_offset,
-    43: forward_kinematics,
-    44: forward_kinematics_of,
-    46: inverse_kinematics,
-    47: is_steady,
-    58: flange_pose,
-    60: has_inverse_kinematics,
-    61: has_inverse_kinematics_near,
+    **{number: _numbers(ask) for number, ask in NUMBERS.items()},
+    **{number: _integer(ask) for number, ask in INTEGERS.items()},
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,18 +25,8 @@ JOG_STOP = 1.2
 """Deceleration at the end of jogging [m/s^2]."""
 
 
-def speed_joints(script: ControlScript) -> None:
-    """9, speedJ."""
-    _order_speed(script, in_space=False)
-
-
-def speed_in_space(script: ControlScript) -> None:
-    """10, speedL."""
-    _order_speed(script, in_space=True)
-
-
-def _order_speed(script: ControlScript, in_space: bool) -> None:
-    """Hand the order to the speed thread.
+def order_speed(script: ControlScript, in_space: bool) -> None:
+    """9 and 10, speedJ and speedL: hand the order to the speed thread.
 
     The time in register 7 has no effect: the script's thread says the same again when it is over,
     so an arm goes on at its last velocity until it is stopped. That is what ur_rtde 1.6 does.
@@ -131,9 +123,9 @@ def stop_jog(script: ControlScript) -> Thread:
     yield from script.stop_in_space(JOG_STOP)
 
 
-COMMANDS = {
-    9: speed_joints,
-    10: speed_in_space,
+COMMANDS: dict[int, Callable[[ControlScript], Thread | None]] = {
+    9: partial(order_speed, in_space=False),
+    10: partial(order_speed, in_space=True),
     11: servo_joints,
     15: stop_speed,
     16: stop_servo,
