@@ -13,7 +13,7 @@ from flangeye import types as t
 from flangeye.devices import Scan, SensorFrame, WeldProfile
 from flangeye.files.recording import Recording
 from flangeye.motion.seam_following import Command
-from flangeye.testing import KITS
+from flangeye.testing import KITS, devices
 from flangeye.types import CAMERA, FLANGE, PointCloud
 from flangeye_emulators.robot.simulated import SimulatedRobot
 from flangeye_plugins.cost.costs import cost_translation
@@ -762,8 +762,14 @@ def kit_of(kind, plugin, attributes):
     ids=lambda v: v if isinstance(v, str) and v.isidentifier() else "",
 )
 def test_a_check_finds_the_plugin_that_fails_it(
-    kind: str, check: str, plugin: Any, message: str, attributes: dict[str, Any]
+    kind: str,
+    check: str,
+    plugin: Any,
+    message: str,
+    attributes: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(devices, "PATIENCE", 0.0)  # what gives nothing is not waited for
     with pytest.raises(AssertionError, match=message) as error:
         getattr(kit_of(kind, plugin, attributes), check)()
     assert "\n" not in str(error.value)
