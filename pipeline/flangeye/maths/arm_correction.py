@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import displacement
-from flangeye.types import FLANGE, ArmCorrection, Floats, Observation
+from flangeye.types import FLANGE, ArmCorrection, Floats, Observation, VerificationView
 
 REACHED = 1e-9
 """Joint angles belong to a pose when they reach it this closely [rad, m]."""
@@ -72,6 +72,14 @@ def corrected_observation(
     pose = corrected_flange(reported.matrix, observation.joints, correction, arm)
     moved = {reported.child: replace(reported, matrix=pose)}
     return replace(observation, poses={**observation.poses, **moved})
+
+
+def corrected_view(
+    view: VerificationView, correction: ArmCorrection | None, arm: Arm | None
+) -> VerificationView:
+    """Return a view with the flange where the corrected arm has it."""
+    pose = corrected_flange(view.base_T_flange.matrix, None, correction, arm)
+    return replace(view, base_T_flange=replace(view.base_T_flange, matrix=pose))
 
 
 def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm | None) -> Floats:

@@ -102,11 +102,11 @@ def _widened(seam: t.Seam, scale: float) -> list[Floats]:
 def _profile(seam: t.Seam, truth: list[Floats]) -> dict[str, Any]:
     """Return the tube's radius along the seam, and the true error where it is known."""
     along = seam.arc_length * 1e3
-    traces = [curve(along, tube_radii(seam) * 1e3, USED, "tube, 95 %", width=2)]
+    traces = [curve(along, tube_radii(seam) * 1e3, "tube, 95 %", USED, width=2)]
     if truth:
         errors = [distances_to_line(seam.points_in_base, line) for line in truth]
         nearest = min(errors, key=lambda each: float(each.max()))
-        traces.append(curve(along, nearest * 1e3, TRUTH, "true error", width=2))
+        traces.append(curve(along, nearest * 1e3, "true error", TRUTH, width=2))
     layout = {
         "xaxis": {"title": {"text": "along the seam [mm]"}},
         "yaxis": {"title": {"text": "across it [mm]"}, "rangemode": "tozero"},

@@ -85,10 +85,10 @@ class _View:
 
     def off_plan(self, points: Floats) -> tuple[Floats, Floats]:
         """Return where along the plan points are, and how far to its left [m]."""
-        return offcurve(self.planned, self.flat(points))
+        return off_line(self.planned, self.flat(points))
 
 
-def offcurve(line: Floats, points: Floats) -> tuple[Floats, Floats]:
+def off_line(line: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return where along a line (M, 2) points (N, 2) are, and how far to its left [m].
 
     The line goes on straight beyond its ends.
@@ -184,7 +184,7 @@ def _beside(view: _View, line: Floats, torch: Floats) -> tuple[Floats, Floats, N
     """Return where a torch (N, 3) is along a seam and to its left [m], and the (N,) beside it."""
     seam = view.flat(line)
     length = float(np.linalg.norm(np.diff(seam, axis=0), axis=1).sum())
-    along, across = offcurve(seam, view.flat(torch))
+    along, across = off_line(seam, view.flat(torch))
     beside = (along >= 0.0) & (along <= length)
     return along[beside], across[beside], beside
 

@@ -77,23 +77,20 @@ class ErrorConformance(Conformance):
         pose = t.Transform(t.BASE, t.CAMERA, candidate)
         return self.call({}, pose, list(kept))
 
-    def _off(self, value: t.PoseError) -> Floats:
-        return np.asarray(value.motion[:3, :3] @ value.at + value.motion[:3, 3] - value.at)
-
     def test_it_gives_the_same_twice(self) -> None:
         """Equal input, equal output, to the last bit."""
         require_repeats(lambda: self.measured(CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
         """What is left is the noise."""
-        off = np.linalg.norm(self._off(self.measured(CAMERA, observed(work_points()))))
+        off = np.linalg.norm(self.measured(CAMERA, observed(work_points())).displacement())
         require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
 
     def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
         """3 mm, at the work, in metres."""
         candidate = CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
-        off = np.linalg.norm(self._off(self.measured(candidate, observed(work_points()))))
+        off = np.linalg.norm(self.measured(candidate, observed(work_points())).displacement())
         require(abs(off - 3e-3) < 0.1e-3, f"3 mm are said to be {1e3 * off:.3f} mm")
 
     def test_too_little_is_refused(self) -> None:
@@ -104,6 +101,6 @@ class ErrorConformance(Conformance):
         """The motion takes what was measured onto what the candidate predicts."""
         candidate = CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
-        off = self._off(self.measured(candidate, observed(work_points())))
+        off = self.measured(candidate, observed(work_points())).displacement()
         expected = -CAMERA[:3, :3].T @ np.array([1e-3, -2e-3, 2e-3])
         require_close(off, expected, 0.1e-3, "the error of a candidate, in camera [m]")

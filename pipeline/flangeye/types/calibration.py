@@ -232,6 +232,11 @@ class PoseError:
     def __post_init__(self) -> None:
         freeze(self, motion=(4, 4), at=(3,), base_R_camera=(3, 3))
 
+    def displacement(self, at: Floats | None = None) -> Floats:
+        """Return the (3,) way that it moves a place, or else the work, in ``camera`` [m]."""
+        at = self.at if at is None else at
+        return np.asarray(self.motion[:3, :3] @ at + self.motion[:3, 3] - at)
+
 
 @dataclass(frozen=True, eq=False)
 class Verification:

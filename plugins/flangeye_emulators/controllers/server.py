@@ -122,8 +122,8 @@ class Server:
         self._actions: dict[str, control.Action] = {
             "truth": self._tell_truth,
             "state": self._tell_state,
-            "log": self._tell_log,
-            "figures": self._tell_figures,
+            "log": lambda _: {"lines": list(self._box.log)},
+            "figures": lambda _: {**self._clock.figures(), "cpu": time.process_time()},
             "fault": self._cause,
             "clear": self._clear,
             "reset": self._reset,
@@ -179,8 +179,7 @@ class Server:
 
     # The control channel
 
-    def _tell_truth(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        del request
+    def _tell_truth(self, _: Mapping[str, Any]) -> Mapping[str, Any]:
         arm = self._box.arm
         return {
             "base_T_flange": arm.true_flange().tolist(),
@@ -189,8 +188,7 @@ class Server:
             "time": self._box.time,
         }
 
-    def _tell_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        del request
+    def _tell_state(self, _: Mapping[str, Any]) -> Mapping[str, Any]:
         box = self._box
         return {
             "time": box.time,
@@ -203,14 +201,6 @@ class Server:
             "connections": len(self._network.connections),
         }
 
-    def _tell_log(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        del request
-        return {"lines": list(self._box.log)}
-
-    def _tell_figures(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        del request
-        return {**self._clock.figures(), "cpu": time.process_time()}
-
     def _add_fault(self, text: str) -> None:
         fault = parse_fault(text, self._fault_injector.kinds)
         self._schedule.add(fault, self._box.time)
@@ -219,8 +209,7 @@ class Server:
         self._add_fault(str(request["fault"]))
         self._schedule.step(self._box.time, not self._box.arm.standing)
 
-    def _clear(self, request: Mapping[str, Any]) -> None:
-        del request
+    def _clear(self, _: Mapping[str, Any]) -> None:
         self._schedule.clear()
         self._fault_injector.clear()
 

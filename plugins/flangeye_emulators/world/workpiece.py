@@ -149,9 +149,9 @@ def write_files(folder: Path) -> None:
         (folder / f"{plate.name}.yaml").write_text(_description(plate), encoding="utf-8")
 
 
-def write_stl(path: Path, mesh: Mesh, per_metre: float = 1000.0) -> None:
-    """Write triangles as binary STL, in a unit of which ``per_metre`` are a metre."""
-    corners = mesh.vertices[mesh.triangles] * per_metre
+def write_stl(path: Path, mesh: Mesh) -> None:
+    """Write triangles as binary STL, in millimetres."""
+    corners = mesh.vertices[mesh.triangles] * 1000.0
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -23,7 +23,11 @@ def identity(session: RecordedSession) -> Findings:
     for whose, poses in _reported(session):
         robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
         if robot.any():
-            yield _left_out(session, robot, "identity matrices", _robots(session, robot, whose))
+            what = (
+                f"{robot.sum()} of {len(session)} {whose} poses are the identity: the flange "
+                "cannot be in the base; the driver had no pose to give"
+            )
+            yield _left_out(session, robot, "identity matrices", what)
     marker = _is_identity(session)
     if marker.any():
         what = f"{marker.sum()} of {len(session)} markers are at the camera itself, not turned"
@@ -46,13 +50,6 @@ def _is_identity(session: RecordedSession) -> Mask:
     return np.asarray(at_camera & ~(turned > SAME))
 
 
-def _robots(session: RecordedSession, wrong: Mask, whose: str) -> str:
-    return (
-        f"{wrong.sum()} of {len(session)} {whose} poses are the identity: the flange cannot be in "
-        "the base; the driver had no pose to give"
-    )
-
-
 @part("check.repeated")
 def repeated(session: RecordedSession) -> Findings:
     """A pose or a detection was repeated although the arm had moved."""
@@ -69,7 +66,8 @@ def _repeats(
     apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2, initial=0.0)
     moved = np.linalg.norm(others[:, None] - others[None], axis=2) > MOVED
     wrong = np.tril((apart < SAME) & moved, k=-1).any(axis=1)
-    if wrong.any() and not _all_identity(session, wrong):
+    made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
+    if wrong.any() and not made_up:
         told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
         yield _left_out(
             session,
@@ -77,10 +75,6 @@ def _repeats(
             f"repeated {what}",
             f"{told}digit, although the arm had moved: it is stale",
         )
-
-
-def _all_identity(session: RecordedSession, wrong: Mask) -> bool:
-    return any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
 
 
 def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:

@@ -64,5 +64,4 @@ def cost_work_radius(error: PoseError, params: WorkRadiusParams) -> float:
 
 def displacement(error: PoseError, place: Place) -> Floats:
     """Return the (3,) translation of the error at a place, in ``camera`` [m]."""
-    at = error.at if place == "work" else np.zeros(3)
-    return np.asarray(error.motion[:3, :3] @ at + error.motion[:3, 3] - at)
+    return error.displacement(None if place == "work" else np.zeros(3))

@@ -23,16 +23,11 @@ ROBOT, MARKER = "effector_wrt_world", "object_wrt_sensor"
 def moveit(path: Path) -> Archive:
     """Read the samples that MoveIt Calibration saved."""
     for file, document in documents_at(path):
-        if _is_samples(document.data):
-            recordings = [_recording(file, i, sample) for i, sample in enumerate(document.data)]
+        data = document.data
+        if isinstance(data, list) and data and isinstance(data[0], Mapping) and ROBOT in data[0]:
+            recordings = [_recording(file, i, sample) for i, sample in enumerate(data)]
             return Archive("MoveIt Calibration", file.parent, recordings, [file])
     raise NotThisLayout(f"{path}: holds no samples of MoveIt Calibration ({ROBOT}, {MARKER})")
-
-
-def _is_samples(data: Any) -> bool:
-    return bool(
-        isinstance(data, list) and data and isinstance(data[0], Mapping) and ROBOT in data[0]
-    )
 
 
 def _recording(file: Path, index: int, sample: Any) -> Recording:

@@ -301,24 +301,23 @@ def _poses(pose: Floats, second: Floats | None) -> dict[str, Floats]:
 def _target(folder: Path, text: Table, params: TableParams) -> Readings:
     given = params.target
     assert given is not None  # noqa: S101  for type checkers: there is one, or nobody asks
-    found = readings_of(_own(folder, text, given), given)
-    if given.pose == "camera_T_target" or given.rotation == POINT:
-        return found
-    return found._replace(values=[None if v is None else inverted(v) for v in found.values])
+    turned = given.pose == "target_T_camera" and given.rotation != POINT
+    return _other(folder, text, given, turned)
 
 
 def _second(folder: Path, text: Table, params: TableParams) -> Readings | None:
     if params.second is None:
         return None
-    found = readings_of(_own(folder, text, params.second), params.second)
-    if params.second.pose == "base2_T_flange2":
+    return _other(folder, text, params.second, params.second.pose == "flange2_T_base2")
+
+
+def _other(folder: Path, text: Table, given: OtherParams, turned: bool) -> Readings:
+    """Return what stands in the same table or in one of its own, inverse poses turned round."""
+    own = text if given.file is None else table_with_rows(folder, given.file)
+    found = readings_of(own, given)
+    if not turned:
         return found
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
-
-
-def _own(folder: Path, text: Table, given: OtherParams) -> Table:
-    """Return the table that has something: its own, or the same."""
-    return text if given.file is None else table_with_rows(folder, given.file)
 
 
 # --- the scans of rows

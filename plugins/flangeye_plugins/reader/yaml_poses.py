@@ -67,15 +67,12 @@ def pose_of_matrix(where: str, data: Any) -> Floats:
     Raises:
         StageError: It is not a rigid transform.
     """
-    flat = [x for row in data for x in row] if _is_nested(data) else data
+    nested = isinstance(data, list) and all(isinstance(row, list) for row in data)
+    flat = [x for row in data for x in row] if nested else data
     values = numbers(where, flat)
     if values.size != 16:
         raise StageError(f"{where}: has {values.size} numbers, a matrix has 16")
     return pose_from_matrix(where, values.reshape(4, 4))
-
-
-def _is_nested(data: Any) -> bool:
-    return isinstance(data, list) and all(isinstance(row, list) for row in data)
 
 
 def numbers(where: str, data: Any) -> Floats:

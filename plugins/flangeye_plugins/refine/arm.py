@@ -196,12 +196,8 @@ def _corrected(calibration: HandEye, found: _Found, arm: Arm) -> CorrectedArm:
         joints=found.session.joints[0],
     )
     transform = replace(calibration.base_T_camera.transform, matrix=fit.base_T_camera)
-    camera = TransformEstimate(transform, _symmetric(covariance), fit.about)
+    camera = TransformEstimate(transform, 0.5 * (covariance + covariance.T), fit.about)
     return CorrectedArm(camera, correction)
-
-
-def _symmetric(covariance: Floats) -> Floats:
-    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _identifiability(known: Mask, combined: int, found: _Found) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, StageError, stage
-from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.geometry import rigid, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
@@ -70,7 +70,8 @@ def refine_compensate(
             "step keep one, or leave this step out"
         )
     calibration = calibration.as_reported()
-    expected = _expected(views, calibration, robot)
+    arm = Arm(robot) if robot else None
+    expected = Views(corrected_view(view, calibration.correction, arm) for view in views)
 
     def measure(base_T_camera: Transform) -> PoseError | None:
         found: PoseError | None = params.error(base_T_camera, (), expected, flange)
@@ -101,13 +102,8 @@ def compensated(base_T_camera: Transform, error: PoseError, rotation: bool = Tru
         error: What takes measured onto predicted points, in ``camera``.
         rotation: Whether its rotation counts; else only what it does where the flange was.
     """
-    motion = error.motion if rotation else rigid(np.eye(3), at_work(error))
+    motion = error.motion if rotation else rigid(np.eye(3), error.displacement())
     return Transform(BASE, CAMERA, base_T_camera.matrix @ motion)
-
-
-def at_work(error: PoseError) -> Floats:
-    """Return the (3,) displacement an error means where it was measured, in ``camera`` [m]."""
-    return np.asarray(error.motion[:3, :3] @ error.at + error.motion[:3, 3] - error.at)
 
 
 def widened(estimate: TransformEstimate, after: Transform) -> TransformEstimate:
@@ -116,19 +112,6 @@ def widened(estimate: TransformEstimate, after: Transform) -> TransformEstimate:
     shift = step[:3, :3] @ estimate.about + step[:3, 3] - estimate.about
     taken = np.concatenate([rotation_log(step[:3, :3]), shift])
     return TransformEstimate(after, estimate.covariance + np.outer(taken, taken), estimate.about)
-
-
-def _expected(views: Views, calibration: HandEye, robot: RobotModel | None) -> Views:
-    """Return the views at the poses the calibration expects: as reported, or corrected."""
-    arm = Arm(robot) if robot else None
-    poses = [
-        corrected_flange(view.base_T_flange.matrix, None, calibration.correction, arm)
-        for view in views
-    ]
-    return Views(
-        replace(view, base_T_flange=replace(view.base_T_flange, matrix=pose))
-        for view, pose in zip(views, poses, strict=True)
-    )
 
 
 def _moved(pair: Pair, before: Transform, after: Transform) -> Pair:
@@ -140,12 +123,12 @@ def _notes(
     before: Sequence[Pair], after: Sequence[Pair], error: PoseError, left: PoseError | None
 ) -> tuple[str, str]:
     turn = np.degrees(np.linalg.norm(rotation_log(error.motion[:3, :3])))
-    rest = "not measurable" if left is None else f"{_mm(at_work(left))} mm"
+    rest = "not measurable" if left is None else f"{_mm(left.displacement())} mm"
     then, now = _rms(before), _rms(after)
     verdict = "worse" if now > then else "better"
     return (
-        f"compensation (19): error {_mm(at_work(error))} mm and {turn:.3f} deg at the verification "
-        f"view, {rest} after it; that view no longer verifies anything",
+        f"compensation (19): error {_mm(error.displacement())} mm and {turn:.3f} deg at the "
+        f"verification view, {rest} after it; that view no longer verifies anything",
         f"compensation (19) changes the residual on the {sum(p.used for p in before)} poses solved "
         f"from {then * 1e3:.3f} to {now * 1e3:.3f} mm rms: {verdict} for them",
     )

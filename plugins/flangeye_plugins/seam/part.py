@@ -49,9 +49,7 @@ class CadPart:
         points = np.einsum("nk,nki->ni", weights, corners[chosen])
         return Oriented(points, self._outwards * normals[chosen] / areas[chosen, None])
 
-    def beyond_edges(
-        self, rng: np.random.Generator, by: float, count: int = EDGE_SAMPLES
-    ) -> Oriented:
+    def beyond_edges(self, rng: np.random.Generator, by: float) -> Oriented:
         """Return points ``by`` [m] beyond the outer edges of faces, in the plane of each face.
 
         There the surface has ended: a scan that goes on was taken of something larger.
@@ -60,8 +58,8 @@ class CadPart:
         lengths = np.linalg.norm(ends - starts, axis=1)
         if not len(lengths):
             return Oriented(np.zeros((0, 3)), np.zeros((0, 3)))
-        chosen = rng.choice(len(lengths), size=count, p=lengths / lengths.sum())
-        along = rng.random((count, 1))
+        chosen = rng.choice(len(lengths), size=EDGE_SAMPLES, p=lengths / lengths.sum())
+        along = rng.random((EDGE_SAMPLES, 1))
         points = starts[chosen] + along * (ends - starts)[chosen] + by * outwards[chosen]
         return Oriented(points, normals[chosen])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -12,13 +12,12 @@ from pydantic import Field
 from flangeye import Params, StageError, stage
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.paths import RecipePath
-from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.geometry import rotation_from_rpy, rotation_log, rpy_from_rotation
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Flange
 from flangeye.types import (
-    Floats,
     HandEye,
     PoseError,
     Transform,
@@ -108,7 +107,8 @@ def verify_icp(
     """
     surface = shape_of(flange, params)
     transform = calibration.base_T_camera.transform
-    expected = [_corrected(view, calibration, robot) for view in require_views(views)]
+    arm, correction = Arm(robot) if robot else None, calibration.as_reported().correction
+    expected = [corrected_view(view, correction, arm) for view in require_views(views)]
     found = {view.id: compare(transform, view, surface, params) for view in expected}
     failed = [f"view {view}: {why}" for view, why in found.items() if isinstance(why, str)]
     if failed:
@@ -129,17 +129,6 @@ def require_views(views: Views) -> Views:
             "verification captures, or use verify.holdout, which needs none"
         )
     return views
-
-
-def _corrected(
-    view: VerificationView, calibration: HandEye, robot: RobotModel | None
-) -> VerificationView:
-    """Return the view at the pose the calibration expects: as reported, or corrected."""
-    arm = Arm(robot) if robot else None
-    pose = corrected_flange(
-        view.base_T_flange.matrix, None, calibration.as_reported().correction, arm
-    )
-    return replace(view, base_T_flange=replace(view.base_T_flange, matrix=pose))
 
 
 def shape_of(flange: Flange, settings: IcpSettings) -> Surface:
@@ -187,7 +176,8 @@ def _judge(compared: Mapping[str, Comparison], params: IcpParams) -> Verificatio
 
 def _figures(comparison: Comparison) -> dict[str, float]:
     error, fit = comparison.error, comparison.registration
-    at_flange = error.motion[:3, :3] @ error.at + error.motion[:3, 3] - error.at
+    at_flange = error.displacement()
+    turns = rpy_from_rotation(error.motion[:3, :3])
     turn = rotation_log(fit.motion[:3, :3])  # in the flange's frame: its axis is z
     figures = {
         **dict(zip("xyz", at_flange.tolist(), strict=True)),
@@ -196,13 +186,9 @@ def _figures(comparison: Comparison) -> dict[str, float]:
             zip(("camera_x", "camera_y", "camera_z"), error.motion[:3, 3].tolist(), strict=True)
         ),
         "camera_translation": float(np.linalg.norm(error.motion[:3, 3])),
-        **_roll_pitch_yaw(error.motion[:3, :3]),
+        **dict(zip(("roll", "pitch", "yaw"), turns.tolist(), strict=True)),
         "tilt": float(np.linalg.norm(turn[:2])),
         "rms": fit.rms,
         "overlap": fit.overlap,
     }
     return {**figures, "clocking": float(turn[2])} if fit.roll_seen else figures
-
-
-def _roll_pitch_yaw(rotation: Floats) -> dict[str, float]:
-    return dict(zip(("roll", "pitch", "yaw"), rpy_from_rotation(rotation).tolist(), strict=True))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.statistics import rms
 from flangeye.types import Floats
 from flangeye_plugins.verify.surface import Surface
 
@@ -130,5 +131,4 @@ def _judge(
         return (
             f"{overlap:.0%} of the points came within {distance * 1e3:g} mm of the flange's shape"
         )
-    rms = float(np.sqrt(np.mean(distances**2)))
-    return Registration(motion, rms, overlap, len(unknown) == 0)
+    return Registration(motion, rms(distances), overlap, len(unknown) == 0)

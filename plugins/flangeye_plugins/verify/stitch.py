@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import Params, StageError, stage
-from flangeye.maths.arm_correction import corrected_flange
+from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import rms
 from flangeye.models.robots import RobotModel
@@ -82,7 +82,7 @@ def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floa
     """Return each view's points (N, 3) in the flange, as the calibration has it."""
     camera, out = calibration.base_T_camera.transform.matrix, []
     for view in views:
-        flange = corrected_flange(view.base_T_flange.matrix, None, calibration.correction, arm)
+        flange = corrected_view(view, calibration.correction, arm).base_T_flange.matrix
         move = np.linalg.inv(flange) @ camera
         out.append(view.flange.cloud.points() @ move[:3, :3].T + move[:3, 3])
     return out
