@@ -32,7 +32,6 @@ from flangeye.types import (
 from flangeye_plugins.error.errors import error_icp
 from flangeye_plugins.refine.compensate import (
     CompensateParams,
-    at_work,
     compensated,
     refine_compensate,
 )
@@ -139,7 +138,7 @@ def test_at_work_is_what_the_error_does_where_it_was_measured() -> None:
     motion = rigid(rotation_exp(np.array([0.0, 0.0, 0.1])), np.array([1e-3, 0.0, 0.0]))
     error = PoseError(motion, np.array([0.0, 1.0, 0.5]), np.eye(3))
     moved = motion[:3, :3] @ error.at + motion[:3, 3]
-    assert at_work(error) == pytest.approx(moved - error.at)
+    assert error.displacement() == pytest.approx(moved - error.at)
     shifted = compensated(TRUTH, error, rotation=False)
     assert shifted.apply(error.at) == pytest.approx(TRUTH.apply(moved))
 
