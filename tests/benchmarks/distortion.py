@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.maths.geometry import covariance_at, kabsch, rigid, rotation_exp, rotation_log
+from flangeye.maths.geometry import covariance_at, kabsch, rotation_exp, rotation_log
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.models.configuration import Configuration
+from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.types import CircleFeature, Floats, HandEye, Observation, TransformEstimate
 from flangeye_emulators.acquire.planned_session import PlannedSession, plan_session
@@ -25,7 +25,7 @@ from flangeye_plugins.solve.robust import RobustParams, solve_poses
 
 ROBOT, SCANNER = load_model("robots", "ur5"), load_model("scanners", "phoxi-m")
 PIXELS = pixels_of(SCANNER, 0.05)
-BEFORE_IT = rigid(np.eye(3), np.array([-0.5, 0.0, 0.0]))
+BEFORE_IT = (-0.5, 0.0, 0.0), (0.0, 0.0, 0.0)
 IN_HAND = {"position": ["60 mm", "0 mm", "40 mm"], "rpy": ["0 deg", "0 deg", "90 deg"]}
 CONFIGURATIONS: dict[str, tuple[Configuration, dict[str, Any]]] = {
     "eye-in-hand, base-circle": (
@@ -36,7 +36,7 @@ CONFIGURATIONS: dict[str, tuple[Configuration, dict[str, Any]]] = {
         Configuration("eye-in-hand", "flange", "base"),
         {"poses": 12, "camera": IN_HAND},
     ),
-    "eye-on-arm 1, flange": (Configuration("eye-on-arm", "link2", "flange", np.eye(4)),
+    "eye-on-arm 1, flange": (Configuration("eye-on-arm", "link2", "flange", ORIGIN),
                              {"poses": 12}),
     "eye-on-arm 2, base-circle": (Configuration("eye-on-arm", "link3", "base", BEFORE_IT),
                                   {"poses": 12}),

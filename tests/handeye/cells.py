@@ -22,7 +22,7 @@ from flangeye.maths.geometry import (
 )
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import passed, pose_at
-from flangeye.models.configuration import Configuration, carriers_of
+from flangeye.models.configuration import ORIGIN, Configuration, carriers_of
 from flangeye.models.loading import load_model
 from flangeye.types import (
     BASE,
@@ -41,19 +41,19 @@ from flangeye.types import (
 )
 
 ROBOT = load_model("robots", "ur5", None)
-KNOWN = rigid(rotation_from_rpy(0.1, -0.2, 0.3), np.array([0.02, -0.01, 0.05]))
+KNOWN = (0.02, -0.01, 0.05), (0.1, -0.2, 0.3)
 
 CONFIGURATIONS = {
-    "eye-on-base, flange": Configuration(place=np.eye(4)),
+    "eye-on-base, flange": Configuration(stands=ORIGIN),
     "eye-on-base, marker": Configuration(),
     "eye-in-hand, marker": Configuration("eye-in-hand", FLANGE, BASE),
     "eye-in-hand, base circle": Configuration("eye-in-hand", FLANGE, BASE, KNOWN),
     "eye-on-arm 1, marker": Configuration("eye-on-arm", "link3", FLANGE),
-    "eye-on-arm 1, flange": Configuration("eye-on-arm", "link3", FLANGE, np.eye(4)),
+    "eye-on-arm 1, flange": Configuration("eye-on-arm", "link3", FLANGE, ORIGIN),
     "eye-on-arm 2, marker": Configuration("eye-on-arm", "link3", BASE),
     "eye-on-arm 2, base circle": Configuration("eye-on-arm", "link3", BASE, KNOWN),
     "two arms, marker": Configuration("two-arms", FLANGE, FLANGE2),
-    "two arms, flange": Configuration("two-arms", FLANGE, FLANGE2, np.eye(4)),
+    "two arms, flange": Configuration("two-arms", FLANGE, FLANGE2, ORIGIN),
 }
 
 

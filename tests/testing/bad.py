@@ -33,7 +33,8 @@ from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
-from flangeye_plugins.fit.rim import RimParams, fit_rim
+from flangeye_plugins.fit.rim import fit_rim
+from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.plan.grid import GridParams, grid
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 

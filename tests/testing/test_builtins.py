@@ -39,7 +39,8 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.units import SI
-from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
+from flangeye_emulators.acquire.simulated import acquire_simulated
+from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.robot.simulated import robot_simulated
 from flangeye_emulators.world.structured_light import StructuredLight
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive

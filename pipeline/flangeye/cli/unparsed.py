@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flangeye.cli.saying import say, say_notes
+from flangeye.files.deferred import defer
 
 
 def answered(words: Sequence[str]) -> bool:
@@ -53,6 +54,7 @@ def say_verdict(name: str, overrides: Sequence[str] = ()) -> None:
     if known is not None:
         say(known)
         return
+    defer("numpy")
     from flangeye.plugin.registry import load_registry
 
     registry = load_registry()

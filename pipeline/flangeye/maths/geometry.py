@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from flangeye.types import Floats
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 NEAR_HALF_A_TURN = -0.9
 """Cosine below which a rotation's axis is read off its quaternion."""

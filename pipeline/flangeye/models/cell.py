@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.arm_correction import corrected_observation
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Ends
 from flangeye.models.robots import RobotModel
 from flangeye.types import Array, Floats, HandEye, Observation, Transform
+
+if TYPE_CHECKING:
+    from flangeye.maths.kinematics import Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class Cell:
     def freedoms(self) -> dict[str, Floats]:
         """(6, k) unit twists that each thing can be moved by, in its base; see ``solve_graph``."""
         return {
-            name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(Arm(mover))
+            name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
         }
 
@@ -123,6 +125,9 @@ class Cell:
         self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
     ) -> list[Observation]:
         """Return observations with the flanges where corrected arms have them; see ``Layout``."""
+        from flangeye.maths.arm_correction import corrected_observation
+        from flangeye.maths.kinematics import Arm
+
         moved = list(observations)
         for name, correction in calibration.arms.items():
             mover = self.movers[name]
@@ -144,11 +149,14 @@ class Cell:
         )
 
 
-def _freedoms_of(arm: Arm) -> Floats:
+def _freedoms_of(robot: RobotModel) -> Floats:
     """Return (6, k) unit twists: those axes of ``base`` that it can turn about, and all shifts.
 
     An arm of four joints turns about one.
     """
+    from flangeye.maths.kinematics import Arm
+
+    arm = Arm(robot)
     bent = np.linspace(0.3, 0.7, arm.n)
     axes = arm.axes(bent)[0][~arm.slides]
     reached = np.linalg.lstsq(axes.T, np.eye(3), rcond=1e-9)[0]

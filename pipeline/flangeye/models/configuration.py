@@ -15,15 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.maths.arm_correction import corrected_observation
-from flangeye.maths.geometry import each_applied
-from flangeye.maths.kinematics import Arm
-from flangeye.maths.shared_errors import without_shared
+from flangeye.maths.geometry import each_applied, rigid, rotation_from_rpy
 from flangeye.types import (
     BASE,
     BASE2,
@@ -31,12 +29,14 @@ from flangeye.types import (
     FLANGE,
     FLANGE2,
     TARGET,
-    Array,
     Floats,
     HandEye,
     Observation,
     Transform,
 )
+
+if TYPE_CHECKING:
+    from flangeye.maths.kinematics import Arm
 
 LINK = "link"
 
@@ -54,6 +54,11 @@ CELL = "cell"
 """And one that serves cells of many cameras and targets: ``serves=(CELL,)``."""
 
 
+Triple = tuple[float, float, float]
+ORIGIN: tuple[Triple, Triple] = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+"""Where the robot's own circles stand in the frame that carries them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Configuration:
     """One configuration of camera and target.
@@ -62,19 +67,27 @@ class Configuration:
         name: One of :data:`CARRIERS`.
         camera: Frame that carries the camera.
         target: Frame that carries the target.
-        place: (4, 4) of the target in that frame; None where it is to be found.
+        stands: Where the target stands in that frame: position [m], and roll, pitch and yaw [rad];
+            None where it is to be found.
     """
 
     name: str = "eye-on-base"
     camera: str = BASE
     target: str = FLANGE
-    place: Array | None = None
+    stands: tuple[Triple, Triple] | None = None
+
+    @cached_property
+    def place(self) -> Floats | None:
+        """(4, 4) of the target in the frame that carries it; None where it is to be found."""
+        if self.stands is None or self.stands == ORIGIN:
+            return None if self.stands is None else np.eye(4)
+        position, rpy = self.stands
+        return rigid(rotation_from_rpy(*rpy), np.asarray(position))
 
     @property
     def is_default(self) -> bool:
         """Whether it is a camera beside the robot that looks at the flange's own circle."""
-        at_origin = self.place is not None and np.array_equal(self.place, np.eye(4))
-        return self.name == "eye-on-base" and at_origin
+        return self.name == "eye-on-base" and self.stands == ORIGIN
 
     @property
     def other_base(self) -> str | None:
@@ -84,7 +97,7 @@ class Configuration:
     @property
     def unknowns(self) -> tuple[str, ...]:
         """Names of the transforms to find, the camera's first."""
-        target = None if self.place is not None else f"{self.target}_T_{TARGET}"
+        target = None if self.stands else f"{self.target}_T_{TARGET}"
         named = (f"{self.camera}_T_{CAMERA}", self.other_base, target)
         return tuple(name for name in named if name)
 
@@ -94,7 +107,7 @@ class Configuration:
         left = [_pose_of(self.camera), f"[{self.camera}_T_{CAMERA}]", f"{CAMERA}_T_{TARGET}"]
         placed = f"{self.target}_T_{TARGET}"
         right = [self.other_base and f"[{self.other_base}]", _pose_of(self.target)]
-        right.append(f"[{placed}]" if self.place is None else placed)
+        right.append(placed if self.stands else f"[{placed}]")
         return " · ".join(filter(None, left)) + " = " + " · ".join(filter(None, right))
 
     def describe(self) -> str:
@@ -105,6 +118,9 @@ class Configuration:
         self, observations: Sequence[Observation], calibration: HandEye, arm: Arm | None = None
     ) -> list[Observation]:
         """Return observations as the calibration corrects them; see :class:`Layout`."""
+        from flangeye.maths.arm_correction import corrected_observation
+        from flangeye.maths.shared_errors import without_shared
+
         found, correction = calibration.shared, calibration.correction
         seen = [without_shared(o, found) for o in observations]
         return [corrected_observation(o, correction, arm) for o in seen]
@@ -125,7 +141,7 @@ class Configuration:
         return Ends(camera, target @ place)
 
 
-DEFAULT = Configuration(place=np.eye(4))
+DEFAULT = Configuration(stands=ORIGIN)
 """A camera beside the robot that looks at the flange's own circle."""
 
 

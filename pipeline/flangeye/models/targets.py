@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from math import pi
+
 from pydantic import BaseModel, ConfigDict
 
 from flangeye.errors import RecipeError, StageError
@@ -68,14 +69,14 @@ def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
     """Return the circle of ``standard`` as it shows on an arm."""
     n, pin = standard.threads, details.pin_angle
     # The pin hole lies on a bisector of the threads (ISO 9409-1, clause 4).
-    holes = (pin or 0.0) + np.pi / n + 2 * np.pi * np.arange(n) / n if n else np.zeros(0)
+    holes = tuple((pin or 0.0) + pi / n + 2 * pi * i / n for i in range(n))
     return Flange(
         name=standard.designation,
         rim=standard.outer / 2 - details.rim_chamfer,
         outer=standard.outer / 2,
         bore=standard.centring / 2 + details.bore_chamfer,
         pitch=standard.pitch_circle / 2,
-        holes=tuple(float(h) for h in holes),
+        holes=holes,
         hole=standard.thread / 2 + details.countersink,
         pin=pin,
         pin_hole=standard.pin / 2 + details.countersink,

@@ -16,7 +16,7 @@ import types as python_types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Protocol, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -31,6 +31,7 @@ from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
 from flangeye.models.configuration import CELL, EVERY
 from flangeye.models.robots import RobotModel
+from flangeye.plugin.hints import Hints
 
 
 class Params(BaseModel):
@@ -396,7 +397,8 @@ def stage(
 
     def declare(function: Callable[..., Any]) -> Stage:
         declared = _read_signature(Stage, name, function)
-        declared = replace(declared, serves=tuple(serves), formerly=tuple(formerly))
+        needs = dict(declared.needs)
+        declared = replace(declared, needs=needs, serves=tuple(serves), formerly=tuple(formerly))
         _check_contract(declared)
         return declared
 
@@ -444,9 +446,9 @@ AnyPlugin = TypeVar("AnyPlugin", bound=Plugin)
 
 
 def _read_signature(cls: type[AnyPlugin], name: str, function: Callable[..., Any]) -> AnyPlugin:
-    hints = get_type_hints(function)
-    params = hints.pop("params", None)
-    gives = _alternatives(hints.pop("return", type(None)))
+    hints = Hints(function)
+    params = hints.pop("params") if "params" in hints else None
+    gives = _alternatives(hints.pop("return"))
     if params is not None and not (isinstance(params, type) and issubclass(params, Params)):
         raise TypeError(f"'{name}': its params must be a subclass of flangeye.Params")
     if not inspect.getdoc(function):
@@ -478,7 +480,7 @@ def _check_contract(declared: Stage) -> None:
 def _check_call(declared: Part, kind: PartKind) -> None:
     """Hold a part's signature against the Protocol of its kind; untyped arguments pass."""
     contract = _at(*kind.contract.split(":"))
-    wanted = get_type_hints(contract.__call__)
+    wanted = Hints(contract.__call__)
     gives = _alternatives(wanted.pop("return"))
     where = f"part '{declared.name}'"
     asked = [n for n in inspect.signature(declared.function).parameters if n not in _GIVEN]
@@ -487,10 +489,11 @@ def _check_call(declared: Part, kind: PartKind) -> None:
             f"{where}: a '{declared.kind}' part is called with {', '.join(wanted)}, "
             f"and has {', '.join(asked) or 'no arguments'}"
         )
-    for name, need in declared.needs.items():
-        if name in wanted and not _fits(wanted[name], need):
+    said = Hints(declared.function)
+    for name in [n for n in declared.needs if n in wanted and not said.says_as(wanted, n)]:
+        if not _fits(wanted[name], said[name]):
             raise TypeError(
-                f"{where}: its {name} is a {_called(wanted[name])}, not a {_called(need)}"
+                f"{where}: its {name} is a {_called(wanted[name])}, not a {_called(said[name])}"
             )
     foreign = [g for g in declared.gives if not any(_fits(g, given) for given in gives)]
     if foreign:

@@ -17,21 +17,20 @@ from flangeye import types as t
 from flangeye.devices import RobotDriver, ScannerDriver
 from flangeye.errors import RecipeError
 from flangeye.models.cell import Cell
-from flangeye.models.configuration import CARRIERS, LINK, Configuration
-from flangeye.models.factory import as_built
+from flangeye.models.configuration import CARRIERS, LINK, ORIGIN, Configuration, Triple
 from flangeye.models.loading import load_model
 from flangeye.models.model import read_model
 from flangeye.models.robots import FlangeDetails, RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerData, ScannerModel
 from flangeye.models.standards import FlangeStandard, load_standard
 from flangeye.models.targets import Flange, Sphere, flange_of, wrist_circle_of
-from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.stage import BoundPart
-from flangeye.recipe.cell import cell_of, place_of
 from flangeye.recipe.header import (
     FeatureSection,
     Header,
     LimitsSection,
+    Place,
+    PlaceSection,
     RobotSection,
     ScannerSection,
 )
@@ -69,6 +68,8 @@ def context_of(header: Header, folder: Path, complain: Complain) -> Context:
         place = ("second_robot", "model")
         offer(SecondRobot, place, lambda: SecondRobot(_model(second.model, folder)))
     if header.cell:
+        from flangeye.recipe.cell import cell_of
+
         context[Cell] = cell_of(header, partial(_model, folder=folder), complain)
     else:
         offer(Configuration, ("configuration",), lambda: _configuration(header, context))
@@ -97,10 +98,18 @@ def _offer(
 def _arm(section: RobotSection, standard: str | None, folder: Path) -> RobotModel:
     if section.model:
         robot = _model(section.model, folder)
-        return as_built(robot, folder / section.factory) if section.factory else robot
+        return _as_built(robot, folder / section.factory) if section.factory else robot
+    from flangeye.models.urdf import robot_from_urdf
+
     packages = {name: folder / path for name, path in section.packages.items()}
     path = folder / str(section.urdf)
     return robot_from_urdf(path, section.base, section.flange, standard, packages)
+
+
+def _as_built(robot: RobotModel, calibration: Path) -> RobotModel:
+    from flangeye.models.factory import as_built
+
+    return as_built(robot, calibration)
 
 
 def _model(name: str, folder: Path) -> RobotModel:
@@ -174,7 +183,13 @@ def _configuration(header: Header, context: Context) -> Configuration:
     if target not in targets:
         allowed = " or ".join(targets)
         raise RecipeError(f"{section.name}: the target is carried by {allowed}, not by {target}")
-    return Configuration(section.name, camera, target, place_of(section.place))
+    return Configuration(section.name, camera, target, _stands(section.place))
+
+
+def _stands(place: Place) -> tuple[Triple, Triple] | None:
+    if isinstance(place, PlaceSection):
+        return place.position, place.rpy
+    return ORIGIN if place == "known" else None
 
 
 def _require_link(camera: str, context: Context) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ForwardRef
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic_core import core_schema
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class _AsNestedLists:
     """Lets pydantic read and write an array as nested JSON lists, bit for bit."""
 
-    def __init__(self, dtype: type[np.generic]) -> None:
+    def __init__(self, dtype: str) -> None:
         self._dtype = dtype
 
     def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:
@@ -25,17 +27,27 @@ class _AsNestedLists:
         return {"type": "array"}
 
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+if TYPE_CHECKING:
+    Floats = NDArray[np.float64]
+    Singles = NDArray[np.float32]
+    Indices = NDArray[np.intp]
+    Mask = NDArray[np.bool_]
 
-Array = Annotated[NDArray[np.float64], _AsNestedLists(np.float64)]
-Pixels = Annotated[NDArray[np.uint8], _AsNestedLists(np.uint8)]
-FloatArray = NDArray[np.float32] | NDArray[np.float64]
+    Array = Annotated[NDArray[np.float64], _AsNestedLists("float64")]
+    Pixels = Annotated[NDArray[np.uint8], _AsNestedLists("uint8")]
+    FloatArray = Singles | Floats
+else:  # names that are evaluated where they are asked for: NumPy takes longer than many a command
+
+    def _arrays(dtype: str) -> ForwardRef:
+        return ForwardRef(f"np.ndarray[Any, np.dtype[np.{dtype}]]", module=__name__)
+
+    Floats, Singles, Indices, Mask = map(_arrays, ("float64", "float32", "intp", "bool_"))
+    Array = Annotated[Floats, _AsNestedLists("float64")]
+    Pixels = Annotated[_arrays("uint8"), _AsNestedLists("uint8")]
+    FloatArray = Singles | Floats
 
 
-def frozen(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+def frozen(value: Any, shape: tuple[int, ...], what: str) -> Floats:
     """Return a read-only float64 copy of ``value``; refuse another shape or non-finite entries."""
     array = np.array(value, dtype=np.float64)
     if array.shape != shape:

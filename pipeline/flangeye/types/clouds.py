@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic_core import core_schema
+
+from flangeye.types.arrays import Singles
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +26,7 @@ class PointCloud:
     """
 
     frame: str
-    xyz: NDArray[np.float32]
+    xyz: Singles
 
     def __init__(self, frame: str, xyz: ArrayLike) -> None:
         xyz = np.asarray(xyz, dtype=np.float32)
@@ -38,7 +42,7 @@ class PointCloud:
         """Whether neighbours in the array are neighbours in the scanner's image."""
         return self.xyz.ndim == 3
 
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Singles:
         """Return the (M, 3) points that are finite."""
         flat = self.xyz.reshape(-1, 3)
         return flat[np.isfinite(flat).all(axis=1)]

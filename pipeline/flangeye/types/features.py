@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flangeye.types.arrays import Array, freeze
+from flangeye.types.arrays import Array, Floats, freeze
 from flangeye.types.frames import (
     CAMERA,
     TARGET,
@@ -52,7 +51,7 @@ class CircleFeature:
             freeze(self, normal=(3,), normal_covariance=(3, 3))
 
     @property
-    def centre_covariance(self) -> NDArray[np.float64]:
+    def centre_covariance(self) -> Floats:
         """(3, 3) of the centre [m^2]: what every feature has."""
         return self.covariance
 
@@ -86,17 +85,17 @@ class PoseFeature:
         freeze(self, covariance=(6, 6), corners=corners.shape, shared=shared.shape)
 
     @property
-    def centre(self) -> NDArray[np.float64]:
+    def centre(self) -> Floats:
         """(3,) the target's origin in ``camera`` [m]."""
         return self.camera_T_target.translation
 
     @property
-    def normal(self) -> NDArray[np.float64]:
+    def normal(self) -> Floats:
         """(3,) the target's z in ``camera``."""
         return self.camera_T_target.rotation[:, 2]
 
     @property
-    def centre_covariance(self) -> NDArray[np.float64]:
+    def centre_covariance(self) -> Floats:
         """(3, 3) of the origin [m^2]."""
         return self.covariance[3:, 3:]
 
@@ -151,13 +150,13 @@ class Observation(Placed):
         raise FrameMismatchError(f"observation {self.id} is a pose, and a circle is needed")
 
     @property
-    def centre_in_mount(self) -> NDArray[np.float64]:
+    def centre_in_mount(self) -> Floats:
         """(3,) where the link that carries the target has what was seen, if that is known [m]."""
         feature = self.feature
         return feature.centre_in_flange if isinstance(feature, CircleFeature) else np.zeros(3)
 
     @property
-    def tcp_in_base(self) -> NDArray[np.float64]:
+    def tcp_in_base(self) -> Floats:
         """(3,) the flange's centre, or what it carries, as the controller reports it [m]."""
         return self.base_T_flange.apply(self.centre_in_mount)
 

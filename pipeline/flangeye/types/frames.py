@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flangeye.types.arrays import Array, FloatArray, freeze, frozen
+from flangeye.types.arrays import Array, FloatArray, Floats, freeze, frozen
 from flangeye.types.clouds import PointCloud
 
 BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"
@@ -55,12 +54,12 @@ class Transform:
         return f"{self.parent}_T_{self.child}"
 
     @property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Floats:
         """(3, 3) rotation ``parent_R_child``."""
         return self.matrix[:3, :3]
 
     @property
-    def translation(self) -> NDArray[np.float64]:
+    def translation(self) -> Floats:
         """(3,) origin of ``child`` in ``parent`` [m]."""
         return self.matrix[:3, 3]
 
@@ -69,7 +68,7 @@ class Transform:
         self._require(self.child, other.parent)
         return Transform(self.parent, other.child, self.matrix @ other.matrix)
 
-    def apply(self, xyz: FloatArray) -> NDArray[np.float64]:
+    def apply(self, xyz: FloatArray) -> Floats:
         """Map (..., 3) coordinates in ``child`` to coordinates in ``parent``."""
         return np.asarray(xyz, dtype=np.float64) @ self.rotation.T + self.translation
 
@@ -171,7 +170,7 @@ class Box:
     def __post_init__(self) -> None:
         freeze(self, centre=(3,), size=(3,))
 
-    def grid(self, n: int = 5) -> NDArray[np.float64]:
+    def grid(self, n: int = 5) -> Floats:
         """Return (n^3, 3) points spread evenly over the box, its faces included."""
         ticks = np.linspace(-0.5, 0.5, n)
         unit = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)

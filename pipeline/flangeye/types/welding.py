@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flangeye.types.arrays import Array, freeze
+from flangeye.types.arrays import Array, Floats, freeze
 from flangeye.types.clouds import PointCloud
 
 
@@ -48,13 +47,13 @@ class Seam:
             raise ValueError("Seam.openings_in_base are not unit vectors")
 
     @property
-    def arc_length(self) -> NDArray[np.float64]:
+    def arc_length(self) -> Floats:
         """(N,) way along the seam from its start to each point [m]."""
         steps = np.linalg.norm(np.diff(self.points_in_base, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
-    def tangents(self) -> NDArray[np.float64]:
+    def tangents(self) -> Floats:
         """(N, 3) unit vectors along the seam, in the direction of welding."""
         along = np.gradient(self.points_in_base, self.arc_length, axis=0)
         return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))

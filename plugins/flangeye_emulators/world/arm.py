@@ -7,7 +7,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import Joint, RobotModel
 from flangeye.plugin.stage import Params
 from flangeye.types import Floats
@@ -16,7 +15,7 @@ from flangeye.units import Angle, Length, param
 REPEATABILITY = 3.6
 """Data sheets give the mean plus three standard deviations of the distance from the mean position
 (ISO 9283): 3.6 times the deviation along one axis, when all three are alike."""
-DOWN = np.array([0.0, 0.0, -1.0])
+DOWN = (0.0, 0.0, -1.0)
 """Where things fall, in ``base``."""
 
 
@@ -103,6 +102,8 @@ class ImperfectArm:
         errors: ArmErrors | None = None,
     ) -> None:
         """Draw the arm's errors; ``scale`` multiplies every one, 0 gives a perfect arm."""
+        from flangeye.maths.kinematics import Arm
+
         sizes = ErrorSizes(*(scale * np.array((errors or ArmErrors()).sizes(robot))))
         self._believed = Arm(robot)
         self._scatter = scale * robot.repeatability / REPEATABILITY

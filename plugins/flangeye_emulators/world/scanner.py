@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
@@ -12,9 +13,11 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params
 from flangeye.types import BASE, CAMERA, Floats, Transform
 from flangeye.units import Angle, Length, param
-from flangeye_emulators.world.raycast import Body, Scene
-from flangeye_emulators.world.structured_light import StructuredLight
-from flangeye_emulators.world.time_of_flight import TimeOfFlight
+
+if TYPE_CHECKING:
+    from flangeye_emulators.world.raycast import Body, Scene
+    from flangeye_emulators.world.structured_light import StructuredLight
+    from flangeye_emulators.world.time_of_flight import TimeOfFlight
 
 
 class CameraPose(Params):
@@ -46,11 +49,16 @@ def scanner_of(
     scanner: ScannerModel, resolution: float, noise: float, rng: np.random.Generator
 ) -> StructuredLight | TimeOfFlight:
     """Return the scanner, with the distortion that ``rng`` draws for it."""
+    from flangeye_emulators.world.structured_light import StructuredLight
+    from flangeye_emulators.world.time_of_flight import TimeOfFlight
+
     kind = StructuredLight if scanner.principle == "structured light" else TimeOfFlight
     return kind(scanner, resolution, noise, rng)
 
 
 def before_camera(bodies: Sequence[Body], base_T_camera: Floats) -> Scene:
     """Return the bodies, given in ``base``, as they stand before the camera."""
+    from flangeye_emulators.world.raycast import Scene
+
     camera_T_base = Transform(BASE, CAMERA, base_T_camera).inverse().matrix
     return Scene([body.moved(camera_T_base) for body in bodies])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,12 +11,9 @@ from flangeye import Params, stage
 from flangeye.models.targets import Flange
 from flangeye.types import Capture, FlangeCloud, PointCloud, Rejected
 from flangeye.units import Angle, Length, param
-from flangeye_plugins.segment.choice import choose
-from flangeye_plugins.segment.crop import crop
-from flangeye_plugins.segment.discs import DiscLimits
-from flangeye_plugins.segment.grid import Grid, coarse_view
-from flangeye_plugins.segment.scale import check_scale
-from flangeye_plugins.segment.search import find_discs
+
+if TYPE_CHECKING:
+    from flangeye_plugins.segment.grid import Grid
 
 
 class SegmentParams(Params):
@@ -56,6 +54,13 @@ def segment_flange(
     Raises:
         StageError: The cloud is in millimetres, or otherwise a thousand times off.
     """
+    from flangeye_plugins.segment.choice import choose
+    from flangeye_plugins.segment.crop import crop
+    from flangeye_plugins.segment.discs import DiscLimits
+    from flangeye_plugins.segment.grid import coarse_view
+    from flangeye_plugins.segment.scale import check_scale
+    from flangeye_plugins.segment.search import find_discs
+
     view = coarse_view(capture.cloud.xyz, flange.rim / 15)
     if view is None:
         return Rejected("no finite point")

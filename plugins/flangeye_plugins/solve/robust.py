@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
 
 from flangeye import FlangeyeError, Params, stage
-from flangeye.handeye.calibration import Options, calibrate
-from flangeye.handeye.loop import ArmNoise
-from flangeye.handeye.observability import ObservabilityLimits
-from flangeye.handeye.observed import Cell
-from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
-from flangeye.models.workspace import workspace_of
 from flangeye.types import (
     Box,
     CircleFeature,
@@ -30,7 +24,10 @@ from flangeye.types import (
     StageLog,
 )
 from flangeye.units import Angle, Length, param
-from flangeye_plugins.solve.svd import check_poses
+
+if TYPE_CHECKING:
+    from flangeye.handeye.calibration import Options
+    from flangeye.handeye.observed import Cell
 
 FEWEST_ONLINE = 6
 """Poses before an online run may stop: fewer tell too little of the noise."""
@@ -170,6 +167,7 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
         CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
             (it says which motion is missing), or a marker has another size than its fit was told.
     """
+    from flangeye.handeye.observed import Cell
 
     def solve(pulled: Sequence[Observation]) -> HandEye:
         other = second.model if second else None
@@ -207,6 +205,9 @@ def _error_at_work(
     pulled: Sequence[Observation], solve: Solver, workspace: Box | None, source: Source
 ) -> float:
     """Return what no point of the workspace is off by more than, with 95 % probability [m]."""
+    from flangeye.maths.statistics import corners_of, largest_error_quantile
+    from flangeye.models.workspace import workspace_of
+
     try:
         found = solve(pulled)
     except FlangeyeError:
@@ -226,11 +227,16 @@ def solve_poses(
     scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Solve observations that are all there; see :func:`solve_robust`."""
+    from flangeye.handeye.observed import Cell
+
     return solve_cell(Cell(pulled, configuration or DEFAULT, robot, scanner), params, method)
 
 
 def solve_cell(cell: Cell, params: RobustParams, method: str = "solve.robust") -> HandEye:
     """Solve what was observed, where; see :func:`solve_robust`."""
+    from flangeye.handeye.calibration import calibrate
+    from flangeye_plugins.solve.svd import check_poses
+
     circles = all(isinstance(o.feature, CircleFeature) for o in cell.observations)
     if cell.configuration.is_default and circles:
         check_poses(cell.observations)
@@ -238,6 +244,10 @@ def solve_cell(cell: Cell, params: RobustParams, method: str = "solve.robust") -
 
 
 def _options(params: RobustParams) -> Options:
+    from flangeye.handeye.calibration import Options
+    from flangeye.handeye.loop import ArmNoise
+    from flangeye.handeye.observability import ObservabilityLimits
+
     noise = params.robot_noise
     return Options(
         normals=params.normals == "auto",

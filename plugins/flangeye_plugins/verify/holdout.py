@@ -4,23 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
-from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.geometry import angle_between, covariance_at
-from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import (
-    chi2_quantile,
-    corners_of,
-    excess_variance,
-    largest_error_quantile,
-    rms,
-    squared_distances,
-)
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import (
     CELL,
@@ -31,11 +21,12 @@ from flangeye.models.configuration import (
     mapped_and_expected,
 )
 from flangeye.models.robots import RobotModel
-from flangeye.models.workspace import work_of
 from flangeye.types import (
     Box,
     Floats,
     HandEye,
+    Indices,
+    Mask,
     Observation,
     Observations,
     Seed,
@@ -44,6 +35,9 @@ from flangeye.types import (
     Verification,
 )
 from flangeye.units import Length, param
+
+if TYPE_CHECKING:
+    from flangeye.maths.kinematics import Arm
 
 
 class HoldoutParams(Params):
@@ -101,6 +95,8 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     Figures [m, rad]: these, ``folds``, ``poses``, ``tilt_rms`` where normals were measured, and
     ``predicted_worst_p95``: with 95 % probability no point of the workspace is off by more.
     """
+    from flangeye.maths.kinematics import Arm
+
     poses = [pair.observation for pair in calibration.pairs]
     folds = (
         deal_moments(poses, params.folds, seed) if cell else deal(len(poses), params.folds, seed)
@@ -132,7 +128,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     return Verification(passed, reason, figures, errors)
 
 
-def deal(count: int, folds: int, seed: int) -> list[NDArray[np.intp]]:
+def deal(count: int, folds: int, seed: int) -> list[Indices]:
     """Return the indices of each fold: shuffled once, then dealt round; none is empty.
 
     Shuffled, because grids are recorded in raster order and whole planes would fall together.
@@ -142,9 +138,7 @@ def deal(count: int, folds: int, seed: int) -> list[NDArray[np.intp]]:
     return [np.sort(order[fold::folds]) for fold in range(folds)]
 
 
-def deal_moments(
-    observations: Sequence[Observation], folds: int, seed: int
-) -> list[NDArray[np.intp]]:
+def deal_moments(observations: Sequence[Observation], folds: int, seed: int) -> list[Indices]:
     """Return the indices of each fold; what cameras saw of the same poses falls in one.
 
     Else the error of a pose that one camera saw would be known from what the other saw.
@@ -159,7 +153,7 @@ def deal_moments(
 
 
 def solve_without(
-    observations: Sequence[Observation], solve: Solver, folds: Sequence[NDArray[np.intp]]
+    observations: Sequence[Observation], solve: Solver, folds: Sequence[Indices]
 ) -> list[HandEye]:
     """Return the calibration without each fold.
 
@@ -173,7 +167,7 @@ def solve_without(
 
 def hold_out(
     observations: Sequence[Observation],
-    folds: Sequence[NDArray[np.intp]],
+    folds: Sequence[Indices],
     solved: Sequence[HandEye],
     given: tuple[Layout, Arm | None],
 ) -> HeldOut:
@@ -194,7 +188,7 @@ def hold_out(
 def _measure_loop(
     calibration: HandEye,
     observations: Sequence[Observation],
-    fold: NDArray[np.intp],
+    fold: Indices,
     given: tuple[Layout, Arm | None],
     held: HeldOut,
 ) -> None:
@@ -214,6 +208,8 @@ def _measure_loop(
 
 def expected_flange(calibration: HandEye, observation: Observation, arm: Arm | None) -> Floats:
     """Return the (4, 4) pose a calibration expects the flange at: as reported, or corrected."""
+    from flangeye.maths.arm_correction import corrected_flange
+
     reported = observation.base_T_flange.matrix
     return corrected_flange(reported, observation.joints, calibration.correction, arm)
 
@@ -231,14 +227,18 @@ def _measure(
         held.tilts[i] = angle_between(rotation @ seen.normal, expected[:3, 2])
 
 
-def _beyond_gate(held: HeldOut, probability: float) -> NDArray[np.bool_]:
+def _beyond_gate(held: HeldOut, probability: float) -> Mask:
+    from flangeye.maths.statistics import chi2_quantile, excess_variance, squared_distances
+
     excess = excess_variance(held.errors, held.covariances)
     covariances = held.covariances + max(excess, 1e-18) * np.eye(3)
     distances = squared_distances(held.errors, covariances)
     return np.asarray(distances > chi2_quantile(probability, 3))
 
 
-def _figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, float]:
+def _figures(held: HeldOut, outlying: Mask) -> dict[str, float]:
+    from flangeye.maths.statistics import rms
+
     norms = np.linalg.norm(held.errors, axis=1)
     tilts = held.tilts[~outlying & np.isfinite(held.tilts)]
     figures = {
@@ -253,7 +253,7 @@ def _figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, float]:
     return {**figures, "tilt_rms": rms(tilts)} if len(tilts) else figures
 
 
-def _corrected_figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, float]:
+def _corrected_figures(held: HeldOut, outlying: Mask) -> dict[str, float]:
     found = _figures(held, outlying)
     return {f"corrected_{name}": found[name] for name in ("rms", "median", "p95", "rms_inliers")}
 
@@ -261,6 +261,9 @@ def _corrected_figures(held: HeldOut, outlying: NDArray[np.bool_]) -> dict[str, 
 def _predicted_worst_p95(
     calibration: HandEye, workspace: Box | None, source: Source | None
 ) -> float:
+    from flangeye.maths.statistics import corners_of, largest_error_quantile
+    from flangeye.models.workspace import work_of
+
     estimate = calibration.camera
     box = work_of(calibration, source or Source(""), workspace)
     corners = corners_of(box.centre, box.size) if box else estimate.about[None]

@@ -8,13 +8,14 @@ import pytest
 
 from flangeye import StageError
 from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import Configuration
+from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.models.standards import load_standard
 from flangeye.models.targets import flange_of
 from flangeye.types import BASE, FLANGE, TARGET, Source, Transform, Truth
 from flangeye_emulators.acquire.planned_session import plan_session
-from flangeye_emulators.acquire.simulated import SimulatedParams, acquire_simulated
+from flangeye_emulators.acquire.simulated import acquire_simulated
+from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.acquire.simulated_session import MarkerParams
 from flangeye_emulators.world.arm import REAL, ArmErrors, ErrorSizes, ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
@@ -161,7 +162,7 @@ def test_poses_that_took_no_part_show_the_arms_error_at_the_work() -> None:
 
 
 def test_a_link_that_carries_the_camera_is_off_too() -> None:
-    on_link = Configuration("eye-on-arm", "link3", FLANGE, np.eye(4))
+    on_link = Configuration("eye-on-arm", "link3", FLANGE, ORIGIN)
     session = planned(ArmErrors(quality="real"), on_link, distance="500 mm")
     assert np.abs(session.actual.camera - session.reported.camera).max() > 1e-4
 

@@ -19,7 +19,8 @@ from flangeye.types import BASE, FLANGE, Capture, Transform, by_frame
 from flangeye.units import SI
 from flangeye_emulators.scanner.loopback import LoopbackParams, scanner_loopback
 from flangeye_emulators.world.scanner import CameraPose
-from flangeye_plugins.fit.rim import RimParams, fit_rim
+from flangeye_plugins.fit.rim import fit_rim
+from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from tests.emulators.controllers.process import Process
 

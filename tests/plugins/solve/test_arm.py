@@ -34,7 +34,8 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye_plugins.acquire.archive import ArchiveParams, acquire_archive
-from flangeye_plugins.fit.rim import RimParams, fit_rim
+from flangeye_plugins.fit.rim import fit_rim
+from flangeye_plugins.fit.rim_params import RimParams
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as published_layout
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange

@@ -1,0 +1,281 @@
+"""What ``acquire.simulated`` does: an arm is led before a scanner, and every scan made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from flangeye.devices import MotionAllowed
+from flangeye.errors import NothingMoved, StageError
+from flangeye.maths.geometry import invert
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel, middle_of_view
+from flangeye.models.targets import Flange, Sphere, plate_of
+from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
+from flangeye.motion.reach import Reach
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    Box,
+    Capture,
+    Captures,
+    Floats,
+    Observation,
+    PointCloud,
+    Role,
+    Source,
+    StageLog,
+    Transform,
+    Truth,
+    by_frame,
+)  # fmt: skip
+from flangeye.units import in_mm
+from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
+from flangeye_emulators.acquire.simulated_params import SimulatedParams
+from flangeye_emulators.world.arm import ImperfectArm
+from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.raycast import Body, Image
+from flangeye_emulators.world.scanner import before_camera, scanner_of
+from flangeye_emulators.world.structured_light import StructuredLight
+from flangeye_emulators.world.time_of_flight import TimeOfFlight
+from flangeye_plugins.acquire.plan_rows import as_plan, left_out, row_at
+
+EPOCH_NS = 1_704_067_200_000_000_000
+"""When simulated runs begin: 2024-01-01, 00:00 UTC."""
+
+INTERVAL_NS = 4_000_000_000
+"""From one exposure to the next."""
+
+FEWEST = 3
+"""Poses without which no camera pose can be found."""
+
+UNSEEN_TILT = 0.3
+"""Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
+
+VERSION = 1
+"""Raised whenever the same parameters would give other captures."""
+
+
+class Setting(NamedTuple):
+    """What stands before what, as ``acquire.simulated`` has it."""
+
+    robot: RobotModel
+    scanner: ScannerModel
+    flange: Flange
+    sphere: Sphere | None
+
+
+def simulate(
+    setting: Setting,
+    seed: int,
+    params: SimulatedParams,
+    stage_log: StageLog | None,
+    motion: MotionAllowed | None,
+) -> Captures:
+    """Return the captures of a session; see ``acquire.simulated``."""
+    robot, scanner, flange, sphere = setting
+    plate = flange if flange.bore else plate_of(robot)
+    planning, checking, errors, noise, later = np.random.SeedSequence([VERSION, seed]).spawn(5)
+    base_T_camera = params.camera.base_T_camera
+    reach = Reach(robot, scanner, base_T_camera, max(plate.outer, plate.details.wrist / 2))
+    site = _site(reach, scanner, base_T_camera)
+    names = f"{robot.model} can show its flange to {scanner.model}"
+    stops = _stops(reach, site, params, (planning, checking), names)
+    if motion and motion.plan_only:
+        raise _plan_alone(stops, reach, site)
+    unseen = [] if params.arm.is_default else _unseen(stops.plan, site, _rng(checking.spawn(1)[0]))
+    cell = Cell(robot, plate, stops.plan.centre, stops.plan.size, sphere)
+    session = _session(cell, scanner, stops, unseen, params, errors)
+    source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere))
+    whys = [pose.why for pose in stops.all]
+    captures = _explained(session.captures(noise), whys, stage_log)
+    look = partial(session.look, rng=_rng(later))
+    # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
+    return Captures(captures, source, len(whys), look, recorded=not any(whys))
+
+
+def _explained(
+    captures: Iterator[Capture], whys: Sequence[str], stage_log: StageLog | None
+) -> Iterator[Capture]:
+    """Yield the captures; before each, say what the plan expects of it, where it does."""
+    for index, why in enumerate(whys):
+        if why and stage_log:
+            stage_log("next", {"id": f"{index:04d}", "why": why})
+        yield next(captures)
+
+
+def _site(reach: Reach, scanner: ScannerModel, base_T_camera: Floats) -> Site:
+    centre = middle_of_view(scanner, base_T_camera)
+    return Site(centre, base_T_camera[:3, 3], reach.facing, reach.joints)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stops:
+    """Where the arm stops: for the captures that verify, then for those that calibrate."""
+
+    plan: Plan
+    checks: list[PlannedPose]
+    poses: list[PlannedPose]
+
+    @property
+    def all(self) -> list[PlannedPose]:
+        return [*self.checks, *self.poses]
+
+
+def _stops(
+    reach: Reach,
+    site: Site,
+    params: SimulatedParams,
+    seeds: tuple[np.random.SeedSequence, np.random.SeedSequence],
+    names: str,
+) -> _Stops:
+    plan: Plan = params.poses(site, _rng(seeds[0]))
+    poses = list(plan.poses)
+    if len(poses) < FEWEST:
+        raise StageError(
+            f"acquire.simulated: {names} at {len(poses)} of {plan.wanted} planned poses, "
+            f"{FEWEST} are needed ({reach.why_refused()}); "
+            "move camera.position, or the plan's centre, or make its size or tilt smaller"
+        )
+    return _Stops(plan, _checks(plan, site, params.verification, _rng(seeds[1])), poses)
+
+
+def _plan_alone(stops: _Stops, reach: Reach, site: Site) -> NothingMoved:
+    """Return the plan that is shown instead of a session."""
+    roles = ["verification"] * len(stops.checks) + ["calibration"] * len(stops.poses)
+    rows = [
+        row_at(f"{i:04d}", role, pose, site.eye)
+        for i, (role, pose) in enumerate(zip(roles, stops.all, strict=True))
+    ]
+    wanted = stops.plan.wanted
+    head = f"{len(rows)} stops of a simulated arm, {wanted} requested; paths are not simulated"
+    return NothingMoved(*as_plan(head, rows, left_out(reach.refusals, stops.all)))
+
+
+def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> list[PlannedPose]:
+    """Return poses for the captures that verify, near the middle of the workspace."""
+    found = poses_near(plan.centre, count, site, rng)
+    if len(found) < count:
+        raise StageError(
+            f"acquire.simulated: no pose for verification near the middle of the workspace "
+            f"({in_mm(plan.centre)}); move the plan's centre, or set verification: 0"
+        )
+    return found
+
+
+def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
+    """Return joints of poses all over the workspace that take no part."""
+    spread = plan.size / 2, UNSEEN_TILT
+    return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
+
+
+def _fingerprint(seed: int, *models: BaseModel | None) -> str:
+    given = [model.model_dump(mode="json") for model in models if model is not None]
+    text = json.dumps([VERSION, seed, given], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class _Session:
+    """One visit to every pose. The scanner's buffers, 300 MB, live while captures are pulled.
+
+    The joints, (N, n) as reported and as they are, go on with those of poses that take no part.
+    """
+
+    cell: Cell
+    scanner: ScannerModel
+    stops: _Stops
+    params: SimulatedParams
+    arm: ImperfectArm
+    joints: Floats
+    angles: Floats
+    of_scanner: np.random.SeedSequence
+
+    @property
+    def base_T_camera(self) -> Floats:
+        return self.params.camera.base_T_camera
+
+    @property
+    def count(self) -> int:
+        return len(self.stops.all)
+
+    def source(self, fingerprint: str) -> Source:
+        """Return where the captures come from, with the truth."""
+        plan, found = self.stops.plan, len(self.stops.poses)
+        note = f"simulated: {self.cell.robot.model} before {self.scanner.model}, {found} poses"
+        if left := plan.wanted - found:
+            note += f"; {left} more were planned and are not possible"
+        truth = Truth(Transform(BASE, CAMERA, self.base_T_camera), unseen=self._unseen())
+        return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth)
+
+    def _unseen(self) -> tuple[Observation, ...]:
+        """Return what a scanner without noise sees at the poses that take no part."""
+        joints, angles = self.joints[self.count :], self.angles[self.count :]
+        reported = [by_frame(Transform(BASE, FLANGE, pose)) for pose in self.arm.reported(joints)]
+        seen = invert(self.base_T_camera) @ self.arm.flange(angles)
+        return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
+
+    def captures(self, noise: np.random.SeedSequence) -> Iterator[Capture]:
+        """Make the captures, each when it is asked for."""
+        of_covers, *of_captures = noise.spawn(1 + self.count)
+        eye = self._eye()
+        covered = self._covered(_rng(of_covers))
+        around = self.cell.around()
+        for index, rng in enumerate(map(_rng, of_captures)):
+            frames, flange = self.arm.stand(self.angles[index], rng)
+            cover = [self.cell.board(flange)] if index in covered else []
+            bodies = around + self.cell.arm(frames, flange) + cover
+            xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
+            yield self._capture(index, xyz, self.arm.reported(self.joints[index]))
+
+    def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
+        """Scan other bodies, given in ``base``, with the same scanner from the same place."""
+        return PointCloud(CAMERA, self._eye().scan(before_camera(bodies, self.base_T_camera), rng))
+
+    def _eye(self) -> StructuredLight | TimeOfFlight:
+        """Return the scanner; its distortion is the same each time."""
+        rng = _rng(self.of_scanner)
+        return scanner_of(self.scanner, self.params.resolution, self.params.noise, rng)
+
+    def _covered(self, rng: np.random.Generator) -> set[int]:
+        """Draw the calibration captures in which a board hides the flange."""
+        calibration = np.arange(len(self.stops.checks), self.count)
+        count = round(self.params.outliers * len(calibration))
+        return set(rng.permutation(calibration)[:count].tolist())
+
+    def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
+        role: Role = "verification" if index < len(self.stops.checks) else "calibration"
+        return Capture(
+            id=f"{index:04d}",
+            cloud=PointCloud(CAMERA, xyz),
+            poses=by_frame(Transform(BASE, FLANGE, base_T_flange)),
+            joints=self.joints[index],
+            time_ns=EPOCH_NS + (index + 1) * INTERVAL_NS,
+            role=role,
+        )
+
+
+def _session(
+    cell: Cell,
+    scanner: ScannerModel,
+    stops: _Stops,
+    unseen: Sequence[Floats],
+    params: SimulatedParams,
+    errors: np.random.SeedSequence,
+) -> _Session:
+    of_arm, of_scanner = errors.spawn(2)
+    arm = ImperfectArm(cell.robot, params.robot_errors, _rng(of_arm), params.arm)
+    joints = np.array([*(pose.joints for pose in stops.all), *unseen])
+    return _Session(cell, scanner, stops, params, arm, joints, arm.angles(joints), of_scanner)
+
+
+def _rng(sequence: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.default_rng(sequence)

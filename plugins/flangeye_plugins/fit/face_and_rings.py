@@ -1,0 +1,141 @@
+"""What ``fit.rim`` does: a plane through the face, and its edges as circles with one centre."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.maths.circles import distances
+from flangeye.maths.geometry import basis_of_plane
+from flangeye.maths.planes import Plane, chosen, fit_plane, thinned
+from flangeye.models.bolt_pattern import roll_angle
+from flangeye.models.targets import Flange
+from flangeye.types import CircleFeature, FlangeCloud, Floats, Mask, Rejected
+from flangeye_plugins.fit.face import disc_face
+from flangeye_plugins.fit.rim_params import RimParams
+from flangeye_plugins.fit.rings import Rings, find_rings
+from flangeye_plugins.fit.uncertainty import plane_covariance
+
+FEWEST_POINTS = 100
+OUTSIDE_PLATE = 0.85
+"""Where the plate has ended, in radii of a wrist circle: of the robots known, wrists are 75 to
+90 mm across and plates 63."""
+
+EDGE = 1e-3
+"""How far from an edge a point is beyond its influence [m]."""
+
+LEAST_NOISE = 3e-5
+"""Scanners round edges by this much, however small their noise is [m]."""
+
+
+def face_and_rings(
+    cloud: FlangeCloud, flange: Flange, params: RimParams
+) -> CircleFeature | Rejected:
+    """Return the circle of a flange's rim, or why there is none; see ``fit.rim``."""
+    points = cloud.cloud.xyz.astype(np.float64, order="F")
+    rough = Plane(cloud.centre, cloud.normal)
+    face = disc_face(points, rough, _ring_of(flange), params.plane_gate)
+    if face is None:
+        return Rejected(f"fewer than 3 of {len(points)} points lie on a common plane")
+    flat = face.flatten(chosen(points, _on_face(face, points, params)))
+    if len(flat) < FEWEST_POINTS:
+        return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
+    start = face.flatten(cloud.centre[None])[0]
+    nominal = np.array(list(flange.radii.values()))
+    rings = find_rings(flat, nominal, start, params.inlier / 2)
+    problem = _why_not(rings, flange, params)
+    if problem:
+        return Rejected(problem)
+    plane = away_from_edges(points, face, rings, flange)
+    return _feature(points, plane, face, rings, flange, params)
+
+
+def _ring_of(flange: Flange) -> tuple[float, float]:
+    # Before a wrist circle's plane stands the plate; only what is outside it is in the plane.
+    return (OUTSIDE_PLATE * flange.rim if flange.bore is None else 0.0, 1.5 * flange.outer)
+
+
+def _on_face(face: Plane, points: Floats, params: RimParams) -> Mask:
+    heights, sigma = face.heights(points), max(face.sigma, LEAST_NOISE)
+    return np.asarray((heights > -params.behind * sigma) & (heights < params.before * sigma))
+
+
+def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
+    """Return why the circles are not the flange's, or None."""
+    coverage = rings.coverage(params.inlier)
+    for k, (name, expected) in enumerate(flange.radii.items()):
+        if coverage[k] < params.min_coverage:
+            return (
+                f"{coverage[k]:.0%} of the {name} lies within {params.inlier * 1e3:g} mm of a "
+                f"circle, at least {params.min_coverage:.0%} is needed"
+            )
+        got = rings.circles.radii[k]
+        if abs(got - expected) > params.radius_tolerance:
+            return (
+                f"{name} radius {got * 1e3:.2f} mm, expected {expected * 1e3:.2f} mm "
+                f"within {params.radius_tolerance * 1e3:g} mm"
+            )
+    return None
+
+
+def away_from_edges(points: Floats, face: Plane, rings: Rings, flange: Flange) -> Plane:
+    """Return the face's plane from points a millimetre inside rim and bore.
+
+    Near an edge chamfers, mixed pixels and reflections pull points off the plane, and most of
+    them backwards: with 0.2 mm of noise they hide in it and move the plane by 0.015 mm.
+    """
+    offsets = face.flatten(points) - rings.circles.centre
+    radius = distances(offsets)
+    rim, *bore = rings.circles.radii
+    inside = (radius < rim - EDGE) & (radius > (bore[0] if bore else _ring_of(flange)[0]) + EDGE)
+    inner = chosen(points, inside)
+    plane, half = face, 3 * max(face.sigma, LEAST_NOISE)
+    # The face is near enough already for a few rounds of its own slab to settle it.
+    for some in (thinned(inner), thinned(inner), inner):
+        near = chosen(some, np.abs(plane.heights(some)) < half)
+        if len(near) < FEWEST_POINTS:
+            return face
+        plane = fit_plane(near, face.normal)
+    return plane
+
+
+def _feature(
+    points: Floats, plane: Plane, face: Plane, rings: Rings, flange: Flange, params: RimParams
+) -> CircleFeature:
+    """Return the circle, found in ``face``, in ``plane``, with all that is known of it."""
+    centre = face.lift(rings.circles.centre)
+    centre = centre - plane.heights(centre) * plane.normal
+    axes = basis_of_plane(plane.normal)
+    heights = plane.heights(points)
+    near = np.abs(heights) < 3 * max(plane.sigma, LEAST_NOISE)
+    about_centre = Plane(centre, plane.normal).flatten(chosen(points, near))
+    of_plane = plane_covariance(about_centre, heights[near]) + _unevenness(flange, params)
+    to_flange = flange.details.thickness if flange.bore is None else 0.0
+    return CircleFeature(
+        centre=centre + to_flange * plane.normal,
+        normal=plane.normal,
+        radii=dict(zip(flange.radii, rings.circles.radii.tolist(), strict=True)),
+        covariance=axes.T @ _centre_covariance(rings, of_plane, params) @ axes,
+        normal_covariance=axes[:2].T @ of_plane[:2, :2] @ axes[:2],
+        arc_coverage=float(rings.coverage(params.inlier)[0]),
+        roll=roll_angle(about_centre, flange),
+    )
+
+
+def _unevenness(flange: Flange, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of slopes and height that the face's tolerance allows.
+
+    A surface anywhere within a band has the band's width over root 12 as standard deviation; a
+    slope is that over the standard deviation of a disc's points along an axis, half its radius.
+    """
+    height = params.flatness**2 / 12
+    slope = height / (flange.rim / 2) ** 2
+    return np.diag([slope, slope, height])
+
+
+def _centre_covariance(rings: Rings, of_plane: Floats, params: RimParams) -> Floats:
+    """Return the (3, 3) covariance of the centre in the face's axes, the normal last [m^2]."""
+    covariance = params.scanner_error**2 * np.eye(3)
+    covariance[:2, :2] += params.edge_bias**2 * np.eye(2)
+    covariance[:2, :2] += rings.covariance()[:2, :2]
+    covariance[2, 2] += of_plane[2, 2]
+    return covariance
