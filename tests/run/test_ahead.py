@@ -16,6 +16,8 @@ from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run import runner
 from flangeye.run.ahead import Done, cores, worked_ahead
 from flangeye.run.runner import Runner
+from flangeye_emulators.acquire import simulation
+from flangeye_emulators.world.structured_light import StructuredLight
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
 
@@ -143,7 +145,13 @@ def test_simulated_scans_are_made_ahead_and_give_the_same_calibration(
     small = ["steps.0.resolution=0.25", "steps.0.poses={grid: {counts: [2, 2, 2]}}"]
     recipe = load_recipe(find_recipe("ur5_phoxi-m_simulated"), registry, small)
     threads: set[str] = set()
+    makers: set[int] = set()
     segment = recipe.steps[1].stage
+    scan = StructuredLight.scan
+
+    def scanned(*given):
+        makers.add(threading.get_ident())
+        return scan(*given)
 
     def watched(**given):
         threads.add(threading.current_thread().name)
@@ -153,13 +161,17 @@ def test_simulated_scans_are_made_ahead_and_give_the_same_calibration(
 
     def run(cores):
         monkeypatch.setattr(runner, "cores", lambda: cores)
+        monkeypatch.setattr(simulation, "cores", lambda: cores)
         threads.clear()
+        makers.clear()
         with replaced(segment, watched):
             result = Runner(recipe, registry, t.ArchivePath()).run().model_dump(mode="json")
         result.pop("timing")
-        return json.dumps(result), threads.copy()
+        return json.dumps(result), threads.copy(), makers - {threading.get_ident()}
 
-    one, here = run(1)
-    two, elsewhere = run(2)
+    monkeypatch.setattr(StructuredLight, "scan", scanned)
+    one, here, others = run(1)
+    two, elsewhere, ahead = run(2)
     assert one == two
     assert here == {"MainThread"} and "MainThread" not in elsewhere
+    assert not others and len(ahead) == 2

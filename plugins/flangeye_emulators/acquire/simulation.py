@@ -20,6 +20,7 @@ from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import Flange, Sphere, plate_of
 from flangeye.motion.planning import Plan, PlannedPose, Site, poses_near
 from flangeye.motion.reach import Reach
+from flangeye.run.ahead import cores, worked_ahead
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -60,6 +61,9 @@ FEWEST = 3
 UNSEEN_TILT = 0.3
 """Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]."""
 
+AT_ONCE = 4
+"""Scans that are made at once at most: each holds 160 MB while it is."""
+
 VERSION = 1
 """Raised whenever the same parameters would give other captures."""
 
@@ -96,10 +100,12 @@ def simulate(
     session = _session(cell, scanner, stops, unseen, params, errors)
     source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere))
     whys = [pose.why for pose in stops.all]
-    captures = _explained(session.captures(noise), whys, stage_log)
-    look = partial(session.look, rng=_rng(later))
     # A plan that says why is heard before each scan, so nothing is scanned ahead of it.
-    return Captures(captures, source, len(whys), look, recorded=not any(whys))
+    ahead = not any(whys)
+    scans = session.captures(noise, min(cores(), AT_ONCE) if ahead else 1)
+    look = partial(session.look, rng=_rng(later))
+    captures = _explained(scans, whys, stage_log)
+    return Captures(captures, source, len(whys), look, recorded=ahead)
 
 
 def _explained(
@@ -223,18 +229,29 @@ class _Session:
         seen = invert(self.base_T_camera) @ self.arm.flange(angles)
         return tuple(noise_free(seen[i], i, reported[i], joints[i]) for i in range(len(joints)))
 
-    def captures(self, noise: np.random.SeedSequence) -> Iterator[Capture]:
-        """Make the captures, each when it is asked for."""
+    def captures(self, noise: np.random.SeedSequence, at_once: int) -> Iterator[Capture]:
+        """Make the captures, each when it is asked for, or so many at once ahead of that.
+
+        Each has its own generator: they are the same whichever is finished first.
+        """
         of_covers, *of_captures = noise.spawn(1 + self.count)
         eye = self._eye()
         covered = self._covered(_rng(of_covers))
         around = self.cell.around()
-        for index, rng in enumerate(map(_rng, of_captures)):
+
+        def captured(index: int) -> Capture:
+            rng = _rng(of_captures[index])
             frames, flange = self.arm.stand(self.angles[index], rng)
             cover = [self.cell.board(flange)] if index in covered else []
             bodies = around + self.cell.arm(frames, flange) + cover
             xyz = eye.scan(before_camera(bodies, self.base_T_camera), rng)
-            yield self._capture(index, xyz, self.arm.reported(self.joints[index]))
+            return self._capture(index, xyz, self.arm.reported(self.joints[index]))
+
+        if at_once == 1:
+            yield from map(captured, range(self.count))
+        else:
+            for _, made in worked_ahead(iter(range(self.count)), captured, at_once):
+                yield made()
 
     def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
         """Scan other bodies, given in ``base``, with the same scanner from the same place."""
