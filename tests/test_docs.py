@@ -2,8 +2,6 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Plugin
+from tests.conftest import Call
 from tools import gallery
 
 ROOT = Path(__file__).parents[1]
@@ -70,7 +69,9 @@ def _runnable():
 
 
 @pytest.mark.parametrize("page", list(_runnable()))
-def test_commands_of_a_page_run(page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_of_a_page_run(
+    page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
     """Files with a title are written, then every command is run, in the order of the page."""
     shared = ROOT.parent / "shared"
     work = tmp_path / "work"
@@ -85,11 +86,8 @@ def test_commands_of_a_page_run(page: Any, tmp_path: Path, monkeypatch: pytest.M
         for line in text.replace("\\\n", " ").splitlines() if language == "sh" else ():
             words = shlex.split(line, comments=True)
             if words[:1] == ["flangeye"] and (shared.exists() or "../shared" not in line):
-                told = subprocess.run(
-                    [sys.executable, "-P", "-m", "flangeye.cli", *words[1:]],
-                    capture_output=True, text=True, timeout=300,
-                )  # fmt: skip
-                assert told.returncode in (0, 1), f"{line}\n{told.stderr}"
+                code, _, err = command(*words[1:])
+                assert code in (0, 1), f"{line}\n{err}"
 
 
 WALKS = ROOT / "docs" / "how-to" / "add-a-plugin.md"

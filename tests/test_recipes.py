@@ -1,9 +1,6 @@
 """Every bundled recipe is checked and run."""
 
 import json
-import subprocess
-import sys
-from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -20,6 +17,7 @@ from flangeye.recipe.load import load_recipe
 from flangeye.recipe.schema import recipe_schema
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
+from tests.conftest import Call
 from tools.outcomes import outcome, outcomes, run
 
 NAMES = list(recipe_names())
@@ -31,18 +29,24 @@ def first_step(name):
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A function that runs a recipe once, whoever asks for it; its result."""
+def results() -> dict[Any, Any]:
+    """What came of each run."""
+    return {}
 
-    @cache
+
+@pytest.fixture
+def ran(
+    command: Call, results: dict[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    """A function that runs a recipe once, whoever asks for it; its result."""
+    monkeypatch.chdir(tmp_path)
+
     def result(*words):
-        folder = tmp_path_factory.mktemp("recipe")
-        told = subprocess.run(
-            [sys.executable, "-m", "flangeye.cli", "run", *map(str, words), "--out", "run"],
-            cwd=folder, capture_output=True, text=True,
-        )  # fmt: skip
-        assert told.returncode == 0, told.stderr
-        return json.loads((folder / "run" / "result.json").read_text())
+        if words not in results:
+            code, _, err = command("run", *words, "--out", "run")
+            assert code == 0, err
+            results[words] = json.loads((tmp_path / "run" / "result.json").read_text())
+        return results[words]
 
     return result
 
