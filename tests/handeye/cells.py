@@ -21,7 +21,7 @@ from flangeye.maths.geometry import (
     rotation_log,
 )
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.streams import passed, pose_at
+from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.configuration import ORIGIN, Configuration, carriers_of
 from flangeye.models.loading import load_model
 from flangeye.types import (
@@ -91,22 +91,26 @@ def moves(rng, n, tilt, reach=0.15):
 
 
 TILT = np.radians(17)
+HOME = np.array([0.2, -1.4, 1.3, -1.2, -1.4, 0.3])
+"""Joint angles of an arm a link of which carries the camera."""
 ISSUE = Noise()
 NOTHING_BEYOND = Beyond(0.0, 0.0)
 
 
-def session(configuration, rng, n=15, tilt=TILT, noise=ISSUE, feature="pose", poses=None):
+def session(
+    configuration, rng, n=15, tilt=TILT, noise=ISSUE, feature="pose", poses=None, joints=None
+):
     """Draw a session whose target is some 0.6 m before the camera.
 
-    ``poses`` gives (n, 4, 4) motions of every arm in place of those drawn, or (2, n, 4, 4).
+    ``poses`` gives (n, 4, 4) motions of every arm in place of those drawn, or (2, n, 4, 4), and
+    ``joints`` (n, 6) where a link carries the camera.
     """
     homes = [rigid(rotation(rng), np.array([0.4, 0.1, 0.4])) for _ in range(2)]
     drawn = [moves(rng, n, tilt) if poses is None else poses for _ in range(2)]
     drawn = drawn[0] if np.ndim(drawn[0]) == 4 else drawn
     first, second = homes[0] @ drawn[0], homes[1] @ drawn[1]
-    joints = None
     if configuration.name == "eye-on-arm":
-        joints = np.array([0.2, -1.4, 1.3, -1.2, -1.4, 0.3]) + rng.uniform(-tilt, tilt, (n, 6))
+        joints = HOME + rng.uniform(-tilt, tilt, (n, 6)) if joints is None else joints
         first = Arm(ROBOT).flange(joints)
     x = rigid(rotation(rng), rng.normal(0, 0.05, 3))
     z = configuration.place
@@ -201,6 +205,8 @@ def moving(times):
 def passing(configuration, rng, delay, n=40, **more):
     """Draw a session of a moving arm, seen by ``delay`` [s] later than the poses' times."""
     at = np.sort(rng.uniform(1.0, 25.0, n))
+    if configuration.name == "eye-on-arm":
+        return _turning(configuration, rng, (at, delay), **more)
     made = session(configuration, rng, n=n, poses=both(at + delay), **more)
     stream, before, start = np.arange(0.0, 26.0, 0.01), made.observations[0].poses, both(at + delay)
     moved = {
@@ -217,6 +223,26 @@ def passing(configuration, rng, delay, n=40, **more):
         poses = {name: replace(o.poses[name], matrix=x) for name, x in at_pose.items()}
         out.append(replace(o, poses=poses, motion=motion))
     return replace(made, observations=out)
+
+
+def _turning(configuration, rng, when, **more):
+    """Draw the same of an arm a link of which carries the camera, its joints recorded."""
+    at, delay = when
+    made = session(configuration, rng, n=len(at), joints=swinging(at + delay), **more)
+    stream, out = np.arange(0.0, 26.0, 0.01), []
+    for o, time in zip(made.observations, at, strict=True):
+        motion = passed(stream, Arm(ROBOT).flange(swinging(stream)), time)
+        motion = with_joints(motion, time, FLANGE, (stream, swinging(stream)))
+        flange = replace(o.poses[FLANGE], matrix=pose_at(motion, 0.0))
+        joints = joints_at(motion, 0.0, FLANGE)
+        out.append(replace(o, poses={FLANGE: flange}, joints=joints, motion=motion))
+    return replace(made, observations=out)
+
+
+def swinging(times):
+    """Return (n, 6) joint angles of an arm that never stands still, some 0.3 rad/s each."""
+    rates = np.array([0.7, 1.3, 0.9, 1.1, 1.7, 0.8])
+    return HOME + 0.3 * np.sin(np.multiply.outer(times, rates) + np.arange(6))
 
 
 def both(times):

@@ -95,10 +95,12 @@ def test_poses_set_aside_are_told_with_their_distance_turn_and_sigma() -> None:
 
 
 def test_the_time_between_clocks_is_told_with_which_was_first() -> None:
-    cell: Any = SimpleNamespace(delay=12e-3)
+    cell: Any = SimpleNamespace(delay=12e-3, flange=True)
     told = "the flange was at the poses {} ms {} the times they are paired by"
     assert calibration._clock_told(cell, 3e-3, 0.5e-3) == told.format("15.0 +- 0.5", "after")
     assert calibration._clock_told(cell, -20e-3, 1e-3) == told.format("8.0 +- 1.0", "before")
+    by_link: Any = SimpleNamespace(delay=12e-3, flange=None)
+    assert calibration._clock_told(by_link, 0.0, 1e-3).startswith("the arm was at the poses 12.0")
     cell.delay = None
     assert calibration._clock_told(cell, -2e-3, 1e-3) == told.format("2.0 +- 1.0", "before")
     fit = modelled(nuisance=replace(two_numbers(9), mean=np.zeros(2)))

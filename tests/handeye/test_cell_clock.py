@@ -18,7 +18,7 @@ from flangeye.handeye.graph import LIMITS
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.statistics import chi2_quantile
-from flangeye.maths.streams import passed, pose_at
+from flangeye.maths.streams import passed, pose_at, with_joints
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import CAMERA, TARGET, Motion, Observation, PoseFeature, Transform
 from tests.handeye.cells import errors, moving
@@ -38,13 +38,29 @@ CELL = Cell(
 )  # fmt: skip
 
 
-def seen(delays: Any, seed: int = 0, recorded: float = 1.0) -> list[Observation]:
+def carried_by(axis: Axis) -> Cell:
+    """Return the same cell, the arm on a rail or on a positioner."""
+    frames = {"axis_base": Frame("base", np.eye(4)), "axis": Frame("axis_base"), **CELL.frames,
+              "arm_base": Frame("axis", np.eye(4))}  # fmt: skip
+    return replace(CELL, frames=frames, movers={"axis": axis, **CELL.movers})
+
+
+def sliding(times: Any) -> Any:
+    """Return the values of an axis that never stands still, some 0.2 m or rad a second."""
+    return 0.3 * np.sin(0.8 * times)
+
+
+def seen(
+    delays: Any, seed: int = 0, recorded: float = 1.0, axis: Axis | None = None
+) -> list[Observation]:
     """Return what two cameras saw of a moving marker, by clocks that are so much early [s]."""
     rng, stream = np.random.default_rng(seed), np.arange(0.0, 26.0, 0.01)
     poses, out = moving(stream), []
     for i, when in enumerate(np.sort(rng.uniform(1.0, 25.0, 40))):
         camera = ("left", "right")[i % 2]
         actual = moving(np.array([when + delays[camera]]))[0]
+        if axis is not None:
+            actual = axis.place(sliding(when + delays[camera])) @ actual
         true = invert(PLACES[camera]) @ actual @ PLACES["marker"]
         noise = rng.standard_normal(6) * np.repeat([TURN, SHIFT], 3)
         pose = rigid(rotation_exp(noise[:3]) @ true[:3, :3], true[:3, 3] + noise[3:])
@@ -56,13 +72,19 @@ def seen(delays: Any, seed: int = 0, recorded: float = 1.0) -> list[Observation]
         arm = {"arm": motion.others["arm"][near]}
         motion = Motion(motion.times[near], motion.poses[near], arm)
         at = {"arm": Transform("arm_base", "arm", pose_at(motion, 0.0, "arm"))}
+        if axis is not None:
+            motion = with_joints(motion, when, "axis", (stream, sliding(stream)))
+            at["axis"] = Transform("axis_base", "axis", axis.place(sliding(when)))
         out.append(Observation(f"{i:03}", feature, at, None, camera, "marker", motion))
     return out
 
 
-def solved(delays: Any, seed: int = 0, recorded: float = 1.0) -> tuple[list[float], list[str]]:
+def solved(
+    delays: Any, seed: int = 0, recorded: float = 1.0, axis: Axis | None = None
+) -> tuple[list[float], list[str]]:
     """Return the squared distance of every transform, of six, and what is told of clocks."""
-    found = calibrate_cell(seen(delays, seed, recorded), CELL, LIMITS, "solve.cell")
+    cell = CELL if axis is None else carried_by(axis)
+    found = calibrate_cell(seen(delays, seed, recorded, axis), cell, LIMITS, "solve.cell")
     squares = []
     for estimate in found.transforms.values():
         off = errors(estimate, PLACES[estimate.transform.child])
@@ -70,9 +92,16 @@ def solved(delays: Any, seed: int = 0, recorded: float = 1.0) -> tuple[list[floa
     return squares, [note for note in found.notes if "the arms were at the poses" in note]
 
 
+RAIL = Axis(np.array([0.0, 1.0, 0.0]), turns=False, travel=(-1.0, 1.0))
+POSITIONER = replace(RAIL, turns=True)
+
+
+@pytest.mark.parametrize("axis", [None, RAIL, POSITIONER])
 @pytest.mark.parametrize("delays", [{"left": 0.0, "right": 0.06}, {"left": -0.04, "right": 0.08}])
-def test_each_cameras_delay_is_found_and_every_place_is_right(delays: Any) -> None:
-    squares, (note,) = solved(delays)
+def test_each_cameras_delay_is_found_and_every_place_is_right(
+    delays: Any, axis: Axis | None
+) -> None:
+    squares, (note,) = solved(delays, axis=axis)
     told = re.findall(r"([\d.]+) \+- ([\d.]+) ms (after|before) the times that (\w+) gives", note)
     assert [camera for *_, camera in told] == ["left", "right"]
     for delay, sigma, which, camera in told:
@@ -83,8 +112,9 @@ def test_each_cameras_delay_is_found_and_every_place_is_right(delays: Any) -> No
     assert max(squares) < chi2_quantile(0.999, 6)
 
 
-def test_where_the_clocks_agree_nothing_is_told() -> None:
-    squares, notes = solved({"left": 0.0, "right": 0.0}, seed=1)
+@pytest.mark.parametrize("axis", [None, RAIL, POSITIONER])
+def test_where_the_clocks_agree_nothing_is_told(axis: Axis | None) -> None:
+    squares, notes = solved({"left": 0.0, "right": 0.0}, seed=1, axis=axis)
     assert not notes
     assert max(squares) < chi2_quantile(0.999, 6)
 

@@ -10,17 +10,19 @@ from flangeye.maths.statistics import chi2_quantile
 from flangeye.maths.streams import later, pose_at, rates_of
 from flangeye.types import FLANGE2, Motion
 from flangeye_plugins.solve.robust import RobustParams, solve_poses
-from tests.handeye.cells import CONFIGURATIONS, errors, passing
+from tests.handeye.cells import CONFIGURATIONS, ROBOT, errors, passing
 
 TOLD = re.compile(r"([\d.]+) \+- ([\d.]+) ms (after|before)")
 CELLS = [("eye-on-base, marker", "pose"), ("eye-in-hand, base circle", "normal"),
-         ("two arms, marker", "pose")]  # fmt: skip
+         ("two arms, marker", "pose"), ("eye-on-arm 1, marker", "pose"),
+         ("eye-on-arm 2, base circle", "normal")]  # fmt: skip
 
 
 def solved(name, kind, delay, seed, n=24):
     """Return the squared distance of the camera's pose, of six, and the notes on the clocks."""
     made = passing(CONFIGURATIONS[name], np.random.default_rng(seed), delay, n, feature=kind)
-    found = solve_poses(made.observations, RobustParams(), None, made.configuration)
+    robot = ROBOT if made.configuration.name == "eye-on-arm" else None
+    found = solve_poses(made.observations, RobustParams(), robot, made.configuration)
     camera = next(iter(found.transforms))
     error = errors(found.transforms[camera], made.truth[camera])
     square = error @ np.linalg.solve(found.transforms[camera].covariance, error)

@@ -234,9 +234,10 @@ def _delay_of(model: Model) -> tuple[float, float]:
 def _clock_told(cell: Cell, further: float, sigma: float) -> str:
     delay = (cell.delay or 0.0) + further
     which = "after" if delay > 0 else "before"
+    carrier = "flange" if cell.flange else "arm"
     return (
-        f"the flange was at the poses {abs(delay) * 1e3:.1f} +- {sigma * 1e3:.1f} ms {which} the "
-        "times they are paired by"
+        f"the {carrier} was at the poses {abs(delay) * 1e3:.1f} +- {sigma * 1e3:.1f} ms {which} "
+        "the times they are paired by"
     )
 
 

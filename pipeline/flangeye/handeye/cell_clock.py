@@ -59,8 +59,8 @@ def on_one_clock(
 ) -> Timed:
     """Return the sightings with the arms at the times they were seen, if that helps.
 
-    Each camera has a clock of its own; those of the arms agree. A time is taken over when it is
-    significant, and errors of sightings held out fall; else it is in the covariance.
+    Each camera has a clock of its own; those of all that moves agree. A time is taken over when it
+    is significant, and errors of sightings held out fall; else it is in the covariance.
 
     Args:
         observations: N of them; nothing is looked for unless all say how the arms passed.
@@ -100,7 +100,8 @@ def _delayed(
     """Return the sightings with the arms so much later [s]; None beyond what was recorded."""
     moved = []
     for o in observations:
-        motion = o.motion and later(o.motion, float(delays[cell.cameras.index(o.camera)]))
+        delay = float(delays[cell.cameras.index(o.camera)])
+        motion = o.motion and later(cell.passing(o.motion), delay)
         if motion is None:
             return None
         at = {n: replace(o.poses[n], matrix=pose_at(motion, 0.0, n)) for n in motion.others}
@@ -139,7 +140,7 @@ def _delays(timed: Timed, cell: Cell) -> _Delays:
 def _lateness(timed: Timed, cell: Cell) -> Floats:
     """Return (N, 6, c) what a second by which each camera's poses are too early does."""
     sighted, found = timed.sighted, timed.found
-    motions = [o.motion for o in timed.observations if o.motion is not None]
+    motions = [cell.passing(o.motion) for o in timed.observations if o.motion is not None]
     noise = {name: found.movers * covariance for name, covariance in sighted.noise.items()}
     graph = sighted.frames, sighted.sightings, found.places, noise
     moved = np.zeros((len(motions), 6))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import chain
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.streams import later, pose_at, rates_of
+from flangeye.maths.streams import joints_at, later, pose_at, rates_of
 from flangeye.models.configuration import LINK, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
@@ -95,12 +96,22 @@ class Cell:
 
     @property
     def motions(self) -> list[Motion] | None:
-        """How the flange passed each capture; None where it stood still or nobody recorded it."""
-        carriers = {self.configuration.camera, self.configuration.target}
-        others = carriers - {BASE, FLANGE}
-        motions = [o.motion for o in self.observations if o.motion and others <= {*o.motion.others}]
-        told = FLANGE in carriers and len(motions) == len(self.observations)
-        return motions if told else None
+        """How what carries camera and target passed each capture; None where it stood still.
+
+        Or where nobody recorded it, as of a link the joints.
+        """
+        others = {self.configuration.camera, self.configuration.target} - {BASE, FLANGE}
+        motions = [self._with_link(o.motion) for o in self.observations if o.motion]
+        told = [motion for motion in motions if others <= {*motion.others}]
+        return told if len(told) == len(self.observations) else None
+
+    def _with_link(self, motion: Motion) -> Motion:
+        """Return a motion with that of the link that carries the camera, by the arm's joints."""
+        camera, joints = self.configuration.camera, motion.joints.get(FLANGE)
+        if self.arm is None or joints is None or not camera.startswith(LINK):
+            return motion
+        poses = self.arm.pose(joints, int(camera.removeprefix(LINK)))
+        return replace(motion, others={**motion.others, camera: poses})
 
     def delayed(self, delay: float) -> Cell | None:
         """Return the cell with its arms where they were ``delay`` later [s]; None if not known."""
@@ -113,20 +124,22 @@ class Cell:
             moved |= {name: pose_at(motion, 0.0, name) for name in motion.others}
             poses = {name: replace(o.poses[name], matrix=x) for name, x in moved.items()}
             poses = {**o.poses, **poses}
-            observations.append(replace(o, poses=poses, joints=None, motion=motion))
+            joints = joints_at(motion, 0.0, FLANGE)
+            observations.append(replace(o, poses=poses, joints=joints, motion=motion))
         return replace(self, observations=observations, delay=(self.delay or 0.0) + delay)
 
     def unknown_delay(self) -> Nuisance | None:
         """Return what a time [s] does by which the arms' poses are still too early."""
         motions = self.motions
-        if motions is None or self.flange is None:
+        if motions is None:
             return None
-        delay = self.flange.nuisance(rates_of(motions)[..., None], np.inf)
-        if self.configuration.target != FLANGE2:
-            return delay
-        moves = rates_of(motions, FLANGE2)[..., None]
-        carried = MovedFlange(self._poses(FLANGE2), None, False).nuisance(moves, np.inf)
-        return delay.joined(carried)
+        late = []
+        for moved in chain(*self.arms):
+            ends = self.configuration
+            frame = ends.camera if moved.carries_camera else ends.target
+            rates = rates_of(motions, None if frame == FLANGE else frame)
+            late.append(moved.nuisance(rates[..., None], np.inf))
+        return reduce(Nuisance.joined, late) if late else None
 
     def resized(self, factor: float) -> Cell:
         """Return the cell with all poses of the target so many times as far from the camera."""

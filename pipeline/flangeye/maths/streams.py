@@ -6,7 +6,7 @@ Times are (N,) ascending [s], poses (N, 4, 4) [m]. Arrays only.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,17 +98,41 @@ def passed(
     return Motion(steps, interpolated(times, poses, at + steps), beside)
 
 
+def with_joints(motion: Motion, at: float, of: str, stream: tuple[Floats, Floats]) -> Motion:
+    """Return the motion about a moment ``at`` [s] with the joints that move a frame.
+
+    It is as long as their stream tells: of times (N,) and values (N, n), or (N,) of one axis.
+    """
+    times, values = stream
+    told = (at + motion.times >= times[0]) & (at + motion.times <= times[-1])
+    told |= motion.times == 0
+    joints = {name: each[told] for name, each in motion.joints.items()}
+    columns = values.reshape(len(times), -1).T
+    joints[of] = np.stack(
+        [np.interp(at + motion.times[told], times, each) for each in columns], axis=1
+    )
+    others = {name: poses[told] for name, poses in motion.others.items()}
+    return Motion(motion.times[told], motion.poses[told], others, joints)
+
+
 def later(motion: Motion, delay: float) -> Motion | None:
     """Return how the flange passed the moment ``delay`` later [s]; None beyond what was kept."""
     if not motion.times[0] <= delay <= motion.times[-1]:
         return None
-    return Motion(motion.times - delay, motion.poses, motion.others)
+    return replace(motion, times=motion.times - delay)
 
 
 def pose_at(motion: Motion, time: float, of: str | None = None) -> Floats:
     """Return the pose (4, 4) at a time of a motion [s]: the flange's, or that of another frame."""
     poses = motion.poses if of is None else motion.others[of]
     return np.asarray(interpolated(motion.times, poses, np.array([time]))[0])
+
+
+def joints_at(motion: Motion, time: float, of: str) -> Floats | None:
+    """Return the (n,) joints that move a frame at a time of a motion; None if not recorded."""
+    if of not in motion.joints:
+        return None
+    return np.array([np.interp(time, motion.times, each) for each in motion.joints[of].T])
 
 
 def rates_of(motions: Sequence[Motion], of: str | None = None) -> Floats:

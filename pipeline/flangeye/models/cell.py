@@ -18,7 +18,7 @@ from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.configuration import Ends
 from flangeye.models.robots import RobotModel
-from flangeye.types import Array, Floats, HandEye, Observation, Transform
+from flangeye.types import Array, Floats, HandEye, Motion, Observation, Transform
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -88,6 +88,16 @@ class Cell:
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
         }
+
+    def passing(self, motion: Motion) -> Motion:
+        """Return how everything passed: rails and positioners where their recorded values say."""
+        axes = {n: mover for n, mover in self.movers.items() if isinstance(mover, Axis)}
+        placed = {
+            name: np.array([axes[name].place(float(value)) for value in values[:, 0]])
+            for name, values in motion.joints.items()
+            if name in axes
+        }
+        return replace(motion, others={**motion.others, **placed})
 
     def name_of(self, frame: str) -> str:
         """Return ``parent_T_frame``."""

@@ -117,17 +117,24 @@ class Motion:
         times: (K,) from the time of the capture's own pose, rising [s].
         poses: (K, 4, 4) base_T_flange [m].
         others: (K, 4, 4) of what else moved, each in its own base, by frame; a cell's are all here.
+        joints: (K, n) of an arm, or of a rail or positioner its one value [rad or m], by the frame
+            that they move.
     """
 
     times: Array
     poses: Array
     others: Mapping[str, Array] = field(default_factory=dict)
+    joints: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.times)
         freeze(self, times=(count,), poses=(count, 4, 4))
         others = {n: frozen(x, (count, 4, 4), f"Motion.{n}") for n, x in self.others.items()}
         object.__setattr__(self, "others", others)
+        joints = {
+            n: frozen(q, (count, np.shape(q)[-1]), f"Motion.{n}") for n, q in self.joints.items()
+        }
+        object.__setattr__(self, "joints", joints)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ from flangeye.maths.streams import (
     mean_pose,
     passed,
     turning,
+    with_joints,
 )
 from flangeye.types import Floats, Motion
 from flangeye.units import param
@@ -299,14 +300,16 @@ def _by_time(
 
 
 def _motion(first: Moved, moved: Sequence[Moved], found: Pair) -> Motion | None:
-    """Return how all arms passed; None where they stood still, or a rail or positioner moved."""
+    """Return how all arms, rails and positioners passed; None where the first stood still."""
     if found.motion is None or first.times is None:
         return None
-    streams = {m.name: (np.asarray(m.times), m.values) for m in moved if m.values.ndim == 3}
-    motion = passed(first.times, first.values, found.time, streams)
-    around = found.time + motion.times
-    axes = [np.interp(around, np.asarray(m.times), m.values) for m in moved if m.values.ndim == 1]
-    return None if any(np.ptp(values) > STILL_DISTANCE for values in axes) else motion
+    streams = {m.name: (np.asarray(m.times), m.values) for m in moved}
+    poses = {name: stream for name, stream in streams.items() if stream[1].ndim == 3}
+    motion = passed(first.times, first.values, found.time, poses)
+    for name, stream in streams.items():
+        if name not in poses:
+            motion = with_joints(motion, found.time, name, stream)
+    return motion
 
 
 Signal = tuple[Floats, Floats]

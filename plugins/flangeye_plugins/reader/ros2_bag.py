@@ -22,9 +22,9 @@ from flangeye import Params, StageError, part
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.streams import mean_pose, turning
+from flangeye.maths.streams import mean_pose, turning, with_joints
 from flangeye.models.robots import RobotModel
-from flangeye.types import FLANGE, Floats
+from flangeye.types import FLANGE, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
 from flangeye_plugins.reader.ros2_frames import Frames, Stream, in_order, pose_of
@@ -309,7 +309,7 @@ class Target:
                 {FLANGE: found.pose},
                 joints=_angles(joints, found),
                 time_ns=round(found.time * 1e9),
-                motion=found.motion,
+                motion=_motion(joints, found),
                 camera_T_target=mean_pose(self.poses[list(found.events)]),
             )
             for i, found in enumerate(pairs)
@@ -387,7 +387,7 @@ class Scans:
                 cloud=files[event] if self.clouds else None,
                 joints=_angles(joints, found),
                 time_ns=round(found.time * 1e9),
-                motion=found.motion,
+                motion=_motion(joints, found),
                 image=images.get(event),
                 camera=self.camera,
             )
@@ -460,6 +460,13 @@ def _target(bag: Bag, params: BagParams) -> Target:
     # Seen from the target the chain is the same, and its times are those of the target's own tf.
     times, poses = bag.frames.between(name, params.camera)
     return Target(times, np.array([inverted(pose) for pose in poses]))
+
+
+def _motion(joints: Stream | None, found: Pair) -> Motion | None:
+    """Return how the arm passed, with its joints where they were recorded."""
+    if found.motion is None or joints is None:
+        return found.motion
+    return with_joints(found.motion, found.time, FLANGE, joints)
 
 
 def _angles(joints: Stream | None, found: Pair) -> Floats | None:

@@ -12,7 +12,7 @@ from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid
-from flangeye.maths.streams import pose_at
+from flangeye.maths.streams import joints_at, pose_at
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run.folder import RunFolder
@@ -236,7 +236,7 @@ def test_streams_are_joined_by_time_where_everything_stands_still(tmp_path: Path
 
 
 @pytest.mark.parametrize("slide", [0.0, 0.05])
-def test_arms_that_pass_are_told_with_how_they_passed_unless_a_rail_moves(
+def test_arms_that_pass_are_told_with_how_they_and_a_rail_passed(
     tmp_path: Path, slide: float
 ) -> None:
     times = np.arange(0, 12.0, 0.01)
@@ -259,10 +259,10 @@ def test_arms_that_pass_are_told_with_how_they_passed_unless_a_rail_moves(
     assert len(recordings) > 10
     for recording in recordings:
         motion = recording.motion
-        assert (motion is None) == (slide > 0)
-        if motion is not None:
-            assert {*motion.others} == {"one", "two"}
-            assert np.allclose(pose_at(motion, 0.0, "two"), recording.poses["two"], atol=1e-6)
+        assert {*motion.others} == {"one", "two"}
+        assert np.allclose(pose_at(motion, 0.0, "two"), recording.poses["two"], atol=1e-6)
+        assert joints_at(motion, 0.0, "rail") == pytest.approx(recording.axes["rail"])
+        assert joints_at(motion, 0.1, "rail") == pytest.approx(recording.axes["rail"] + 0.1 * slide)
 
 
 def _quaternions(poses: Any) -> Any:

@@ -19,6 +19,7 @@ from flangeye.files.recording import NotThisLayout
 from flangeye.log import records
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
+from flangeye.maths.streams import joints_at
 from flangeye.models.loading import load_model
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import load_registry
@@ -236,6 +237,23 @@ def test_joint_angles_give_poses_by_the_recipes_robot(
     assert np.allclose([r.base_T_flange for r in found.recordings], poses, atol=1e-9)
     assert np.allclose([r.joints for r in found.recordings], angles, atol=1e-9)
     assert any("the flange's poses by the joints of ur5e" in note for note in found.notes)
+
+
+def test_the_joints_of_an_arm_that_passed_are_told_beside_its_poses(
+    bag: Callable[..., Any], tmp_path: Path
+) -> None:
+    times = START + np.arange(0, 8.0, 0.02)
+    angles = 0.4 * np.sin(np.outer(times - START, [0.7, 1.1, 0.9, 1.3, 0.8, 1.0])) - 0.5
+    told = [("/joint_states", t, joint_state(t, q)) for t, q in zip(times, angles, strict=True)]
+    told += [("/marker", t, pose_stamped(t, POSES[1])) for t in times[20:-20:10] + 0.007]
+    reader = {"ros2_bag": {"robot": "/joint_states", "target": "/marker"}}
+    recordings = reader_of(tmp_path, "ur5e", reader)(bag(told)).recordings
+    assert len(recordings) > 10
+    arm = Arm(load_model("robots", "ur5e"))
+    for recording in recordings:
+        motion = recording.motion
+        assert joints_at(motion, 0.0, "flange") == pytest.approx(recording.joints)
+        assert np.allclose(arm.flange(motion.joints["flange"]), motion.poses, atol=1e-3)
 
 
 OWN = {"urdf": "own.urdf", "base": "l0", "flange": "l6"}
