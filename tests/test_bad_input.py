@@ -4,15 +4,14 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye.files.clouds import write_cloud
 from flangeye.types import CAMERA, PointCloud
+from tests.conftest import Call
 
 RECIPE = """\
 title: Bad input
@@ -46,26 +45,14 @@ def archive(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Callable[..., Any]:
-    def call(archive, *words):
-        told = subprocess.run(
-            [sys.executable, "-m", "flangeye.cli", "run", "recipe.yaml", "--archive", str(archive),
-             *words],
-            cwd=tmp_path, capture_output=True, text=True,
-        )  # fmt: skip
-        assert "Traceback" not in told.stderr
-        return told
-
-    return call
-
-
 def refusal(told, tmp_path):
     """Return the one line of an exit 2 that left nothing behind."""
-    assert told.returncode == 2, told.stderr
+    code, _, err = told
+    assert "Traceback" not in err
+    assert code == 2, err
     assert not (tmp_path / "runs").exists()
-    errors = [line for line in told.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, told.stderr
+    errors = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, err
     return errors[0].replace(str(tmp_path) + "/", "")
 
 
@@ -115,11 +102,13 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_one_line_that_names_the_place(
-    name: str, archive: Path, run: Callable[..., Any], tmp_path: Path
+    name: str, archive: Path, command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil, words, mentions = CASES[name]
     spoil(archive)
-    line = refusal(run(archive, *words), tmp_path)
+    monkeypatch.chdir(tmp_path)
+    told = command("run", "recipe.yaml", "--archive", archive, *words)
+    line = refusal(told, tmp_path)
     assert mentions in line
     assert len(line) < 400
 

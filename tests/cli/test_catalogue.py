@@ -1,7 +1,5 @@
 """Lists of what is known, files for what is not, and what the command line offers to complete."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.models.loading import load_model, model_names
 from flangeye.plugin.registry import PluginNotFoundError, load_registry
 from flangeye.recipe.load import load_recipe
+from tests.conftest import Call
 
 
 def flangeye(*words, typed=""):
@@ -98,14 +97,13 @@ def test_a_whole_scanner_can_be_simulated(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_wrong_value_is_one_line_and_leaves_no_file(
-    words: list[Any], line: str, tmp_path: Path
+    words: list[Any], line: str, command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = subprocess.run(
-        [sys.executable, "-m", "flangeye.cli", *words], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert told.returncode == 2
-    assert told.stderr.startswith(line)
-    assert len(told.stderr.splitlines()) == 1
+    monkeypatch.chdir(tmp_path)
+    code, _, err = command(*words)
+    assert code == 2
+    assert err.startswith(line)
+    assert len(err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 

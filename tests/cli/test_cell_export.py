@@ -1,7 +1,5 @@
 """A cell's transforms in other programs' words: all of them, or those of one camera."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,6 +16,7 @@ from flangeye.report.certificate.budget import shares_of
 from flangeye.result import result_of_camera
 from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
+from tests.conftest import Call
 
 TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"
 
@@ -34,18 +33,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return path, result
 
 
-def export(run: Path, *words: str) -> Any:
-    return subprocess.run(
-        [sys.executable, "-m", "flangeye.cli", "export", str(run), *words],
-        capture_output=True, text=True,
-    )  # fmt: skip
-
-
-def test_a_urdf_has_a_joint_for_every_transform(run: Any) -> None:
+def test_a_urdf_has_a_joint_for_every_transform(run: Any, command: Call) -> None:
     path, result = run
-    told = export(path, "--to", "urdf", "--out", "-")
-    assert told.returncode == 0
-    joints = ElementTree.fromstring(told.stdout).findall("joint")
+    code, out, _ = command("export", path, "--to", "urdf", "--out", "-")
+    assert code == 0
+    joints = ElementTree.fromstring(out).findall("joint")
     found = {f"{j.find('parent').get('link')}_T_{j.find('child').get('link')}": j for j in joints}
     assert set(found) == set(result.transforms) == {"base_T_left", "base_T_right", "arm_T_marker"}
     for name, joint in found.items():
@@ -53,31 +45,31 @@ def test_a_urdf_has_a_joint_for_every_transform(run: Any) -> None:
         assert np.allclose(place, np.array(result.transforms[name].matrix)[:3, 3], atol=1e-8)
 
 
-def test_a_refused_run_says_on_the_console_which_motion_is_missing(tmp_path: Path) -> None:
+def test_a_refused_run_says_on_the_console_which_motion_is_missing(
+    tmp_path: Path, command: Call
+) -> None:
     words = ["--set", "steps.0.spread=0.01 deg", "--set", "steps.0.sightings=8"]
-    told = subprocess.run(
-        [sys.executable, "-m", "flangeye.cli", "run", str(TWO), *words, "--out", "still"],
-        capture_output=True, text=True, cwd=tmp_path,
-    )  # fmt: skip
-    assert told.returncode == 1
-    assert "refused: the sightings do not tell where left and right and marker are" in told.stdout
-    assert "turn arm about (" in told.stdout
-    assert "of arm_base by 20 deg or more, and see it again" in told.stdout
+    code, out, _ = command("run", TWO, *words, "--out", tmp_path / "still")
+    assert code == 1
+    assert "refused: the sightings do not tell where left and right and marker are" in out
+    assert "turn arm about (" in out
+    assert "of arm_base by 20 deg or more, and see it again" in out
 
 
-def test_one_camera_is_chosen_where_a_format_carries_one(run: Any) -> None:
+def test_one_camera_is_chosen_where_a_format_carries_one(run: Any, command: Call) -> None:
     path, result = run
-    told = export(path, "--to", "matrix")
-    assert told.returncode == 2
-    assert told.stderr == (
+    code, _, err = command("export", path, "--to", "matrix")
+    assert code == 2
+    assert err == (
         "error: export.matrix: carries one transform, and the cell has 3: add --camera left or "
         "--camera right\n"
     )
     for camera in ("left", "right"):
-        assert export(path, "--to", "matrix", "--camera", camera).returncode == 0
+        assert command("export", path, "--to", "matrix", "--camera", camera)[0] == 0
         wanted = np.array(result.transforms[f"base_T_{camera}"].matrix)
         assert np.allclose(np.loadtxt(path / "exports" / f"{camera}.txt"), wanted, atol=1e-8)
-    launched = export(path, "--to", "ros2_launch", "--camera", "right", "--out", "-").stdout
+    words = ("--to", "ros2_launch", "--camera", "right", "--out", "-")
+    _, launched, _ = command("export", path, *words)
     assert '"--frame-id", "base"' in launched
     assert '"--child-frame-id", "right"' in launched
     assert "left" not in launched
@@ -116,6 +108,6 @@ def test_a_certificate_is_of_one_camera(run: Any) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_refused(run: Any, words: list[str], told: str) -> None:
-    refused = export(run[0], *words)
-    assert (refused.returncode, refused.stderr) == (2, told)
+def test_what_cannot_be_is_refused(run: Any, words: list[str], told: str, command: Call) -> None:
+    code, _, err = command("export", run[0], *words)
+    assert (code, err) == (2, told)
