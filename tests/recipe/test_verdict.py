@@ -13,7 +13,7 @@ from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye.recipe.verdict import recall_verdict, verdict
+from flangeye.recipe.verdict import key_of, recall_verdict, verdict
 from tests.conftest import toy_plugins
 
 NAME = "ur5_phoxi-m_simulated"
@@ -30,23 +30,23 @@ def recipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_a_sound_recipe_is_remembered_as_it_was_said(recipe: Path) -> None:
-    assert recall_verdict(recipe) is None
-    said = verdict(recipe, load_registry())
+    assert recall_verdict(key_of(recipe)) is None
+    said = verdict(recipe, key_of(recipe), load_registry())
     assert said.startswith(f"{recipe}: ok, 5 steps\neye-on-base: [base_T_camera]")
-    assert recall_verdict(recipe) == said
+    assert recall_verdict(key_of(recipe)) == said
 
 
 def test_a_changed_recipe_and_another_folder_are_checked_again(
     recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    verdict(recipe, load_registry())
+    verdict(recipe, key_of(recipe), load_registry())
     text = recipe.read_text()
     recipe.write_text(text + "# more\n")
-    assert recall_verdict(recipe) is None
+    assert recall_verdict(key_of(recipe)) is None
     recipe.write_text(text)
-    assert recall_verdict(recipe) is not None
+    assert recall_verdict(key_of(recipe)) is not None
     monkeypatch.chdir(recipe.parent)
-    assert recall_verdict(Path(recipe.name)) is None
+    assert recall_verdict(key_of(Path(recipe.name))) is None
 
 
 def test_a_changed_model_of_the_project_is_seen(
@@ -59,10 +59,10 @@ def test_a_changed_model_of_the_project_is_seen(
     data = tmp_path / "data"
     shutil.copytree(bundled("data"), data)
     monkeypatch.setattr(installed, "bundled", lambda _: data)
-    verdict(recipe, load_registry())
-    assert recall_verdict(recipe) is not None
+    verdict(recipe, key_of(recipe), load_registry())
+    assert recall_verdict(key_of(recipe)) is not None
     os.utime(data / "robots" / "ur5.yaml", ns=(1, 1))
-    assert recall_verdict(recipe) is None
+    assert recall_verdict(key_of(recipe)) is None
 
 
 @pytest.mark.parametrize("name", ["--", "missing"])
@@ -70,46 +70,46 @@ def test_a_mistake_is_never_remembered(recipe: Path, name: str) -> None:
     recipe.write_text(recipe.read_text().replace("fit.rim", f"fit.{name}"))
     for _ in range(2):
         with pytest.raises(RecipeError, match=f"fit.{name}"):
-            verdict(recipe, load_registry())
-    assert recall_verdict(recipe) is None
+            verdict(recipe, key_of(recipe), load_registry())
+    assert recall_verdict(key_of(recipe)) is None
 
 
 def test_values_set_on_the_command_line_are_not_remembered(recipe: Path) -> None:
-    verdict(recipe, load_registry(), ["title=Other"])
-    assert recall_verdict(recipe) is None
+    verdict(recipe, key_of(recipe), load_registry(), ["title=Other"])
+    assert recall_verdict(key_of(recipe)) is None
 
 
 def test_a_recipe_with_a_file_of_ones_own_is_not_remembered(recipe: Path) -> None:
     (recipe.parent / "arm.yaml").write_bytes((bundled("data") / "robots/ur5.yaml").read_bytes())
     recipe.write_text(recipe.read_text().replace("model: ur5", "model: arm.yaml"))
     assert "arm.yaml" in recipe.read_text()
-    verdict(recipe, load_registry())
-    assert recall_verdict(recipe) is None
+    verdict(recipe, key_of(recipe), load_registry())
+    assert recall_verdict(key_of(recipe)) is None
 
 
 def test_a_stage_of_another_package_is_not_remembered(recipe: Path) -> None:
     recipe.write_text("title: Toy\nsteps: [acquire.toy, segment.toy, fit.toy, solve.toy]\n")
-    assert "4 steps" in verdict(recipe, toy_plugins())
-    assert recall_verdict(recipe) is None
+    assert "4 steps" in verdict(recipe, key_of(recipe), toy_plugins())
+    assert recall_verdict(key_of(recipe)) is None
 
 
 def test_a_former_name_is_told_each_time(recipe: Path) -> None:
     registry = load_registry()
     registry.renamed["fit.edge"] = "fit.rim"
     recipe.write_text(recipe.read_text().replace("fit.rim", "fit.edge"))
-    verdict(recipe, registry)
+    verdict(recipe, key_of(recipe), registry)
     assert registry.notes()
-    assert recall_verdict(recipe) is None
+    assert recall_verdict(key_of(recipe)) is None
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{", '{"a": 3}', "null"])
 def test_a_damaged_memory_is_made_anew(recipe: Path, content: str) -> None:
-    verdict(recipe, load_registry())
+    verdict(recipe, key_of(recipe), load_registry())
     file = user_cache_path("flangeye") / "checks.json"
     file.write_text(content)
-    assert recall_verdict(recipe) is None
-    verdict(recipe, load_registry())
-    assert recall_verdict(recipe) is not None
+    assert recall_verdict(key_of(recipe)) is None
+    verdict(recipe, key_of(recipe), load_registry())
+    assert recall_verdict(key_of(recipe)) is not None
 
 
 def test_the_memory_is_bounded(recipe: Path) -> None:
@@ -143,10 +143,10 @@ def _looked_at(recipes: Iterable[Path], folder: Path) -> set[Path]:
         "os.stat = lambda p, *a, **k: (seen.add(str(p)), stat(p, *a, **k))[1]\n"
         "from pathlib import Path\n"
         "from flangeye.plugin.registry import load_registry\n"
-        "from flangeye.recipe.verdict import verdict\n"
+        "from flangeye.recipe.verdict import key_of, verdict\n"
         "registry = load_registry()\n"
         "for name in sys.argv[1:]:\n"
-        "    verdict(Path(name), registry)\n"
+        "    verdict(Path(name), key_of(Path(name)), registry)\n"
         "print(*seen, sep='\\n')\n"
     )
     done = subprocess.run(

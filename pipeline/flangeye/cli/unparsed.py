@@ -47,10 +47,11 @@ def say_verdict(name: str, overrides: Sequence[str] = ()) -> None:
         RecipeError: Names every mistake found.
     """
     from flangeye.recipe.find import find_recipe
-    from flangeye.recipe.verdict import recall_verdict, verdict
+    from flangeye.recipe.verdict import key_of, recall_verdict, verdict
 
     path = find_recipe(name)
-    known = None if overrides else recall_verdict(path)
+    key = key_of(path)
+    known = None if overrides else recall_verdict(key)
     if known is not None:
         say(known)
         return
@@ -58,7 +59,7 @@ def say_verdict(name: str, overrides: Sequence[str] = ()) -> None:
     from flangeye.plugin.registry import load_registry
 
     registry = load_registry()
-    say(verdict(path, registry, overrides))
+    say(verdict(path, key, registry, overrides))
     say_notes(registry.notes())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
 
 from flangeye.files.bundled import bundled
+from flangeye.files.near import nearest
 
 
 def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
@@ -45,7 +45,7 @@ def bundled_file(
         path = bundled("data") / folder / f"{value}.yaml"
         if not path.is_file():
             known = sorted(p.stem for p in path.parent.glob("*.yaml"))
-            near = difflib.get_close_matches(str(value), known, n=2) or known
+            near = nearest(str(value), known, n=2) or known
             raise ValueError(f"no {kind} '{value}'; known: {', '.join(near)}, or {allowed}")
         return path
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, get_args
 
 from pydantic import BaseModel
+
+from flangeye.files.near import nearest
 
 EXPLAINED = "explained"
 """Type of an error whose message went through :func:`sentence` already."""
@@ -35,7 +36,7 @@ def sentence(details: Any, model: type[BaseModel], given: Any) -> str:
 
 
 def _unknown_key(key: str, fields: list[str]) -> str:
-    near = difflib.get_close_matches(key, fields, n=1)
+    near = nearest(key, fields, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     return f"unknown key '{key}'{hint} (allowed: {', '.join(fields) or 'none'})"
 

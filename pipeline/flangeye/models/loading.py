@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Any, Literal
 
 from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
+from flangeye.files.near import nearest
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
@@ -46,6 +46,6 @@ def _path(kind: str, name: str, near: Path | None) -> Path:
         return near / name if near and (near / name).exists() else Path(name)
     known = model_names(kind)
     if name not in known:
-        close = difflib.get_close_matches(name, known, n=2) or known
+        close = nearest(name, known, n=2) or known
         raise RecipeError(f"no {kind[:-1]} '{name}'; known: {', '.join(close)}, or a .yaml file")
     return bundled("data") / kind / f"{name}.yaml"

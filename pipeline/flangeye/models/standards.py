@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
-
 from pydantic import Field
 
 from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
+from flangeye.files.near import nearest
 from flangeye.models.model import Model, read_model
 from flangeye.units import Length, param
 
@@ -37,7 +36,7 @@ def load_standard(designation: str) -> FlangeStandard:
         if _designation_key(row.designation) == wanted:
             return row
     known = [row.designation for row in known_standards()]
-    close = difflib.get_close_matches(designation, known, n=3, cutoff=0.4) or known
+    close = nearest(designation, known, n=3, cutoff=0.4) or known
     raise RecipeError(f"no flange standard '{designation}'; known: {', '.join(close)}")
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from flangeye.files.near import nearest
 from flangeye.plugin.registry import PluginNotFoundError, Registry
 from flangeye.plugin.stage import KINDS, PARTS, Choose, Plugin
 
@@ -39,7 +39,7 @@ def describe_one(registry: Registry, name: str) -> str:
     """
     if name in KINDS or name in PARTS:
         return _kinds(registry, [name])
-    near = difflib.get_close_matches(name, [*KINDS, *PARTS], n=1)
+    near = nearest(name, [*KINDS, *PARTS], n=1)
     if near and "." not in name:
         raise PluginNotFoundError(f"no kind of stages '{name}'; did you mean {near[0]}?")
     plugin: Plugin = registry.parts[name] if name in registry.parts else registry.stage(name)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
+from importlib.metadata import Distribution, EntryPoint
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +13,7 @@ import pluggy
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.collector import collector_paused
+from flangeye.files.near import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
 from flangeye.plugin.installed import installed_plugins
@@ -95,7 +95,7 @@ class Registry:
         parts: Name -> part.
         broken: Entry point name -> why it could not be loaded.
         owners: Stage or part name -> entry point that offers it.
-        installed: Entry point name -> version of the package it comes from.
+        installed: Entry point name -> the package it comes from, None where nobody knows.
         renamed: Former name -> present name of stages and parts.
         outdated: The former names that were asked for.
         asked: The present names that were asked for.
@@ -106,7 +106,7 @@ class Registry:
     parts: Offered[Part] = field(default_factory=lambda: Offered(Part))
     broken: dict[str, Exception] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
-    installed: dict[str, str] = field(default_factory=dict)
+    installed: dict[str, Distribution | None] = field(default_factory=dict)
     renamed: dict[str, str] = field(default_factory=dict)
     outdated: set[str] = field(default_factory=set)
     asked: set[str] = field(default_factory=set)
@@ -166,16 +166,16 @@ class Registry:
     def versions(self) -> dict[str, str]:
         """Return each loaded plugin's entry point and the version of what installed it."""
         return {
-            plugin: version
-            for plugin, version in self.installed.items()
+            plugin: package.version if package else "unknown"
+            for plugin, package in self.installed.items()
             if plugin not in self.broken
         }
 
     def _missing(self, sort: str, name: str) -> PluginNotFoundError:
         offered = list(self.stages if sort == "stage" else self.parts)
         same_kind = sorted(n for n in offered if n.startswith(name.partition(".")[0] + "."))
-        near = difflib.get_close_matches(name, same_kind, n=3, cutoff=0.7) or same_kind
-        near = near or difflib.get_close_matches(name, offered, n=3)
+        near = nearest(name, same_kind, n=3, cutoff=0.7) or same_kind
+        near = near or nearest(name, offered, n=3)
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
         failed = "".join(
             f"; plugin '{plugin}' could not be loaded ({type(error).__name__}: {error})"
@@ -263,8 +263,7 @@ def load_registry() -> Registry:
 
 
 def _load(registry: Registry, entry_point: EntryPoint) -> None:
-    distribution = entry_point.dist
-    registry.installed[entry_point.name] = distribution.version if distribution else "unknown"
+    registry.installed[entry_point.name] = entry_point.dist
     try:
         registry.register(entry_point.name, entry_point.load())
     except DuplicatePluginError:

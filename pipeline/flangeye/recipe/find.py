@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
 from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
+from flangeye.files.near import nearest
 
 
 def recipe_names() -> dict[str, Path]:
@@ -36,7 +36,7 @@ def find_recipe(name: str) -> Path:
         return known[name]
     if path.suffix in (".yaml", ".yml") or path.is_dir():
         raise RecipeError(f"{name}: no such recipe file; {_near_file(path, known)}")
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    near = nearest(name, known, n=3, cutoff=0.4)
     hint = f"did you mean {' or '.join(near)}?" if near else "'flangeye recipes' lists them"
     raise RecipeError(f"no recipe '{name}'; {hint}")
 
@@ -47,8 +47,8 @@ def _near_file(path: Path, known: Iterable[str]) -> str:
     if not folder.is_dir():
         return f"there is no folder {folder}"
     files = sorted(str(file) for file in folder.glob("*.y*ml"))
-    near = difflib.get_close_matches(str(path), files, n=3)
-    near = near or difflib.get_close_matches(path.stem, known, n=1)
+    near = nearest(str(path), files, n=3)
+    near = near or nearest(path.stem, known, n=1)
     if near:
         return f"did you mean {' or '.join(near)}?"
     return f"{folder} holds {', '.join(files[:5]) or 'no recipe'}; 'flangeye recipes' lists others"

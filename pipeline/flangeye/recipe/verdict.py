@@ -17,7 +17,7 @@ from flangeye.errors import RecipeError
 from flangeye.files.bundled import bundled
 from flangeye.files.memory import keep, recall
 from flangeye.files.regular import noting_opened, read_regular
-from flangeye.plugin.installed import installed_digest, installed_plugins
+from flangeye.plugin.installed import installed_digest, installed_plugins, package_of
 
 if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
@@ -25,20 +25,17 @@ if TYPE_CHECKING:
 SORT = "checks"
 
 
-def recall_verdict(path: Path) -> str | None:
-    """Return what was said of a recipe as it is written, None where it must be checked.
-
-    Raises:
-        RecipeError: It cannot be read.
-    """
-    return recall(SORT, _key(path))
+def recall_verdict(key: str) -> str | None:
+    """Return what was said under a key, None where the recipe must be checked."""
+    return recall(SORT, key)
 
 
-def verdict(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> str:
+def verdict(path: Path, key: str, registry: Registry, overrides: Sequence[str] = ()) -> str:
     """Check a recipe; return how many steps it has and what it solves for.
 
     Args:
         path: The recipe.
+        key: What :func:`key_of` says of it.
         registry: The plugins on offer.
         overrides: As for :func:`flangeye.recipe.load.load_recipe`.
 
@@ -49,18 +46,21 @@ def verdict(path: Path, registry: Registry, overrides: Sequence[str] = ()) -> st
     from flangeye.models.configuration import Configuration
     from flangeye.recipe.load import load_recipe
 
-    key = _key(path)
     with noting_opened() as opened:
         checked = load_recipe(path, registry, overrides)
     loop = checked.context.get(Cell) or checked.context[Configuration]
     text = f"{path}: ok, {len(checked.steps)} steps\n{loop.describe()}"
-    if not overrides and _follows_from_key(path, opened, registry) and key == _key(path):
+    if not overrides and _follows_from_key(path, opened, registry) and key == key_of(path):
         keep(SORT, key, text)
     return text
 
 
-def _key(path: Path) -> str:
-    """Return a digest of which recipe is meant, its bytes and what is installed."""
+def key_of(path: Path) -> str:
+    """Return a digest of which recipe is meant, its bytes and what is installed.
+
+    Raises:
+        RecipeError: It cannot be read.
+    """
     recipe = read_regular(path, error=RecipeError)
     asked = (str(path), str(path.absolute()), recipe, installed_digest())
     return hashlib.sha256(repr(asked).encode("utf-8", "surrogateescape")).hexdigest()
@@ -68,7 +68,7 @@ def _key(path: Path) -> str:
 
 def _follows_from_key(path: Path, opened: Sequence[Path], registry: Registry) -> bool:
     """Return whether only the project's own stages were asked, and only its own files read."""
-    ours = {p.name for p in installed_plugins() if p.dist and p.dist.name == "flangeye"}
+    ours = {plugin.name for plugin in installed_plugins() if package_of(plugin) == "flangeye"}
     asked = {registry.owners.get(name) for name in registry.asked}
     own_files = all(file == path or file.is_relative_to(bundled("data")) for file in opened)
     return own_files and asked <= ours and not registry.notes()

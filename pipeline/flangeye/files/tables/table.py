@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.near import nearest
 from flangeye.types import Floats
 
 Column = str | int
@@ -56,7 +56,7 @@ class Table:
             raise StageError(f"{self.file}: has no column {column}; they are 1 to {width}")
         if column in self.heading:
             return self.heading.index(column)
-        near = difflib.get_close_matches(column, self.heading, n=2) or list(self.heading)
+        near = nearest(column, self.heading, n=2) or list(self.heading)
         known = f"known: {', '.join(near)}" if near else "it has no heading; give numbers from 1"
         raise StageError(f"{self.file}: has no column '{column}'; {known}")
 
