@@ -93,6 +93,16 @@ def test_a_solver_says_so(name: str) -> None:
     assert told.notes[-1] == OPTIMAL
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_circle_anywhere_is_certified_though_nothing_tells_its_turn_about_itself(
+    seed: int,
+) -> None:
+    configuration = CONFIGURATIONS["eye-on-base, marker"]
+    made = session(configuration, np.random.default_rng(seed), n=25, tilt=0.5, feature="normal")
+    told = solve_poses(made.observations, RobustParams(certify=True), ROBOT, configuration)
+    assert told.notes[-1] == OPTIMAL
+
+
 def test_what_cannot_be_certified_is_said_to_be_so() -> None:
     made = session(CONFIGURATIONS["two arms, marker"], np.random.default_rng(3), n=15)
     told = solve_poses(made.observations, RobustParams(certify=True), ROBOT, made.configuration)

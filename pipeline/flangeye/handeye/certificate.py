@@ -32,6 +32,8 @@ STEPS, SETTLED = 50, 1e-12
 """Of the descent to the bottom of the valley; a step as small [rad] is the last."""
 PROJECTIONS = 3000
 """Tries to find multipliers; most take a few dozen."""
+TOLD = 1e-7
+"""How well a turn is known at least, of the best known one: a circle's about itself is not."""
 GAP, ROUNDING = 1e-3, 1e-9
 """Share of the cost that may be missing; and of the size of ``Q``, where the cost is none."""
 
@@ -170,7 +172,7 @@ def _descend(quadratic: Floats, rotations: Floats) -> Floats:
         for k, turn in enumerate(rotations):
             # A turn on the left, about each axis.
             moves[9 * k : 9 * k + 9, 3 * k : 3 * k + 3] = (hat(np.eye(3)) @ turn).reshape(3, 9).T
-        step = -np.linalg.lstsq(root @ moves, root @ _vector(rotations), rcond=None)[0]
+        step = -np.linalg.lstsq(root @ moves, root @ _vector(rotations), rcond=TOLD)[0]
         turned = rotation_exp(step.reshape(-1, 3)) @ rotations
         rotations = np.array([nearest_rotation(each) for each in turned])
         if np.abs(step).max() < SETTLED:
