@@ -6,6 +6,7 @@ Poses are (N, 4, 4) ``base_T_flange`` [m], in the order they were recorded.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,16 +111,26 @@ def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
         times: (N,) when, rising [s].
         delay: Negative for earlier [s].
     """
+    return delaying(poses, times)(delay)
+
+
+def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Mask]]:
+    """Return :func:`delayed` of poses for many delays: half of its work is the same for all."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    wanted = times + delay
-    kept = (wanted >= times[0]) & (wanted <= times[-1])
-    inside = np.clip(wanted, times[0], times[-1])
-    out = np.array(poses)
-    out[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
-    for axis in range(3):
-        out[:, axis, 3] = np.interp(inside, times, poses[:, axis, 3])
-    return out, np.asarray(kept)
+    turning = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))
+
+    def later(delay: float) -> tuple[Floats, Mask]:
+        wanted = times + delay
+        kept = (wanted >= times[0]) & (wanted <= times[-1])
+        inside = np.clip(wanted, times[0], times[-1])
+        out = np.array(poses)
+        out[:, :3, :3] = turning(inside).as_matrix()
+        for axis in range(3):
+            out[:, axis, 3] = np.interp(inside, times, poses[:, axis, 3])
+        return out, np.asarray(kept)
+
+    return later
 
 
 def without_tool(poses: Floats, offset: Floats) -> Floats:

@@ -33,9 +33,10 @@ MARGIN = 1e-9
 
 
 class Block(NamedTuple):
-    """Errors of one kind: residuals (K, N, 3), derivatives (K, N, 3, P), dimension, finest."""
+    """Errors of one kind: residuals (K, N, 3), their squares (K, N), derivatives (K, N, 3, P)."""
 
     residuals: Floats
+    squares: Floats
     jacobian: Floats
     dimension: int
     finest: float
@@ -160,27 +161,24 @@ def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: f
     jacobian = np.empty((*residuals.shape, 3 * len(parts)))
     for i, part in enumerate(parts):
         jacobian[..., 3 * i : 3 * i + 3] = part
-    return Block(residuals, jacobian, dimension, finest)
-
-
-def _squares(block: Block) -> Floats:
-    return np.asarray((block.residuals**2).sum(axis=-1))
+    squares = np.asarray((residuals**2).sum(axis=-1))
+    return Block(residuals, squares, jacobian, dimension, finest)
 
 
 def _first_scale(block: Block) -> Floats:
-    middle = np.nanmedian(_squares(block), axis=-1)
+    middle = np.nanmedian(block.squares, axis=-1)
     return np.asarray(np.sqrt(np.maximum(middle / block.dimension, block.finest**2)))
 
 
 def _weights(block: Block, scale: Floats) -> Floats:
     """(K, N) what each sample counts: 0 where it was not measured."""
-    distances = _squares(block) / scale[:, None] ** 2
+    distances = block.squares / scale[:, None] ** 2
     return np.nan_to_num((TAILS + block.dimension) / (TAILS + distances))
 
 
 def _scale(block: Block, weights: Floats) -> Floats:
-    seen = np.isfinite(_squares(block)).sum(axis=-1)
-    total = (weights * np.nan_to_num(_squares(block))).sum(axis=-1)
+    seen = np.isfinite(block.squares).sum(axis=-1)
+    total = (weights * np.nan_to_num(block.squares)).sum(axis=-1)
     return np.asarray(np.sqrt(np.maximum(total / (block.dimension * seen), block.finest**2)))
 
 
@@ -238,7 +236,7 @@ def _score(
 ) -> VariantFits:
     likelihood = count = np.zeros(1)
     for block, scale in zip(blocks, scales, strict=True):
-        squares, d = _squares(block), block.dimension
+        squares, d = block.squares, block.dimension
         seen = np.isfinite(squares).sum(axis=-1)
         tails = np.nansum(np.log1p(squares / (TAILS * scale[:, None] ** 2)), axis=-1)
         likelihood = likelihood - d * seen * np.log(scale) - 0.5 * (TAILS + d) * tails

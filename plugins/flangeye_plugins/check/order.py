@@ -10,7 +10,7 @@ import numpy as np
 
 from flangeye import part
 from flangeye.doctor.diagnosis import Arms, Findings, NotApplicable, RecordedSession
-from flangeye.maths.pose_corrections import delayed, shifted
+from flangeye.maths.pose_corrections import delaying, shifted
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Mask
 from flangeye_plugins.check.equations import equations_of
@@ -27,6 +27,8 @@ DELAYS = 24
 
 Change = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
+Later = Callable[[float], tuple[Floats, Mask]]
+"""Gives an arm's poses after a delay [s], and the samples that have one."""
 
 
 class Alternative(NamedTuple):
@@ -121,13 +123,22 @@ def clock(session: RecordedSession) -> Findings:
 
 
 def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[Alternative]:
-    return [_delayed(session, each, float(delay)) for each in arms for delay in delays]
+    made: dict[int, Later] = {}
+
+    def later_of(poses: Floats) -> Later:
+        if id(poses) not in made:
+            made[id(poses)] = delaying(poses, session.times)
+        return made[id(poses)]
+
+    return [_delayed(session, later_of, each, float(delay)) for each in arms for delay in delays]
 
 
-def _delayed(session: RecordedSession, arms: Arms, delay: float) -> Alternative:
+def _delayed(
+    session: RecordedSession, later_of: Callable[[Floats], Later], arms: Arms, delay: float
+) -> Alternative:
     def change(poses: Floats) -> tuple[Floats, Mask]:
         if session.motions is None or poses is not session.poses:
-            return delayed(poses, session.times, delay)
+            return later_of(poses)(delay)
         known = np.array([later(each, delay) is not None for each in session.motions])
         return np.array([pose_at(each, delay) for each in session.motions]), known
 
