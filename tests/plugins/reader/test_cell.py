@@ -1,5 +1,6 @@
 """Tables of a cell, however they are joined, hold the session they were written from."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
 from flangeye.run.session import Start, record_run
 from flangeye.run.tables import write_tables
-from flangeye.types import ArchivePath
+from flangeye.types import ArchivePath, Source
 from flangeye_plugins.reader.cell import CellParams, cell
+from tests.handeye.cells import moving
 
 REGISTRY = load_registry()
 RECIPES = Path(__file__).parents[3] / "recipes" / "configurations"
@@ -263,6 +265,52 @@ def test_arms_that_pass_are_told_with_how_they_and_a_rail_passed(
         assert np.allclose(pose_at(motion, 0.0, "two"), recording.poses["two"], atol=1e-6)
         assert joints_at(motion, 0.0, "rail") == pytest.approx(recording.axes["rail"])
         assert joints_at(motion, 0.1, "rail") == pytest.approx(recording.axes["rail"] + 0.1 * slide)
+
+
+SLIDING = """\
+title: An arm that passes on a rail that slides
+cell:
+  rails: {rail: {axis: [0, 1, 0], travel: [-1 m, 1 m]}}
+  arms: {arm: {model: ur5, on: rail}}
+  cameras: {left: base}
+  targets: {marker: arm}
+steps:
+  - acquire.samples:
+      path: FOLDER
+      reader:
+        cell:
+          arms: {arm: {file: arm.csv, time: t, rotation: xyzw, length: m}}
+          axes: {rail: {file: rail.csv, time: t, column: value, unit: m}}
+          sightings:
+            - {camera: left, target: marker, file: left.csv, time: t, rotation: xyzw, length: m}
+          join: {clock_offset: 0 ms}
+  - solve.cell
+"""
+
+
+def test_tables_of_an_arm_that_passed_while_its_rail_slid_give_the_time_between_the_clocks(
+    tmp_path: Path,
+) -> None:
+    """The camera's clock is 60 ms behind."""
+    times, rng = np.arange(0, 26.0, 0.01), np.random.default_rng(0)
+    left = rigid(Rotation.from_rotvec([3.0, 0.1, 0.0]).as_matrix(), [0.4, 0.6, 1.1])
+    marker = rigid(Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix(), [0.01, 0.02, 0.05])
+    at = np.arange(1.0, 25.0, 0.4)
+    actual = moving(at)
+    actual[:, 1, 3] += 0.3 * np.sin(at)
+    seen = np.linalg.inv(left) @ actual @ marker
+    seen[:, :3, 3] += 1e-4 * rng.standard_normal((len(at), 3))
+    _written(tmp_path / "arm.csv", "t,x,y,z,qx,qy,qz,qw", times, _quaternions(moving(times)))
+    _written(tmp_path / "rail.csv", "t,value", times, 0.3 * np.sin(times)[:, None])
+    _written(tmp_path / "left.csv", "t,x,y,z,qx,qy,qz,qw", at - 0.06, _quaternions(seen))
+    recipe = parse_recipe(SLIDING.replace("FOLDER", str(tmp_path)), "r", REGISTRY)
+    runner = Runner(recipe, REGISTRY, ArchivePath(None))
+    found = runner.solve(runner.take(None), Source("tables"))
+    (told,) = [note for note in found.notes if "the arms were at the poses" in note]
+    assert re.match(
+        "the arms were at the poses (59.[5-9]|60.[0-5]) .* after the times that left", told
+    )
+    assert found.camera.transform.matrix == pytest.approx(left, abs=1e-3)
 
 
 def _quaternions(poses: Any) -> Any:
