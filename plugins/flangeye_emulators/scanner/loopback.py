@@ -65,9 +65,7 @@ class LoopbackParams(Params):
 def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scanner:
     """Scan the simulated cell around a controller on loopback.
 
-    Args:
-        model: Which scanner to be.
-        params: See :class:`LoopbackParams`.
+    The model says which scanner to be.
 
     Raises:
         DeviceError: There is no model, no controller, or the controller moves another arm.

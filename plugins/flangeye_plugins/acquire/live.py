@@ -109,20 +109,9 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
 
     Every pose and every way is checked before anything moves. The arm is watched by a process of
     its own and stops on any safety fault. While a scan is transferred, logged and fitted, the arm
-    is already on its way to the next pose. When the solver has enough, the arm stops.
-
-    Args:
-        robot: The arm's model.
-        scanner: The scanner's model.
-        flange: What to look for.
-        arm: Opens the arm.
-        eye: Opens the scanner.
-        limits: What the arm must keep to.
-        motion: Whether it may move at all; if not, the arm is only read, and the plan is shown.
-        seed: Decides the poses.
-        stage_log: Hears where the arm is.
-        params: See :class:`LiveParams`.
-        resumed: What an earlier run already took.
+    is already on its way to the next pose. When the solver has enough, the arm stops. Without
+    permission to move the arm is only read, and the plan is shown. Captures that an earlier run
+    took (``resumed``) are not taken again.
 
     Raises:
         StageError: Fewer than three poses are possible, or a device cannot be opened.

@@ -61,11 +61,6 @@ def next_best(site: Site, rng: np.random.Generator, params: NextBestParams) -> P
     leaves the smallest expected square error over the work, given the poses visited before. Poses
     that gave nothing do not count. Candidates are checked best first, so that inverse kinematics is
     solved for a few only.
-
-    Args:
-        site: The place.
-        rng: Draws the candidates.
-        params: See :class:`NextBestParams`.
     """
     centre = site.centre if params.centre is None else np.asarray(params.centre)
     size = np.asarray(params.size)

@@ -69,9 +69,7 @@ def scanner_azure_kinect(model: ScannerModel | None, params: AzureKinectParams) 
     """Scan with an Azure Kinect, or play its recording: depth, and colour as the depth camera
     would see it.
 
-    Args:
-        model: What the scanner can see; a scan far out of its range is refused.
-        params: See :class:`AzureKinectParams`.
+    A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no camera, or no recording.

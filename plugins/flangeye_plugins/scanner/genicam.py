@@ -43,9 +43,7 @@ class GenicamParams(Params):
 def scanner_genicam(model: ScannerModel | None, params: GenicamParams) -> Scanner:
     """Scan with a GenICam 3D scanner, such as a PhoXi, through the maker's GenTL producer.
 
-    Args:
-        model: What the scanner can see; a scan far out of its range is refused.
-        params: See :class:`GenicamParams`.
+    A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no producer, no such device, or it cannot give an organised range map

@@ -34,9 +34,7 @@ class MechEyeParams(Params):
 def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scanner:
     """Scan with a Mech-Eye camera, with the settings its own viewer left in it.
 
-    Args:
-        model: What the scanner can see; a scan far out of its range is refused.
-        params: See :class:`MechEyeParams`.
+    A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no camera, or it does not connect.

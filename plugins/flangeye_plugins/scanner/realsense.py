@@ -48,9 +48,7 @@ class RealsenseParams(Params):
 def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Scanner:
     """Scan with a RealSense, or play its recording.
 
-    Args:
-        model: What the scanner can see; a scan far out of its range is refused.
-        params: See :class:`RealsenseParams`.
+    A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no camera, or no recording.

@@ -48,11 +48,8 @@ def scanner_watched_folder(model: ScannerModel | None, params: WatchedFolderPara
     """Read each new cloud that appears in a folder, once it is complete.
 
     What lies there when the recipe starts is left alone. Trigger the scan in the scanner's own
-    software when the arm stands; files are taken in the order in which they appear.
-
-    Args:
-        model: What the scanner can see; the stated unit is held against it.
-        params: See :class:`WatchedFolderParams`.
+    software when the arm stands; files are taken in the order in which they appear. The stated unit
+    is held against the model's range.
 
     Raises:
         DeviceError: There is no such folder, or it may not be read.

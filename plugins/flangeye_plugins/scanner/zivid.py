@@ -41,9 +41,7 @@ class ZividParams(Params):
 def scanner_zivid(model: ScannerModel | None, params: ZividParams) -> Scanner:
     """Scan with a Zivid camera.
 
-    Args:
-        model: What the scanner can see; a scan far out of its range is refused.
-        params: See :class:`ZividParams`.
+    A scan far out of the model's range is refused.
 
     Raises:
         DeviceError: No SDK, no camera, or settings that cannot be read.

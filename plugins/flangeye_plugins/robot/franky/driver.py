@@ -62,11 +62,8 @@ def robot_franky(model: RobotModel, params: FrankyParams) -> Robot:
     """An arm of Franka Robotics, through franky.
 
     In Desk: joints unlocked, FCI activated, the end effector and its load; a wired network of its
-    own, and a real-time kernel on this computer.
-
-    Args:
-        model: The arm; its kinematics are compared with what the controller says.
-        params: See :class:`FrankyParams`.
+    own, and a real-time kernel on this computer. The model's kinematics are compared with what the
+    controller says.
 
     Raises:
         DeviceError: The library is missing, or the arm cannot be driven: why, and what to do.

@@ -59,11 +59,7 @@ def robot_manual(model: RobotModel, params: ManualParams) -> Robot:
 
     Opening it waits for the person to say where the arm stands. Text comes from standard input, so
     a file of poses can be piped in; a pose that makes no sense is asked about, with the probable
-    mistake, and kept when the answer is ``yes``.
-
-    Args:
-        model: The arm; its kinematics find the joint angles of a pose.
-        params: See :class:`ManualParams`.
+    mistake, and kept when the answer is ``yes``. The model's kinematics find its joint angles.
 
     Raises:
         DeviceError: The input ends before a pose was said.
