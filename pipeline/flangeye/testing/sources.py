@@ -25,6 +25,7 @@ from flangeye.testing.judge import (
     require_close,
     require_refusal,
     require_round_trip,
+    require_type,
 )
 from flangeye.types import Floats
 
@@ -139,10 +140,7 @@ class ReaderConformance(Conformance):
 
     def read(self, path: Path | None = None) -> Archive:
         """Return what the reader makes of a path."""
-        found = self.call({}, path or self.archive)
-        require(isinstance(found, Archive), f"gave {type(found).__name__}, not an Archive")
-        assert isinstance(found, Archive)  # noqa: S101  for type checkers
-        return found
+        return require_type(self.call({}, path or self.archive), Archive)
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal files, equal recordings, in equal order."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.doctor.monitor.history import Finding, History
-from flangeye.errors import StageError
+from flangeye.files.written import write_whole
 from flangeye.handeye.drift import DriftTest
 
 COLOURS = {"OK": "#2e9e5b", "DEGRADED": "#d68910", "MOVED": "#d64545"}
@@ -37,10 +37,7 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
         figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
         checks=len(history.findings), path=escape(str(history.path)), rate=test.false_alarms,
     )  # fmt: skip
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise StageError(f"{path}: cannot be written: {error.strerror or error}") from None
+    write_whole(path, page)
 
 
 def sentence(finding: Finding) -> str:

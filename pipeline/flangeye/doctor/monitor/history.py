@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import StageError
+from flangeye.files.written import write_whole
 from flangeye.types import Floats
 
 FORMAT = "flangeye.doctor.monitor.1"
@@ -130,12 +131,9 @@ class History:
             row |= {"state": finding.state, "shift": finding.shift, "part": finding.part}
         findings = json.dumps([asdict(f) for f in self.findings])
         meta = {"format": FORMAT, "calibration": self.key, "findings": findings}
-        new = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        try:
-            pq.write_table(pa.Table.from_pylist(rows).replace_schema_metadata(meta), new)
-            new.replace(self.path)
-        except OSError as error:
-            raise StageError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        content = io.BytesIO()
+        pq.write_table(pa.Table.from_pylist(rows).replace_schema_metadata(meta), content)
+        write_whole(self.path, content.getvalue())
 
     def _take(self, row: dict[str, Any]) -> None:
         seen = _observation(row)
