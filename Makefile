@@ -6,8 +6,9 @@ BIN := $(VENV)/bin
 export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -q
 TWO := $(PYTEST) -n 2 --dist worksteal
-# Tests in real time share the machine with whatever runs beside them: what fails is tried once more,
-# with nothing of ours beside it.
+# Tests in real time wait most of their time, so three run at once. They share the machine with whatever
+# runs beside them: what fails is tried once more, with nothing of ours beside it.
+THREE := $(PYTEST) -n 3 --dist worksteal
 BESIDE := -m "realtime and not (slow or alone)"
 ALONE := -m "realtime and alone and not slow"
 ALONE_ALL := -m "realtime and (slow or alone)"
@@ -29,12 +30,12 @@ demo: $(VENV)/.run
 
 test: $(VENV)/.dev
 	$(TWO) -m "not slow and not realtime"
-	$(TWO) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
+	$(THREE) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
 	$(PYTEST) $(ALONE) || $(PYTEST) $(ALONE) --last-failed
 
 test-all: $(VENV)/.dev
 	$(TWO) -m "not realtime" --hypothesis-profile=search
-	$(TWO) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
+	$(THREE) $(BESIDE) || $(PYTEST) $(BESIDE) --last-failed
 	$(PYTEST) $(ALONE_ALL) || $(PYTEST) $(ALONE_ALL) --last-failed
 
 check: $(VENV)/.dev
