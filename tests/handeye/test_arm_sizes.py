@@ -5,11 +5,13 @@ import pytest
 
 from flangeye.handeye.arm_sizes import (
     BESIDE,
+    LARGEST,
     LIKELY,
     RATIOS,
+    SMALLEST,
+    TOGETHER,
     Sizes,
-    _combined,
-    _one_each,
+    _shapes,
     likely_sizes,
 )
 
@@ -42,13 +44,16 @@ def test_what_the_errors_leave_of_the_noise_is_told() -> None:
     assert (likely_sizes(rows, kinds, 3 * errors, FREEDOM).noise == 1.0).all()  # at most
 
 
-def test_errors_are_no_smaller_than_was_said() -> None:
+def test_errors_are_neither_far_smaller_nor_far_larger_than_was_said() -> None:
     rows, kinds, errors = drawn(np.random.default_rng(2), 0.0, 1.0)
     sizes = likely_sizes(rows, kinds, errors, FREEDOM)
-    assert (sizes.factors[:, 0] >= 1.0).all()
-    assert sizes.expected[0] < 1.2
-    huge = likely_sizes(rows, kinds, errors / 1e6, FREEDOM)
-    assert huge.expected == pytest.approx([1.0, 1.0])
+    assert (sizes.factors[:, 0] >= SMALLEST).all()
+    assert sizes.expected[0] < 0.6
+    far = likely_sizes(rows, kinds, errors + 25.0 * kinds[0][:, :, 0], FREEDOM)
+    assert (far.factors[:, 0] <= LARGEST).all()
+    for scale in (1e-6, 1e6):  # none of those is likely: it is taken as was said
+        out = likely_sizes(rows, kinds, (kinds[0] @ np.ones(20) + errors) * scale, FREEDOM)
+        assert out.expected == pytest.approx([1.0, 1.0])
 
 
 def test_sizes_that_nothing_tells_stay_open() -> None:
@@ -86,7 +91,7 @@ def test_sizes_weigh_as_much_as_they_are_likely() -> None:
     for ratio in RATIOS:
         shape = np.eye(54) + ratio**2 * effects @ effects.T
         noise = left @ np.linalg.solve(shape, left) / 54
-        if ratio * np.sqrt(noise) >= 1.0:
+        if SMALLEST <= ratio * np.sqrt(noise) <= LARGEST:
             logs.append(-0.5 * (54 * np.log(noise) + np.linalg.slogdet(shape)[1]))
             factors.append(ratio * np.sqrt(noise))
     weights = np.exp(np.array(logs) - max(logs))
@@ -96,20 +101,32 @@ def test_sizes_weigh_as_much_as_they_are_likely() -> None:
     assert sizes.weights == pytest.approx(weights[kept] / weights[kept].sum())
 
 
-def test_one_kind_at_a_time_is_larger_or_smaller_where_that_is_asked_for() -> None:
-    assert list(_one_each(1)) == list(_combined(1)) == [(b,) for b in BESIDE]
-    few = list(_one_each(5))
-    assert len(few) == len(set(few)) == 1 + 2 * 5
-    assert set(few) < set(_combined(5))
-    assert (1.0,) * 5 in few and (1.0, 3.0, 1.0, 1.0, 1.0) in few
+def test_others_are_larger_or_smaller_one_at_a_time_or_all_together() -> None:
+    assert _shapes(0) == [()]
+    assert _shapes(1) == [(b,) for b in BESIDE]
+    shapes = _shapes(5)
+    assert len(shapes) == len(set(shapes)) == 1 + 2 * 5 + len(TOGETHER)
+    assert (1.0,) * 5 in shapes and (1.0, 3.0, 1.0, 1.0, 1.0) in shapes
+    assert (0.1,) * 5 in shapes and (3.0, 3.0, 1.0, 1.0, 1.0) not in shapes
 
 
-def test_sizes_that_nothing_tells_are_as_was_expected_beforehand() -> None:
-    """Of a normal logarithm that is not below nought; what was not expected stays open."""
-    rng = np.random.default_rng(8)
-    rows, kind = rng.standard_normal((40, 6, 12)), 1e-9 * rng.standard_normal((40, 6, 3))
-    errors = rng.standard_normal((40, 6))
-    open_, told = (likely_sizes(rows, [kind], errors, 240.0, s) for s in (np.inf, 1.2))
-    logs = np.log(told.factors[:, 0])
-    assert told.weights @ logs**2 == pytest.approx(1.2**2, rel=0.05)
-    assert open_.expected[0] > 10 * told.expected[0]
+def test_a_region_of_errors_along_one_axis_holds_its_share() -> None:
+    """Whose squares spread more than those of six."""
+    sizes = Sizes(np.ones(1), np.array([[10.0]]), np.ones(1))
+    along = np.diag([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    covariance = sizes.mixed([1e-2 * np.eye(6), along])
+    errors = np.random.default_rng(5).standard_normal((20000, 6)) * np.sqrt(
+        np.diag(1e-2 * np.eye(6) + 100 * along)
+    )
+    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors.T).T)
+    assert (squares < 12.59).mean() == pytest.approx(0.95, abs=0.01)
+
+
+def test_each_place_has_a_region_of_its_own() -> None:
+    """One of two follows the errors; what is no unknown stays so."""
+    sizes = Sizes(np.array([0.7, 0.3]), np.array([[1.0], [5.0]]), np.ones(2))
+    first, second = np.diag([1.0] * 6 + [0.0] * 6), np.diag([0.0] * 6 + [1.0] * 5 + [0.0])
+    covariance = sizes.mixed([first + second, 4 * first])
+    alone = sizes.mixed([np.eye(6), 4 * np.eye(6)])
+    assert covariance[:6, :6] == pytest.approx(alone)
+    assert covariance[6:, 6:] == pytest.approx(second[6:, 6:], rel=1e-6)

@@ -25,7 +25,6 @@ from flangeye.handeye.candidates import (
 )
 from flangeye.handeye.consensus import Consensus
 from flangeye.handeye.likelihood import weigh
-from flangeye.handeye.nuisance import no_nuisance
 from flangeye.handeye.walk import StepSize, Walk
 from flangeye.types import ArmCorrection
 from tests.handeye.cells import fitted, given, two_numbers
@@ -163,13 +162,8 @@ def test_what_moves_all_poses_alike_is_followed_by_the_answer() -> None:
         added = added + np.outer(moved, moved)
     assert considered(bare, further) == pytest.approx(added, rel=1e-6, abs=1e-16)
     sized = model(nuisance=replace(two_numbers(9, sized=True), mean=np.zeros(2)))
-    same = considered(sized, further)  # what was estimated along is not estimated here
-    alone = replace(sized.problem, nuisance=no_nuisance(9))
-    at = replace(sized.found.at, nuisance=np.zeros(0))
-    left_out = replace(
-        sized, consensus=Consensus(alone, replace(sized.found, at=at, basis=np.eye(20)))
-    )
-    assert same == pytest.approx(considered(left_out, further), rel=1e-9)
+    # Such an error of unknown size, estimated along, has taken its part already.
+    assert np.trace(considered(sized, further)) < 1e-3 * np.trace(added)
 
 
 def test_residuals_stand_in_the_base_with_what_a_smooth_error_explains_or_without() -> None:

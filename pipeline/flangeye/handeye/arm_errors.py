@@ -17,15 +17,9 @@ import numpy as np
 from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.arm_sizes import Sizes, sizes_told
 from flangeye.handeye.bent import Bent
-from flangeye.handeye.candidates import Model, weighed_with
-from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.candidates import Model, following, weighed_with
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import Floats
-
-WORSE = 1.2
-"""Standard deviation of the logarithm of how much worse an arm is than its file says: one in three
-is three times worse, one in twenty ten times. Where few poses tell, this does."""
-
 
 Arms = Sequence[Sequence[MovedFlange]]
 """What each of some arms moves."""
@@ -45,14 +39,12 @@ def with_arm_errors(model: Model, arms: Arms, inflation: float) -> tuple[Floats,
     Raises:
         ValueError: The kinematics are not known, or do not reach the poses.
     """
-    fit, counts = _fitted(model, arms)
-    p = fit.basis.shape[1] - sum(counts)
-    known: Floats = np.asarray(np.linalg.inv(fit.information[:p, :p]), dtype=np.float64)
-    sizes = _sizes(model, fit, known, counts)
-    each = np.split(known @ fit.information[:p, p:], np.cumsum(counts)[:-1], axis=1)
-    mixed = sizes.mixed([inflation * known, *(followed @ followed.T for followed in each)])
-    basis = fit.basis[:18, :p]
-    return np.asarray(basis @ mixed @ basis.T), sizes
+    kinds = _kinds(arms)
+    sizes = _sizes(model, kinds)
+    moved = following(model, reduce(Nuisance.and_also, kinds))
+    each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1], axis=1)
+    own = inflation * model.found.covariance[:18, :18]
+    return sizes.mixed([own, *(followed @ followed.T for followed in each)]), sizes
 
 
 def evidence(model: Model, arms: Arms) -> float:
@@ -65,24 +57,27 @@ def evidence(model: Model, arms: Arms) -> float:
     """
     if any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms)):
         return 0.0
-    fit, counts = _fitted(model, arms)
-    p = fit.basis.shape[1] - sum(counts)
-    return _sizes(model, fit, np.asarray(np.linalg.inv(fit.information[:p, :p])), counts).gain
+    return _sizes(model, _kinds(arms)).gain
 
 
-def _sizes(model: Model, fit: Solution, known: Floats, counts: Sequence[int]) -> Sizes:
+def _sizes(model: Model, kinds: Sequence[Nuisance]) -> Sizes:
     """Return how large the arm's errors are, by a fit in which each is expected as the file says.
 
-    Of the fit's information and slope, so that what walked has been taken out as well.
+    Of the fit's information and slope, so that what walked has been taken out as well. A smooth
+    error that was found is none of it: it would explain what the arm's do.
     """
-    p, own = len(known), fit.information[len(known) :, len(known) :]
-    across = fit.information[:p, p:]
+    bare = replace(model.problem, nuisance=model.problem.nuisance.without_sized())
+    fit = weighed_with(bare, model.found, reduce(Nuisance.and_also, kinds))
+    counts = [len(kind) for kind in kinds]
+    p = fit.basis.shape[1] - sum(counts)
+    known, across = np.linalg.inv(fit.information[:p, :p]), fit.information[:p, p:]
     along = fit.slope[p:] - across.T @ known @ fit.slope[:p]
     left = fit.cost - fit.slope[:p] @ known @ fit.slope[:p]
-    effects = own - np.eye(len(own)) - across.T @ known @ across  # less what is expected of each
+    expected = np.eye(sum(counts))
+    effects = fit.information[p:, p:] - expected - across.T @ known @ across
     gram = np.block([[effects, along[:, None]], [along, left]])
     measured = np.trace(model.problem.measurements.projectors[fit.inliers], axis1=1, axis2=2).sum()
-    return sizes_told(gram, counts, float(measured) - p, WORSE, one_each=True)
+    return sizes_told(gram, counts, float(measured) - p)
 
 
 def _kinds(arms: Arms) -> list[Nuisance]:
@@ -103,11 +98,3 @@ def _moves(moved: MovedFlange) -> list[Nuisance]:
         raise ValueError("the arm's kinematics are not known, or do not reach its poses")
     bent = Bent("", arm, joints, moved.deviation, np.zeros(arm.n), moved.link)
     return [moved.nuisance(kind, 1.0) for kind in (bent.twists, *bent.others)]
-
-
-def _fitted(model: Model, arms: Arms) -> tuple[Solution, list[int]]:
-    """Return the fit with the arms' errors beside its unknowns, and how many each kind has."""
-    kinds = _kinds(arms)
-    bare = replace(model.problem, nuisance=model.problem.nuisance.without_sized())
-    moves = reduce(Nuisance.and_also, kinds)
-    return weighed_with(bare, model.found, moves), [len(kind) for kind in kinds]

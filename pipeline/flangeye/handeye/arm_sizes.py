@@ -7,7 +7,7 @@ mixture of variances.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,12 +17,19 @@ from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import mixture_inflation
 from flangeye.types import Floats
 
-RATIOS = np.logspace(-1, 2.5, 71)
+RATIOS = np.logspace(-1.5, 2.5, 61)
 """Sizes that are compared, in units of what was said and of the noise's scale."""
+SMALLEST, LARGEST = 0.3, 20.0
+"""Size of errors of the first kind, in what was said: whichever between is as likely beforehand as
+any other, by its logarithm. A joint that is off by a quarter of a degree is mastered anew."""
 BESIDE = (1 / 3, 1.0, 3.0)
-"""How large errors of one kind may be beside those of another, in what was said of both."""
+"""How large errors of one kind may be beside those of the first, in what was said of both."""
+TOGETHER = (0.1, 1 / 3, 3.0)
+"""How large all others together may be: there are arms with hardly more than zeros that are off."""
 LIKELY = 1e-6
 """What is less likely than this, beside the likeliest, does not count."""
+NOTHING = 1e-10
+"""Along an axis of less variance than this share of the largest nothing is unknown."""
 SILENT = 1e-12
 """Least variance of a noise, in units of what it was taken to be."""
 
@@ -33,18 +40,16 @@ class Sizes:
 
     Attributes:
         weights: (G,) of the cases, one together.
-        factors: (G, K) of each kind of error; the first at least one.
+        factors: (G, K) of each kind of error.
         noise: (G,) what that leaves of the noise's variance, at most one.
         gain: Twice by how much the logarithm of the residuals' likelihood is larger at the
             likeliest case than without any error of an arm.
-        beyond: The same, than with errors that are as large as was said.
     """
 
     weights: Floats
     factors: Floats
     noise: Floats
     gain: float = 0.0
-    beyond: float = 0.0
 
     @property
     def expected(self) -> Floats:
@@ -52,27 +57,42 @@ class Sizes:
         return np.asarray(np.sqrt(self.weights @ self.factors**2))
 
     def mixed(self, parts: Sequence[Floats], noise: Floats | None = None) -> Floats:
-        """Return the (m, m) covariance whose 95 % regions hold 95 %, whichever case is true.
+        """Return a (6 n, 6 n) covariance: each six hold 95 %, whichever case is true.
 
         Args:
-            parts: (m, m) covariances: of the noise, and of the last kinds of error as was said.
+            parts: (6 n, 6 n) covariances: of the noise, and of the last kinds of error as was said.
             noise: (G,) factors on that of the noise; by default ``noise``.
         """
         kinds = self.factors[:, self.factors.shape[1] + 1 - len(parts) :] ** 2
-        squares = np.column_stack([self.noise if noise is None else noise, kinds])
-        mean = np.einsum("k,kij->ij", self.weights @ squares, np.array(parts))
-        shares = np.array([np.trace(np.linalg.solve(mean, part)) for part in parts]) / len(mean)
-        return np.asarray(mixture_inflation(squares @ shares, self.weights) * mean)
+        cases = np.column_stack([self.noise if noise is None else noise, kinds])
+        every = np.array(parts)
+        mean = np.einsum("k,kij->ij", self.weights @ cases, every)
+        sixes = [slice(i, i + 6) for i in range(0, len(mean), 6)]
+        wider = [self._wider(cases, every[:, six, six], mean[six, six]) for six in sixes]
+        root = np.sqrt(np.repeat(wider, 6))
+        return np.asarray(mean * np.outer(root, root))
+
+    def _wider(self, cases: Floats, parts: Floats, mean: Floats) -> float:
+        """Return by what the mean covariance of a mixture has to be larger to hold its share.
+
+        Args:
+            cases: (G, K) factors on the parts.
+            parts: (K, 6, 6).
+            mean: (6, 6) of the cases; it may leave out what is no unknown.
+        """
+        unit = np.sqrt(np.diag(mean))
+        unit[unit == 0] = 1.0
+        own = np.linalg.pinv(mean / np.outer(unit, unit), rcond=NOTHING, hermitian=True)
+        shares = own @ (parts / np.outer(unit, unit))
+        firsts = cases @ np.trace(shares, axis1=1, axis2=2)
+        pairs = np.einsum("kij,lji->kl", shares, shares)
+        seconds = ((cases @ pairs) * cases).sum(axis=1)
+        if not firsts.any():
+            return 1.0
+        return mixture_inflation(np.column_stack([firsts, seconds]), self.weights)
 
 
-def likely_sizes(
-    rows: Floats,
-    kinds: Sequence[Floats],
-    errors: Floats,
-    freedom: float,
-    spread: float = np.inf,
-    one_each: bool = False,
-) -> Sizes:
+def likely_sizes(rows: Floats, kinds: Sequence[Floats], errors: Floats, freedom: float) -> Sizes:
     """Return how large errors of some kinds are likely to be.
 
     Args:
@@ -80,19 +100,15 @@ def likely_sizes(
         kinds: (N, 6, k) what errors of each kind, as large as was said, do to them.
         errors: (N, 6) their residuals.
         freedom: How many numbers those are.
-        spread: As in :func:`sizes_told`.
-        one_each: As in :func:`sizes_told`.
     """
     p, counts = rows.shape[2], [kind.shape[2] for kind in kinds]
     known = np.linalg.qr(stack_rows(rows))[0]
     told = stack_rows(np.concatenate([*kinds, errors[..., None]], axis=2))
     told = told - known @ (known.T @ told)
-    return sizes_told(told.T @ told, counts, freedom - p, spread, one_each)
+    return sizes_told(told.T @ told, counts, freedom - p)
 
 
-def sizes_told(
-    gram: Floats, counts: Sequence[int], freedom: float, spread: float, one_each: bool
-) -> Sizes:
+def sizes_told(gram: Floats, counts: Sequence[int], freedom: float) -> Sizes:
     """Return how large errors of some kinds are likely to be, by the products of what they do.
 
     Args:
@@ -100,38 +116,31 @@ def sizes_told(
             of the residuals, in units of the noise; what unknowns could take up is left out.
         counts: How many errors each kind has, k together.
         freedom: How many numbers residuals are, less the unknowns.
-        spread: Standard deviation of the logarithm of the first kind's size about what was said.
-        one_each: Whether one kind at a time is larger or smaller beside the others, not each in
-            every combination: with six kinds that takes a twentieth of the time.
     """
-    left, cases, as_said = max(freedom, 1.0), [], 0.0
-    for beside in (_one_each if one_each else _combined)(len(counts) - 1):
-        scale = np.repeat([1.0, *beside], counts)
-        gains, noises = _likelihoods(gram, scale, left)
-        sizes = np.sqrt(noises) * RATIOS
-        if set(beside) <= {1.0}:
-            as_said = float(np.interp(1.0, sizes, gains))
-        factors = np.outer(sizes, [1.0, *beside])
+    left, cases = max(freedom, 1.0), []
+    for beside in _shapes(len(counts) - 1):
+        gains, noises = _likelihoods(gram, np.repeat([1.0, *beside], counts), left)
+        factors = np.outer(np.sqrt(noises) * RATIOS, [1.0, *beside])
         cases.append(np.column_stack([gains, noises, factors]))
     every = np.concatenate(cases)
-    every = every[every[:, 2] >= 1.0]
+    every = every[(every[:, 2] >= SMALLEST) & (every[:, 2] <= LARGEST)]
     if not len(every):
         return Sizes(np.ones(1), np.ones((1, len(counts))), np.ones(1))
-    every[:, 0] -= (np.log(every[:, 2]) / spread) ** 2
     weights = np.exp((every[:, 0] - every[:, 0].max()) / 2)
     some = weights > LIKELY
     weights, every = weights[some] / weights[some].sum(), every[some]
-    likeliest, silent = float(every[:, 0].max()), -left * np.log(max(gram[-1, -1] / left, SILENT))
-    more = likeliest - float(silent), likeliest - as_said
-    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0), *more)
+    silent = -left * np.log(max(gram[-1, -1] / left, SILENT))
+    gain = float(every[:, 0].max() - silent)
+    return Sizes(weights, every[:, 2:], np.minimum(every[:, 1], 1.0), gain)
 
 
-def _combined(kinds: int) -> Iterable[tuple[float, ...]]:
-    return product(BESIDE, repeat=kinds)
+def _shapes(kinds: int) -> list[tuple[float, ...]]:
+    """Return how large errors of so many kinds may be beside the first: one of them, or all.
 
-
-def _one_each(kinds: int) -> Iterable[tuple[float, ...]]:
-    return (b for b in _combined(kinds) if sum(size != 1.0 for size in b) <= 1)
+    Of six kinds in every combination there were twenty times as many, and they tell no more.
+    """
+    single = [b for b in product(BESIDE, repeat=kinds) if sum(size != 1.0 for size in b) <= 1]
+    return [*single, *((size,) * kinds for size in TOGETHER if kinds > 1)]
 
 
 def _likelihoods(gram: Floats, scale: Floats, left: float) -> tuple[Floats, Floats]:

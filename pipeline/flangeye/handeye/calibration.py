@@ -60,9 +60,6 @@ CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
 SIZES, EXACT_SIZE, LOOSEST_SIZE = 10, 1e-6, 0.1
 """Steps to find a target's size, the share by which the last one changes it, and the largest
 standard deviation of what is taken for found."""
-LIKELIER = 2.0
-"""Twice by how much likelier residuals have to be of an arm that is worse than its file says, as
-one number more has to make them (Akaike 1974)."""
 TYPICAL_ARM = ArmNoise(np.radians(0.01), 0.05e-3)
 """Noise of the poses of an arm of which nothing is known: what else is found is in its ratio."""
 
@@ -135,11 +132,11 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     stated = _stated(reported, cell, options, weak)
     distortion = _distortion(reported, cell, options, weak)
     camera, *others = _estimates(reported, cell, weak, stated.covariance, distortion)
-    scatter, told = _scatter(model.found), stated.notes
-    if cell.configuration.is_default and stated.of_scatter is not stated.covariance:
-        alone = _estimates(reported, cell, weak, stated.of_scatter, distortion)[0]
-        scatter = replace(scatter, pose=alone.covariance)
-    notes = (*_noise_notes(model, cell, weak), *told, *_note_of_shared(_shared_of(reported)))
+    scatter = replace(
+        _scatter(model.found), pose=_scattered(reported, cell, weak, stated, distortion)
+    )
+    told = *stated.notes, *_note_of_shared(_shared_of(reported))
+    notes = (*_noise_notes(model, cell, weak), *told)
     if cell.scanner is not None and distortion is not None:
         notes = (*notes, _note_of_distortion(cell.scanner))
     if options.certify:
@@ -317,8 +314,15 @@ def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> Corr
     if model.correction is None or not model.corrects_joints:
         return None
     distortion = _distortion(model, cell, options, weak)
-    camera, *others = _estimates(model, cell, weak, _covariance(model), distortion)
-    return CorrectedArm(camera, model.correction, tuple(others), shared=_shared_of(model))
+    stated = _stated(model, cell, options, weak)
+    camera, *others = _estimates(model, cell, weak, stated.covariance, distortion)
+    return CorrectedArm(
+        camera,
+        model.correction,
+        tuple(others),
+        shared=_shared_of(model),
+        scatter=_scattered(model, cell, weak, stated, distortion),
+    )
 
 
 def _inflation(model: Model) -> float:
@@ -350,9 +354,8 @@ class _Stated(NamedTuple):
 def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated:
     """Return the covariance with what the arm does wrong alike at all poses, and say so.
 
-    That moves the answer, and held-out errors do not show it. Of a flange seen from the base it is
-    what the zeros may be off by as the robot's file has it, unless the residuals are likelier of an
-    arm that is worse.
+    That moves the answer, and held-out errors do not show it. What is found of it with the pose,
+    such as offsets of joints, is so no more.
     """
     own, flange = _covariance(model), cell.flange
     if not cell.arms or not options.joint_zeros:
@@ -363,19 +366,16 @@ def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated
     each = f"unknown joint zeros ({deviation:g} mrad each)"
     if any(moved.some_joints is None for moved in chain(*cell.arms)):
         return _Stated(own, own, (f"{each} not considered: the arm's model misses these poses",))
-    by_file = None
+    notes: tuple[str, ...] = ()
     if flange is not None and cell.configuration.is_default:
         own = own + unknown_zeros(model, flange)
-        note = (
+        notes = (
             f"{each} are in the covariance: they move all poses alike, which held-out errors do "
-            "not show"
+            "not show",
         )
-        by_file = _Stated(own, own, (note,))
     if weak.shape[1]:
-        return by_file or _Stated(own, own)
+        return _Stated(own, own, notes)
     covariance, sizes = with_arm_errors(model, cell.arms, _inflation(model))
-    if by_file and sizes.beyond <= LIKELIER:
-        return by_file
     zeros = deviation * float(sizes.expected[0])
     note = (
         f"what the arm does wrong alike at all poses is in the covariance, as large as the "
@@ -384,6 +384,15 @@ def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated
         "held-out errors show what does not"
     )
     return _Stated(covariance, own, (note,))
+
+
+def _scattered(
+    model: Model, cell: Cell, weak: Floats, stated: _Stated, distortion: Nuisance | None
+) -> Floats | None:
+    """Return the (6, 6) of the camera's pose as scatter leaves it; see :class:`ScatterNoise`."""
+    if not cell.configuration.is_default or stated.of_scatter is stated.covariance:
+        return None
+    return _estimates(model, cell, weak, stated.of_scatter, distortion)[0].covariance
 
 
 def _note_of_unknown_arm(cell: Cell) -> str:

@@ -105,11 +105,19 @@ def considered(model: Model, further: Nuisance) -> Floats:
         model: What was found without them; it stays.
         further: The errors, with what is known of their sizes.
     """
-    k, bare = len(further), replace(model.problem, nuisance=model.problem.nuisance.without_sized())
-    fit = weighed_with(bare, model.found, further)
-    followed = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
-    moved = fit.basis[:18, :-k] @ followed * further.prior
+    moved = following(model, further) * further.prior
     return np.asarray(moved @ moved.T)
+
+
+def following(model: Model, further: Nuisance) -> Floats:
+    """Return (18, k) by how much the transforms follow further errors, as the model found them.
+
+    A smooth error of the arm and a walk are found with them, and take their part.
+    """
+    k = len(further)
+    fit = weighed_with(model.problem, model.found, further)
+    moved = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
+    return np.asarray(fit.basis[:18, :-k] @ moved)
 
 
 def weighed_with(problem: Problem, found: Solution, further: Nuisance) -> Solution:

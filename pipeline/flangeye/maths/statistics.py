@@ -67,23 +67,27 @@ def covariance_inflation(freedom: float, parameters: int = 6, probability: float
     return honest / chi2_quantile(probability, parameters)
 
 
-def mixture_inflation(
-    scales: Floats, weights: Floats, parameters: int = 6, probability: float = 0.95
-) -> float:
+def mixture_inflation(squares: Floats, weights: Floats, probability: float = 0.95) -> float:
     """Return the factor on a covariance that makes its region hold its share of a mixture.
 
+    The squared distance of a case is taken for a scaled chi-square variable of the same mean and
+    variance (Satterthwaite 1946): errors of one case may lie along few axes.
+
     Args:
-        scales: (G,) of the variance in each case, in units of that covariance.
+        squares: (G, 2) traces of the covariance in each case and of its square, in units of the
+            covariance that is to be scaled.
         weights: (G,) of the cases, one together.
-        parameters: Of the error.
         probability: The region's.
     """
     from scipy.special import chdtr
 
-    edge, low, high = chi2_quantile(probability, parameters), 0.0, float(scales.max())
+    parameters = round(float(weights @ squares[:, 0]))
+    scales = squares[:, 1] / np.maximum(squares[:, 0], 1e-300)
+    freedoms = squares[:, 0] / np.maximum(scales, 1e-300)
+    edge, low, high = chi2_quantile(probability, parameters), 0.0, float(squares[:, 0].max())
     for _ in range(60):
         middle = 0.5 * (low + high)
-        inside = float(weights @ chdtr(parameters, edge * middle / np.maximum(scales, 1e-300)))
+        inside = float(weights @ chdtr(freedoms, edge * middle / scales))
         low, high = (middle, high) if inside < probability else (low, middle)
     return high
 

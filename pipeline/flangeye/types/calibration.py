@@ -103,6 +103,7 @@ class CorrectedArm:
         others: As in :class:`HandEye`.
         arms: As in :class:`HandEye`.
         shared: As in :class:`HandEye`.
+        scatter: (6, 6) as the pose of :class:`ScatterNoise`; None where the camera's is no larger.
     """
 
     camera: TransformEstimate
@@ -110,9 +111,12 @@ class CorrectedArm:
     others: tuple[TransformEstimate, ...] = ()
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
     shared: Array = field(default_factory=lambda: np.zeros(0))
+    scatter: Array | None = None
 
     def __post_init__(self) -> None:
         freeze(self, shared=(len(self.shared),))
+        if self.scatter is not None:
+            freeze(self, scatter=(6, 6))
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,7 @@ class HandEye:
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
-            noise = self.noise and replace(self.noise, pose=None)
+            noise = self.noise and replace(self.noise, pose=found.scatter)
             answer = replace(answer, shared=found.shared, noise=noise)
             others = found.others or self.others
             return replace(answer, others=others, corrected=None, arms=found.arms)

@@ -78,9 +78,8 @@ class RobustParams(Params):
     joint_zeros: Literal["consider", "ignore"] = Field(
         "consider",
         description="Whether the covariance includes what the arm does wrong alike at all poses: "
-        "zeros, encoders, sag, lengths, twists, as large as the residuals show them. For a flange "
-        "seen from the base: zeros as the robot's file has them (joint_accuracy), and all of it "
-        "where the residuals show an arm worse than that.",
+        "zeros, encoders, sag, lengths, twists, and what is smooth over the workspace, as large as "
+        "the residuals show them.",
     )
     joint_prior: Angle = param(
         "0.5 deg", gt=0, description="Expected standard deviation of a joint's offset."
