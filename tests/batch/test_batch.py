@@ -309,12 +309,15 @@ def test_files_for_tls_go_together_and_exist(batch: Callable[..., Any], tmp_path
         batch(tls=missing)
 
 
-def test_nobody_without_its_key_speaks_to_the_local_cluster() -> None:
+def test_the_local_cluster_keeps_few_messages_and_speaks_to_nobody_without_its_key() -> None:
     from distributed import Client
 
     from flangeye.batch.cluster import local_client
 
     with local_client(1) as client:
+        # Each connection would keep a thousand messages, with every chunk that was sent.
+        sending = [client.scheduler_comm, *client.cluster.scheduler.stream_comms.values()]
+        assert len(sending) == 2 and all(s.recent_message_log.maxlen < 10 for s in sending)
         address = client.scheduler.address
         assert address.startswith("tls://127.0.0.1:")
         assert client.submit(os.getpid).result(PATIENCE) > 0

@@ -56,7 +56,12 @@ SINGLE_THREADED = {
 }  # fmt: skip
 """Sessions run side by side, so each keeps to one core."""
 
+_LOGS = {"distributed.admin.low-level-log-length": 8}
+"""Dask keeps as many of the last messages on each connection, 1,000 if nothing is said: with them
+every chunk that was sent to a worker, 600 bytes a session."""
+
 _LOCAL = {
+    **_LOGS,
     "distributed.nanny.pre-spawn-environ": SINGLE_THREADED,
     # A session counts its own starts (work.py), which tells the culprit from those that waited.
     "distributed.scheduler.allowed-failures": 1_000_000,
@@ -157,6 +162,7 @@ def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
     Raises:
         BatchError: No scheduler answers there.
     """
+    import dask
     from distributed import Client
 
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # rows say it
@@ -172,7 +178,10 @@ def remote_client(address: str, tls: Tls | None = None) -> Iterator[Client]:
             f"--scheduler {address}: no dask scheduler answers there ({kind}); the address is "
             "what 'dask scheduler' prints, such as tcp://host:8786"
         )
-    with Client(address, timeout=CONNECT_SECONDS, security=security) as client:
+    with (
+        dask.config.set(_LOGS),
+        Client(address, timeout=CONNECT_SECONDS, security=security) as client,
+    ):
         yield client
 
 
