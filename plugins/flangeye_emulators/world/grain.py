@@ -28,7 +28,7 @@ def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Gener
     # and the deviation is a little higher there.
     scale = np.float32(1 / (kernel**2).sum())
     blurred = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel)
-    return np.asarray(blurred * scale)
+    return np.asarray(np.multiply(blurred, scale, out=blurred))
 
 
 def normal_quantile(probability: Image | Floats) -> Image:

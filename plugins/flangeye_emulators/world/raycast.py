@@ -6,9 +6,10 @@ Rays are followed through every second pixel of every second row; the pixels of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,10 @@ single precision leaves of it."""
 
 SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Row and column of the pixels that a sample stands for, itself first."""
+
+
+BAND = 1 << 16
+"""Pixels that are worked on at once: the images of as many stay in a core's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +165,7 @@ class Scene:
         depth, slants = _in_planes(pixels, met.normals, np.where(slant != 0, away, np.inf))
         depth[::2, ::2][bent] = met.depth[bent]
         between = _between(bent, pixels.shape)
-        row, column = np.divmod(between, len(pixels.x))
-        x, y = pixels.x[column], pixels.y[row]
+        x, y = _through(pixels, between)
         exact = self._cast(_rays(np.zeros(3), x, y, 1))
         body = _spread(met.body, pixels.shape)
         depth.ravel()[between], body.ravel()[between] = exact.depth, exact.body
@@ -191,13 +195,15 @@ class Scene:
         cells = _any_of_square(wanted)
         square = np.ones((3, 3), np.uint8)
         dark = np.zeros_like(cells)
-        row, column = np.nonzero(cv2.dilate(cells, square))
-        dark[row, column] = self._blocked(_beams(light, pixels, depth, (2 * row, 2 * column)))
+        at = np.flatnonzero(cv2.dilate(cells, square))
+        row = at // cells.shape[1]
+        # In the image, a cell's pixel has twice its row and twice its column.
+        pixel = 2 * at + row * (2 * len(pixels.x) - 2 * cells.shape[1])
+        dark.ravel()[at] = self._blocked(_beams(light, pixels, depth, pixel))
         border = (cv2.dilate(dark, square) != cv2.erode(dark, square)) & (cells > 0)
         out = _spread(dark, pixels.shape).astype(bool)
         between = _between(border, pixels.shape)
-        at = np.divmod(between, len(pixels.x))
-        out.ravel()[between] = self._blocked(_beams(light, pixels, depth, at))
+        out.ravel()[between] = self._blocked(_beams(light, pixels, depth, between))
         return out
 
     def _blocked(self, rays: Any) -> Mask:
@@ -215,9 +221,19 @@ class Scene:
         return np.asarray(cv2.LUT(body, table))
 
 
+def bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield the rows of an (H, W) image, some at a time."""
+    height = max(BAND // shape[1], 1)
+    for start in range(0, shape[0], height):
+        yield slice(start, start + height)
+
+
 def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
     """Return the product of (3, ...) vectors and others, given by their coordinates."""
-    return np.asarray(vectors[0] * x + vectors[1] * y + vectors[2] * z)
+    out = vectors[0] * x
+    out += vectors[1] * y
+    out += vectors[2] if isinstance(z, int) and z == 1 else vectors[2] * z
+    return np.asarray(out)
 
 
 def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Image]:
@@ -230,19 +246,25 @@ def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Imag
     """
     depth = np.empty(pixels.shape, dtype=np.float32)
     slant = np.empty_like(depth)
-    for r, c in SQUARES:
-        x, y = pixels.x[c::2], pixels.y[r::2, None]
-        part = np.s_[..., : len(y), : len(x)]
-        slant[r::2, c::2] = _dot(normals[part], x, y, 1)
-        np.divide(away[part], slant[r::2, c::2], out=depth[r::2, c::2])
+    for rows, (r, c) in product(bands(away.shape), SQUARES):
+        x, y = pixels.x[c::2], pixels.y[r::2, None][rows]
+        part = np.s_[..., rows.start : rows.start + len(y), : len(x)]
+        facing = _dot(normals[part], x, y, 1)
+        slant[r::2, c::2][rows] = facing
+        np.divide(away[part], facing, out=depth[r::2, c::2][rows])
     return depth, slant
 
 
-def _beams(light: Floats, pixels: Pixels, depth: Image, at: tuple[Indices, Indices]) -> Any:
-    """Return Open3D's rays (N, 6) from a light to the points that pixels at (row, column) see."""
-    row, column = at
-    z = depth[at]
-    x, y = pixels.x[column] * z, pixels.y[row] * z
+def _through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
+    """Return x and y of the directions through pixels, given their flat indices."""
+    row = at // len(pixels.x)
+    return pixels.x.take(at - row * len(pixels.x)), pixels.y.take(row)
+
+
+def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
+    """Return Open3D's rays (N, 6) from a light to the points that pixels at flat indices see."""
+    z = depth.ravel().take(at)
+    x, y = (direction * z for direction in _through(pixels, at))
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 
@@ -283,11 +305,13 @@ def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
 
 def _between(marked: Mask, shape: tuple[int, ...]) -> Indices:
     """Return the flat indices of the pixels that marked samples stand for, but for themselves."""
-    row, column = np.nonzero(marked)
+    at = np.flatnonzero(marked)
+    row = at // marked.shape[1]
+    column = at - row * marked.shape[1]
     found = []
     for r, c in SQUARES[1:]:
         inside = (2 * row + r < shape[0]) & (2 * column + c < shape[1])
-        found.append(((2 * row + r) * shape[1] + 2 * column + c)[inside])
+        found.append(((2 * row + r) * shape[1] + 2 * column + c).compress(inside))
     return np.concatenate(found)
 
 

@@ -11,7 +11,7 @@ from flangeye.types import Mask
 from flangeye_emulators.world import edges
 from flangeye_emulators.world.distortion import Distortion
 from flangeye_emulators.world.grain import correlated_normal, normal_quantile
-from flangeye_emulators.world.raycast import Hits, Image, Scene, pixels_of
+from flangeye_emulators.world.raycast import Hits, Image, Scene, bands, pixels_of
 
 FAINTEST = 0.012
 """Least share of the light that a point must return, of what a white surface at mid range and
@@ -91,7 +91,7 @@ class StructuredLight:
         distance = edges.distance_to(beside)
         depth = edges.rounded(hits.depth, width, self._grain)
         to_light = hits.facing(self.projector)
-        for rows in edges.bands(depth.shape):
+        for rows in bands(depth.shape):
             view = self._view(scene, hits, to_light, rows)
             self._decode(
                 view, distance[rows], (grain[::-1][rows], grain[rows, ::-1]), measured[rows]
@@ -100,13 +100,13 @@ class StructuredLight:
             depth[rows] += sigma * grain[rows]
             depth[rows] += self._distortion.depth_error(depth[rows], rows)
         edges.fly(depth, beside & measured, rng)
-        depth[~measured] = np.nan
+        np.copyto(depth, np.float32(np.nan), where=~measured)
         return self._distortion.points(depth)
 
     def _illuminated(self, scene: Scene, depth: Image) -> Mask:
         """Return which points (H, W) are in range and see the projector's light."""
         seen = np.empty(depth.shape, dtype=bool)
-        for rows in edges.bands(depth.shape):
+        for rows in bands(depth.shape):
             near, far = self.scanner.near, self.scanner.far
             seen[rows] = (depth[rows] >= near) & (depth[rows] <= far)
             seen[rows] &= self._in_projection(*self._beams(depth, rows))
@@ -163,15 +163,18 @@ class StructuredLight:
         measured &= view.cosine > GRAZING
         measured &= view.strength * (1 + np.float32(0.3) * patchy) > FAINTEST
         measured &= ~edges.lost(distance, self.scanner.edge_loss, ragged)
-        at = np.nonzero(measured & (view.dazzled > 0.01))
-        measured[at] = patchy[at] > normal_quantile(view.dazzled[at])
+        at = np.flatnonzero(measured & (view.dazzled > 0.01))
+        measured.ravel()[at] = patchy.ravel().take(at) > normal_quantile(
+            view.dazzled.ravel().take(at)
+        )
 
     def _depth_noise(self, view: _View, distance: Image) -> Image:
         """Return the standard deviation of the depth (R, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise) * view.grain
         sigma *= (view.depth / self._middle) ** 2 / np.maximum(view.cosine, np.float32(0.1))
-        close = np.nonzero(distance < 3)
-        sigma[close] *= 1 + np.float32(EDGE_NOISE) * np.exp(-distance[close])
+        close = np.flatnonzero(distance < 3)
+        near = distance.ravel().take(close)
+        sigma.ravel()[close] *= 1 + np.float32(EDGE_NOISE) * np.exp(-near)
         return np.asarray(sigma)
 
 
