@@ -102,6 +102,20 @@ def test_what_is_in_the_covariance_is_said_with_the_size_that_was_found() -> Non
     assert sizes[0] < 0.6 < 0.8 < sizes[1] < 8.0
 
 
+def test_a_corrected_arm_s_answer_has_what_else_is_wrong_with_the_arm() -> None:
+    """Its lengths, encoders and sag stay where offsets of joints are found."""
+    configuration = CONFIGURATIONS["eye-in-hand, marker"]
+    far: dict[str, list[float]] = {"consider": [], "ignore": []}
+    for seed in (300, 303, 307):
+        observations, truth = drawn(configuration, seed, REAL)
+        for zeros, told in far.items():
+            answer = solved(observations, configuration, joint_zeros=zeros, joint_offsets="auto")
+            corrected = answer.as_corrected()
+            assert corrected is not None
+            told += squares(corrected, truth)
+    assert max(far["consider"]) < 15 < 100 < max(far["ignore"])
+
+
 def test_the_answer_itself_does_not_depend_on_what_is_considered() -> None:
     configuration = CONFIGURATIONS["eye-on-base, marker"]
     observations, _ = drawn(configuration, 2, worse(1))
