@@ -114,7 +114,7 @@ class Recorder:
             self._file = path.open("wb")
             # One message, one chunk: what was written survives the death of the process. Scans and
             # images come packed, and the other points are noise to a codec: LZ4 won 0.3 % of a
-            # calibration's log, 7 % of a weld's, and cost a third of writing a whole scan.
+            # calibration's log, 7 % of a weld's, and cost a fifth of writing a whole scan.
             self._writer = Writer(
                 self._file, chunk_size=1, compression=CompressionType.NONE, enable_data_crcs=True
             )
