@@ -105,7 +105,7 @@ def test_both_answers_hold_for_two_arms_as_bad_as_real_ones() -> None:
     found = [list(answers(seed, "quality: real", THREE)) for seed in range(16)]
     for answer in ([each[i] for each in found if each[i]] for i in (0, 1)):
         assert len(answer) >= 8
-        assert (np.array(answer)[..., 0] < 12.6).mean() > 0.88
+        assert (np.array(answer)[..., 0] < 12.6).mean() > 0.85
 
 
 def test_the_size_of_every_kind_of_error_is_told() -> None:
