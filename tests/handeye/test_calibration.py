@@ -375,7 +375,7 @@ def on_one_clock(
         calibration, "better", lambda m, other, what: (other if helps else m).noted(what)
     )
     options: Any = None
-    cell: Any = Clocked(delay=None, reach=0.05, clock_deviation=0.0)
+    cell: Any = Clocked(delay=None, flange=True, reach=0.05, clock_deviation=0.0)
     return *calibration._with_clock(cell, fit, options), fit
 
 

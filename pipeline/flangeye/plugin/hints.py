@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
@@ -45,5 +46,5 @@ class Hints(Mapping[str, Any]):
         written = self._written[name]
         if not isinstance(written, str) or written != other._written[name]:
             return False
-        names = compile(written, name, "eval").co_names
+        names = {node.id for node in ast.walk(ast.parse(written)) if isinstance(node, ast.Name)}
         return all(self._names.get(each) is other._names.get(each) for each in names)
