@@ -2,7 +2,7 @@
 
 import math
 
-from tools.equal_results import _differences, _environment
+from tools.equal_results import _differences, _environment, _summary
 
 RESULT = {
     "status": "verified",
@@ -31,6 +31,12 @@ def test_the_last_bit_counts_and_is_named_by_its_place() -> None:
 
 def test_a_value_that_one_result_has_alone_counts() -> None:
     assert list(_differences(RESULT, {**RESULT, "seam": []})) == ["seam: None, now []"]
+
+
+def test_a_line_tells_the_names_of_what_differs() -> None:
+    assert _summary([]) == "equal"
+    apart = ["a.matrix[0][1]: 0.0, now 1.0", "a.matrix[0][2]: 0.0, now 1.0", "b.rms: 1, now 2"]
+    assert _summary(apart) == f"3 values differ, of matrix, rms; {apart[0]}"
 
 
 def test_code_is_run_with_its_own_list_of_plugins(tmp_path) -> None:

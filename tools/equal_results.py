@@ -6,7 +6,7 @@ COMMIT is checked out into a temporary folder and run by the same interpreter an
 other state is this folder as it stands, or another commit (``--to``). Recipes that have one of the
 words in their names are run, or all that both states have. Timing, versions and the names of folders do not count.
 
-A line a recipe: ``equal``; or what differs first and by how much. What follows an emulator in
+A line a recipe: ``equal``; or how many values differ, of which names, and the first. What follows an emulator in
 real time (``--move``) differs from run to run by itself and is left out, and the paper's studies
 are run by tests/paper. Archives are those of ``--archive`` (../shared/data/ancorasir).
 """
@@ -15,6 +15,7 @@ import argparse
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -93,11 +94,19 @@ def _line(name: str, before: Path, after: Path, archive: Path) -> str:
             _result(name, code, Path(place) / code.name, archive) for code in (before, after)
         )
     if isinstance(old, dict) and isinstance(new, dict):
-        apart = list(_differences(old, new))
-        return f"{name}: " + (f"{len(apart)} values differ; {apart[0]}" if apart else "equal")
+        return f"{name}: " + _summary(list(_differences(old, new)))
     return (
         f"{name}: equal" if old == new else f"{name}: {_ending(old)} before, {_ending(new)} after"
     )
+
+
+def _summary(apart: list[str]) -> str:
+    """Return how many values differ, of which names, and the first."""
+    if not apart:
+        return "equal"
+    places = (re.sub(r"\[\d+\]", "", line.partition(":")[0]) for line in apart)
+    names = ", ".join(sorted({place.rpartition(".")[2] for place in places}))
+    return f"{len(apart)} values differ, of {names}; {apart[0]}"
 
 
 def _ending(result: Any) -> str:
