@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
-from flangeye_emulators.world.raycast import Image, Pixels
+from flangeye_emulators.world.raycast import Image, Pixels, bands
 
 DEGREE = 3
 """Highest total degree of the polynomials: bends of the volume, no ripples."""
@@ -58,9 +58,10 @@ class Distortion:
     def points(self, depth: Image) -> Image:
         """Return the (H, W, 3) points the scanner reports for depths, error of direction only."""
         out = np.empty((*depth.shape, 3), dtype=np.float32)
-        np.multiply(self._terms[-2], depth, out=out[..., 0])
-        np.multiply(self._terms[-1], depth, out=out[..., 1])
-        out[..., 2] = depth
+        for rows in bands(depth.shape):
+            np.multiply(self._terms[-2][rows], depth[rows], out=out[rows, :, 0])
+            np.multiply(self._terms[-1][rows], depth[rows], out=out[rows, :, 1])
+            out[rows, :, 2] = depth[rows]
         return out
 
 

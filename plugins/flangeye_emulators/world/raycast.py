@@ -165,7 +165,7 @@ class Scene:
         depth, slants = _in_planes(pixels, met.normals, np.where(slant != 0, away, np.inf))
         depth[::2, ::2][bent] = met.depth[bent]
         between = _between(bent, pixels.shape)
-        x, y = _through(pixels, between)
+        x, y = through(pixels, between)
         exact = self._cast(_rays(np.zeros(3), x, y, 1))
         body = _spread(met.body, pixels.shape)
         depth.ravel()[between], body.ravel()[between] = exact.depth, exact.body
@@ -255,7 +255,7 @@ def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Imag
     return depth, slant
 
 
-def _through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
+def through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
     """Return x and y of the directions through pixels, given their flat indices."""
     row = at // len(pixels.x)
     return pixels.x.take(at - row * len(pixels.x)), pixels.y.take(row)
@@ -264,7 +264,7 @@ def _through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
 def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
     """Return Open3D's rays (N, 6) from a light to the points that pixels at flat indices see."""
     z = depth.ravel().take(at)
-    x, y = (direction * z for direction in _through(pixels, at))
+    x, y = (direction * z for direction in through(pixels, at))
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 

@@ -11,7 +11,7 @@ from flangeye.types import Mask
 from flangeye_emulators.world import edges
 from flangeye_emulators.world.distortion import Distortion
 from flangeye_emulators.world.grain import correlated_normal, normal_quantile
-from flangeye_emulators.world.raycast import Hits, Image, Scene, bands, pixels_of
+from flangeye_emulators.world.raycast import Hits, Image, Scene, bands, pixels_of, through
 
 FAINTEST = 0.012
 """Least share of the light that a point must return, of what a white surface at mid range and
@@ -69,11 +69,13 @@ class StructuredLight:
         self.noise = noise
         self._middle = np.float32((scanner.near + scanner.far) / 2)
         self._grain = scanner.noise_grain * resolution
+        # Eight pixels beyond what is lost, a step has no part in any error.
+        self._reach = int(np.ceil(scanner.edge_loss)) + 8
         self._distortion = Distortion(scanner, self.pixels, noise * scanner.calibration_error, rng)
         lean = scanner.convergence
         # The camera leans towards the projector, which therefore stands a little before it.
         self.projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
-        self._inverse_length = 1 / np.linalg.norm(self.pixels.directions, axis=-1)
+        self._inverse_length: Image = 1 / np.linalg.norm(self.pixels.directions, axis=-1)
 
     def scan(self, scene: Scene, rng: np.random.Generator) -> Image:
         """Return the organised scan, (H, W, 3) in ``camera`` [m], NaN where nothing was measured.
@@ -88,7 +90,7 @@ class StructuredLight:
         grain = correlated_normal(hits.depth.shape, self._grain, rng)
         width = hits.depth * np.float32(self.pixels.size)
         beside = edges.steps(hits.depth, width)
-        distance = edges.distance_to(beside)
+        distance = edges.distance_within(self._reach, beside)
         depth = edges.rounded(hits.depth, width, self._grain)
         to_light = hits.facing(self.projector)
         for rows in bands(depth.shape):
@@ -146,12 +148,16 @@ class StructuredLight:
         strength = scene.figure("albedo", body) * cosine * np.abs(to_projector)
         strength *= (self._middle / depth) ** 2
         gloss = scene.figure("gloss", body)
-        shiny = gloss > 0
-        along = self.pixels.x * x + self.pixels.y[rows, None] * y + z
-        dazzled = np.zeros_like(gloss)
-        dazzled[shiny] = gloss[shiny] * _highlight(
-            (to_camera + to_projector)[shiny], (along * self._inverse_length[rows] / length)[shiny]
+        shiny = np.flatnonzero(gloss > 0)
+        inverse = self._inverse_length[rows]
+        images: tuple[Image, ...] = gloss, to_camera, to_projector, x, y, z, inverse, length
+        lustre, here, there, x, y, z, inverse, length = (
+            image.ravel().take(shiny) for image in images
         )
+        across, down = through(self.pixels, shiny + rows.start * depth.shape[1])
+        along = across * x + down * y + z
+        dazzled = np.zeros_like(gloss)
+        dazzled.ravel()[shiny] = lustre * _highlight(here + there, along * inverse / length)
         return _View(depth, cosine, strength, dazzled, scene.figure("grain", body))
 
     def _decode(
