@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye_emulators.world import materials
+from flangeye_emulators.world import edges, materials
 from flangeye_emulators.world.distortion import Distortion
 from flangeye_emulators.world.grain import correlated_normal, normal_quantile
 from flangeye_emulators.world.mesh import box
@@ -190,3 +190,11 @@ def test_edges_lose_points_and_few_fly() -> None:
     assert rim.sum() < 0.7 * sharp_rim.sum()
     flying = (points[:, 2] < -0.05) & (points[:, 2] > -0.25)
     assert 1 <= flying.sum() < 0.005 * len(points)
+
+
+def test_distances_near_steps_are_those_of_the_whole_image() -> None:
+    marked = np.random.default_rng(3).random((150, 2000)) < 1e-4
+    marked[-1, -1] = marked[0, 0] = True
+    whole, near = edges.distance_to(marked), edges.distance_within(9, marked)
+    assert np.array_equal(near[whole < 8], whole[whole < 8])
+    assert near[whole >= 8].min() >= 8
