@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -214,7 +215,7 @@ class SolveConformance(SolvingConformance):
             ("centres on a line", WORK + along),
         ):
             few = observed(points, noise=NOISE / 5, normals=False)
-            require_refusal(lambda few=few: self.answer(few), t.Rejected, what)  # type: ignore[misc]
+            require_refusal(partial(self.answer, few), t.Rejected, what)
 
 
 class RefineConformance(SolvingConformance):
