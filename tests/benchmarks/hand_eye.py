@@ -22,9 +22,10 @@ from flangeye.handeye.closed import daniilidis, robot_world, separable
 from flangeye.handeye.closed.comanipulation import alternate, random_rotations
 from flangeye.handeye.closed.motions import motions_of
 from flangeye.handeye.components import Noise as Extra
-from flangeye.handeye.likelihood import Problem, weigh
-from flangeye.handeye.loop import ArmNoise, Unknowns
+from flangeye.handeye.likelihood import weigh
+from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.configuration import Configuration
 from flangeye_plugins.solve.robust import (
@@ -86,11 +87,12 @@ def bound(made: list) -> tuple[float, float]:
     """Return the Cramer-Rao bound of the same two figures."""
     traces = []
     for m in made:
-        problem = Problem(
-            measurements_of(m.observations, MARKER, None), loop_of(Configuration("eye-in-hand", "flange", "base")),
-            ArmNoise(2e-4, 5e-5), None,
-        )  # fmt: skip
-        at = Unknowns(m.truth["flange_T_camera"], np.eye(4), m.truth["base_T_target"], np.zeros(2))
+        problem = LoopProblem(
+            measurements=measurements_of(m.observations, MARKER, None),
+            loop=loop_of(Configuration("eye-in-hand", "flange", "base")),
+            arms=ArmNoise(2e-4, 5e-5),
+        )
+        at = Unknowns.of_loop(m.truth["flange_T_camera"], np.eye(4), m.truth["base_T_target"])
         known = weigh(problem, at, Extra(0.0, 0.0), np.ones(len(m.observations))).covariance
         traces.append([np.trace(known[:3, :3]), np.trace(known[3:6, 3:6])])
     turn, shift = np.sqrt(np.mean(traces, axis=0))

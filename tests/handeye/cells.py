@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from flangeye.handeye.components import Noise as Beyond
-from flangeye.handeye.likelihood import Problem, Solution, climb, weigh
-from flangeye.handeye.loop import ArmNoise, Unknowns
+from flangeye.handeye.likelihood import Solution, climb, weigh
+from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.handeye.measurements import loop_of, measurements_of
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.handeye.starts import start_of
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import (
     hat,
     invert,
@@ -265,21 +266,27 @@ def walking(made, rng, turn=5e-4, shift=2e-4):
     return replace(made, observations=out)
 
 
-def given(name: str, feature: str, n: int, noise: Noise = ISSUE, **more: Any) -> Problem:
+def given(name: str, feature: str, n: int, noise: Noise = ISSUE, **more: Any) -> LoopProblem:
     """Return the problem of a session of n measurements; its noise is stated, where not said."""
     configuration = CONFIGURATIONS[name]
     made = session(configuration, np.random.default_rng(n), n, 0.4, noise, feature)
     measured = measurements_of(made.observations, configuration, Arm(ROBOT))
     more = {"stated": True, **more}
-    return Problem(measured, loop_of(configuration), ArmNoise(2e-4, 5e-5), 1e-3, **more)
+    return LoopProblem(
+        measurements=measured,
+        loop=loop_of(configuration),
+        arms=ArmNoise(2e-4, 5e-5),
+        tilt=1e-3,
+        **more,
+    )
 
 
-def start(problem: Problem) -> Unknowns:
+def start(problem: LoopProblem) -> Unknowns:
     """Return where its search begins."""
     return start_of(problem.measurements, problem.loop, np.random.default_rng(0))
 
 
-def fitted(problem: Problem, beyond: Beyond = NOTHING_BEYOND) -> Solution:
+def fitted(problem: LoopProblem, beyond: Beyond = NOTHING_BEYOND) -> Solution:
     """Return the most likely unknowns, all measurements taking part."""
     every = np.ones(len(problem.measurements))
     return climb(problem, weigh(problem, start(problem), beyond, every), beyond, every)

@@ -15,8 +15,7 @@ from flangeye.handeye.calibration import TYPICAL_ARM, _beyond
 from flangeye.handeye.candidates import Model
 from flangeye.handeye.components import Noise
 from flangeye.handeye.consensus import Consensus, _first_noise
-from flangeye.handeye.likelihood import Problem
-from flangeye.handeye.loop import ArmNoise
+from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.maths.statistics import covariance_inflation
 from tests.handeye.cells import CONFIGURATIONS, Session, fitted, given, session, two_numbers
 
@@ -230,7 +229,7 @@ def test_what_is_stated_of_noise_goes_into_the_problem() -> None:
         normals=True, normal_bias=1e-3, robot_noise=None, pose_noise=None
     )
 
-    def problem(of: Session) -> Problem:
+    def problem(of: Session) -> LoopProblem:
         cell: Any = SimpleNamespace(
             observations=of.observations, configuration=of.configuration, arm=None
         )

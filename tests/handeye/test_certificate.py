@@ -20,8 +20,8 @@ from flangeye.handeye.certificate import (
 )
 from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, answer_of, certificate_note
 from flangeye.handeye.components import Noise
-from flangeye.handeye.likelihood import Problem, settle
-from flangeye.handeye.loop import ArmNoise
+from flangeye.handeye.likelihood import settle
+from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.handeye.measurements import loop_of, measurements_of
 from flangeye.handeye.starts import start_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
@@ -316,9 +316,8 @@ def test_a_best_answer_further_away_than_five_sigma_is_named(
     """Along any axis: by the largest standard deviation of the camera's rotation."""
     made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), n=15)
     measured = measurements_of(made.observations, made.configuration, None)
-    problem = Problem(
-        measured, loop_of(made.configuration), ArmNoise(2e-4, 5e-5), None, stated=True
-    )
+    loop = loop_of(made.configuration)
+    problem = LoopProblem(measurements=measured, loop=loop, arms=ArmNoise(2e-4, 5e-5), stated=True)
     start = start_of(measured, problem.loop, np.random.default_rng(0))
     found = settle(problem, start, Noise(0.0, 0.0))
     values, axes = np.linalg.eigh(found.covariance[:3, :3])

@@ -25,8 +25,9 @@ from flangeye.handeye.consensus import (
     targets_of,
 )
 from flangeye.handeye.inliers import gate
-from flangeye.handeye.likelihood import Problem, Solution
-from flangeye.handeye.loop import Unknowns, linearise
+from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.loop import LoopProblem, linearise
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import hat, rotation_exp, rotation_log
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, HandEye, Observation
@@ -118,7 +119,7 @@ HAND = "eye-in-hand, marker"
 EXACT = ISSUE.scaled(0.0)
 
 
-def exactly(name: str = HAND, feature: str = "pose", n: int = 8) -> tuple[Problem, Solution]:
+def exactly(name: str = HAND, feature: str = "pose", n: int = 8) -> tuple[LoopProblem, Solution]:
     """Return a problem of exact measurements, and its answer."""
     problem = cells.given(name, feature, n, EXACT, stated=False)
     return problem, fitted(problem)
@@ -229,7 +230,7 @@ def test_a_mirror_that_leaves_a_tenth_is_named(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(consensus, "_from_all", lambda *_: found)
     for share in (0.0099, 0.0101):
 
-        def distances(of: Problem, _: Unknowns, share: float = share) -> Floats:
+        def distances(of: LoopProblem, _: Unknowns, share: float = share) -> Floats:
             return ours if of is problem else share * ours
 
         monkeypatch.setattr(consensus, "_distances", distances)

@@ -20,8 +20,9 @@ from flangeye.handeye.likelihood import (
     weigh,
     with_noise,
 )
-from flangeye.handeye.loop import ArmNoise, linearise, weights_of
+from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.handeye.smoothing import steps_told
+from flangeye.handeye.unknowns import weights_of
 from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.geometry import rotation_exp
 from flangeye.maths.statistics import f_quantile
@@ -34,10 +35,10 @@ HAND = "eye-in-hand, marker"
 CELLS = [(HAND, "pose"), ("eye-on-base, flange", "normal"), ("two arms, flange", "normal")]
 
 
-def cost_at(problem: Problem, here: Solution, shares: Floats, step: Floats) -> float:
+def cost_at(problem: LoopProblem, here: Solution, shares: Floats, step: Floats) -> float:
     """Return the cost after a step, the weights as they were."""
     at = here.at.moved(here.basis @ step)
-    linear = linearise(problem.measurements, problem.loop, at, ARMS, problem.nuisance)
+    linear = replace(problem, arms=ARMS).linearised(at)
     return likelihood._weighed(problem, at, linear, here.noise, shares, here.weights).cost
 
 

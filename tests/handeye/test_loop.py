@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from flangeye.handeye.components import Noise
-from flangeye.handeye.loop import (
-    ArmNoise,
-    Unknowns,
-    free_columns,
-    linearise,
-    meaningless_turns,
-    weights_of,
-)
+from flangeye.handeye.loop import ArmNoise, free_columns, linearise, meaningless_turns
 from flangeye.handeye.measurements import Loop, Measurements, loop_of, measurements_of
+from flangeye.handeye.unknowns import Unknowns, weights_of
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats
@@ -35,7 +29,7 @@ def exact(name: str, feature: str) -> tuple[Measurements, Loop, Unknowns]:
     loop = loop_of(configuration)
     places = iter(drawn.truth.values())
     x, y = next(places), next(places) if loop.y else np.eye(4)
-    return s, loop, Unknowns(x, y, next(places) if loop.z else loop.place, np.zeros(2))
+    return s, loop, Unknowns.of_loop(x, y, next(places) if loop.z else loop.place)
 
 
 def slopes(residuals, count: int) -> Floats:

@@ -15,9 +15,15 @@ def some() -> Measurements:
     projectors[4, :3, :3] = 0.0
     still, rng = np.tile(np.eye(4), (5, 1, 1)), np.random.default_rng(0)
     return Measurements(
-        still, still, np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), rng.normal(size=(5, 3)),
-        np.tile(1e-6 * np.eye(6), (5, 1, 1)), projectors, freedoms,
-    )  # fmt: skip
+        rotations=np.tile(np.eye(3), (5, 1, 1)),
+        centres=rng.normal(size=(5, 3)),
+        covariances=np.tile(1e-6 * np.eye(6), (5, 1, 1)),
+        projectors=projectors,
+        freedoms=freedoms,
+        a=still,
+        b=still,
+        offsets=np.zeros((5, 3)),
+    )
 
 
 def test_a_normal_that_is_left_out_leaves_its_centre_and_no_pose_is_touched() -> None:

@@ -8,7 +8,6 @@ import pytest
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.handeye import observability as room
-from flangeye.handeye.loop import weights_of
 from flangeye.handeye.observability import (
     FLOOR,
     ObservabilityLimits,
@@ -34,6 +33,7 @@ from flangeye.handeye.observability import (
     unobservable,
     weak_moves,
 )
+from flangeye.handeye.unknowns import weights_of
 from flangeye.maths.geometry import kabsch, rigid, rotation_exp
 from flangeye.types import Floats
 from tests.handeye.cells import fitted, given

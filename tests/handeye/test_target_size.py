@@ -8,7 +8,8 @@ import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye import target_size
-from flangeye.handeye.likelihood import Problem, with_noise
+from flangeye.handeye.likelihood import with_noise
+from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.target_size import (
     EstimatedFactor,
     correlation,
@@ -23,7 +24,7 @@ from tests.handeye.cells import ISSUE, fitted, given, two_numbers
 HAND = "eye-in-hand, marker"
 
 
-def resized(factor: float, focal: float = 1.0) -> Problem:
+def resized(factor: float, focal: float = 1.0) -> LoopProblem:
     """Return a problem whose camera takes all distances, or those in depth, for longer."""
     problem = given(HAND, "pose", 14, ISSUE.scaled(0.1), stated=False)
     s = problem.measurements
@@ -69,7 +70,7 @@ def test_the_surer_of_size_and_focal_length_is_named(
     size: tuple[float, float], focal: tuple[float, float], told: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    def factor(problem: Problem, found: Any, moves: Any) -> EstimatedFactor:
+    def factor(problem: LoopProblem, found: Any, moves: Any) -> EstimatedFactor:
         return EstimatedFactor(*(size if moves[:, :5].any() else focal), freedom=50.0)
 
     monkeypatch.setattr(target_size, "estimated_factor", factor)
@@ -102,9 +103,9 @@ def test_a_factor_is_looked_for_beside_noise_in_depth_where_noise_is_not_stated(
 ) -> None:
     """Which would hide a wrong focal length; what poses tell of other nuisances stays."""
     problem = replace(resized(1.0), stated=stated, nuisance=two_numbers(14))
-    seen: list[Problem] = []
+    seen: list[LoopProblem] = []
 
-    def watched(problem: Problem, found: Any) -> Any:
+    def watched(problem: LoopProblem, found: Any) -> Any:
         seen.append(problem)
         return with_noise(problem, found)
 

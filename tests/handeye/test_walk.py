@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flangeye.handeye.loop import Linear
 from flangeye.handeye.smoothing import size_told, smoothed, steps_told
+from flangeye.handeye.unknowns import Linear
 from flangeye.handeye.walk import Course, Of, StepSize, Walk
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.statistics import chi2_quantile

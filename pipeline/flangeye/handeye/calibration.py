@@ -28,8 +28,8 @@ from flangeye.handeye.estimates import (
     transforms_of,
 )
 from flangeye.handeye.flange_roll import roll_note
-from flangeye.handeye.likelihood import Problem, Solution, freedom_of_sizes
-from flangeye.handeye.loop import COLUMNS, ArmNoise, meaningless_turns
+from flangeye.handeye.likelihood import Solution, freedom_of_sizes
+from flangeye.handeye.loop import ArmNoise, LoopProblem, meaningless_turns
 from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.handeye.observability import (
@@ -186,7 +186,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     )
 
 
-def _agreed(cell: Cell, options: Options, problem: Problem | None = None) -> Model:
+def _agreed(cell: Cell, options: Options, problem: LoopProblem | None = None) -> Model:
     """Return what the measurements agree on, with the time between two clocks if it was found."""
     problem = problem or _problem(cell, options)
     model = Model(find_consensus(problem, options.limits.rotation))
@@ -225,7 +225,8 @@ def _with_clock(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model
 def _delay_of(model: Model) -> tuple[float, float]:
     """Return the first of the nuisances, and its standard deviation."""
     found = model.found
-    return float(found.at.nuisance[0]), float(np.sqrt(found.covariance[COLUMNS, COLUMNS]))
+    first = found.at.before_nuisance
+    return float(found.at.nuisance[0]), float(np.sqrt(found.covariance[first, first]))
 
 
 def _clock_told(cell: Cell, further: float, sigma: float) -> str:
@@ -277,14 +278,18 @@ def _with_depth(model: Model) -> Model:
     return model.with_problem(replace(problem, in_depth=True)) or model
 
 
-def _problem(cell: Cell, options: Options) -> Problem:
+def _problem(cell: Cell, options: Options) -> LoopProblem:
     s = measurements_of(cell.observations, cell.configuration, cell.arm, normals=options.normals)
     loop, noise = loop_of(cell.configuration), options.robot_noise
     typical = TYPICAL_ARM if loop.y or loop.z or s.are_poses else None
-    return Problem(
-        s, loop, noise or typical, options.normal_bias, stated=noise is not None,
+    return LoopProblem(
+        measurements=s,
+        loop=loop,
+        arms=noise or typical,
+        tilt=options.normal_bias,
+        stated=noise is not None,
         pose_noise=None if options.pose_noise is None else options.pose_noise**2,
-    )  # fmt: skip
+    )
 
 
 def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]:
@@ -513,7 +518,7 @@ def _noise_notes(model: Model, cell: Cell, weak: Floats) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _beyond(found: Solution, problem: Problem) -> list[str]:
+def _beyond(found: Solution, problem: LoopProblem) -> list[str]:
     """Say what noise there is beyond the features' own."""
     of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
     shift = np.sqrt(of_arms[3:].mean() + found.noise.pose + found.noise.depth / 3) * 1e3

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.consensus import Consensus, again
 from flangeye.handeye.likelihood import Problem, Solution, weigh
-from flangeye.handeye.loop import COLUMNS
+from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.maths.geometry import stack_rows
 from flangeye.types import ArmCorrection, Floats, Mask
@@ -40,7 +40,7 @@ class Model:
     notes: tuple[str, ...] = ()
 
     @property
-    def problem(self) -> Problem:
+    def problem(self) -> LoopProblem:
         """What was given."""
         return self.consensus.problem
 
@@ -72,12 +72,12 @@ class Model:
                 resting, found.at, found.noise, found.inliers.astype(float)
             ).linear.residuals[:, 3:]
         if as_reported and sized.any():
-            moves = found.linear.jacobian[:, 3:, COLUMNS:][:, :, sized]
+            moves = found.linear.jacobian[:, 3:, found.at.before_nuisance :][:, :, sized]
             left = left + moves @ found.at.nuisance[sized]
         turns = self.problem.measurements.a[:, :3, :3] @ found.at.x[:3, :3]
         return np.asarray((turns @ left[..., None])[..., 0])
 
-    def with_problem(self, problem: Problem) -> Model | None:
+    def with_problem(self, problem: LoopProblem) -> Model | None:
         """Return the model of another problem; None when no answer of it can be trusted."""
         try:
             return replace(self, consensus=again(self.consensus, problem))

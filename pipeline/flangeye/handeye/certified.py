@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.handeye.certificate import Certificate, Sightings, certify
-from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.loop import LoopProblem
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.types import BASE, BASE2, CAMERA, TARGET, Floats, Indices
@@ -67,7 +68,7 @@ class Answer:
         return first, second
 
 
-def answer_of(problem: Problem, found: Solution) -> Answer:
+def answer_of(problem: LoopProblem, found: Solution) -> Answer:
     """Return the answer for one camera and one target; what else was found stays as it is."""
     s, loop, kept = problem.measurements, problem.loop, found.inliers
     s = (s if found.at.course is None else found.at.course.applied(s)).where(kept)

@@ -9,10 +9,11 @@ import numpy as np
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.handeye.components import SHIFT, TURN, Noise
 from flangeye.handeye.inliers import find_inliers
-from flangeye.handeye.likelihood import Problem, Solution, agreeing, gates, settle, weigh
-from flangeye.handeye.loop import Unknowns, linearise, weights_of
+from flangeye.handeye.likelihood import Solution, agreeing, gates, settle, weigh
+from flangeye.handeye.loop import LoopProblem, linearise
 from flangeye.handeye.observability import FINEST_NOISE, require_observable, spread_of
 from flangeye.handeye.starts import fewest, start_of
+from flangeye.handeye.unknowns import Unknowns, weights_of
 from flangeye.maths.geometry import invert, kabsch, rigid, rotation_log
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, Mask
@@ -48,12 +49,12 @@ class Consensus:
         notes: For the person.
     """
 
-    problem: Problem
+    problem: LoopProblem
     found: Solution
     notes: tuple[str, ...] = ()
 
 
-def find_consensus(problem: Problem, rotation_limit: float) -> Consensus:
+def find_consensus(problem: LoopProblem, rotation_limit: float) -> Consensus:
     """Return what most measurements agree on.
 
     Args:
@@ -70,12 +71,12 @@ def find_consensus(problem: Problem, rotation_limit: float) -> Consensus:
     return _of_points(problem, rotation_limit)
 
 
-def again(consensus: Consensus, problem: Problem) -> Consensus:
+def again(consensus: Consensus, problem: LoopProblem) -> Consensus:
     """Return what the measurements agree on in another model, begun at what is known."""
     return replace(consensus, problem=problem, found=agreeing(problem, consensus.found))
 
 
-def _of_points(problem: Problem, rotation_limit: float) -> Consensus:
+def _of_points(problem: LoopProblem, rotation_limit: float) -> Consensus:
     """Return the camera's pose alone, of centres whose places its carrier knows."""
     s = problem.measurements
     places, axes = targets_of(problem)
@@ -93,7 +94,7 @@ def _of_points(problem: Problem, rotation_limit: float) -> Consensus:
     return Consensus(problem, found, notes)
 
 
-def targets_of(problem: Problem) -> tuple[Floats, Floats]:
+def targets_of(problem: LoopProblem) -> tuple[Floats, Floats]:
     """Return (N, 3) centres and axes of the target where the camera's carrier has them."""
     s = problem.measurements
     poses = invert(s.a) @ s.b @ problem.loop.place
@@ -102,7 +103,7 @@ def targets_of(problem: Problem) -> tuple[Floats, Floats]:
 
 
 def _start(
-    problem: Problem, targets: tuple[Floats, Floats], inliers: Mask, sigma: float
+    problem: LoopProblem, targets: tuple[Floats, Floats], inliers: Mask, sigma: float
 ) -> Solution:
     """Return the closed-form pose of the inliers, and first guesses of the noise.
 
@@ -121,13 +122,15 @@ def _start(
     # Mirroring every vector as well makes their mean zero, which is what Kabsch takes away.
     rotation, _ = kabsch(np.vstack([source, -source]), np.vstack([target, -target]))
     x = rigid(rotation, mean_b - rotation @ mean_c)
-    at = Unknowns(x, np.eye(4), problem.loop.place, np.zeros(2))
+    at = Unknowns.of_loop(x, np.eye(4), problem.loop.place)
     pose = sigma**2 if problem.pose_noise is None else problem.pose_noise
     noise = Noise(0.0, 0.0) if problem.stated else Noise(pose, tilt)
     return weigh(problem, at, noise, inliers.astype(float))
 
 
-def _without_bad_normals(problem: Problem, found: Solution) -> tuple[Problem, Solution, int]:
+def _without_bad_normals(
+    problem: LoopProblem, found: Solution
+) -> tuple[LoopProblem, Solution, int]:
     """Leave out normals that disagree where their centres do not, and fit again."""
     left = problem.measurements.has_normal & ~found.inliers
     if not left.any():
@@ -138,7 +141,7 @@ def _without_bad_normals(problem: Problem, found: Solution) -> tuple[Problem, So
 
 
 def _require_rotation(
-    problem: Problem, found: Solution, places: Floats, axes: Floats, limit: float
+    problem: LoopProblem, found: Solution, places: Floats, axes: Floats, limit: float
 ) -> None:
     """Refuse a camera whose rotation about some axis, its place free, stays unknown."""
     kept = found.inliers
@@ -169,8 +172,8 @@ def _require_agreement(places: Floats, sigma: float) -> None:
 
 
 def _with_plausible_normals(
-    problem: Problem, places: Floats, axes: Floats, inliers: Mask
-) -> tuple[Problem, tuple[str, ...]]:
+    problem: LoopProblem, places: Floats, axes: Floats, inliers: Mask
+) -> tuple[LoopProblem, tuple[str, ...]]:
     """Leave out all normals when they belong to another frame than the target's axis."""
     s = problem.measurements
     used = inliers & s.has_normal
@@ -194,7 +197,7 @@ def _with_plausible_normals(
     return replace(problem, measurements=s.without_normals(s.has_normal)), (note,)
 
 
-def _of_any(problem: Problem) -> Solution:
+def _of_any(problem: LoopProblem) -> Solution:
     """Return what most measurements of any loop agree on.
 
     All of them give the first start. Where that leaves some beyond the gate, small sets drawn at
@@ -216,7 +219,7 @@ def _of_any(problem: Problem) -> Solution:
     return found
 
 
-def _from_all(problem: Problem, rng: np.random.Generator) -> Solution | None:
+def _from_all(problem: LoopProblem, rng: np.random.Generator) -> Solution | None:
     try:
         start = start_of(problem.measurements, problem.loop, rng)
     except np.linalg.LinAlgError:
@@ -224,7 +227,7 @@ def _from_all(problem: Problem, rng: np.random.Generator) -> Solution | None:
     return settle(problem, start, _first_noise(problem, start))
 
 
-def _from_subsets(problem: Problem, rng: np.random.Generator) -> Solution | None:
+def _from_subsets(problem: LoopProblem, rng: np.random.Generator) -> Solution | None:
     n = len(problem.measurements)
     size = min(fewest(problem.measurements, problem.loop) + 1, n)
     best, least = None, np.inf
@@ -240,13 +243,13 @@ def _from_subsets(problem: Problem, rng: np.random.Generator) -> Solution | None
     return None if best is None else settle(problem, best, _first_noise(problem, best))
 
 
-def _distances(problem: Problem, at: Unknowns) -> Floats:
+def _distances(problem: LoopProblem, at: Unknowns) -> Floats:
     """Return (N,) squared residuals, a degree weighing like 5 mm."""
     r = linearise(problem.measurements, problem.loop, at, None).residuals
     return np.asarray((r[:, :3] ** 2).sum(axis=1) * 0.3**2 + (r[:, 3:] ** 2).sum(axis=1))
 
 
-def _first_noise(problem: Problem, at: Unknowns) -> Noise:
+def _first_noise(problem: LoopProblem, at: Unknowns) -> Noise:
     """Return the noise that the better half of the residuals at a start speaks for."""
     if problem.stated:
         return Noise(pose=0.0, tilt=0.0)
@@ -258,7 +261,7 @@ def _first_noise(problem: Problem, at: Unknowns) -> Noise:
     )  # fmt: skip
 
 
-def _cost(problem: Problem, found: Solution) -> float:
+def _cost(problem: LoopProblem, found: Solution) -> float:
     """Return the truncated cost, every measurement weighed by its stated covariance alone."""
     stated = Noise(pose=1e-8, tilt=1e-8)
     weights = weights_of(problem.measurements, found.linear, stated)
@@ -278,7 +281,7 @@ def spread(found: Solution) -> tuple[float, float]:
     return float(shift), float(turn)
 
 
-def _plausible(problem: Problem, found: Solution) -> bool:
+def _plausible(problem: LoopProblem, found: Solution) -> bool:
     """Whether most agree, and better than scans would that belong to other poses."""
     s, (shift, turn) = problem.measurements, spread(found)
     extent = np.sqrt(s.centres.var(axis=0).sum())
@@ -290,7 +293,7 @@ def _plausible(problem: Problem, found: Solution) -> bool:
     )
 
 
-def _require_right_handed(problem: Problem, found: Solution, rng: np.random.Generator) -> None:
+def _require_right_handed(problem: LoopProblem, found: Solution, rng: np.random.Generator) -> None:
     if _plausible(problem, found):
         return
     mirrored = replace(problem, measurements=problem.measurements.mirrored())
@@ -307,7 +310,7 @@ def _require_right_handed(problem: Problem, found: Solution, rng: np.random.Gene
         )
 
 
-def _require_majority(problem: Problem, found: Solution) -> None:
+def _require_majority(problem: LoopProblem, found: Solution) -> None:
     agreeing, given = int(found.inliers.sum()), len(found.inliers)
     shift, turn = spread(found)
     if agreeing < max(3, given / 2):

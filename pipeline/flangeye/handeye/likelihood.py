@@ -6,8 +6,10 @@ non-convexity, then by how far each measurement is from what the others say. Arr
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +25,10 @@ from flangeye.handeye.components import (
     without_arms,
 )
 from flangeye.handeye.inliers import gate, truncated_weights
-from flangeye.handeye.loop import (
-    COLUMNS,
-    ArmNoise,
-    Linear,
-    Unknowns,
-    free_columns,
-    linearise,
-    weights_of,
-)
-from flangeye.handeye.measurements import Loop, Measurements
+from flangeye.handeye.measurements import Seen
 from flangeye.handeye.nuisance import Nuisance, no_nuisance
 from flangeye.handeye.smoothing import Smoothed, size_told, smoothed, steps_told
+from flangeye.handeye.unknowns import Linear, Unknowns, weights_of
 from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import f_quantile
@@ -53,14 +47,12 @@ GRADUATION = 1.4
 TINY = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What is given.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem(ABC):
+    """What is given: what was seen, and how it is predicted from the unknowns.
 
     Attributes:
         measurements: N of them.
-        loop: What is unknown.
-        arms: Noise of the arms' reported poses; None where nothing is known of it.
         tilt: Standard deviation of a tilt common to all normals [rad], or None.
         stated: Whether that is all the noise there is beside the measurements' own; else more is
             estimated, or all of it scaled down.
@@ -70,27 +62,37 @@ class Problem:
         walk: How the base walks from pose to pose; None where it rests.
     """
 
-    measurements: Measurements
-    loop: Loop
-    arms: ArmNoise | None
-    tilt: float | None
+    measurements: Seen
+    tilt: float | None = None
     stated: bool = False
     nuisance: Nuisance = field(default_factory=lambda: no_nuisance(0))
     pose_noise: float | None = None
     in_depth: bool = False
     walk: Walk | None = None
 
-    def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
+    @abstractmethod
+    def linearised(self, at: Unknowns) -> Linear:
+        """Return what is predicted at some values of the unknowns."""
+
+    @abstractmethod
+    def free(self, at: Unknowns) -> Floats:
+        """Return (6 K + 2 + k, p), a basis of the moves that anything could be known of."""
+
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Self:
         """Return the problem of some of the measurements."""
         nuisance = self.nuisance.where(chosen) if len(self.nuisance) else self.nuisance
         return replace(self, measurements=self.measurements.where(chosen), nuisance=nuisance)
 
-    def prior(self, noise: Noise) -> tuple[Floats, Floats]:
-        """Return information and mean (20 + k,) known beforehand: of tilt and nuisances alone."""
+    def prior(self, at: Unknowns, noise: Noise) -> tuple[Floats, Floats]:
+        """Return information and mean known beforehand of (6 K + 2 + k,) moves.
+
+        Of tilt and nuisances alone; what is known of a place, it is.
+        """
         known = 0.0 if self.tilt is None else self.tilt**-2.0
         nuisance = self.nuisance.of_size(noise.size)
-        information = np.concatenate([np.zeros(18), np.full(2, known), nuisance.prior**-2.0])
-        return information, np.concatenate([np.zeros(COLUMNS), nuisance.mean])
+        still = np.zeros(at.of_places)
+        information = np.concatenate([still, np.full(2, known), nuisance.prior**-2.0])
+        return information, np.concatenate([still, np.zeros(2), nuisance.mean])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,7 @@ class Solution:
 
     Attributes:
         at: The values.
-        basis: (20 + k, p) moves of the unknowns that were fitted.
+        basis: (6 K + 2 + k, p) moves of the unknowns that were fitted.
         information: (p, p) Fisher information.
         linear: All N measurements, linearised there.
         weights: (N, 6, 6) their inverse covariances.
@@ -129,7 +131,7 @@ class Solution:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(20 + k, 20 + k) of all moves, the unobservable directions left out."""
+        """(6 K + 2 + k, 6 K + 2 + k) of all moves, the unobservable directions left out."""
         return np.asarray(self.basis @ self.known @ self.basis.T)
 
     @cached_property
@@ -199,8 +201,7 @@ def weigh(problem: Problem, at: Unknowns, noise: Noise, shares: Floats) -> Solut
         at = replace(at, nuisance=np.zeros(len(problem.nuisance)))
     if (at.course is None) != (problem.walk is None):
         at = replace(at, course=Course.still(problem.walk) if problem.walk else None)
-    linear = linearise(problem.measurements, problem.loop, at, problem.arms, problem.nuisance)
-    return _weighed(problem, at, linear, noise, shares)
+    return _weighed(problem, at, problem.linearised(at), noise, shares)
 
 
 def _weighed(
@@ -213,13 +214,13 @@ def _weighed(
 ) -> Solution:
     s = problem.measurements
     weights = weights_of(s, linear, noise) if weights is None else weights
-    basis = free_columns(s, problem.loop, at, problem.tilt)
+    basis = problem.free(at)
     jacobian = stack_rows(linear.jacobian) @ basis
     weighted = stack_rows(weights @ jacobian.reshape(len(s), 6, -1))
     squares = (linear.residuals * (weights @ linear.residuals[..., None])[..., 0]).sum(axis=1)
     counting = np.repeat(shares, 6)
-    known, mean = problem.prior(noise)
-    surprise = np.concatenate([np.zeros(18), at.tilt, at.nuisance]) - mean
+    known, mean = problem.prior(at, noise)
+    surprise = np.concatenate([np.zeros(at.of_places), at.tilt, at.nuisance]) - mean
     counted = counting[:, None] * weighted
     information = jacobian.T @ counted + basis.T @ (known[:, None] * basis)
     slope = counted.T @ linear.residuals.ravel() - basis.T @ (known * surprise)
@@ -452,7 +453,9 @@ def _size(problem: Problem, found: Solution) -> float:
     if not sized.any():
         return size
     values = found.at.nuisance[sized]
-    told = sized.sum() - np.diag(found.covariance)[COLUMNS:][sized].sum() / size**2
+    told = (
+        sized.sum() - np.diag(found.covariance)[found.at.before_nuisance :][sized].sum() / size**2
+    )
     return max(float(np.sqrt((values @ values) / max(told, 1e-3))), FINEST)
 
 

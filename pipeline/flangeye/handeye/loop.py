@@ -1,62 +1,25 @@
-"""The loop A X M = Y B Z, predicted and linearised, for every configuration. Arrays only.
+"""The loop A X M = Y B Z of one camera and one target, predicted and linearised. Arrays only.
 
-Unknowns are moved by (rotation, translation), ``R' = Exp(phi) R`` and ``t' = t + tau``, in the
-parent's frame. The residual of a measurement is what takes the predicted target in the camera to
-the measured one, in the same way.
+The graph of frames (:mod:`flangeye.handeye.graph`) of every configuration with one camera, written
+out: it has closed forms to begin with, and what walks.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flangeye.handeye.components import FINEST, Noise
+from flangeye.handeye.likelihood import Problem
 from flangeye.handeye.measurements import Loop, Measurements
 from flangeye.handeye.nuisance import Nuisance
-from flangeye.handeye.walk import Course, Of
+from flangeye.handeye.unknowns import Linear, Unknowns
+from flangeye.handeye.walk import Of
 from flangeye.maths.geometry import each_applied, hat, rotation_between, rotation_exp, rotation_log
 from flangeye.types import Floats
 
 COLUMNS = 20
 """Six for each of X, Y, Z; two for a tilt common to all normals. Nuisances come after."""
-
-
-@dataclass(frozen=True, eq=False)
-class Unknowns:
-    """Values of the unknowns.
-
-    Attributes:
-        x: (4, 4) camera carrier to camera.
-        y: (4, 4) second base in the first.
-        z: (4, 4) target in its carrier.
-        tilt: (2,) of all normals, about the target's x and y [rad].
-        nuisance: (k,) of the arms.
-        course: Where the base walked; None where it rests.
-    """
-
-    x: Floats
-    y: Floats
-    z: Floats
-    tilt: Floats
-    nuisance: Floats = field(default_factory=lambda: np.zeros(0))
-    course: Course | None = None
-
-    def moved(self, step: Floats) -> Unknowns:
-        """Return the unknowns moved by (20 + k,)."""
-        x, y, z = (
-            _moved(m, step[6 * k : 6 * k + 6]) for k, m in enumerate((self.x, self.y, self.z))
-        )
-        tilt, nuisance = self.tilt + step[18:COLUMNS], self.nuisance + step[COLUMNS:]
-        return Unknowns(x, y, z, tilt, nuisance, self.course)
-
-
-def _moved(transform: Floats, step: Floats) -> Floats:
-    out = transform.copy()
-    out[:3, :3] = rotation_exp(step[:3]) @ transform[:3, :3]
-    out[:3, 3] += step[3:]
-    return out
 
 
 @dataclass(frozen=True)
@@ -72,27 +35,27 @@ class ArmNoise:
         return np.diag([self.rotation**2] * 3 + [self.translation**2] * 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """The loop at some values of its unknowns.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LoopProblem(Problem):
+    """What is given of a loop.
 
     Attributes:
-        residuals: (N, 6).
-        jacobian: (N, 6, 20 + k) of what is predicted.
-        of_arms: (N, 6, 6) covariance that the arms' noise has in the camera; None if not stated.
-        drift: (N, 6, s) of what is predicted by a motion of the base, and of the camera's scale;
-            none where it rests.
+        measurements: N of them.
+        loop: What is unknown.
+        arms: Noise of the arms' reported poses; None where nothing is known of it.
     """
 
-    residuals: Floats
-    jacobian: Floats
-    of_arms: Floats
-    drift: Floats
+    measurements: Measurements
+    loop: Loop
+    arms: ArmNoise | None
 
-    def where(self, chosen: NDArray[np.bool_]) -> Linear:
-        """Return some of the measurements."""
-        each = self.residuals, self.jacobian, self.of_arms, self.drift
-        return Linear(*(of_all[chosen] for of_all in each))
+    def linearised(self, at: Unknowns) -> Linear:
+        """Return what is predicted at some values of the unknowns."""
+        return linearise(self.measurements, self.loop, at, self.arms, self.nuisance)
+
+    def free(self, at: Unknowns) -> Floats:
+        """Return a basis of the moves that anything could be known of; see ``free_columns``."""
+        return free_columns(self.measurements, self.loop, at, self.tilt)
 
 
 def linearise(
@@ -224,16 +187,3 @@ def _turns_of_place(measurements: Measurements, at: Unknowns, seen: bool) -> Flo
     turns = np.zeros((COLUMNS + len(at.nuisance), axes.shape[1]))
     turns[12:15] = axes
     return turns
-
-
-def weights_of(measurements: Measurements, linear: Linear, noise: Noise) -> Floats:
-    """Return the (N, 6, 6) inverse covariances, zero across what was not measured."""
-    scale = np.repeat(np.sqrt([noise.normal_scale, noise.centre_scale]), 3)
-    extra = np.diag(np.repeat([noise.tilt + FINEST**2, noise.pose + FINEST**2], 3))
-    own = measurements.covariances + noise.arms * linear.of_arms
-    extra[5, 5] += noise.depth
-    covariance = own * np.outer(scale, scale) + extra
-    if measurements.are_poses:
-        return np.asarray(np.linalg.inv(covariance))
-    p = measurements.projectors
-    return np.asarray(p @ np.linalg.inv(p @ covariance @ p + (np.eye(6) - p)) @ p)

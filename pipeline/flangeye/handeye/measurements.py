@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +48,10 @@ def loop_of(configuration: Configuration) -> Loop:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
-    """N measurements.
+class Seen:
+    """What cameras saw of targets, N times.
 
     Attributes:
-        a: (N, 4, 4) where the camera was carried, in ``base``.
-        b: (N, 4, 4) where the target was carried, in its own arm's base.
-        offsets: (N, 3) what was seen, in the target's frame [m].
         rotations: (N, 3, 3) camera_R_target; the turn about z means nothing for circles, and all
             of it nothing for centres.
         centres: (N, 3) in ``camera`` [m].
@@ -62,9 +60,6 @@ class Measurements:
         freedoms: (N,) how many numbers that is: 6 for a pose, 5 with a normal, 3 for a centre.
     """
 
-    a: Floats
-    b: Floats
-    offsets: Floats
     rotations: Floats
     centres: Floats
     covariances: Floats
@@ -91,9 +86,24 @@ class Measurements:
         """Whether every measurement has a normal at least."""
         return bool((self.freedoms >= 5).all())
 
-    def where(self, chosen: Mask | NDArray[np.intp]) -> Measurements:
-        """Return some of the measurements."""
-        return Measurements(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Self:
+        """Return some of it."""
+        return type(self)(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements(Seen):
+    """N measurements of one target by one camera.
+
+    Attributes:
+        a: (N, 4, 4) where the camera was carried, in ``base``.
+        b: (N, 4, 4) where the target was carried, in its own arm's base.
+        offsets: (N, 3) what was seen, in the target's frame [m].
+    """
+
+    a: Floats
+    b: Floats
+    offsets: Floats
 
     @property
     def has_normal(self) -> Mask:

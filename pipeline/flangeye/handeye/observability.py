@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.handeye.components import Noise
-from flangeye.handeye.likelihood import Problem, Solution
-from flangeye.handeye.loop import weights_of
+from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.starts import fewest
+from flangeye.handeye.unknowns import weights_of
 from flangeye.maths.geometry import hat, invert, kabsch, rotation_log, stack_rows
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats
@@ -278,7 +279,7 @@ class ObservabilityLimits:
     mark: bool
 
 
-def require_enough(problem: Problem) -> None:
+def require_enough(problem: LoopProblem) -> None:
     """Refuse fewer poses than the configuration needs, or poses that are all the same.
 
     Raises:
@@ -294,7 +295,7 @@ def require_enough(problem: Problem) -> None:
         raise StageError(f"all {len(s)} poses are the same: move the arm between captures")
 
 
-def require_turns(problem: Problem) -> None:
+def require_turns(problem: LoopProblem) -> None:
     """Refuse arms that stood still or never turned, before any start is looked for.
 
     Raises:
@@ -309,7 +310,7 @@ def require_turns(problem: Problem) -> None:
             )
 
 
-def unobservable(problem: Problem, found: Solution, limits: ObservabilityLimits) -> Floats:
+def unobservable(problem: LoopProblem, found: Solution, limits: ObservabilityLimits) -> Floats:
     """Return (20, k) unit moves of the unknowns that the poses tell nothing of.
 
     Args:
@@ -326,7 +327,7 @@ def unobservable(problem: Problem, found: Solution, limits: ObservabilityLimits)
     jacobian = found.linear.jacobian[kept] @ found.basis
     information = np.einsum("nai,nab,nbj->ij", jacobian, weights, jacobian, optimize=True)
     # What normals have in common is known beforehand, and all else is left to the poses.
-    known, _ = problem.prior(found.noise)
+    known, _ = problem.prior(found.at, found.noise)
     information += found.basis.T @ (known[:, None] * found.basis)
     found_weak = weak_moves(information, _scale(found.basis, limits))
     if not found_weak:
@@ -362,7 +363,7 @@ def _of_what(weak: Floats) -> str:
     return f"{what} of {named} cannot be told from these poses"
 
 
-def missing_motion(problem: Problem) -> str:
+def missing_motion(problem: LoopProblem) -> str:
     """Return what the arms did not do, in words."""
     if not (problem.loop.y or problem.loop.z):
         return (
@@ -375,7 +376,7 @@ def missing_motion(problem: Problem) -> str:
     return "the poses are too much alike; spread them, by 20 deg or more about two axes"
 
 
-def _arms(problem: Problem) -> list[tuple[str, Floats]]:
+def _arms(problem: LoopProblem) -> list[tuple[str, Floats]]:
     """Return each arm's name and (N, 4, 4) poses: one of camera and target against each other."""
     s = problem.measurements
     if problem.loop.y:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flangeye.handeye.loop import Linear
+from flangeye.handeye.unknowns import Linear
 from flangeye.handeye.walk import FINEST_STEP, Course, StepSize, Walk
 from flangeye.maths.tridiagonal import Tridiagonal, solve_tridiagonal
 from flangeye.types import Floats

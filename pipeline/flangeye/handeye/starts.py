@@ -12,8 +12,8 @@ from flangeye.handeye.closed.comanipulation import (
 )
 from flangeye.handeye.closed.motions import motions_of, place_of
 from flangeye.handeye.closed.separable import park_martin
-from flangeye.handeye.loop import Unknowns
 from flangeye.handeye.measurements import Loop, Measurements
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import (
     basis_of_plane,
     invert,
@@ -59,8 +59,7 @@ def start_of(
     Raises:
         CalibrationRefused: The configuration cannot be solved from such features.
     """
-    x, y, z = _start(measurements, loop, rng, restarts)
-    return Unknowns(x, y, z, np.zeros(2))
+    return Unknowns.of_loop(*_start(measurements, loop, rng, restarts))
 
 
 def size_of(measurements: Measurements, loop: Loop, rng: np.random.Generator) -> float:

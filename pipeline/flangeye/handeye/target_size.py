@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.handeye.likelihood import Problem, Solution, weigh, with_noise
+from flangeye.handeye.likelihood import Solution, weigh, with_noise
+from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.measurements import Measurements
 from flangeye.handeye.nuisance import nuisance_of
 from flangeye.maths.statistics import f_quantile
@@ -21,7 +22,7 @@ CERTAIN = 1 - 1e-6
 """Probability with which a factor that is named is not noise's doing."""
 
 
-def require_size(problem: Problem, found: Solution, limit: float) -> None:
+def require_size(problem: LoopProblem, found: Solution, limit: float) -> None:
     """Refuse poses of a target whose distances fit far better when all are longer or shorter.
 
     All distances, as those of a target of another size are; or those along the camera's axis alone,
@@ -81,7 +82,7 @@ class EstimatedFactor:
         return self.score > f_quantile(CERTAIN, 1, self.freedom)
 
 
-def estimated_factor(problem: Problem, found: Solution, moves: Floats) -> EstimatedFactor:
+def estimated_factor(problem: LoopProblem, found: Solution, moves: Floats) -> EstimatedFactor:
     """Return the factor that poses of a target tell, with all else unknown, the noise as well.
 
     The noise of a fit without the factor would take what the factor does for noise, and where only

@@ -104,12 +104,13 @@ def _about_the_mean(model: Model) -> Model:
     mean = course.motions[found.inliers].mean(axis=0)
     mean[:3, :3] = nearest_rotation(mean[:3, :3])
     if model.problem.loop.camera_moves and course.of == "base":
-        place, motions = {"z": mean @ found.at.z}, course.motions @ invert(mean)
+        which, moved, motions = 2, mean, course.motions @ invert(mean)
     else:
-        name = "z" if course.of == "target" else "x"
-        place = {name: invert(mean) @ getattr(found.at, name)}
-        motions = invert(mean) @ course.motions
-    at = replace(found.at, course=replace(course, motions=motions), **place)
+        which, moved = (2 if course.of == "target" else 0), invert(mean)
+        motions = moved @ course.motions
+    places = found.at.places.copy()
+    places[which] = moved @ places[which]
+    at = replace(found.at, places=places, course=replace(course, motions=motions))
     return replace(model, consensus=replace(model.consensus, found=replace(found, at=at)))
 
 

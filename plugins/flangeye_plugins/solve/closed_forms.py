@@ -18,8 +18,8 @@ from flangeye.handeye.estimates import (
     points_of_interest,
     transforms_of,
 )
-from flangeye.handeye.likelihood import Problem, weigh, with_noise
-from flangeye.handeye.loop import Unknowns, meaningless_turns
+from flangeye.handeye.likelihood import weigh, with_noise
+from flangeye.handeye.loop import LoopProblem, meaningless_turns
 from flangeye.handeye.measurements import Loop, Measurements, loop_of, measurements_of
 from flangeye.handeye.observability import (
     ObservabilityLimits,
@@ -27,6 +27,7 @@ from flangeye.handeye.observability import (
     require_turns,
     unobservable,
 )
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import invert, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import covariance_inflation
@@ -77,14 +78,14 @@ def solve_closed(
     """
     configuration, arm = cell[0] or DEFAULT, cell[1]
     loop, measurements = loop_of(configuration), measurements_of(pulled, configuration, arm)
-    problem = Problem(measurements, loop, None, None)
+    problem = LoopProblem(measurements=measurements, loop=loop, arms=None)
     require_enough(problem)
     require_turns(problem)
     try:
         values = solver(measurements, loop)
     except np.linalg.LinAlgError:
         raise CalibrationRefused(f"{method}: its equations have no solution here") from None
-    at, everyone = Unknowns(*values, np.zeros(2)), np.ones(len(pulled))
+    at, everyone = Unknowns.of_loop(*values), np.ones(len(pulled))
     found = with_noise(problem, weigh(problem, at, Noise(0.0, 0.0), everyone), refit=False)
     unobservable(
         problem, found, ObservabilityLimits(params.rotation_limit, params.translation_limit, False)
