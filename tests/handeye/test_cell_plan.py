@@ -59,7 +59,7 @@ def test_the_choice_is_the_one_after_which_least_is_left_unknown(session: Any) -
         return sum(e**2 for e in errors.values())
 
     some = candidates[::5]
-    expected = [foreseen([o.poses], (o.camera, o.target), found, cell, o.feature)[0] for o in some]
+    expected = [foreseen([o], found, cell)[0] for o in some]
     chosen = most_telling(expected, found, cell, seen)
     assert some[chosen].camera == "right"
     states = np.array([left(o) for o in some])

@@ -61,6 +61,7 @@ class Recording:
         seen_by: Which camera of a cell looked.
         saw: Which target of a cell it saw.
         motion: How the (first) arm's flange passed, where that was recorded and it moved.
+        arm_joints: Of a cell, (n,) joint angles of each arm that has them [rad].
     """
 
     id: str
@@ -77,6 +78,7 @@ class Recording:
     seen_by: str = CAMERA
     saw: str = TARGET
     motion: Motion | None = None
+    arm_joints: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def base_T_flange(self) -> Floats:

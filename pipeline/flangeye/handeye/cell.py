@@ -139,7 +139,7 @@ def sighted_of(
 
 def mover_noise(cell: Cell) -> dict[str, Floats]:
     """Return the (6, 6) covariance of what moves that is believed before anything is seen."""
-    return {name: TYPICAL_ARM.covariance for name in cell.movers}
+    return {name: TYPICAL_ARM.covariance for name in cell.measured}
 
 
 def sighting_of(i: int, observation: Observation) -> Sighting:

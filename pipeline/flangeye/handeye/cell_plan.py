@@ -18,7 +18,7 @@ import numpy as np
 
 from flangeye.handeye.cell import mover_noise, sighting_of
 from flangeye.handeye.graph import Solved, rows_of
-from flangeye.maths.frame_graph import Frame, composed
+from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import hat, invert, stack_rows
 from flangeye.maths.statistics import chi2_quantile, largest_error_quantile
 from flangeye.models.cell import Cell
@@ -29,7 +29,6 @@ from flangeye.types import (
     Floats,
     Observation,
     PoseFeature,
-    Poses,
     Transform,
 )
 
@@ -81,41 +80,30 @@ def most_telling(
     return int(np.argmax(worth))
 
 
-def foreseen(
-    moments: Sequence[Poses], ends: tuple[str, str], found: Solved, cell: Cell, like: Feature
-) -> list[Observation]:
-    """Return what a camera would see of a target at M moments, by what is known so far.
+def foreseen(moments: Sequence[Observation], found: Solved, cell: Cell) -> list[Observation]:
+    """Return M sightings of one target by one camera as they would be, by what is known so far.
 
     Args:
-        moments: Where the controllers would have what moves.
-        ends: The camera, and the target.
+        moments: Where the controllers would have what moves, the camera, the target, and by a
+            feature anywhere what such a sighting measures, and how well.
         found: What is known so far.
         cell: What stands on what.
-        like: What such a sighting measures, and how well.
     """
-    poses = foreseen_poses(moments, ends, found, cell)
+    poses = foreseen_poses(moments, found, cell)
     return [
-        Observation(str(i), _moved(like, pose), moment, None, *ends)
-        for i, (moment, pose) in enumerate(zip(moments, poses, strict=True))
+        replace(moment, feature=_moved(moment.feature, pose))
+        for moment, pose in zip(moments, poses, strict=True)
     ]
 
 
-def foreseen_poses(
-    moments: Sequence[Poses], ends: tuple[str, str], found: Solved, cell: Cell
-) -> Floats:
-    """Return (M, 4, 4) camera_T_target at M moments, by what is known so far."""
+def foreseen_poses(moments: Sequence[Observation], found: Solved, cell: Cell) -> Floats:
+    """Return (M, 4, 4) camera_T_target at such moments, by what is known so far."""
     frames = {
-        name: replace(frame, place=_placed(name, frame, moments, found))
-        for name, frame in cell.frames.items()
+        name: replace(frame, place=found.places.get(name, frame.place))
+        for name, frame in cell.graph(moments).items()
     }
-    camera, target = (composed(frames, end) for end in ends)
+    camera, target = (composed(frames, end) for end in (moments[0].camera, moments[0].target))
     return np.broadcast_to(invert(camera) @ target, (len(moments), 4, 4))
-
-
-def _placed(name: str, frame: Frame, moments: Sequence[Poses], found: Solved) -> Floats | None:
-    if moments and name in moments[0]:
-        return np.array([moment[name].matrix for moment in moments])
-    return found.places.get(name, frame.place)
 
 
 def _moved(like: Feature, pose: Floats) -> Feature:

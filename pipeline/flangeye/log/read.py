@@ -69,6 +69,7 @@ class _CaptureFacts(TypedDict):
     camera: NotRequired[str]
     target: NotRequired[str]
     motion: NotRequired[t.Motion | None]
+    arm_joints: NotRequired[dict[str, list[float]]]
 
 
 class _StepFacts(TypedDict):
@@ -212,6 +213,7 @@ class RunLog:
                 *self._pose(str(e.capture)),
                 *self._ends(str(e.capture)),
                 self._motion(str(e.capture)),
+                self._arm_joints(str(e.capture)),
             )
             for e in self.of_kind("fit")
             if e.capture in self.poses
@@ -301,14 +303,18 @@ class RunLog:
         image = None if pixels is None else t.Image(pixels, **meta["image"])
         ends = self._ends(capture)
         when = meta["time_ns"], meta["role"]
-        return t.Capture(
-            capture, cloud, poses, joints, *when, image, *ends, self._motion(capture)
-        )  # fmt: skip
+        moved = self._motion(capture), self._arm_joints(capture)
+        return t.Capture(capture, cloud, poses, joints, *when, image, *ends, *moved)
 
     def _motion(self, capture: str) -> t.Motion | None:
         """Return how the flange passed; logs of arms that stood still do not say."""
         motion = adapter(t.Motion | None).validate_python(self.poses[capture].get("motion"))
         return cast("t.Motion | None", motion)
+
+    def _arm_joints(self, capture: str) -> dict[str, t.Floats]:
+        """Return the joint angles of a cell's arms, by their frames."""
+        given = self.poses[capture].get("arm_joints", {})
+        return {name: np.array(joints) for name, joints in given.items()}
 
     def _ends(self, capture: str) -> tuple[str, str]:
         """Return which camera looked at which target; logs of one camera may not say."""

@@ -68,10 +68,13 @@ def corrected_observation(
     """
     if correction is None:
         return observation
-    reported = observation.poses[flange]
-    pose = corrected_flange(reported.matrix, observation.joints, correction, arm)
+    reported, told = observation.poses[flange], observation.arm_joints
+    joints = told.get(flange, observation.joints)
+    pose = corrected_flange(reported.matrix, joints, correction, arm)
     moved = {reported.child: replace(reported, matrix=pose)}
-    return replace(observation, poses={**observation.poses, **moved})
+    if flange in told and correction.joint_offsets is not None:
+        told = {**told, flange: told[flange] + correction.joint_offsets}  # the links follow
+    return replace(observation, poses={**observation.poses, **moved}, arm_joints=told)
 
 
 def corrected_view(

@@ -2,13 +2,14 @@
 
 What moves has two frames: ``NAME_base``, which stands somewhere, and ``NAME``, which its controller
 places in that base: an arm's flange, a rail's carriage, a positioner's plate. Cameras and targets
-stand on these, or on the root of the cell, ``base``.
+stand on these, on a link of an arm (``NAME_link3``), whose place in the arm's base follows from its
+joints, or on the root of the cell, ``base``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,7 @@ from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.configuration import Ends
 from flangeye.models.robots import RobotModel
-from flangeye.types import Array, Floats, HandEye, Motion, Observation, Transform
+from flangeye.types import Array, Floats, HandEye, Mask, Motion, Observation, Transform
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -52,6 +53,24 @@ class Axis:
         return rigid(np.eye(3), moved)
 
 
+@dataclass(frozen=True)
+class Link:
+    """A link of an arm that carries a camera or a target.
+
+    Attributes:
+        arm: The arm's frame.
+        number: Which of its links, from 1; its frame is that of Denavit and Hartenberg.
+    """
+
+    arm: str
+    number: int
+
+    @property
+    def frame(self) -> str:
+        """What its frame is called."""
+        return f"{self.arm}_link{self.number}"
+
+
 @dataclass(frozen=True, eq=False)
 class Cell:
     """What stands on what.
@@ -61,19 +80,27 @@ class Cell:
         movers: What moves which frame.
         cameras: Frames of cameras, in the recipe's order.
         targets: Frames of targets.
+        links: By frame, the links that carry something. Their places are None, too: they follow
+            from the joints.
     """
 
     frames: Mapping[str, Frame]
     movers: Mapping[str, RobotModel | Axis]
     cameras: tuple[str, ...]
     targets: tuple[str, ...]
+    links: Mapping[str, Link] = field(default_factory=dict)
 
     is_default = False
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        """Frames whose places controllers tell: of what moves, and of links."""
+        return (*self.movers, *self.links)
+
+    @property
     def unknown_frames(self) -> tuple[str, ...]:
         """Frames whose place is to be found, the cameras' first."""
-        unknown = [n for n, f in self.frames.items() if f.place is None and n not in self.movers]
+        unknown = [n for n, f in self.frames.items() if f.place is None and n not in self.measured]
         return tuple(sorted(unknown, key=lambda name: name not in self.cameras))
 
     @property
@@ -84,20 +111,39 @@ class Cell:
     @property
     def freedoms(self) -> dict[str, Floats]:
         """(6, k) unit twists that each thing can be moved by, in its base; see ``solve_graph``."""
-        return {
+        able = {
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
         }
+        links = {name: _freedoms_of_link(link, self.arms) for name, link in self.links.items()}
+        return able | links
+
+    @property
+    def arms(self) -> dict[str, RobotModel]:
+        """The models of the arms."""
+        return {n: mover for n, mover in self.movers.items() if not isinstance(mover, Axis)}
 
     def passing(self, motion: Motion) -> Motion:
-        """Return how everything passed: rails and positioners where their recorded values say."""
+        """Return how everything passed: rails, positioners and links where recorded values say."""
         axes = {n: mover for n, mover in self.movers.items() if isinstance(mover, Axis)}
         placed = {
             name: np.array([axes[name].place(float(value)) for value in values[:, 0]])
             for name, values in motion.joints.items()
             if name in axes
         }
+        placed |= {
+            name: self.link_poses(name, motion.joints[link.arm])
+            for name, link in self.links.items()
+            if link.arm in motion.joints
+        }
         return replace(motion, others={**motion.others, **placed})
+
+    def link_poses(self, name: str, joints: Floats) -> Floats:
+        """Return (N, 4, 4) of a link in its arm's base at (N, n) joints, by the arm's model."""
+        from flangeye.maths.kinematics import Arm
+
+        link = self.links[name]
+        return Arm(self.arms[link.arm]).pose(joints, link.number)
 
     def name_of(self, frame: str) -> str:
         """Return ``parent_T_frame``."""
@@ -121,11 +167,16 @@ class Cell:
             transforms: The unknowns by name, where they were found.
 
         Raises:
-            StageError: An observation lacks the pose of something that moves.
+            StageError: An observation lacks the pose of something that moves, or the joints that
+                a link's follows from.
         """
         found = {x.child: x.matrix for x in (transforms or {}).values()}
         measured = {name: _measured(name, observations) for name in self.movers}
-        places = found | measured
+        links = {
+            name: self.link_poses(name, _joints(name, link, observations))
+            for name, link in self.links.items()
+        }
+        places = found | measured | links
         return {
             name: replace(frame, place=places.get(name, frame.place))
             for name, frame in self.frames.items()
@@ -167,11 +218,27 @@ def _freedoms_of(robot: RobotModel) -> Floats:
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(robot)
-    bent = np.linspace(0.3, 0.7, arm.n)
-    axes = arm.axes(bent)[0][~arm.slides]
-    reached = np.linalg.lstsq(axes.T, np.eye(3), rcond=1e-9)[0]
-    able = np.linalg.norm(axes.T @ reached - np.eye(3), axis=0) < 1e-6
-    return np.eye(6)[:, [*able, True, True, True]]
+    axes = arm.axes(np.linspace(0.3, 0.7, arm.n))[0][~arm.slides]
+    return np.eye(6)[:, [*_spanned(axes), True, True, True]]
+
+
+def _freedoms_of_link(link: Link, arms: Mapping[str, RobotModel]) -> Floats:
+    """Return (6, k) unit twists: axes of ``base`` that it can turn about, or move along.
+
+    By the joints before it, over some places of the arm: the first link only turns about one.
+    """
+    from flangeye.maths.kinematics import Arm
+
+    arm = Arm(arms[link.arm])
+    bent = np.multiply.outer([1.0, -1.0, 2.0], np.linspace(0.3, 0.7, arm.n))
+    moves = np.concatenate(np.swapaxes(arm.jacobian(bent, link.number), 1, 2))
+    return np.eye(6)[:, [*_spanned(moves[:, :3]), *_spanned(moves[:, 3:])]]
+
+
+def _spanned(directions: Floats) -> Mask:
+    """Return which of the three axes lie in the span of (N, 3) directions."""
+    reached = np.linalg.lstsq(directions.T, np.eye(3), rcond=1e-9)[0]
+    return np.asarray(np.linalg.norm(directions.T @ reached - np.eye(3), axis=0) < 1e-6)
 
 
 def _measured(name: str, observations: Sequence[Observation]) -> Floats:
@@ -182,6 +249,16 @@ def _measured(name: str, observations: Sequence[Observation]) -> Floats:
                 f"it has {', '.join(observation.poses) or 'none'}"
             )
     return np.array([o.poses[name].matrix for o in observations]).reshape(-1, 4, 4)
+
+
+def _joints(name: str, link: Link, observations: Sequence[Observation]) -> Floats:
+    for observation in observations:
+        if link.arm not in observation.arm_joints:
+            raise StageError(
+                f"where {name} was at observation {observation.id} follows from the joint angles "
+                f"of '{link.arm}', and there are none: record them"
+            )
+    return np.array([o.arm_joints[link.arm] for o in observations])
 
 
 def _of_each(frames: Mapping[str, Frame], names: Sequence[str]) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.errors import RecipeError, StageError
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye.models.cell import Axis, Cell
+from flangeye.models.cell import Axis, Cell, Link
 from flangeye.models.robots import RobotModel
 from flangeye.recipe.header import (
     CellArmSection,
@@ -20,6 +20,7 @@ from flangeye.recipe.header import (
     PlaceSection,
     PositionerSection,
     RailSection,
+    StandingSection,
 )
 from flangeye.types import BASE, Floats
 
@@ -50,12 +51,14 @@ def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Compla
             movers[name] = _mover(each, model)
         except RecipeError as error:
             mistakes += [(("arms", name, "model"), line) for line in str(error).splitlines()]
+    mistakes = mistakes or [*_beyond_links(section, movers)]
     for keys, message in mistakes:
         complain(("cell", *keys), message)
     if mistakes:
         return None
-    frames = _frames(section)
-    return Cell(frames, movers, tuple(section.cameras), tuple(section.targets))
+    links = {link.frame: link for _, _, _, link in _on_links(section)}
+    ends = tuple(section.cameras), tuple(section.targets)
+    return Cell(_frames(section), movers, *ends, links)
 
 
 Mistake = tuple[tuple[Hashable, ...], str]
@@ -69,9 +72,12 @@ def _beside(header: Header) -> Iterator[Mistake]:
 
 def _twice(section: CellSection) -> Iterator[Mistake]:
     seen: dict[str, str] = {}
+    own = {f"{name}_base": f"what '{name}' stands on" for name, _ in _movers(section)}
+    own |= {link.frame: f"a link of '{link.arm}'" for _, _, _, link in _on_links(section)}
+    own[BASE] = "the cell's root"
     for group, name, _ in _entries(section):
-        if name == BASE or name in seen:
-            what = "the cell's root" if name == BASE else f"one of the {seen[name]}"
+        if name in own or name in seen:
+            what = own.get(name) or f"one of the {seen[name]}"
             yield (group, name), f"'{name}' is {what} already; choose another name"
         seen[name] = group
 
@@ -82,15 +88,38 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
     for group, name, each in _entries(section):
         if each.on not in carriers:
             lost = True
+            link = f"; a link is written {{on: {each.on.partition('_')[0]}, link: 3}}"
             yield (
                 (group, name, "on"),
-                f"'{each.on}' is nothing that carries: write {' or '.join(carriers)}",
+                f"'{each.on}' is nothing that carries: write {' or '.join(carriers)}"
+                f"{link if 'link' in each.on else ''}",
+            )
+    for group, name, each, _ in _on_links(section):
+        if each.on in carriers and each.on not in section.arms:
+            yield (
+                (group, name, "link"),
+                f"'{each.on}' is no arm and has no links: leave out link",
             )
     for name, _ in () if lost else _movers(section):
         try:
             chain(_frames(section), name)
         except StageError:
             yield (), f"'{name}' is its own parent; everything leads to base"
+
+
+def _beyond_links(
+    section: CellSection, movers: Mapping[str, RobotModel | Axis]
+) -> Iterator[Mistake]:
+    """Tell of links that arms do not have."""
+    for group, name, each, link in _on_links(section):
+        arm = movers[each.on]
+        most = 0 if isinstance(arm, Axis) else len(arm.joints)
+        if link.number > most:
+            yield (
+                (group, name, "link"),
+                f"'{each.on}' has links 1 to {most}, and no {link.number}; without link it is on "
+                "the flange",
+            )
 
 
 def _at_one_place(section: CellSection) -> Iterator[Mistake]:
@@ -119,6 +148,12 @@ def _movers(section: CellSection) -> Iterator[tuple[str, MoverSection]]:
             yield name, each
 
 
+def _on_links(section: CellSection) -> Iterator[tuple[str, str, StandingSection, Link]]:
+    for group, name, each in _entries(section):
+        if isinstance(each, StandingSection) and each.link is not None:
+            yield group, name, each, Link(each.on, each.link)
+
+
 def _mover(section: MoverSection, model: Callable[[str], RobotModel]) -> RobotModel | Axis:
     if isinstance(section, CellArmSection):
         return model(section.model)
@@ -132,9 +167,11 @@ def _frames(section: CellSection) -> dict[str, Frame]:
     for name, each in _movers(section):
         frames[f"{name}_base"] = Frame(each.on, place_of(each.place))
         frames[name] = Frame(f"{name}_base")
+    carriers = {name: link.frame for _, name, _, link in _on_links(section)}
+    frames |= {link.frame: Frame(f"{link.arm}_base") for _, _, _, link in _on_links(section)}
     for group, name, each in _entries(section):
         if group in ("cameras", "targets"):
-            frames[name] = Frame(each.on, place_of(each.place))
+            frames[name] = Frame(carriers.get(name, each.on), place_of(each.place))
     return frames
 
 

@@ -254,6 +254,9 @@ class StandingSection(NamedSection):
     word: ClassVar[str] = "on"
 
     on: str = Field("base", description=ON)
+    link: int | None = Field(
+        None, ge=1, description="Which link of that arm it is on, from 1; its flange if not given."
+    )
     place: Place = TO_FIND
 
 

@@ -226,7 +226,7 @@ class Runner:
             return None
         return t.Observation(
             capture.id, feature, capture.poses, capture.joints, capture.camera, capture.target,
-            capture.motion,
+            capture.motion, capture.arm_joints,
         )  # fmt: skip
 
     def _segment(self, capture: t.Capture) -> t.FlangeCloud | None:

@@ -92,11 +92,16 @@ def _number(observation: Observation) -> str:
 
 def _moved(name: str, cell: Cell, seen: Sequence[Observation]) -> Iterator[Sequence[Any]]:
     mover = cell.movers[name]
-    yield ("number", "value") if isinstance(mover, Axis) else POSE
-    poses = {_number(o): o.poses[name] for o in seen}
-    for number in sorted(poses, key=lambda number: (len(number), number)):
-        pose = poses[number]
-        yield number, *(_value(mover, pose) if isinstance(mover, Axis) else _pose(pose))
+    yield ("number", "value") if isinstance(mover, Axis) else (*POSE, *_joints(name, seen))
+    moments = {_number(o): o for o in seen}
+    for number in sorted(moments, key=lambda number: (len(number), number)):
+        pose, joints = moments[number].poses[name], moments[number].arm_joints.get(name, ())
+        yield number, *(_value(mover, pose) if isinstance(mover, Axis) else (*_pose(pose), *joints))
+
+
+def _joints(name: str, seen: Sequence[Observation]) -> list[str]:
+    """Return the columns of an arm's joint angles; none where they were not recorded."""
+    return [f"j{i}_rad" for i, _ in enumerate(seen[0].arm_joints.get(name, ()), 1)]
 
 
 def _seen(seen: Sequence[Observation], scans: Mapping[str, str]) -> Iterator[Sequence[Any]]:
@@ -158,7 +163,7 @@ def _acquire(cell: Cell, seen: Sequence[Observation], scans: bool) -> dict[str, 
     written: Mapping[str, Any] = {**WRITTEN, "rotation": "xyzw" if poses else "point"}
     written = {"number": "number"} if scans else written
     tables: dict[str, Any] = {
-        "arms": {name: {"file": f"{name}.csv", **WRITTEN} for name in arms},
+        "arms": {name: _arm(name, seen) for name in arms},
         "axes": {name: _axis(name, axis) for name, axis in axes.items()},
         "scans" if scans else "sightings": [
             {"camera": camera, "target": target, "file": f"{camera}_{target}.csv", **written}
@@ -170,6 +175,11 @@ def _acquire(cell: Cell, seen: Sequence[Observation], scans: bool) -> dict[str, 
         return {"acquire.archive": {"path": ".", "reader": reader, "unit": "m"}}
     stage = "acquire.samples" if poses else "acquire.centres"
     return {stage: {"path": ".", "reader": reader, **_noise(seen)}}
+
+
+def _arm(name: str, seen: Sequence[Observation]) -> dict[str, Any]:
+    joints = _joints(name, seen)
+    return {"file": f"{name}.csv", **WRITTEN, **({"joints": joints} if joints else {})}
 
 
 def _axis(name: str, axis: Axis) -> dict[str, Any]:

@@ -132,6 +132,7 @@ class Observation(Placed):
         camera: Frame of the camera that saw it; a cell has several.
         target: Frame of what it saw.
         motion: How the flange passed it, where that was recorded and it moved.
+        arm_joints: (n,) joint angles of each arm of a cell that told them [rad], by its frame.
     """
 
     id: str
@@ -141,6 +142,7 @@ class Observation(Placed):
     camera: str = CAMERA
     target: str = TARGET
     motion: Motion | None = None
+    arm_joints: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def circle(self) -> CircleFeature:

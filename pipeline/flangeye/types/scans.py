@@ -63,6 +63,7 @@ class Capture(Placed):
         camera: Frame of the scanner that took it; a cell has several.
         target: Frame of what it looked at.
         motion: How the flange passed, where that was recorded and it moved.
+        arm_joints: (n,) joint angles of each arm of a cell that told them [rad], by its frame.
     """
 
     id: str
@@ -75,6 +76,7 @@ class Capture(Placed):
     camera: str = CAMERA
     target: str = TARGET
     motion: Motion | None = None
+    arm_joints: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -21,7 +21,7 @@ from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params
-from flangeye.types import Feature, Floats, Observation, Poses, Source, Transform, Truth
+from flangeye.types import Floats, Observation, Poses, Source, Transform, Truth
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, PlaceParams, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
@@ -139,27 +139,26 @@ class NextBest:
         if self._found is None:
             return None
         cell = self._planned.moments.cell
-        foreseen = [o for pair in self._pairs(seen) for o in self._in_view(*pair, self._found)]
+        # Who may see whom, and what such a sighting measures.
+        pairs = {(o.camera, o.target): o for o in seen}
+        foreseen = [o for like in pairs.values() for o in self._in_view(like, self._found)]
         if not foreseen:
             return None
         best = foreseen[most_telling(foreseen, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
-    def _pairs(self, seen: Sequence[Observation]) -> list[tuple[tuple[str, str], Feature]]:
-        """Return who may see whom, and what such a sighting measures."""
-        of = {(o.camera, o.target): o.feature for o in seen}
-        return [(pair, feature) for pair, feature in of.items()]
-
-    def _in_view(self, ends: tuple[str, str], like: Feature, found: Solved) -> list[Observation]:
-        """Return moments drawn, at which a camera sees a target by what is known so far."""
+    def _in_view(self, like: Observation, found: Solved) -> list[Observation]:
+        """Return moments drawn, at which its camera sees its target by what is known so far."""
         moments = self._planned.moments
         drawn = self._rng.choice(DRAWS, CANDIDATES, replace=False)
-        free = [int(i) for i in drawn if int(i) not in self._taken]
-        reported = [moments.poses(i) for i in free]
-        foretold = foreseen(reported, ends, found, moments.cell, like)
-        poses = foreseen_poses(reported, ends, found, moments.cell)
-        visible = np.flatnonzero(self._planned.view.sees(poses))
-        return [replace(foretold[k], id=str(free[k])) for k in visible]
+        reported = [
+            replace(like, id=str(i), poses=moments.poses(i), arm_joints=moments.joints_at(i))
+            for i in map(int, drawn)
+            if i not in self._taken
+        ]
+        foretold = foreseen(reported, found, moments.cell)
+        visible = self._planned.view.sees(foreseen_poses(reported, found, moments.cell))
+        return [foretold[k] for k in np.flatnonzero(visible)]
 
 
 def plan_cell(
@@ -197,12 +196,14 @@ class Moments:
         cell: What stands on what.
         reported: (N, 4, 4) by what moves.
         actual: All frames with their true places.
+        joints: (N, n) by arm, as reported [rad].
         angles: (N, n) by arm, as they are [rad].
     """
 
     cell: Cell
     reported: Mapping[str, Floats]
     actual: Mapping[str, Frame]
+    joints: Mapping[str, Floats]
     angles: Mapping[str, Floats]
 
     def seen(self, camera: str, target: str) -> Floats:
@@ -230,6 +231,10 @@ class Moments:
             for name, places in self.reported.items()
         }
 
+    def joints_at(self, i: int) -> dict[str, Floats]:
+        """Return the joints that the arms report at one moment."""
+        return {name: joints[i] for name, joints in self.joints.items()}
+
     def exact(self, i: int, camera: str, target: str) -> Observation:
         """Return what a camera without noise sees."""
         return replace(
@@ -237,6 +242,7 @@ class Moments:
             id=name_of((i, camera, target)),
             camera=camera,
             target=target,
+            arm_joints=self.joints_at(i),
         )
 
 
@@ -253,32 +259,53 @@ def _each(frames: Mapping[str, Frame], name: str) -> Floats:
 def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Moments:
     """Draw where everything that moves is reported to be, and where it then is."""
     drawn = {name: _moved(name, mover, params, rng) for name, mover in cell.movers.items()}
-    reported = {name: places for name, (places, *_) in drawn.items()}
-    angles = {name: joints for name, (*_, joints) in drawn.items() if joints is not None}
+    reported = {name: each.reported for name, each in drawn.items()}
+    places = {name: each.actual for name, each in drawn.items()}
+    places |= {name: drawn[link.arm].links[:, link.number] for name, link in cell.links.items()}
     noise = params.robot_rotation, params.robot_position
-    actual = {name: disturbed(places, noise, rng) for name, (_, places, _) in drawn.items()}
+    actual = {name: disturbed(each, noise, rng) for name, each in places.items()}
     still = {name: place.matrix for name, place in params.places.items()}
     frames = {
         name: replace(frame, place=(still | actual).get(name, frame.place))
         for name, frame in cell.frames.items()
     }
-    return Moments(cell, reported, frames, angles)
+    joints = {name: drawn[name].joints for name in cell.arms}
+    angles = {name: drawn[name].angles for name in cell.arms}
+    return Moments(cell, reported, frames, joints, angles)
+
+
+class Drawn(NamedTuple):
+    """Where something that moves is at N moments.
+
+    Attributes:
+        reported: (N, 4, 4) by its controller.
+        actual: (N, 4, 4) as it is.
+        joints: (N, n) of an arm, by its controller [rad].
+        angles: (N, n) as they are.
+        links: (N, n + 1, 4, 4) of its base and links, as they are.
+    """
+
+    reported: Floats
+    actual: Floats
+    joints: Floats = np.zeros((0, 0))
+    angles: Floats = np.zeros((0, 0))
+    links: Floats = np.zeros((0, 0, 4, 4))
 
 
 def _moved(
     name: str, mover: RobotModel | Axis, params: CellSessionParams, rng: np.random.Generator
-) -> tuple[Floats, Floats, Floats | None]:
-    """Return (N, 4, 4) places of what moves: as reported, and as they are; an arm's true angles."""
+) -> Drawn:
+    """Draw where something that moves is."""
     if isinstance(mover, Axis):
         low, high = mover.travel
         shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
         places = np.array([mover.place(low + x * (high - low)) for x in shares])
-        return places, places, None
+        return Drawn(places, places)
     home = np.array(params.home.get(name, UPRIGHT))
     joints = home + params.spread * _changes(params.plan, len(home), rng)
     arm = ImperfectArm(mover, 0.0 if params.arm.is_default else 1.0, rng.spawn(1)[0], params.arm)
     angles = arm.angles(joints)
-    return arm.reported(joints), arm.flange(angles), angles
+    return Drawn(arm.reported(joints), arm.flange(angles), joints, angles, arm.frames(angles))
 
 
 def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
@@ -315,7 +342,7 @@ def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[
 
 def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
     """Return whether anything moves the two against each other."""
-    first, second = ({*chain(cell.frames, end)} & {*cell.movers} for end in pair)
+    first, second = ({*chain(cell.frames, end)} & {*cell.measured} for end in pair)
     return first != second
 
 

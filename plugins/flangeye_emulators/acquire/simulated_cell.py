@@ -135,7 +135,7 @@ def acquire_simulated_cell_scans(
             xyz = eyes[camera].scan(before_camera(_arms(planned.moments, i, flange), place), rng)
             yield Capture(
                 name_of(sighting), PointCloud(CAMERA, xyz), planned.moments.poses(i),
-                camera=camera, target=target,
+                camera=camera, target=target, arm_joints=planned.moments.joints_at(i),
             )  # fmt: skip
 
     stream = Captures(captures(), planned.source, len(planned.scheduled))

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from flangeye import StageError, stage
@@ -190,6 +191,7 @@ def _captures(
             recording.seen_by,
             recording.saw,
             recording.motion,
+            recording.arm_joints,
         )
 
 
@@ -236,4 +238,7 @@ def _of_log(name: str, meta: Mapping[str, Any]) -> Recording:
     poses = adapter(dict[str, Transform]).validate_python(meta["poses"])
     matrices = {frame: pose.matrix for frame, pose in poses.items()}
     ends = meta.get("camera", CAMERA), meta.get("target", TARGET)
-    return Recording(name, matrices, role=meta["role"], seen_by=ends[0], saw=ends[1])
+    joints = {frame: np.array(each) for frame, each in meta.get("arm_joints", {}).items()}
+    return Recording(
+        name, matrices, role=meta["role"], seen_by=ends[0], saw=ends[1], arm_joints=joints
+    )

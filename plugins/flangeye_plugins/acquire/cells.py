@@ -34,14 +34,17 @@ def check_cell(root: Path, recordings: Sequence[Recording], cell: Cell) -> None:
 
     Raises:
         StageError: A camera, a target or something that moves is unknown or lacks its recordings,
-            an arm is out of any arm's reach, or nothing moves.
+            an arm is out of any arm's reach, or its joints do not lead to its poses, or nothing
+            moves.
     """
     _require_known(root, "camera", (r.seen_by for r in recordings), cell.cameras)
     _require_known(root, "target", (r.saw for r in recordings), cell.targets)
-    moved = {name for r in recordings for name in (*r.poses, *r.axes)}
+    moved = {name for r in recordings for name in (*r.poses, *r.axes, *r.arm_joints)}
     _require_known(root, "arm, rail or positioner", moved, tuple(cell.movers))
     _require_all(root, recordings, cell)
     _require_kinds(root, recordings, cell)
+    for name in cell.arms:
+        _require_joints(root, recordings, name, cell)
     if len(recordings) < MIN_CAPTURES:
         raise StageError(
             f"{root}: {len(recordings)} sightings; at least {MIN_CAPTURES} of each camera are "
@@ -90,6 +93,34 @@ def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> N
                     f"{root}: pose '{recording.id}' has '{name}' {distance:.4g} m from its base, "
                     "beyond any arm; are the positions in millimetres?"
                 )
+
+
+def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell: Cell) -> None:
+    """Refuse joints of an arm that are not those of its poses, and a link's place without any."""
+    from flangeye.handeye.arm import LARGEST_MODEL_ERROR
+    from flangeye.maths.kinematics import Arm
+
+    arm, told = Arm(cell.arms[name]), [r for r in recordings if name in r.arm_joints]
+    links = [link for link in cell.links.values() if link.arm == name]
+    if links and len(told) < len(recordings):
+        raise StageError(
+            f"{root}: where link {links[0].number} of '{name}' is follows from its joint angles, "
+            f"and there are none: give their columns in the reader, arms: {{{name}: {{joints: …}}}}"
+        )
+    for recording in told:
+        joints = recording.arm_joints[name]
+        if len(joints) != arm.n:
+            raise StageError(
+                f"{root}: '{name}' has {len(joints)} joint angles, and a "
+                f"{cell.arms[name].model} has {arm.n} joints"
+            )
+        away = float(np.linalg.norm((arm.flange(joints) - recording.poses[name])[:3, 3]))
+        if away > LARGEST_MODEL_ERROR:
+            raise StageError(
+                f"{root}: pose '{recording.id}': the joint angles of '{name}' put the flange of a "
+                f"{cell.arms[name].model} {away * 1e3:.3g} mm from its pose; check their order, "
+                "joint_unit and the model, or leave out joints"
+            )
 
 
 def _require_motion(root: Path, recordings: Sequence[Recording]) -> None:

@@ -58,10 +58,11 @@ def acquire_centres(
         fitted = log.observations()
         recordings = [
             Recording(
-                o.id, {n: x.matrix for n, x in o.poses.items()}, seen_by=o.camera, saw=o.target
+                o.id, {n: x.matrix for n, x in o.poses.items()}, seen_by=o.camera, saw=o.target,
+                arm_joints=o.arm_joints,
             )
             for o in fitted
-        ]
+        ]  # fmt: skip
         return Observations(fitted, log_source(log, recordings, cell), total=len(fitted))
     recorded = open_archive(path, params)
     usable = _usable(recorded)

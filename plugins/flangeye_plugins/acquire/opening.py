@@ -141,6 +141,7 @@ def observation_of(recording: Recording, feature: Feature, cell: Cell | None = N
         recording.seen_by,
         recording.saw,
         recording.motion,
+        recording.arm_joints,
     )
 
 

@@ -60,6 +60,12 @@ class ArmTableParams(OwnTableParams):
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
         "base_T_flange", description="Whose pose it is: the flange's in the arm's base, or inverse."
     )
+    joints: tuple[Column, ...] = Field(
+        (), description="Columns of the joint angles, from the base; a link's place needs them."
+    )
+    joint_unit: Literal["rad", "deg"] = Field(
+        "rad", description="Unit of the joint angles; with rad, joints that slide are in m."
+    )
 
 
 class AxisTableParams(Params):
@@ -131,6 +137,7 @@ class Moved:
         values: (N, 4, 4) poses, or (N,) values of an axis [m or rad].
         keys: Of each row: the pose's number, its place in the table; None where it has a time.
         times: (N,) [s], or None.
+        joints: (N, n) of an arm that told them [rad], or None.
     """
 
     name: str
@@ -138,6 +145,7 @@ class Moved:
     values: Floats
     keys: dict[str, int] | None
     times: Floats | None
+    joints: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +157,23 @@ class Seen:
     values: Sequence[Floats | Path | None]
     keys: dict[str, int] | None
     times: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """Where controllers had everything when something was seen.
+
+    Attributes:
+        at: Of what moves, by name: (4, 4), or the value of an axis [m or rad].
+        joints: (n,) of each arm that told them [rad].
+        time: Of it [s].
+        motion: How everything passed it.
+    """
+
+    at: Mapping[str, Floats]
+    joints: Mapping[str, Floats]
+    time: float = 0.0
+    motion: Motion | None = None
 
 
 @part("reader.cell")
@@ -177,13 +202,20 @@ def cell(path: Path, params: CellParams) -> Archive:
 def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
     for name, given in params.arms.items():
         text = table_with_rows(folder, given.file)
-        found = readings_of(text, given, _taken(given))
+        found = readings_of(text, given, [*_taken(given), *given.joints])
         for row, value in enumerate(found.values):
             if value is None:
                 raise StageError(f"{text.where(row)}: has no pose of '{name}'")
         poses = np.array(found.values)
         poses = poses if given.pose == "base_T_flange" else inverted(poses)
-        yield Moved(name, text, poses, _keys(text, given.number, found.times), found.times)
+        keys = _keys(text, given.number, found.times)
+        yield Moved(name, text, poses, keys, found.times, _joints(text, given))
+
+
+def _joints(text: Table, given: ArmTableParams) -> Floats | None:
+    if not given.joints:
+        return None
+    return text.numbers(text.indices(given.joints)) * PER_UNIT[given.joint_unit]
 
 
 def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
@@ -267,8 +299,10 @@ def _by_number(seen: Seen, moved: Sequence[Moved]) -> Iterator[Recording]:
                     f"{seen.text.where(row)}: pose {key} is not in {each.text.file.name}; "
                     f"every pose needs its row of '{each.name}'"
                 )
-        at = {each.name: each.values[(each.keys or {})[key]] for each in moved}
-        yield _recording(seen, key, seen.values[row], at)
+        rows = {each.name: (each.keys or {})[key] for each in moved}
+        at = {each.name: each.values[rows[each.name]] for each in moved}
+        joints = {m.name: m.joints[rows[m.name]] for m in moved if m.joints is not None}
+        yield _recording(seen, key, seen.values[row], Moment(at, joints))
 
 
 def _by_time(
@@ -289,14 +323,20 @@ def _by_time(
     if len(still) < len(pairs):
         notes.append(f"left out {len(pairs) - len(still)} poses, at which something else moved")
     found = [
-        _recording(
-            seen, f"{i:04}", _mean([values[k] for k in p.events]),
-            {each.name: p.pose if each is first else _at(each, p.time) for each in moved}, p.time,
-            _motion(first, moved, p),
-        )
+        _recording(seen, f"{i:04}", _mean([values[k] for k in p.events]), _moment(first, moved, p))
         for i, p in enumerate(still)
-    ]  # fmt: skip
+    ]
     return found, [f"{seen.text.file.name}: {note}" for note in notes]
+
+
+def _moment(first: Moved, moved: Sequence[Moved], found: Pair) -> Moment:
+    at = {each.name: found.pose if each is first else _at(each, found.time) for each in moved}
+    joints = {
+        m.name: np.array([np.interp(found.time, np.asarray(m.times), each) for each in m.joints.T])
+        for m in moved
+        if m.joints is not None
+    }
+    return Moment(at, joints, found.time, _motion(first, moved, found))
 
 
 def _motion(first: Moved, moved: Sequence[Moved], found: Pair) -> Motion | None:
@@ -306,9 +346,10 @@ def _motion(first: Moved, moved: Sequence[Moved], found: Pair) -> Motion | None:
     streams = {m.name: (np.asarray(m.times), m.values) for m in moved}
     poses = {name: stream for name, stream in streams.items() if stream[1].ndim == 3}
     motion = passed(first.times, first.values, found.time, poses)
-    for name, stream in streams.items():
-        if name not in poses:
-            motion = with_joints(motion, found.time, name, stream)
+    joints = {name: stream for name, stream in streams.items() if name not in poses}
+    joints |= {m.name: (np.asarray(m.times), m.joints) for m in moved if m.joints is not None}
+    for name, stream in joints.items():
+        motion = with_joints(motion, found.time, name, stream)
     return motion
 
 
@@ -347,23 +388,17 @@ def _mean(values: Sequence[Floats | Path | None]) -> Floats:
     return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
-def _recording(
-    seen: Seen,
-    key: str,
-    value: Floats | Path | None,
-    at: Mapping[str, Floats],
-    time: float = 0.0,
-    motion: Motion | None = None,
-) -> Recording:
+def _recording(seen: Seen, key: str, value: Floats | Path | None, moment: Moment) -> Recording:
     given = seen.given
     found = Recording(
         f"{key}-{given.camera}-{given.target}",
-        {name: pose for name, pose in at.items() if pose.ndim == 2},
-        time_ns=round(time * 1e9),
-        axes={name: float(x) for name, x in at.items() if x.ndim == 0},
+        {name: pose for name, pose in moment.at.items() if pose.ndim == 2},
+        time_ns=round(moment.time * 1e9),
+        axes={name: float(x) for name, x in moment.at.items() if x.ndim == 0},
         seen_by=given.camera,
         saw=given.target,
-        motion=motion,
+        motion=moment.motion,
+        arm_joints=moment.joints,
     )
     if value is None or isinstance(value, Path):
         return replace(found, cloud=value)

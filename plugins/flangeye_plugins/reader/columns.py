@@ -61,7 +61,7 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
     Raises:
         StageError: A cell is no number, or the times do not ascend.
     """
-    other = [own.index(column) for column in (given.time, *taken) if column is not None]
+    other = own.indices([column for column in (given.time, *taken) if column is not None])
     width = max(len(cells) for _, cells in own.rows)  # empty last cells are not counted
     free = [i for i in range(width) if i not in other]
     columns = own.indices(given.columns) or free
