@@ -25,6 +25,7 @@ CONFIGURATIONS = {
     "two-arms-three-scanners": "two arms with a scanner each and one between",
     "arm-on-rail": "an arm on a rail",
     "hand-and-wall": "a scanner in the hand, one on the wall",
+    "forearm-and-wall": "a scanner on the forearm, one on the wall",
 }
 """Recipes of recipes/configurations, by the first word of their name."""
 

@@ -1,16 +1,20 @@
 """The ``cell`` section: what stands on what, and every mistake in it, word for word."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flangeye.errors import RecipeError
-from flangeye.models.cell import Axis, Cell
+from flangeye.errors import RecipeError, StageError
+from flangeye.maths.frame_graph import Frame
+from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import Axis, Cell, Link
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
+from flangeye.types import Observation, Transform
 
 STEPS = "steps: [acquire.simulated_cell, solve.cell, verify.holdout]\n"
 TWO = "cell: {arms: {arm: ur5}, cameras: {left: base, right: base}, targets: {marker: arm}}\n"
@@ -53,6 +57,37 @@ def test_rails_and_positioners_move_along_and_about_their_axis() -> None:
     assert cell.freedoms["arm"] == pytest.approx(np.eye(6))
 
 
+def test_a_camera_on_a_link_stands_on_a_frame_of_the_arm() -> None:
+    cell = parsed(TWO.replace("left: base", "left: {on: arm, link: 3}") + STEPS).context[Cell]
+    assert cell.unknowns == ("arm_link3_T_left", "base_T_right", "arm_T_marker")
+    assert cell.describe().startswith("cell: base - arm_base - arm_link3 - left; base - right;")
+    assert cell.links == {"arm_link3": Link("arm", 3)}
+    assert cell.measured == ("arm", "arm_link3")
+    assert cell.freedoms["arm_link3"] == pytest.approx(np.eye(6))
+
+
+def test_the_first_link_turns_about_the_first_joint_alone() -> None:
+    arm, frames = load_model("robots", "ur5"), {"arm_link1": Frame("arm_base")}
+    cell = Cell(frames, {"arm": arm}, (), (), {"arm_link1": Link("arm", 1)})
+    assert cell.freedoms["arm_link1"] == pytest.approx(np.eye(6)[:, [2]])
+
+
+def test_a_link_is_where_the_joints_have_it() -> None:
+    cell = parsed(TWO.replace("left: base", "left: {on: arm, link: 3}") + STEPS).context[Cell]
+    joints = np.array([0.3, -1.2, 1.1, -0.4, 0.6, 0.2])
+    arm = Arm(cell.movers["arm"])
+    poses = {"arm": Transform("arm_base", "arm", arm.flange(joints))}
+    feature: Any = None
+    seen = Observation("7", feature, poses, arm_joints={"arm": joints})
+    assert cell.graph([seen])["arm_link3"].place[0] == pytest.approx(arm.frames(joints)[3])
+    with pytest.raises(StageError) as error:
+        cell.graph([replace(seen, arm_joints={})])
+    assert str(error.value) == (
+        "where arm_link3 was at observation 7 follows from the joint angles of 'arm', and there "
+        "are none: record them"
+    )
+
+
 def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
     ur5 = load_model("robots", "ur5")
     upright = tuple(joint.model_copy(update={"alpha": 0.0}) for joint in ur5.joints[:4])
@@ -88,6 +123,30 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         (
             "robot: ur5\n" + TWO,
             "r.yaml:3: cell: says itself what stands where; leave out robot",
+        ),
+        (
+            TWO.replace("right: base", "right: {on: base, link: 3}"),
+            "r.yaml:2: cell.cameras.right.link: 'base' is no arm and has no links: leave out link",
+        ),
+        (
+            TWO.replace("right: base", "right: {on: arm, link: 7}"),
+            "r.yaml:2: cell.cameras.right.link: 'arm' has links 1 to 6, and no 7; without link it "
+            "is on the flange",
+        ),
+        (
+            TWO.replace("right: base", "right: arm_link3"),
+            "r.yaml:2: cell.cameras.right.on: 'arm_link3' is nothing that carries: write base or "
+            "arm; a link is written {on: arm, link: 3}",
+        ),
+        (
+            TWO.replace("left: base, right: base", "arm_link3: {on: arm, link: 3}, right: base"),
+            "r.yaml:2: cell.cameras.arm_link3: 'arm_link3' is a link of 'arm' already; choose "
+            "another name",
+        ),
+        (
+            TWO.replace("left: base", "arm_base: base"),
+            "r.yaml:2: cell.cameras.arm_base: 'arm_base' is what 'arm' stands on already; choose "
+            "another name",
         ),
         (
             TWO.replace("ur5", "ur55"),

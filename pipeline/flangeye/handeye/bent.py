@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,6 +104,63 @@ class Bent:
     def moved(self, deviations: Floats) -> Bent:
         """Return the arm with (n - 1,) more added to its offsets, in units of the deviation."""
         return replace(self, offsets=self.offsets + self.deviation * np.pad(deviations, (1, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class BentArm:
+    """All that an arm moves, its flange and links that carry something: its errors move all of it.
+
+    Attributes:
+        parts: F of them, the flange first.
+    """
+
+    parts: Sequence[Bent]
+
+    @property
+    def name(self) -> str:
+        """Frame of the flange."""
+        return self.parts[0].name
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a zero, by the robot's file [rad]."""
+        return self.parts[0].deviation
+
+    @property
+    def joints(self) -> Floats:
+        """(N, n) by which it is where the controller has it [rad]."""
+        return self.parts[0].joints
+
+    @property
+    def offsets(self) -> Floats:
+        """(n,) to add to the joints [rad]."""
+        return self.parts[0].offsets
+
+    @property
+    def poses(self) -> dict[str, Floats]:
+        """(N, 4, 4) of each frame in the arm's base, with the offsets."""
+        return {part.name: part.poses for part in self.parts}
+
+    @property
+    def twists(self) -> Floats:
+        """(N, 6 F, n - 1) what zeros of one deviation do to the frames."""
+        return np.concatenate([part.twists for part in self.parts], axis=1)
+
+    @property
+    def others(self) -> list[Floats]:
+        """(N, 6 F, m) what each of :data:`KINDS` does; what is smooth, to each frame by itself."""
+        *kinds, smooth = zip(*(part.others for part in self.parts), strict=True)
+        nothing = [0 * each for each in smooth]
+        each_alone = [
+            np.concatenate([*nothing[:i], each, *nothing[i + 1 :]], axis=1)
+            for i, each in enumerate(smooth)
+        ]
+        common = [np.concatenate(kind, axis=1) for kind in kinds]
+        return [*common, np.concatenate(each_alone, axis=2)]
+
+    def moved(self, deviations: Floats) -> BentArm:
+        """Return the arm with (n - 1,) more added to its offsets, in units of the deviation."""
+        return BentArm([part.moved(deviations) for part in self.parts])
 
 
 def _levers(arm: Arm, joints: Floats) -> Floats:

@@ -134,7 +134,8 @@ def sighted_of(
         raise StageError("no sighting to solve with: every capture was set aside, for its reason")
     sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
     frames = cell.graph(observations)
-    return Sighted(frames, sightings, mover_noise(cell), limits, cell.freedoms)
+    noise, joints = mover_noise(cell), cell.joints(observations)
+    return Sighted(frames, sightings, noise, limits, cell.freedoms, joints)
 
 
 def mover_noise(cell: Cell) -> dict[str, Floats]:

@@ -7,14 +7,14 @@ independent noise would average out. ("Consider" covariance, Schmidt 1966.)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.arm_sizes import Sizes, likely_sizes
-from flangeye.handeye.bent import Bent
+from flangeye.handeye.bent import Bent, BentArm
 from flangeye.handeye.candidates import Fit, by_folds, judged, rms
 from flangeye.handeye.graph import Sighting, Solved, information_of, linear_of, solve_graph
 from flangeye.maths.frame_graph import Frame
@@ -37,6 +37,7 @@ class Sighted:
         noise: (6, 6) covariance believed of what moves, by frame.
         limits: As for :func:`flangeye.handeye.graph.solve_graph`.
         freedoms: Likewise.
+        joints: (N, n) of the arms that told them, by frame [rad].
     """
 
     frames: Mapping[str, Frame]
@@ -44,24 +45,25 @@ class Sighted:
     noise: Mapping[str, Floats]
     limits: tuple[float, float]
     freedoms: Mapping[str, Floats] | None = None
+    joints: Mapping[str, Floats] = field(default_factory=dict)
 
     def solved(self, start: Mapping[str, Floats] | None = None) -> Solved:
         """Return the unknowns."""
         graph = self.frames, self.sightings, self.noise, self.limits
         return solve_graph(*graph, start, self.freedoms)
 
-    def with_arms(self, arms: Sequence[Bent]) -> Sighted:
+    def with_arms(self, arms: Sequence[BentArm]) -> Sighted:
         """Return the same with the arms where their offsets put them."""
-        poses = {arm.name: arm.poses for arm in arms}
+        poses = {name: places for arm in arms for name, places in arm.poses.items()}
         frames = {n: replace(f, place=poses.get(n, f.place)) for n, f in self.frames.items()}
         return replace(self, frames=frames)
 
-    def linear(self, found: Solved, arms: Sequence[Bent] = ()) -> Linear:
+    def linear(self, found: Solved, arms: Sequence[BentArm] = ()) -> Linear:
         """Return what the sightings tell of the unknowns, and of the arms' zeros."""
         noise = {name: found.movers * covariance for name, covariance in self.noise.items()}
         graph = self.frames, self.sightings, found.places, noise
         residuals, jacobian, whiteners = linear_of(*graph)
-        moves = [(arm, linear_of(*graph, moved=[arm.name])[1]) for arm in arms]
+        moves = [(arm, linear_of(*graph, moved=[*arm.poses])[1]) for arm in arms]
         nothing = np.zeros((*residuals.shape, 0))
         zeros = np.concatenate([nothing, *(by @ arm.twists for arm, by in moves)], axis=2)
         kept = found.inliers
@@ -77,7 +79,7 @@ class Linear:
         residuals: (N, 6).
         jacobian: (N, 6, P) by the unknowns.
         zeros: (N, 6, k) by the joint zeros, in units of their deviations.
-        moves: Of each arm, (N, 6, 6) by its flange's turns and shifts.
+        moves: Of each arm, (N, 6, 6 F) by turns and shifts of the F frames that it moves.
         whiteners: (N, 6, 6).
         kept: (N,) which count.
         freedom: How many numbers those are.
@@ -86,7 +88,7 @@ class Linear:
     residuals: Floats
     jacobian: Floats
     zeros: Floats
-    moves: Sequence[tuple[Bent, Floats]]
+    moves: Sequence[tuple[BentArm, Floats]]
     whiteners: Floats
     kept: Mask
     freedom: float
@@ -141,7 +143,7 @@ class CorrectedArms:
     """
 
     found: Solved
-    arms: Sequence[Bent]
+    arms: Sequence[BentArm]
 
     @property
     def corrections(self) -> dict[str, ArmCorrection]:
@@ -150,12 +152,14 @@ class CorrectedArms:
         return {arm.name: ArmCorrection(tool, arm.offsets, arm.joints[0]) for arm in self.arms}
 
 
-def branches_of(sighted: Sighted, cell: Cell) -> list[list[Bent]]:
-    """Return each arm whose model reaches its poses, with the joints of every branch."""
+def branches_of(sighted: Sighted, cell: Cell) -> list[list[BentArm]]:
+    """Return each arm whose model reaches its poses, with its joints, or those of every branch."""
     return [arms for name in cell.movers if (arms := _branches(name, sighted, cell))]
 
 
-def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]) -> list[Bent]:
+def likeliest(
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[BentArm]]
+) -> list[BentArm]:
     """Return each arm on the branch whose zeros explain most."""
     chosen = [arms[0] for arms in branches]
     size = float(_sizes(sighted.linear(found, chosen), zeros_alone=True).expected[0])
@@ -166,7 +170,7 @@ def likeliest(found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]
 
 
 def considering_zeros(
-    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]]
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[BentArm]]
 ) -> tuple[Solved, Sizes | None]:
     """Return the solution with what its arms may be off by in its covariance, and how much it is.
 
@@ -182,7 +186,7 @@ def considering_zeros(
 
 
 def correcting_zeros(
-    found: Solved, sighted: Sighted, branches: Sequence[Sequence[Bent]], sizes: Sizes
+    found: Solved, sighted: Sighted, branches: Sequence[Sequence[BentArm]], sizes: Sizes
 ) -> tuple[CorrectedArms | None, str]:
     """Return the answer for corrected arms if it helps on sightings held out, and what to say.
 
@@ -206,8 +210,8 @@ def correcting_zeros(
 
 
 def _corrected(
-    found: Solved, sighted: Sighted, arms: Sequence[Bent], size: float
-) -> tuple[Solved, Linear, Sequence[Bent]]:
+    found: Solved, sighted: Sighted, arms: Sequence[BentArm], size: float
+) -> tuple[Solved, Linear, Sequence[BentArm]]:
     linear = sighted.linear(found, arms)
     for _ in range(STEPS):
         arms = _stepped(linear, arms, size)
@@ -217,17 +221,21 @@ def _corrected(
     return found, linear, arms
 
 
-def _branches(name: str, sighted: Sighted, cell: Cell) -> list[Bent]:
-    """Return an arm with the joints of every branch it may be on; none of what is no arm."""
+def _branches(name: str, sighted: Sighted, cell: Cell) -> list[BentArm]:
+    """Return an arm with its joints, or those of every branch; none of what is no arm."""
     mover = cell.movers[name]
     if isinstance(mover, Axis):
         return []
     arm = Arm(mover)
-    flange = MovedFlange(np.asarray(sighted.frames[name].place), None, False, arm)
+    place, joints = np.asarray(sighted.frames[name].place), sighted.joints.get(name)
+    links = {n: link.number for n, link in cell.links.items() if link.arm == name}
     return [
-        Bent(name, arm, joints, mover.joint_accuracy, np.zeros(arm.n))
-        for joints in flange.branches()
-    ]
+        BentArm([
+            Bent(frame, arm, each, mover.joint_accuracy, np.zeros(arm.n), link)
+            for frame, link in ({name: None} | links).items()
+        ])
+        for each in MovedFlange(place, joints, False, arm).branches()
+    ]  # fmt: skip
 
 
 def _explained(linear: Linear, size: float) -> float:
@@ -237,7 +245,7 @@ def _explained(linear: Linear, size: float) -> float:
     return float(told @ np.linalg.solve(linear.information(size), told))
 
 
-def _stepped(linear: Linear, arms: Sequence[Bent], size: float) -> list[Bent]:
+def _stepped(linear: Linear, arms: Sequence[BentArm], size: float) -> list[BentArm]:
     """Return the arms with their offsets a step nearer to the likeliest."""
     rows, zeros, errors = linear.whitened
     told = np.einsum("nij,ni->j", np.concatenate([rows, zeros], axis=2), errors)
@@ -264,7 +272,7 @@ def _inverse(information: Floats) -> Floats:
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _told(arms: Sequence[Bent]) -> str:
+def _told(arms: Sequence[BentArm]) -> str:
     listed = (
         f"{arm.name} are off by ({', '.join(f'{x * 1e3:.2f}' for x in arm.offsets)}) mrad"
         for arm in arms

@@ -13,9 +13,9 @@ from flangeye.handeye.candidates import Fit, by_folds, judged, rms
 from flangeye.handeye.cell_arms import Sighted
 from flangeye.handeye.graph import Solved, information_of, linear_of
 from flangeye.maths.statistics import f_quantile
-from flangeye.maths.streams import later, pose_at, rates_of
+from flangeye.maths.streams import joints_at, later, pose_at, rates_of
 from flangeye.models.cell import Cell
-from flangeye.types import Floats, Observation
+from flangeye.types import Floats, Motion, Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +68,8 @@ def on_one_clock(
         sighted: The same, as the graph takes them.
         found: The answer for the times as they are.
     """
-    as_paired = Timed(observations, sighted, found)
-    if not all(o.motion is not None and o.motion.others for o in observations):
+    as_paired, linked = Timed(observations, sighted, found), {x.arm for x in cell.links.values()}
+    if not all(_tells(o.motion, linked) for o in observations):
         return as_paired
     first = _delays(as_paired, cell)
     total, moved, left = np.zeros(len(first.values)), as_paired, first
@@ -94,6 +94,13 @@ def on_one_clock(
     return replace(chosen, notes=(told,))
 
 
+def _tells(motion: Motion | None, linked: set[str]) -> bool:
+    """Return whether a motion says how everything passed; a link passed by its arm's joints."""
+    if motion is None or not motion.others:
+        return False
+    return not linked or linked <= {*motion.joints}
+
+
 def _delayed(
     observations: Sequence[Observation], cell: Cell, before: Timed, delays: Floats
 ) -> Timed | None:
@@ -104,9 +111,11 @@ def _delayed(
         motion = o.motion and later(cell.passing(o.motion), delay)
         if motion is None:
             return None
-        at = {n: replace(o.poses[n], matrix=pose_at(motion, 0.0, n)) for n in motion.others}
-        moved.append(replace(o, poses={**o.poses, **at}, motion=motion))
-    sighted = replace(before.sighted, frames=cell.graph(moved))
+        told = {n: x for n, x in o.poses.items() if n in motion.others}
+        at = {n: replace(x, matrix=pose_at(motion, 0.0, n)) for n, x in told.items()}
+        joints = {n: q for n in o.arm_joints if (q := joints_at(motion, 0.0, n)) is not None}
+        moved.append(replace(o, poses={**o.poses, **at}, motion=motion, arm_joints=joints))
+    sighted = replace(before.sighted, frames=cell.graph(moved), joints=cell.joints(moved))
     return Timed(moved, sighted, sighted.solved(before.found.places))
 
 

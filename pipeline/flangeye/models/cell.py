@@ -138,6 +138,11 @@ class Cell:
         }
         return replace(motion, others={**motion.others, **placed})
 
+    def joints(self, observations: Sequence[Observation]) -> dict[str, Floats]:
+        """Return (N, n) of the arms that told them at all of N observations [rad]."""
+        told = [n for n in self.arms if all(n in o.arm_joints for o in observations)]
+        return {name: np.array([o.arm_joints[name] for o in observations]) for name in told}
+
     def link_poses(self, name: str, joints: Floats) -> Floats:
         """Return (N, 4, 4) of a link in its arm's base at (N, n) joints, by the arm's model."""
         from flangeye.maths.kinematics import Arm

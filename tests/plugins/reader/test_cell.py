@@ -74,6 +74,7 @@ def test_tables_hold_the_session_that_they_were_written_from(run: Path) -> None:
         pose = back.feature.camera_T_target.matrix
         assert np.allclose(pose, o.feature.camera_T_target.matrix, atol=1e-9)
         assert np.allclose(back.feature.covariance, o.feature.covariance, rtol=1e-3)
+        assert np.allclose(back.arm_joints["arm"], o.arm_joints["arm"], atol=1e-9)
 
 
 def test_points_go_to_acquire_centres(tables: Path) -> None:
@@ -114,6 +115,26 @@ def _without(group: str, name: str) -> Any:
     return change
 
 
+def _without_joints(data: Any) -> None:
+    del reader_of(data)["arms"]["arm"]["joints"]
+    reader_of(data)["arms"]["arm"]["columns"] = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+
+
+def _on_a_link(data: Any) -> None:
+    data["cell"]["cameras"]["first"] = {"on": "arm", "link": 3}
+    _without_joints(data)
+
+
+def _in_degrees(data: Any) -> None:
+    reader_of(data)["arms"]["arm"]["joint_unit"] = "deg"
+
+
+def _five_joints(data: Any) -> None:
+    arm = reader_of(data)["arms"]["arm"]
+    arm["columns"] = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    arm["joints"].pop()
+
+
 def _renamed(data: Any) -> None:
     reader_of(data)["sightings"][1]["camera"] = "secnd"
 
@@ -151,6 +172,9 @@ def _of_one_camera(data: Any) -> None:
          "or all by number"),
         (_as_axis, "{}: 'arm' is an arm, and has one value a pose; give its poses in the reader's "
          "arms"),
+        (_on_a_link, "{}: where link 3 of 'arm' is follows from its joint angles, and there are "
+         "none: give their columns in the reader, arms: {{arm: {{joints: …}}}}"),
+        (_five_joints, "{}: 'arm' has 5 joint angles, and a ur5 has 6 joints"),
         (_of_one_camera, "{}: holds recordings of a cell; describe it in the recipe: cell: "
          "{{arms: …}}"),
     ],
@@ -159,6 +183,17 @@ def test_what_is_not_of_the_cell_is_named(tables: Path, change: Any, told: str) 
     with pytest.raises(StageError) as error:
         seen_in(tables, change)
     assert str(error.value) == told.format(tables)
+
+
+def test_joint_angles_that_are_not_those_of_the_poses_are_refused(tables: Path) -> None:
+    with pytest.raises(StageError, match=re.escape(
+        "the joint angles of 'arm' put the flange of a ur5 "
+    ) + r"[\d.e+]+ mm from its pose; check their order, joint_unit and the model, or leave out j"):  # fmt: skip
+        seen_in(tables, _in_degrees)
+
+
+def test_an_arm_whose_joints_are_not_recorded_has_none(tables: Path) -> None:
+    assert all(not o.arm_joints for o in seen_in(tables, _without_joints))
 
 
 def _rows(path: Path, change: Any) -> None:

@@ -1,0 +1,168 @@
+"""A camera on a link of a cell's arm: its place, the errors that move it, and its clock."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.files.bundled import bundled
+from flangeye.handeye.bent import Bent, BentArm
+from flangeye.handeye.cell import calibrate_cell, sighted_of
+from flangeye.handeye.cell_arms import branches_of
+from flangeye.handeye.graph import LIMITS
+from flangeye.log.read import read_run
+from flangeye.maths.geometry import invert, rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
+from flangeye.models.cell import Cell
+from flangeye.plugin.registry import load_registry
+from flangeye.recipe.load import load_recipe
+from flangeye.run.folder import RunFolder
+from flangeye.run.runner import Runner
+from flangeye.run.session import Start, record_run
+from flangeye.run.tables import write_tables
+from flangeye.types import (
+    CAMERA,
+    TARGET,
+    ArchivePath,
+    ArmCorrection,
+    HandEye,
+    Observation,
+    PoseFeature,
+    Transform,
+)
+from tests.handeye.cells import ROBOT, errors, swinging
+
+REGISTRY = load_registry()
+RECIPE = (
+    bundled("recipes") / "configurations" / "forearm-and-wall_marker_most-likely_simulated.yaml"
+)
+ARM = Arm(ROBOT)
+
+
+def session(*overrides: str) -> Any:
+    """Return the cell, what was seen in it, and where everything truly is."""
+    recipe = load_recipe(RECIPE, REGISTRY, overrides)
+    seen = Runner(recipe, REGISTRY, ArchivePath(None)).take(None)
+    params: Any = recipe.steps[0].params
+    places = {name: place.matrix for name, place in params.places.items()}
+    return recipe.context[Cell], seen, places
+
+
+def squares(found: HandEye, places: Any) -> list[float]:
+    """Return the squared distance of every transform from the true one, in its region's measure."""
+    off = [(e, errors(e, places[e.transform.child])) for e in found.transforms.values()]
+    return [float(x @ np.linalg.solve(e.covariance, x)) for e, x in off]
+
+
+def test_the_camera_on_the_forearm_is_found_within_its_region() -> None:
+    cell, seen, places = session()
+    found = calibrate_cell(seen, cell, LIMITS, "solve.cell")
+    assert [*found.transforms] == ["arm_link3_T_forearm", *cell.unknowns[1:]]
+    assert max(squares(found, places)) < chi2_quantile(0.999, 6)
+
+
+def test_zeros_move_the_flange_and_the_link_together() -> None:
+    """As an arm with such zeros would stand."""
+    joints, zeros = swinging(np.arange(5.0)), np.zeros(6)
+    bent = BentArm([Bent("arm", ARM, joints, 1e-4, zeros), Bent("elbow", ARM, joints, 1e-4, zeros, 3)])  # fmt: skip
+    step = np.array([1.0, -2.0, 0.5, 0.3, -1.0])
+    moved = bent.moved(step)
+    assert moved.offsets == pytest.approx([0.0, *(1e-4 * step)])
+    for i, (name, link) in enumerate((("arm", None), ("elbow", 3))):
+        assert moved.poses[name] == pytest.approx(ARM.pose(joints + moved.offsets, link))
+        shift = (bent.twists[:, 6 * i + 3 : 6 * i + 6] @ step[:, None])[..., 0]
+        apart = moved.poses[name][:, :3, 3] - bent.poses[name][:, :3, 3]
+        assert apart == pytest.approx(shift, abs=1e-7)
+    *common, smooth = bent.others
+    assert [kind.shape for kind in common] == [(5, 12, m) for m in (12, 7, 12, 6)]
+    half = smooth.shape[2] // 2
+    assert not smooth[:, :6, half:].any() and not smooth[:, 6:, :half].any()
+    assert smooth[:, :6, :half] == pytest.approx(bent.parts[0].others[-1])
+
+
+def test_recorded_joints_are_the_branch_and_move_the_links() -> None:
+    cell, seen, _ = session("steps.0.sightings=12")
+    sighted = sighted_of(seen, cell, LIMITS)
+    ((arm,),) = branches_of(sighted, cell)
+    assert arm.joints == pytest.approx(np.array([o.arm_joints["arm"] for o in seen]))
+    assert [part.name for part in arm.parts] == ["arm", "arm_link3"]
+    for name, places in arm.poses.items():
+        assert places == pytest.approx(np.asarray(sighted.frames[name].place), abs=1e-9)
+
+
+def test_a_corrected_arm_has_its_links_where_its_joints_then_are() -> None:
+    cell, seen, places = session("steps.0.sightings=12")
+    offsets = np.array([0.0, 1e-3, -2e-3, 0.0, 1e-3, 0.0])
+    found = calibrate_cell(seen, cell, LIMITS, "solve.cell", joint_offsets=False)
+    correction = ArmCorrection(np.zeros(3), offsets, seen[0].arm_joints["arm"])
+    found = HandEye(found.camera, found.pairs, "x", arms={"arm": correction})
+    moved = cell.graph(cell.corrected(seen, found))
+    joints = np.array([o.arm_joints["arm"] for o in seen]) + offsets
+    assert moved["arm_link3"].place == pytest.approx(ARM.pose(joints, 3))
+    assert moved["arm"].place == pytest.approx(ARM.flange(joints))
+
+
+def test_a_log_and_its_tables_hold_the_joints(tmp_path: Any) -> None:
+    recipe = load_recipe(RECIPE, REGISTRY, ["steps.0.sightings=12", "steps.2.max_rms=5 mm"])
+    record_run(recipe, REGISTRY, RunFolder.create("run", tmp_path / "run"), Start(), report=False)
+    log = read_run(tmp_path / "run")
+    given = {o.id: o for o in log.observations()}
+    *_, written = write_tables(log, tmp_path / "tables", REGISTRY)
+    again = load_recipe(written, REGISTRY)
+    assert again.context[Cell].links == recipe.context[Cell].links
+    for o in Runner(again, REGISTRY, ArchivePath(None)).take(None):
+        assert o.arm_joints["arm"] == pytest.approx(given[o.id].arm_joints["arm"], abs=1e-9)
+
+
+def test_the_next_best_sighting_knows_where_the_link_is() -> None:
+    cell, seen, _ = session("steps.0.plan=next_best", "steps.0.sightings=16")
+    assert {o.camera for o in seen} == {"forearm", "wall"}
+    assert all("arm" in o.arm_joints for o in seen)
+    assert calibrate_cell(seen, cell, LIMITS, "solve.cell").camera.transform.child == "forearm"
+
+
+def test_the_arm_that_stood_still_is_told_to_move_its_link() -> None:
+    cell, seen, _ = session("steps.0.spread=0.1 deg", "steps.0.sightings=12")
+    with pytest.raises(Exception, match="the sightings do not tell where .*forearm.* are: .* turn arm_link3 about"):  # fmt: skip
+        calibrate_cell(seen, cell, LIMITS, "solve.cell")
+
+
+def passing(delays: Any, places: Any) -> list[Observation]:
+    """Return what two cameras saw of an arm that swings, by clocks that are so much early [s]."""
+    rng, stream, out = np.random.default_rng(0), np.arange(0.0, 26.0, 0.01), []
+    poses = ARM.flange(swinging(stream))
+    for i, when in enumerate(np.sort(rng.uniform(1.0, 25.0, 60))):
+        camera, target = (("forearm", "table"), ("wall", "marker"))[i % 2]
+        joints = swinging(np.array([when + delays[camera]]))[0]
+        on_arm, carried = ARM.pose(joints, 3), ARM.flange(joints)
+        ends = {"forearm": on_arm @ places["forearm"], "wall": places["wall"],
+                "table": places["table"], "marker": carried @ places["marker"]}  # fmt: skip
+        noise = rng.standard_normal(6) * np.repeat([0.5e-3, 0.1e-3], 3)
+        pose = invert(ends[camera]) @ ends[target]
+        pose = rigid(rotation_exp(noise[:3]) @ pose[:3, :3], pose[:3, 3] + noise[3:])
+        feature = PoseFeature(
+            Transform(CAMERA, TARGET, pose), np.diag(np.repeat([0.5e-3, 0.1e-3], 3) ** 2)
+        )
+        motion = passed(stream, poses, when, {"arm": (stream, poses)})
+        motion = with_joints(motion, when, "arm", (stream, swinging(stream)))
+        at = {"arm": Transform("arm_base", "arm", pose_at(motion, 0.0, "arm"))}
+        told: Any = {"arm": joints_at(motion, 0.0, "arm")}
+        out.append(
+            Observation(f"{i:03}", feature, at, None, camera, target, motion, arm_joints=told)
+        )
+    return out
+
+
+def test_the_clock_of_a_camera_on_a_link_is_found_by_the_arms_joints() -> None:
+    cell, _, places = session("steps.0.sightings=8")
+    delays = {"forearm": 0.06, "wall": -0.03}
+    found = calibrate_cell(passing(delays, places), cell, LIMITS, "solve.cell")
+    (note,) = [note for note in found.notes if "the arms were at the poses" in note]
+    told = re.findall(r"([\d.]+) \+- ([\d.]+) ms (after|before) the times that (\w+) gives", note)
+    for delay, sigma, which, camera in told:
+        signed = float(delay) * (1 if which == "after" else -1)
+        assert signed == pytest.approx(1e3 * delays[camera], abs=4 * float(sigma) + 0.2)
+    assert max(squares(found, places)) < chi2_quantile(0.999, 6)
