@@ -12,7 +12,7 @@ from flangeye.cli.commands import app
 from flangeye.doctor.cells import _moved, _scaled, _seen, examine_cell
 from flangeye.files.bundled import bundled
 from flangeye.maths.geometry import invert, rigid, rotation_exp
-from flangeye.models.cell import Cell
+from flangeye.models.cell import Cell, Link
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
@@ -81,6 +81,21 @@ def test_each_mistake_is_named_with_the_line_that_cures_it(
 ) -> None:
     (finding,) = examine_cell(*mistake(*session("two-scanners"))).findings
     assert (finding.name, finding.fix) == (name, fix)
+
+
+def on_the_wrong_link(link: str) -> Session:
+    """Return a session of a camera on the forearm that the recipe has elsewhere on the arm."""
+    seen, cell = session("forearm-and-wall")
+    cell = cell.with_links([Link("arm", 2)])
+    frame = replace(cell.frames["forearm"], parent=link)
+    return seen, replace(cell, frames={**cell.frames, "forearm": frame})
+
+
+@pytest.mark.parametrize("link", ["arm", "arm_link2"])
+def test_a_camera_on_another_link_is_named(link: str) -> None:
+    (finding,) = examine_cell(*on_the_wrong_link(link)).findings
+    assert finding.what == f"forearm stands on arm_link3, not on {link}"
+    assert finding.fix == "cell: {cameras: {forearm: {on: arm, link: 3}}}"
 
 
 def test_nothing_is_named_in_a_sound_session_of_a_bad_arm() -> None:

@@ -21,7 +21,7 @@ from flangeye.handeye.candidates import by_folds
 from flangeye.handeye.cell import sighted_of
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import invert, rigid
-from flangeye.models.cell import Axis, Cell
+from flangeye.models.cell import Cell, Link
 from flangeye.types import CAMERA, TARGET, Floats, Observation, PoseFeature, Transform
 
 HELPS = 0.5
@@ -140,8 +140,7 @@ def _of_arms(
     observations: Sequence[Observation], cell: Cell, tables: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[Suspicion]:
     """Yield inverted poses, wrong units and exchanged tables of the arms."""
-    arms = [name for name, mover in cell.movers.items() if not isinstance(mover, Axis)]
-    for arm in arms:
+    for arm in cell.arms:
         pose = _other(tables.get(arm, {}).get("pose"), "base_T_flange", "flange_T_base")
         yield Suspicion(
             "inverted pose",
@@ -158,13 +157,13 @@ def _of_arms(
                 [_moved(o, {arm: _scaled(o.poses[arm].matrix, factor)}) for o in observations],
                 cell,
             )
-    files = {arm: tables.get(arm, {}).get("file", f"the table of {arm}") for arm in arms}
-    for one, two in combinations(arms, 2):
+    files = {arm: tables.get(arm, {}).get("file", f"the table of {arm}") for arm in cell.arms}
+    for one, two in combinations(cell.arms, 2):
         yield Suspicion(
             "swapped arms",
             f"the poses of {one} are those of {two}, and the other way round",
             f"arms: {{{one}: {{file: {files[two]}}}, {two}: {{file: {files[one]}}}}}",
-            [_moved(o, {one: o.poses[two].matrix, two: o.poses[one].matrix}) for o in observations],
+            [_exchanged(o, one, two) for o in observations],
             cell,
         )
 
@@ -174,17 +173,32 @@ def _of_mountings(observations: Sequence[Observation], cell: Cell) -> Iterator[S
     for group, names in (("cameras", cell.cameras), ("targets", cell.targets)):
         for name in names:
             stands = cell.frames[name].parent
-            for other in ("base", *cell.movers):
+            others = {each: f"on: {each}" for each in ("base", *cell.movers)}
+            links = _links_beside(stands, observations, cell)
+            others |= {link.frame: f"on: {link.arm}, link: {link.number}" for link in links}
+            elsewhere = cell.with_links(links)
+            for other, line in others.items():
                 if other == stands or cell.frames[name].place is not None:
                     continue
                 frame = replace(cell.frames[name], parent=other)
                 yield Suspicion(
                     "mounting",
                     f"{name} stands on {other}, not on {stands}",
-                    f"cell: {{{group}: {{{name}: {{on: {other}}}}}}}",
+                    f"cell: {{{group}: {{{name}: {{{line}}}}}}}",
                     observations,
-                    replace(cell, frames={**cell.frames, name: frame}),
+                    replace(elsewhere, frames={**elsewhere.frames, name: frame}),
                 )
+
+
+def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) -> list[Link]:
+    """Return the links of the arm that carries something, if its joints are known.
+
+    The last is left out: what stands on it stands on the flange as well.
+    """
+    arm = cell.links[stands].arm if stands in cell.links else stands
+    if arm not in cell.joints(observations):
+        return []
+    return [Link(arm, i) for i in range(1, len(cell.arms[arm].joints))]
 
 
 def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]:
@@ -305,6 +319,14 @@ def _moved(observation: Observation, poses: Mapping[str, Floats]) -> Observation
     """Return an observation at which controllers reported other poses (4, 4)."""
     moved = {name: replace(observation.poses[name], matrix=pose) for name, pose in poses.items()}
     return replace(observation, poses={**observation.poses, **moved})
+
+
+def _exchanged(observation: Observation, one: str, two: str) -> Observation:
+    """Return an observation at which two arms reported what the other did."""
+    poses, told = observation.poses, observation.arm_joints
+    moved = _moved(observation, {one: poses[two].matrix, two: poses[one].matrix})
+    other = {one: two, two: one}
+    return replace(moved, arm_joints={other.get(name, name): x for name, x in told.items()})
 
 
 def _scaled(pose: Floats, factor: float) -> Floats:

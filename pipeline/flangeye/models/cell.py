@@ -150,6 +150,15 @@ class Cell:
         link = self.links[name]
         return Arm(self.arms[link.arm]).pose(joints, link.number)
 
+    def with_links(self, links: Sequence[Link]) -> Cell:
+        """Return the cell with frames of some links."""
+        frames = {link.frame: Frame(f"{link.arm}_base") for link in links}
+        return replace(
+            self,
+            frames={**self.frames, **frames},
+            links={**self.links, **{link.frame: link for link in links}},
+        )
+
     def name_of(self, frame: str) -> str:
         """Return ``parent_T_frame``."""
         return f"{self.frames[frame].parent}_T_{frame}"

@@ -56,9 +56,9 @@ def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Compla
         complain(("cell", *keys), message)
     if mistakes:
         return None
-    links = {link.frame: link for _, _, _, link in _on_links(section)}
     ends = tuple(section.cameras), tuple(section.targets)
-    return Cell(_frames(section), movers, *ends, links)
+    links = [link for *_, link in _on_links(section)]
+    return Cell(_frames(section), movers, *ends).with_links(links)
 
 
 Mistake = tuple[tuple[Hashable, ...], str]
@@ -168,7 +168,6 @@ def _frames(section: CellSection) -> dict[str, Frame]:
         frames[f"{name}_base"] = Frame(each.on, place_of(each.place))
         frames[name] = Frame(f"{name}_base")
     carriers = {name: link.frame for _, name, _, link in _on_links(section)}
-    frames |= {link.frame: Frame(f"{link.arm}_base") for _, _, _, link in _on_links(section)}
     for group, name, each in _entries(section):
         if group in ("cameras", "targets"):
             frames[name] = Frame(carriers.get(name, each.on), place_of(each.place))

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flangeye import StageError
 from flangeye.files.recording import MAX_REACH, MIN_CAPTURES, MIN_SPREAD, Recording
+from flangeye.maths.pose_corrections import inverted, scaled
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import Floats, Poses, Transform
+
+if TYPE_CHECKING:
+    from flangeye.maths.kinematics import Arm
 
 
 def cell_poses(recording: Recording, cell: Cell) -> Poses:
@@ -118,9 +123,26 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
         if away > LARGEST_MODEL_ERROR:
             raise StageError(
                 f"{root}: pose '{recording.id}': the joint angles of '{name}' put the flange of a "
-                f"{cell.arms[name].model} {away * 1e3:.3g} mm from its pose; check their order, "
-                "joint_unit and the model, or leave out joints"
+                f"{cell.arms[name].model} {away * 1e3:.3g} mm from its pose; "
+                f"{_cure(arm, joints, recording.poses[name])}"
             )
+
+
+def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
+    """Return what would make joints and pose of an arm agree."""
+    from flangeye.handeye.arm import LARGEST_MODEL_ERROR
+
+    cures = {
+        "write joint_unit: deg": (np.radians(joints), pose),
+        "write joint_unit: rad": (np.degrees(joints), pose),
+        "write pose: the other way round": (joints, inverted(pose)),
+        "write length: mm": (joints, scaled(pose, 1e-3)),
+        "write length: m": (joints, scaled(pose, 1e3)),
+    }
+    for cure, (angles, place) in cures.items():
+        if np.linalg.norm((arm.flange(angles) - place)[:3, 3]) < LARGEST_MODEL_ERROR:
+            return cure
+    return "check their order and the model, or leave out joints"
 
 
 def _require_motion(root: Path, recordings: Sequence[Recording]) -> None:

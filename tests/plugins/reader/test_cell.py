@@ -125,10 +125,6 @@ def _on_a_link(data: Any) -> None:
     _without_joints(data)
 
 
-def _in_degrees(data: Any) -> None:
-    reader_of(data)["arms"]["arm"]["joint_unit"] = "deg"
-
-
 def _five_joints(data: Any) -> None:
     arm = reader_of(data)["arms"]["arm"]
     arm["columns"] = ["x", "y", "z", "qx", "qy", "qz", "qw"]
@@ -185,11 +181,28 @@ def test_what_is_not_of_the_cell_is_named(tables: Path, change: Any, told: str) 
     assert str(error.value) == told.format(tables)
 
 
-def test_joint_angles_that_are_not_those_of_the_poses_are_refused(tables: Path) -> None:
-    with pytest.raises(StageError, match=re.escape(
-        "the joint angles of 'arm' put the flange of a ur5 "
-    ) + r"[\d.e+]+ mm from its pose; check their order, joint_unit and the model, or leave out j"):  # fmt: skip
-        seen_in(tables, _in_degrees)
+@pytest.mark.parametrize(
+    ("stated", "cure"),
+    [
+        ({"joint_unit": "deg"}, "write joint_unit: rad"),
+        ({"pose": "flange_T_base"}, "write pose: the other way round"),
+        ({"length": "mm"}, "write length: m"),
+        ({"joints": [f"j{i}_rad" for i in (2, 1, 3, 4, 5, 6)]},
+         "check their order and the model, or leave out joints"),
+    ],
+)  # fmt: skip
+def test_joint_angles_that_are_not_those_of_the_poses_are_refused(
+    tables: Path, stated: Any, cure: str
+) -> None:
+    with pytest.raises(StageError) as error:
+        seen_in(tables, lambda data: reader_of(data)["arms"]["arm"].update(stated))
+    assert (
+        re.search(
+            r": the joint angles of 'arm' put the flange of a ur5 [\d.e+]+ mm from its pose; (.*)",
+            str(error.value),
+        )[1]
+        == cure
+    )
 
 
 def test_an_arm_whose_joints_are_not_recorded_has_none(tables: Path) -> None:
