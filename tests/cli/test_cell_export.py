@@ -54,6 +54,8 @@ def test_a_refused_run_says_on_the_console_which_motion_is_missing(
     assert "refused: the sightings do not tell where left and right and marker are" in out
     assert "turn arm about (" in out
     assert "of arm_base by 20 deg or more, and see it again" in out
+    doctor = f"what to do: flangeye doctor {tmp_path / 'still' / 'run.mcap'}"
+    assert out.rstrip().endswith(f"{doctor}\n  it finds no mistake that it knows in poses or scans")
 
 
 def test_one_camera_is_chosen_where_a_format_carries_one(run: Any, command: Call) -> None:

@@ -38,6 +38,16 @@ def on_poses(change):
     return lambda session: session.with_poses(change(session.poses))
 
 
+def on_markers(change):
+    def plant(session):
+        poses = np.tile(np.eye(4), (len(session), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = session.rotations, session.centres
+        changed = change(poses)
+        return replace(session, rotations=changed[:, :3, :3], centres=changed[:, :3, 3])
+
+    return plant
+
+
 def on_rows(rows, **changes):
     """Change what was seen, or reported, in some rows."""
 
@@ -69,6 +79,8 @@ FAULTS = {
     "wxyz as xyzw": ("pose convention", on_poses(lambda p: reread(p, "wxyz", "xyzw"))),
     "ZYX as xyz": ("pose convention", on_poses(lambda p: reread(p, "ZYX", "xyz"))),
     "vectors as ZYX": ("pose convention", on_poses(lambda p: reread(p, "vector", "ZYX"))),
+    "markers' wxyz as xyzw": ("pose convention", on_markers(lambda p: reread(p, "wxyz", "xyzw"))),
+    "markers transposed": ("pose direction", on_markers(transposed)),
     "the base in the flange": ("pose direction", on_poses(inverted)),
     "transposed": ("pose direction", on_poses(transposed)),
     "shifted by one": ("shifted poses", late),
@@ -124,7 +136,13 @@ def apart(first, second):
     return np.linalg.norm(first[:3, 3] - second[:3, 3]), turned
 
 
-QUICK = ("metres as millimetres", "vectors as ZYX", "the base in the flange", "an outlier")
+QUICK = (
+    "metres as millimetres",
+    "markers transposed",
+    "vectors as ZYX",
+    "the base in the flange",
+    "an outlier",
+)
 
 
 @pytest.mark.parametrize(

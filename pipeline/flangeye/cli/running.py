@@ -136,8 +136,8 @@ def run(  # noqa: PLR0913  one for each option
         folder = RunFolder.create(checked.name, results)
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, recipe or checked.name, registry, folder, start)
-        if result.status == "refused" and checked.header.cell is None:
-            _advise(folder.log, registry)
+        if result.status == "refused":
+            _advise(folder.log, registry, measured=result.holdout is not None)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
@@ -158,8 +158,14 @@ def _refuse(options: object, why: str) -> None:
         raise StageError(why)
 
 
-def _advise(log: Path, registry: Registry) -> None:
-    """Say what to do about a refusal: the doctor's command, and what it finds first."""
+def _advise(log: Path, registry: Registry, measured: bool) -> None:
+    """Say what to do about a refusal: the doctor's command, and what it finds first.
+
+    Args:
+        log: Of the run.
+        registry: For the checks.
+        measured: Whether poses were held out: then they agree with one answer, but not well enough.
+    """
     from flangeye.cli.foreign import of_foreign
     from flangeye.doctor import examine, examine_cell, fix_lines, open_cell, open_session
     from flangeye.files.elsewhere import with_urls
@@ -175,10 +181,13 @@ def _advise(log: Path, registry: Registry) -> None:
     if findings := told.findings:
         say(f"  likely: {findings[0].name}: {findings[0].what}")
         say("\n".join(fix_lines(findings[0], "  ")))
-    else:
+    elif measured:
         say(
-            "  it finds no mistake in poses or scans: more poses, turned further, are the next step"
+            "  it finds no mistake in poses or scans: the arm itself may be off by as much, which "
+            "joint_offsets: auto in the solver looks for; more poses, turned further, tell more"
         )
+    else:
+        say("  it finds no mistake that it knows in poses or scans")
 
 
 def _recipe_of(

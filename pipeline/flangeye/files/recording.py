@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.elsewhere import digest_elsewhere
-from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Motion, Role
+from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Role
 
 MIN_CAPTURES = 3
 MIN_SPREAD = 1e-3
@@ -152,15 +152,22 @@ def check_poses(root: Path, recordings: Sequence[Recording], whole: bool = False
 
 def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
     poses = np.array([recording.base_T_flange for recording in recordings])
-    for i in range(len(poses)):
-        difference = np.abs(poses[i + 1 :] - poses[i]).max(axis=1)
-        same = np.all(difference < SAME_POSE, axis=1)
-        if same.any():
-            other = recordings[i + 1 + int(np.argmax(same))]
-            raise StageError(
-                f"{root}: poses '{recordings[i].id}' and '{other.id}' are the same; every capture "
-                "needs a pose of its own"
-            )
+    for first in poses:
+        same = np.flatnonzero(np.abs(poses - first).max(axis=(1, 2)) < SAME_POSE)
+        if len(same) > 1:
+            raise StageError(f"{root}: {_repeated([r.id for r in recordings], same, first)}")
+
+
+def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
+    """Return what to say of poses that are one: most of them a driver made up."""
+    if len(same) > max(2, len(names) / 2):
+        made_up = "the identity" if np.abs(pose - np.eye(4)).max() < SAME_POSE else "the same"
+        told = f"{len(same)} of {len(names)} robot poses are {made_up}"
+        return f"{told}: the driver had no others to give; record again"
+    return (
+        f"poses '{names[same[0]]}' and '{names[same[1]]}' are the same; every capture needs a pose "
+        "of its own"
+    )
 
 
 def _check_motion(root: Path, recordings: Sequence[Recording], whole: bool) -> None:

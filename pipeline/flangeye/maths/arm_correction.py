@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ def corrected_flange(
     if correction.joint_offsets is not None:
         if arm is None or correction.joints is None:
             raise ValueError("joint offsets need the arm's kinematics and a configuration")
-        angles = follow(arm, base_T_flange, correction.joints) if joints is None else joints
+        angles = _near(arm, base_T_flange, correction.joints) if joints is None else joints
         built = arm if correction.lengths is None else arm.altered(np.asarray(correction.lengths))
         moved = built.flange(angles + correction.joint_offsets)
         pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved
@@ -102,9 +103,29 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
     of_arm = replace(correction, tool_offset=np.zeros(3))
     commanded = np.array(base_T_flange)
     for _ in range(SUBSTITUTIONS):
-        reached = corrected_flange(commanded, None, of_arm, arm)
+        joints = None
+        if arm is not None and of_arm.joints is not None:
+            joints = follow(arm, commanded, of_arm.joints)  # commands stay on the known branch
+        reached = corrected_flange(commanded, joints, of_arm, arm)
         commanded = base_T_flange @ np.linalg.inv(reached) @ commanded
     return commanded
+
+
+def _near(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
+    """Return joint angles (n,) that reach a pose: on the branch of ``near``, or closest to it.
+
+    An arm that was turned far has passed on to another branch where its own does not go on.
+
+    Raises:
+        ValueError: No joint angles reach the pose.
+    """
+    with suppress(ValueError):
+        return follow(arm, base_T_flange, near)
+    reaching = arm.inverse(base_T_flange)
+    if not len(reaching):
+        raise ValueError("no joint angles reach the pose")
+    apart = np.abs((reaching - near + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
+    return np.asarray(reaching[np.argmin(apart)])
 
 
 def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:

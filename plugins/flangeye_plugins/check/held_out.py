@@ -31,6 +31,11 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
     return bool(better and after[0] <= EXPLAINED)
 
 
+def explained(session: RecordedSession) -> bool:
+    """Whether the samples foretell each other: those that have nothing in common do not."""
+    return bool(_foretold(session)[0] <= EXPLAINED)
+
+
 def moved_helps(session: RecordedSession, after: Mask) -> bool:
     """Whether two calibrations, before and after a move, foretell samples better than one."""
     equations = equations_of(session)
@@ -38,7 +43,7 @@ def moved_helps(session: RecordedSession, after: Mask) -> bool:
     first, second = (held_out_errors(equations, mask) for mask in (after, ~after))
     halves = np.where(np.isfinite(first), first, second)
     one, two = (np.nanmedian(errors, axis=0) for errors in (whole, halves))
-    return bool(two[0] <= HELPS * one[0])
+    return bool(two[0] <= min(HELPS * one[0], EXPLAINED * _spread(session)))
 
 
 def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
@@ -62,7 +67,11 @@ def _foretold(session: RecordedSession) -> Floats:
     """Return (B,) medians of the errors held out; positions as a share of the samples' spread."""
     errors = held_out_errors(equations_of(session), ~session.seen)
     middle = np.nanmedian(errors, axis=0)
-    sides = (session.poses[session.seen, :3, 3], session.centres[session.seen])
-    spread = max(float(np.linalg.norm(side.std(axis=0))) for side in sides)
-    middle[0] /= max(spread, 1e-12)
+    middle[0] /= max(_spread(session), 1e-12)
     return np.asarray(middle)
+
+
+def _spread(session: RecordedSession) -> float:
+    """Return how far the samples are apart [m]: the arm's places, or what was seen, if farther."""
+    sides = (session.poses[session.seen, :3, 3], session.centres[session.seen])
+    return max(float(np.linalg.norm(side.std(axis=0))) for side in sides)

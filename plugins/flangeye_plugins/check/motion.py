@@ -19,6 +19,8 @@ SHIFT = 5e-3
 """Likewise of where it sees the work [m]."""
 LITTLE = np.radians(10.0)
 """Poses that differ by less do not turn the target enough [rad]."""
+ERRORS = np.array([3e-3, np.radians(1.0)])
+"""Errors beyond these [m, rad] are a mistake's or an outlier's, and no motion makes up for them."""
 OFFSET = 1e-3
 """An offset of the target that would be known less well cannot be told [m]."""
 
@@ -74,8 +76,14 @@ def _advice(needs: bool, one_axis: bool) -> str:
 
 
 def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, float]:
-    """Return the largest standard deviation of the camera's rotation, and at the work [rad, m]."""
-    covariance = _covariance(null.information[0])[:6, :6]
+    """Return the largest standard deviation of the camera's rotation, and at the work [rad, m].
+
+    With errors as large as :data:`ERRORS` at most: what larger ones leave open, motion does not
+    tell.
+    """
+    scales = null.scales[0]
+    share = min(1.0, float((ERRORS[: len(scales)] / scales).min()))
+    covariance = share**2 * _covariance(null.information[0])[:6, :6]
     work = null.unknowns.rotation[0] @ np.nanmean(session.centres, axis=0)
     at_work = np.concatenate([-hat(work), np.eye(3)], axis=1)
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]

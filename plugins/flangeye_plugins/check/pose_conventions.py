@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from flangeye import part
-from flangeye.doctor.diagnosis import OR_ELSE, Arms, Change, Finding, Findings, RecordedSession
+from flangeye.doctor.diagnosis import OR_ELSE, Change, Finding, Findings, RecordedSession
 from flangeye.maths.pose_corrections import inverted, reread, transposed
 from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS
-from flangeye.types import Floats
 from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
@@ -30,30 +30,78 @@ NAMES = {
 }  # fmt: skip
 
 
+class Reading(NamedTuple):
+    """Rotations in another convention: whose, as what they were read, and how they fit."""
+
+    session: RecordedSession
+    whose: str
+    read_as: str
+    written_as: str
+
+
 @part("check.convention")
 def convention(session: RecordedSession) -> Findings:
     """The rotations fit far better when their numbers are read in another convention."""
     session.require_poses()
-    tried = [(arms, *pair) for arms in session.arms for pair in _readings(session)]
-    others = [_reread(session, *each) for each in tried]
-    evidence = best_of(fit_of(session), fit(equations_of(*others)))
-    if evidence.probability < 1 and helps(session, others[evidence.which]):
-        arms, read_as, written_as = tried[evidence.which]
+    tried = [*_of_arms(session), *_of_markers(session)]
+    evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
+    found = tried[evidence.which]
+    if evidence.probability < 1 and helps(session, found.session):
+        read, fits = _name(found.read_as), _name(found.written_as)
+        what = f"{found.whose} were read as {read}, and fit as {fits}"
+        yield evidence.finding("pose convention", what, found.session)
+
+
+def _of_arms(session: RecordedSession) -> Iterator[Reading]:
+    for arms in session.arms:
         whose = "the" if session.seconds is None else named(arms, session)
-        what = f"{whose} rotations were read as {_name(read_as)}, and fit as {_name(written_as)}"
-        yield evidence.finding("pose convention", what, others[evidence.which])
+        for read_as, written_as in _readings(_stated(session)):
+            reread_session = session.corrected(
+                _rereading(read_as, written_as), arms, read_as=read_as, written_as=written_as
+            )
+            yield Reading(reread_session, f"{whose} rotations", read_as, written_as)
 
 
-def _reread(session: RecordedSession, arms: Arms, read_as: str, written_as: str) -> RecordedSession:
-    def change(poses: Floats) -> Floats:
-        return reread(poses, read_as, written_as)
+def _of_markers(session: RecordedSession) -> Iterator[Reading]:
+    """Give other readings of ready-made markers' rotations, alone and with the arms'."""
+    if not _has_ready_made_markers(session):
+        return
+    stated = _stated(session, "target")
+    for read_as, written_as in _readings(stated):
+        change = _rereading(read_as, written_as)
+        told = {"target_read_as": read_as, "target_written_as": written_as}
+        alone = _with_markers(session, change).read_with(**told)
+        yield Reading(alone, "the markers' rotations", read_as, written_as)
+        if stated == _stated(session):
+            both = _with_markers(session, change).corrected(
+                change, "both", read_as=read_as, written_as=written_as, **told
+            )
+            whose = "the rotations of robot and markers"
+            yield Reading(both, whose, read_as, written_as)
 
-    return session.corrected(change, arms, read_as=read_as, written_as=written_as)
+
+def _has_ready_made_markers(session: RecordedSession) -> bool:
+    """Whether the recordings hold markers' poses, which may be written in any way."""
+    return session.acquire == "acquire.samples" and bool(np.isfinite(session.rotations).any())
 
 
-def _readings(session: RecordedSession) -> Iterator[tuple[str, str]]:
+def _with_markers(session: RecordedSession, change: Change) -> RecordedSession:
+    """Return the session with the markers' poses changed."""
+    rotations, centres = np.array(session.rotations), np.array(session.centres)
+    shown = np.isfinite(rotations).all(axis=(1, 2))
+    poses = np.tile(np.eye(4), (int(shown.sum()), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations[shown], centres[shown]
+    changed = change(poses)
+    rotations[shown], centres[shown] = changed[:, :3, :3], changed[:, :3, 3]
+    return replace(session, rotations=rotations, centres=centres)
+
+
+def _rereading(read_as: str, written_as: str) -> Change:
+    return lambda poses: reread(poses, read_as, written_as)
+
+
+def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
     """Give (as read, as written): every pair of conventions with as many numbers."""
-    stated = _stated(session)
     for read_as in [stated] if stated else [*QUATERNIONS, *COMMON]:
         others = QUATERNIONS if read_as in QUATERNIONS else ("vector", *EULER_ORDERS)
         if not stated and read_as not in QUATERNIONS:
@@ -61,12 +109,13 @@ def _readings(session: RecordedSession) -> Iterator[tuple[str, str]]:
         yield from ((read_as, other) for other in others if other != read_as)
 
 
-def _stated(session: RecordedSession) -> str | None:
-    """Return how the recipe says the rotations are written, if it does."""
+def _stated(session: RecordedSession, of: str | None = None) -> str | None:
+    """Return how the recipe says the arm's rotations are written, or the target's, if it does."""
     if isinstance(session.reader, str):
         return None
     ((_, params),) = session.reader.items()
-    rotation = params.get("rotation") if params else None
+    stated = params.get(of) if params and of else params
+    rotation = stated.get("rotation") if isinstance(stated, Mapping) else None
     if not isinstance(rotation, str):
         return None
     return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
@@ -83,21 +132,35 @@ def _name(rotation: str) -> str:
 def direction(session: RecordedSession) -> Findings:
     """The poses are those of the base in the flange, not of the flange in the base."""
     session.require_poses()
-    tried = [(arms, way) for arms in session.arms for way in _WAYS]
-    others = [session.corrected(_WAYS[way][0], arms, **{way: True}) for arms, way in tried]
-    evidence = best_of(fit_of(session), fit(equations_of(*others)))
-    corrected_session = others[evidence.which]
+    tried = [*_turned_round(session), *_transposed_markers(session)]
+    evidence = best_of(fit_of(session), fit(equations_of(*(each for each, _, _ in tried))))
+    corrected_session, whose, way = tried[evidence.which]
     if evidence.probability == 1 or not helps(session, corrected_session):
         return
-    arms, way = tried[evidence.which]
     if way == "inverted" and _marker_rather(session):
         yield _inverted_marker(session, evidence)
         return
-    whose = "the" if session.seconds is None else named(arms, session)
     what, fix = f"{whose} {_WAYS[way][1]}", corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
         what, fix = _of_exchanged(session, fix)
     yield evidence.finding("pose direction", what, corrected_session, fix)
+
+
+def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
+    for arms in session.arms:
+        whose = "the" if session.seconds is None else named(arms, session)
+        for way, (change, _) in _WAYS.items():
+            yield session.corrected(change, arms, **{way: True}), whose, way
+
+
+def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
+    """Give the session with ready-made markers' matrices transposed, alone and with the arms'."""
+    if not _has_ready_made_markers(session):
+        return
+    alone = _with_markers(session, transposed)
+    yield alone.read_with(target_transposed=True), "the markers'", "transposed"
+    both = alone.corrected(transposed, transposed=True, target_transposed=True)
+    yield both, "robot's and markers'", "transposed"
 
 
 LENS = np.radians(35)
@@ -140,10 +203,7 @@ def _off_axis(session: RecordedSession) -> float:
 
 
 def _marker_inverted(session: RecordedSession) -> RecordedSession:
-    turned = session.rotations.swapaxes(-1, -2)
-    centres = -(turned @ session.centres[..., None])[..., 0]
-    read = session.read_with(target_inverted=True)
-    return replace(read, rotations=turned, centres=centres)
+    return _with_markers(session, inverted).read_with(target_inverted=True)
 
 
 def _inverted_marker(session: RecordedSession, evidence: Significance) -> Finding:

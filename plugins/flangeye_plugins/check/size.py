@@ -11,6 +11,7 @@ from flangeye.doctor.diagnosis import Findings, NotApplicable, RecordedSession
 from flangeye_plugins.check.as_recorded import fit_of
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import VariantFits
+from flangeye_plugins.check.held_out import explained
 from flangeye_plugins.check.significance import best_of, exceedance
 
 NEGLIGIBLE_SCALE = 5e-3
@@ -33,7 +34,7 @@ def size(session: RecordedSession) -> Findings:
     ratio, count = float(found.likelihood[0] - null.likelihood[0]), float(null.count[0])
     effect = abs(np.log(factor)) / NEGLIGIBLE_SCALE
     p = exceedance(ratio, count, 1, count - found.parameters - 1, effect)
-    if p < 1:
+    if p < 1 and explained(corrected_session):
         what = f"the marker is {factor:.4f} times as large as the recipe says"
         fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
         evidence = evidence._replace(probability=p)

@@ -50,7 +50,14 @@ class CorrectedParams(Params):
     written_as: str | None = Field(
         None, description=f"How they were written: one of {', '.join(ROTATIONS[:3])}, or axes."
     )
+    target_read_as: str | None = Field(
+        None, description="Convention in which that reader read the markers' rotations."
+    )
+    target_written_as: str | None = Field(
+        None, description="How they were written, as for the robot's."
+    )
     transposed: bool = Field(False, description="The rotations' matrices were transposed.")
+    target_transposed: bool = Field(False, description="Those of the markers were.")
     scale: float = Field(1.0, gt=0, description="Factor for the robot's positions.")
     target_scale: float = Field(
         1.0,
@@ -67,7 +74,7 @@ class CorrectedParams(Params):
     shift_from: str | None = Field(None, description="Id of the first scan that is shifted.")
     delay: Duration = param("0 ms", description="Time from a pose to its scan.")
 
-    @field_validator("read_as", "written_as")
+    @field_validator("read_as", "written_as", "target_read_as", "target_written_as")
     @classmethod
     def _known(cls, value: str | None) -> str | None:
         if value is not None and value not in ROTATIONS:
@@ -78,6 +85,8 @@ class CorrectedParams(Params):
     def _both(self) -> CorrectedParams:
         if (self.read_as is None) != (self.written_as is None):
             raise ValueError("read_as and written_as go together")
+        if (self.target_read_as is None) != (self.target_written_as is None):
+            raise ValueError("target_read_as and target_written_as go together")
         return self
 
 
@@ -102,8 +111,8 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         for frame, pose in recording.poses.items()
     }
     centre, target = recording.centre_in_camera, recording.camera_T_target
-    if target is not None and params.target_inverted:
-        target = inverted(target[None])[0]
+    if target is not None:
+        target = _corrected_target(target[None], params)[0]
     motion = recording.motion
     if motion is not None:
         first = motion.poses if spared == FLANGE else _corrected(motion.poses, params)
@@ -117,8 +126,19 @@ def _alone(recording: Recording, params: CorrectedParams) -> Recording:
         motion=motion,
         poses=poses,
         centre_in_camera=None if centre is None else centre * params.target_scale,
-        camera_T_target=None if target is None else scaled(target, params.target_scale),
+        camera_T_target=target,
     )
+
+
+def _corrected_target(poses: Floats, params: CorrectedParams) -> Floats:
+    """Return markers' poses (N, 4, 4) in the camera as they should be."""
+    if params.target_read_as and params.target_written_as:
+        poses = reread(poses, params.target_read_as, params.target_written_as)
+    if params.target_transposed:
+        poses = transposed(poses)
+    if params.target_inverted:
+        poses = inverted(poses)
+    return scaled(poses, params.target_scale)
 
 
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:
