@@ -7,7 +7,7 @@ mean square distance in the region's measure (six is right), and by how much its
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -47,10 +47,12 @@ def misses(calibration: Any, places: Any) -> Iterator[Miss]:
         yield Miss(squared, float(np.linalg.norm(off)))
 
 
-def answers(cell: str, arm: str, seed: int, registry: Registry) -> dict[str, list[Miss]]:
+def answers(
+    cell: str, changes: Sequence[str], seed: int, registry: Registry
+) -> dict[str, list[Miss]]:
     """Return what the answers of one session miss; the corrected one only if there is one."""
     name = recipe_names()[f"configurations/{cell}_marker_most-likely_simulated"]
-    recipe = load_recipe(name, registry, [f"seed={seed}", f"steps.0.arm={{{arm}}}"])
+    recipe = load_recipe(name, registry, [f"seed={seed}", *changes])
     seen = Runner(recipe, registry, ArchivePath(None)).take(None)
     params: Any = recipe.steps[0].params
     found = calibrate_cell(seen, recipe.context[Cell], LIMITS, "solve.cell")
@@ -66,6 +68,9 @@ def table(
     ] = None,
     seeds: Annotated[int, typer.Option(help="Sessions of each.")] = 16,
     first: Annotated[int, typer.Option(help="The first one's seed.")] = 100,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Of the recipes, such as steps.0.at_once=true")
+    ] = None,
 ) -> None:
     """Print the table."""
     registry = load_registry()
@@ -76,7 +81,8 @@ def table(
     )
     for name in cell or CELLS:
         for bad in arm or ("quality: real", "zeros: 2 mrad"):
-            found = [answers(name, bad, seed, registry) for seed in range(first, first + seeds)]
+            changes = [f"steps.0.arm={{{bad}}}", *(change or ())]
+            found = [answers(name, changes, seed, registry) for seed in range(first, first + seeds)]
             for answer in ("as reported", "corrected"):
                 told = [each[answer] for each in found if answer in each]
                 if told:

@@ -21,7 +21,7 @@ from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params
-from flangeye.types import Floats, Observation, Poses, Source, Transform, Truth
+from flangeye.types import Floats, Mask, Observation, Poses, Source, Transform, Truth
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.acquire.planned_session import UNSEEN, VERSION, PlaceParams, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
@@ -59,6 +59,12 @@ class CellSessionParams(Params):
         description="Which moments are taken: drawn at random, or a grid of joints, in turn for "
         "each camera and target; or always the camera, the target and the joints that promise to "
         "tell most of the whole cell, by what was seen so far.",
+    )
+    at_once: bool = Field(
+        False,
+        description="What is seen at one moment is seen by every camera that can, of every target, "
+        "so that these sightings share the noise of the arms' poses; else each sighting has a "
+        "moment of its own.",
     )
     spread: Angle = param("30 deg", gt=0, description="Largest change of a joint from there.")
     facing: Angle = param(
@@ -172,7 +178,9 @@ def plan_cell(
     """
     _require_places(cell, params)
     moments = _draw(cell, params, rng)
-    chosen = _schedule(cell, moments, params.sightings, view)
+    schedule = _schedule_at_once if params.at_once else _schedule
+    chosen = schedule(cell, moments, params.sightings, view)
+    _require_seen(cell, chosen, params.sightings)
     sightings, unseen = chosen[: params.sightings], chosen[params.sightings :]
     truth = Truth(*_true(cell, params), unseen=tuple(moments.exact(*each) for each in unseen))
     source = replace(_source(cell, seed, params), truth=truth)
@@ -325,8 +333,7 @@ def _changes(plan: str, joints: int, rng: np.random.Generator) -> Floats:
 
 def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sighting]:
     """Choose who sees whom at which moment: each pair in turn, as long as it sees anything."""
-    pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
-    free = {p: list(np.flatnonzero(view.sees(moments.seen(*p)))) for p in pairs if _apart(cell, p)}
+    free = {p: list(np.flatnonzero(seen)) for p, seen in _visible(cell, moments, view).items()}
     taken: set[int] = set()
     chosen: list[Sighting] = []
     while len(chosen) < sightings + UNSEEN and any(free.values()):
@@ -336,8 +343,21 @@ def _schedule(cell: Cell, moments: Moments, sightings: int, view: View) -> list[
             if i is not None:
                 taken.add(int(i))
                 chosen.append((int(i), camera, target))
-    _require_seen(cell, chosen, sightings)
     return chosen
+
+
+def _schedule_at_once(cell: Cell, moments: Moments, sightings: int, view: View) -> list[Sighting]:
+    """Choose moments at which most is seen, and all that is."""
+    visible = _visible(cell, moments, view)
+    most = np.argsort(-np.sum([*visible.values()], axis=0), kind="stable")
+    seen = [(int(i), *pair) for i in most for pair, sees in visible.items() if sees[i]]
+    return seen[: sightings + UNSEEN]
+
+
+def _visible(cell: Cell, moments: Moments, view: View) -> dict[tuple[str, str], Mask]:
+    """Return (N,) whether a camera sees a target at each moment, by the two."""
+    pairs = [(camera, target) for camera in cell.cameras for target in cell.targets]
+    return {pair: view.sees(moments.seen(*pair)) for pair in pairs if _apart(cell, pair)}
 
 
 def _apart(cell: Cell, pair: tuple[str, str]) -> bool:
