@@ -43,6 +43,11 @@ class Facts:
         return next(iter(self.result.transforms.items()), None)
 
     @property
+    def of_cell(self) -> bool:
+        """Whether several cameras or targets may have been calibrated: those of a cell."""
+        return any(o.camera != t.CAMERA for o in self.log.observations()[:1])
+
+    @property
     def base_T_camera(self) -> t.Array | None:
         """(4, 4) the camera's pose in the base, where that is what was estimated."""
         found = self.result.transforms.get("base_T_camera")

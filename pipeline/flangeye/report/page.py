@@ -17,6 +17,7 @@ from flangeye.report.checks import drawings_of
 from flangeye.report.clouds import cloud_panels
 from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
+from flangeye.report.graph import graph_drawing
 from flangeye.report.images import image_view, missed_view
 from flangeye.report.plotly_js import packed_plotly, plotly_js
 from flangeye.report.residuals import errors_of, residual_figure
@@ -87,7 +88,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "panels": cloud_panels(facts),
         "image": image_view(facts),
         "missed": missed_view(facts),
-        "cell": cell_drawing(facts),
+        "cell": graph_drawing(facts) if facts.of_cell else cell_drawing(facts),
         "drawings": drawings_of(facts),
         "seam": seam_view(facts),
         "weld": weld_drawing(facts),
