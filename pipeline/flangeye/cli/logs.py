@@ -9,7 +9,7 @@ import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
-from flangeye.cli.saying import say, say_notes
+from flangeye.cli.saying import at_work, say, say_notes
 from flangeye.cli.unparsed import say_report
 from flangeye.errors import RecipeError
 from flangeye.files.collector import collector_paused
@@ -197,7 +197,7 @@ def doctor(
     if checked is not None and recipe == str(archive):
         archive = _archive_of(checked)
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
-    with of_foreign(archive, "it cannot be examined"):
+    with of_foreign(archive, "it cannot be examined"), at_work("looking for mistakes"):
         cell = open_cell(archive, registry, checked)
         if cell is None:
             session = open_session(archive, registry, checked)

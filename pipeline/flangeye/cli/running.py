@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
-from flangeye.cli.saying import say
+from flangeye.cli.saying import at_work, say
 from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def _advise(log: Path, registry: Registry, measured: bool) -> None:
     say(with_urls(f"\nwhat to do: flangeye doctor {log}"))
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
-        with of_foreign(log, "it cannot be examined"):
+        with of_foreign(log, "it cannot be examined"), at_work("looking for the mistake"):
             cell = open_cell(log, registry)
             told = examine_cell(*cell) if cell else examine(open_session(log, registry), checks)
     except FlangeyeError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -15,6 +15,7 @@ from flangeye.files.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
 
 def say(text: object, err: bool = False) -> None:
@@ -26,6 +27,15 @@ def say_notes(notes: Sequence[str]) -> None:
     """Say beside the output what the person should know."""
     for note in notes:
         say(f"note: {note}", err=True)
+
+
+def at_work(what: str) -> AbstractContextManager[object]:
+    """Say in a terminal what takes its time, while it does."""
+    if not sys.stderr.isatty():
+        return nullcontext()
+    from rich.console import Console
+
+    return Console(stderr=True).status(what)
 
 
 def end_in_words(command: Callable[[], object]) -> None:
