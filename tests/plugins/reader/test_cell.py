@@ -13,6 +13,7 @@ from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, pose_at
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe, parse_recipe
@@ -22,7 +23,7 @@ from flangeye.run.session import Start, record_run
 from flangeye.run.tables import write_tables
 from flangeye.types import ArchivePath, Source
 from flangeye_plugins.reader.cell import CellParams, cell
-from tests.handeye.cells import moving
+from tests.handeye.cells import ROBOT, moving, swinging
 
 REGISTRY = load_registry()
 RECIPES = Path(__file__).parents[3] / "recipes" / "configurations"
@@ -308,6 +309,32 @@ def test_arms_that_pass_are_told_with_how_they_and_a_rail_passed(
         assert np.allclose(pose_at(motion, 0.0, "two"), recording.poses["two"], atol=1e-6)
         assert joints_at(motion, 0.0, "rail") == pytest.approx(recording.axes["rail"])
         assert joints_at(motion, 0.1, "rail") == pytest.approx(recording.axes["rail"] + 0.1 * slide)
+
+
+def test_joints_of_an_arm_that_passes_are_told_with_how_they_passed(tmp_path: Path) -> None:
+    times = np.arange(0, 12.0, 0.01)
+    at = np.arange(1.0, 11.0, 0.5)
+    joints, poses = swinging(times), Arm(ROBOT).flange(swinging(times))
+    rows = np.hstack([_quaternions(poses), np.degrees(joints)])
+    heading = "t,x,y,z,qx,qy,qz,qw," + ",".join(f"q.{i}" for i in range(6))
+    _written(tmp_path / "arm.csv", heading, times, rows)
+    _written(tmp_path / "left.csv", "t,u,v,w", at, np.ones((len(at), 3)))
+    params = CellParams.model_validate({
+        "arms": {"arm": {"file": "arm.csv", "time": "t", "rotation": "xyzw", "length": "m",
+                         "joints": ["q"], "joint_unit": "deg"}},
+        "sightings": [{"camera": "left", "target": "ball", "file": "left.csv", "time": "t",
+                       "rotation": "point", "length": "m"}],
+        "join": {"clock_offset": "0 ms"},
+    })  # fmt: skip
+    recordings = cell(tmp_path, params).recordings
+    assert len(recordings) > 10
+    for recording in recordings:
+        when = recording.time_ns * 1e-9
+        told = recording.arm_joints["arm"]
+        assert told == pytest.approx(swinging(np.array([when]))[0], abs=1e-4)
+        assert joints_at(recording.motion, 0.0, "arm") == pytest.approx(told)
+        later = swinging(np.array([when + 0.1]))[0]
+        assert joints_at(recording.motion, 0.1, "arm") == pytest.approx(later, abs=1e-4)
 
 
 SLIDING = """\
