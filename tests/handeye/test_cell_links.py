@@ -18,7 +18,7 @@ from flangeye.maths.statistics import chi2_quantile
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.load import load_recipe
+from flangeye.recipe.load import load_recipe, parse_recipe
 from flangeye.run.folder import RunFolder
 from flangeye.run.runner import Runner
 from flangeye.run.session import Start, record_run
@@ -61,6 +61,37 @@ def test_the_camera_on_the_forearm_is_found_within_its_region() -> None:
     cell, seen, places = session()
     found = calibrate_cell(seen, cell, LIMITS, "solve.cell")
     assert [*found.transforms] == ["arm_link3_T_forearm", *cell.unknowns[1:]]
+    assert max(squares(found, places)) < chi2_quantile(0.999, 6)
+
+
+PLATE = """\
+title: A plate on the forearm and a marker on the flange, before a camera on the wall
+cell:
+  arms: {arm: ur5}
+  cameras: {wall: base}
+  targets: {plate: {on: arm, link: 3}, marker: arm}
+steps:
+  - acquire.simulated_cell:
+      sightings: 40
+      home: {arm: [0 deg, -90 deg, 90 deg, 0 deg, 90 deg, 0 deg]}
+      spread: 20 deg
+      arm: {quality: real}
+      places:
+        wall: {position: [-0.5 m, -1.4 m, 0.45 m], rpy: [-90 deg, 0 deg, 5 deg]}
+        plate: {position: [150 mm, 0 mm, 80 mm]}
+        marker: {position: [60 mm, 30 mm, 20 mm], rpy: [0 deg, 90 deg, 0 deg]}
+  - solve.cell
+"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_target_on_the_forearm_is_found_within_its_region(seed: int) -> None:
+    recipe = parse_recipe(PLATE, "plate", REGISTRY, [f"seed={seed}"])
+    params: Any = recipe.steps[0].params
+    places = {name: place.matrix for name, place in params.places.items()}
+    seen = Runner(recipe, REGISTRY, ArchivePath(None)).take(None)
+    found = calibrate_cell(seen, recipe.context[Cell], LIMITS, "solve.cell")
+    assert [*found.transforms] == ["base_T_wall", "arm_link3_T_plate", "arm_T_marker"]
     assert max(squares(found, places)) < chi2_quantile(0.999, 6)
 
 
