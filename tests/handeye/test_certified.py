@@ -16,8 +16,8 @@ from flangeye.maths.frame_graph import Frame, composed
 from flangeye.maths.geometry import basis_of_plane, invert, rigid, rotation_exp
 from flangeye.types import Floats, Observations, Source
 from flangeye_plugins.solve.cell import CellParams, solve_cell
+from tests.handeye.sightings import anywhere, squared
 from tests.handeye.test_cell_clock import CELL, seen
-from tests.handeye.test_certificate import anywhere, squares_of
 
 NOISE = np.repeat([2e-3, 5e-4], 3) * [1.0, 3.0, 1.0, 1.0, 1.0, 4.0]
 """Of a sighting, about and along the camera's axes [rad, m]."""
@@ -44,6 +44,25 @@ GRAPHS: dict[str, tuple[list[tuple[str, str]], dict[str, bool]]] = {
     "two on the camera's way": (
         [("other_hand", "table"), ("other_hand", "tool")],
         {"other_base": True, "other_hand": True},
+    ),
+    "three places between": (
+        [("hand", "other_tool")],
+        {"hand": True, "other_base": True, "other_tool": True},
+    ),
+    "three, and two the other way round": (
+        [("wall", "other_tool"), ("hand", "other_spare")],
+        {"hand": True, "other_base": True, "other_tool": True},
+    ),
+    "two arms, three cameras": (
+        [("hand", "other_tool"), ("other_hand", "tool"), ("left", "tool"), ("left", "other_tool")],
+        {
+            "hand": True,
+            "other_hand": True,
+            "left": True,
+            "other_base": True,
+            "tool": True,
+            "other_tool": True,
+        },
     ),
     "what stands on both ways": (
         [("other_hand", "other_wall")],
@@ -116,9 +135,10 @@ def test_circles_and_centres_are_certified_as_well(kind: str) -> None:
 def test_what_is_certified_are_the_squares_that_the_graph_made_small(name: str, kind: str) -> None:
     given = made(name, 2, kind)
     found, answer = answered(given) if kind == "pose" else _as_it_is(given)
-    inverse = certified._inverse_in(answer)
-    places = np.array([invert(x) if n in inverse else x for n, x in answer.places.items()])
-    told = squares_of(_sightings(answer, inverse), places)
+    root = certified._seen_from(answer)
+    assert root is not None
+    places = certified._turned(answer.places, root, answer)
+    told = squared(_sightings(answer, root), np.array(list(places.values())))
     assert told == pytest.approx(found.squares.sum(), rel=1e-6)
 
 
@@ -163,24 +183,27 @@ def test_noise_that_hides_the_answer_is_told_with_its_gap() -> None:
     assert all(note == OPTIMAL or wanted.fullmatch(note) for note in told)
 
 
-@pytest.mark.parametrize(
-    ("pairs", "unknown", "named"),
-    [
-        ([("hand", "other_tool")], ["hand", "other_base", "other_tool"],
-         "hand saw other_tool, squared errors are no quadratic of the 3 unknown places between "
-         "them: hand, other_base, other_tool"),
-        # Its inverse in the one, itself in the other.
-        ([("wall", "other_tool"), ("hand", "other_spare")], ["hand", "other_base", "other_tool"],
-         "hand saw other_spare, squared errors are no quadratic of the 2 unknown places between "
-         "them: hand, other_base"),
-    ],
-)  # fmt: skip
-def test_what_is_no_quadratic_is_named(
-    pairs: Any, unknown: list[str], named: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(GRAPHS, "this", (pairs, dict.fromkeys(unknown, True)))
-    _, answer = _as_it_is(made("this"))
-    assert certificate_note(answer) == f"not certifiable: where {named}"
+def test_what_has_too_many_unknown_places_between_is_named() -> None:
+    """A camera alone sees what stands at the end of four slides, each mounted somewhere."""
+    moved = np.tile(np.eye(4), (2, 1, 1))
+    frames = {"camera": Frame("base"), "slide1": Frame("base"), "end": Frame("moved3")}
+    for k in (1, 2, 3):
+        frames[f"moved{k}"] = Frame(f"slide{k}", moved)
+        frames[f"slide{k + 1}"] = Frame(f"moved{k}")
+    del frames["slide4"]
+    for count, told in ((5, "not certifiable: where camera saw end, too many unknown places lie "
+                         "between them: camera, slide1, slide2, slide3, end"), (4, None)):  # fmt: skip
+        places = {n: np.eye(4) for n, f in frames.items() if f.place is None}
+        if count == 4:
+            frames["camera"] = Frame("base", places.pop("camera"))
+        nothing = np.zeros((2, 6))
+        answer = Answer(frames, [("camera", "end")] * 2, np.arange(2), places,
+                        {n: np.eye(6) for n in places}, nothing, np.tile(np.eye(6), (2, 1, 1)),
+                        np.full(2, 6.0))  # fmt: skip
+        if told:
+            assert certificate_note(answer) == told
+        else:
+            assert certified._seen_from(answer) == "slide2"
 
 
 @pytest.mark.parametrize("certify", [True, False])

@@ -1,20 +1,21 @@
 """What is said of an answer of which somebody asks if it is the best: for any graph of frames.
 
-Between a camera and what it saw the graph has known places and unknown ones. Where one is unknown
-on either way, from where both part, or two on the same, ``C M = T`` can be written as certificates
-take it (:mod:`flangeye.handeye.certificate`): of two on the same way the nearer to the root goes
-over as its inverse. Of three, such as two arms with a marker anywhere, it cannot.
+Between a camera and what it saw the graph has known places and unknown ones. From any of its frames
+on one may look at it: places that then lead the other way go over as their inverses. Where two at
+most are unknown on either way, from where both part, ``C M = T`` can be written as certificates
+take it (:mod:`flangeye.handeye.certificate`). It is looked at from where that takes least.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.handeye.certificate import Certificate, Sightings, certify
+from flangeye.handeye.certificate import Certificate, certify
+from flangeye.handeye.lifted import Side, Sightings, families_of
 from flangeye.handeye.likelihood import Solution
 from flangeye.handeye.loop import LoopProblem
 from flangeye.maths.frame_graph import Frame, chain
@@ -26,6 +27,13 @@ NEAR, ROUNDING = 5.0, 1e-9
 rounding [rad]."""
 OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"
 NOT_CERTIFIED = "not certified as globally optimal"
+
+
+class Step(NamedTuple):
+    """One frame on a way, or back from it to what it stands on."""
+
+    name: str
+    back: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +64,33 @@ class Answer:
         """Return (M,) the sightings of one target by one camera."""
         return np.flatnonzero([each == ends for each in self.ends])
 
-    def ways(self, ends: tuple[str, str]) -> tuple[list[str], list[str]]:
-        """Return the frames that lead to a camera and to a target, from where both ways part."""
-        first, second = (chain(self.frames, end) for end in ends)
+    def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
+        """Return the frames that lead to a camera and to a target, from where both ways part.
+
+        Args:
+            ends: The camera and the target.
+            root: From where on one looks at the graph; by default from its own root.
+        """
+        first, second = (self._way(root, end) for end in ends)
         shared = sum(1 for a, b in zip(first, second, strict=False) if a == b)
         return first[shared:], second[shared:]
 
-    def unknown(self, ends: tuple[str, str]) -> tuple[list[str], list[str]]:
+    def _way(self, root: str, end: str) -> list[Step]:
+        up, down = chain(self.frames, root), chain(self.frames, end)
+        shared = sum(1 for a, b in zip(up, down, strict=False) if a == b)
+        back = [Step(name, True) for name in reversed(up[shared:])]
+        return [*back, *(Step(name, False) for name in down[shared:])]
+
+    def unknown(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
         """Return the unknown ones of those."""
-        first, second = ([n for n in way if n in self.places] for way in self.ways(ends))
+        first, second = ([s for s in w if s.name in self.places] for w in self.ways(ends, root))
         return first, second
+
+    def place(self, step: Step, times: Indices) -> Floats:
+        """Return the (M, 4, 4) places of a step whose frame's is known."""
+        place = np.asarray(self.frames[step.name].place)
+        every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
+        return invert(every) if step.back else every
 
 
 def answer_of(problem: LoopProblem, found: Solution) -> Answer:
@@ -98,12 +123,11 @@ def answer_of(problem: LoopProblem, found: Solution) -> Answer:
 
 def certificate_note(answer: Answer) -> str:
     """Return in words whether the sightings that agree have no better answer than the one found."""
-    inverse = _inverse_in(answer)
-    for ends in dict.fromkeys(answer.ends):
-        if not _is_quadratic(answer.unknown(ends), inverse):
-            return _not_certifiable(ends, answer)
-    places = np.array([invert(x) if n in inverse else x for n, x in answer.places.items()])
-    shown = certify(_sightings(answer, inverse), places)
+    seen = _seen_from(answer)
+    if seen is None:
+        return _not_certifiable(answer)
+    places = np.array(list(_turned(answer.places, seen, answer).values()))
+    shown = certify(_sightings(answer, seen), places)
     if not shown.optimal:
         share = min(shown.missing / max(shown.cost, 1e-300), 1)
         return (
@@ -115,7 +139,8 @@ def certificate_note(answer: Answer) -> str:
 
 def _far_away(shown: Certificate, places: Floats, answer: Answer) -> str | None:
     """Return what is said where the bottom of the valley is not the answer."""
-    away = np.linalg.norm(rotation_log(shown.rotations @ invert(places)[:, :3, :3]), axis=1)
+    turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
+    away = np.linalg.norm(rotation_log(turns), axis=1)
     known = [np.linalg.eigvalsh(each[:3, :3])[-1] for each in answer.covariances.values()]
     beyond = away > NEAR * np.sqrt(known) + ROUNDING
     if not beyond.any():
@@ -124,102 +149,90 @@ def _far_away(shown: Certificate, places: Floats, answer: Answer) -> str | None:
     return f"{NOT_CERTIFIED}: with its weights the best answer is {far:.2g} deg from it"
 
 
-def _not_certifiable(ends: tuple[str, str], answer: Answer) -> str:
-    camera, target = ends
-    between = [name for way in answer.unknown(ends) for name in way]
+def _not_certifiable(answer: Answer) -> str:
+    def between(ends: tuple[str, str]) -> list[str]:
+        return [step.name for way in answer.unknown(ends) for step in way]
+
+    camera, target = most = max(dict.fromkeys(answer.ends), key=lambda ends: len(between(ends)))
     return (
-        f"not certifiable: where {camera} saw {target}, squared errors are no quadratic of the "
-        f"{len(between)} unknown places between them: {', '.join(between)}"
+        f"not certifiable: where {camera} saw {target}, too many unknown places lie between them: "
+        f"{', '.join(between(most))}"
     )
 
 
-# --- which sides unknowns stand on ---------------------------------------------------------------
+# --- from where the graph is looked at -----------------------------------------------------------
 
 
-def _inverse_in(answer: Answer) -> frozenset[str]:
-    """Return the unknowns that go over as their inverses."""
-    ways = (way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends))
-    return frozenset(way[0] for way in ways if len(way) == 2)
+def _seen_from(answer: Answer) -> str | None:
+    """Return the frame from which errors are a quadratic of fewest features; None if there is none.
+
+    The root is an empty name.
+    """
+    sizes = {root: _size(answer, root) for root in ("", *answer.places)}
+    possible = {root: size for root, size in sizes.items() if size}
+    return min(possible, key=possible.__getitem__) if possible else None
 
 
-def _is_quadratic(unknown: tuple[list[str], list[str]], inverse: frozenset[str]) -> bool:
-    """Whether either side gets one unknown at most, each the way round that it has elsewhere."""
-    first, second = unknown
-    if inverse.isdisjoint(first + second):
-        return len(first) <= 1 and len(second) <= 1
-    leads, *others = first or second
-    return not (first and second) and len(others) <= 1 and inverse & {leads, *others} == {leads}
+def _size(answer: Answer, root: str) -> int:
+    """Return how many features errors are a quadratic of; none where they are not."""
+    ways = [way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends, root)]
+    index = {name: i for i, name in enumerate(answer.places)}
+    pairs = {(index[way[0].name], index[way[1].name]) for way in ways if len(way) == 2}
+    nested = {u for u, _ in pairs} & {v for _, v in pairs}
+    if nested or any(len(way) > 2 for way in ways):
+        return 0
+    return families_of(pairs, len(index))[1]
 
 
-class _Way(NamedTuple):
-    """A way from the root: one more (M, 4, 4) known places than unknown frames between them."""
-
-    known: list[Floats]
-    unknown: list[str]
-
-    @property
-    def side(self) -> tuple[Floats, str | None, Floats]:
-        """What is known before the one unknown, or none, and after it."""
-        if self.unknown:
-            return self.known[0], self.unknown[0], self.known[1]
-        return self.known[0], None, np.broadcast_to(np.eye(4), self.known[0].shape)
-
-
-def _way(way: Sequence[str], answer: Answer, times: Indices) -> _Way:
-    known, unknown = [np.tile(np.eye(4), (len(times), 1, 1))], list[str]()
-    for name in way:
-        if name in answer.places:
-            unknown.append(name)
-            known.append(np.tile(np.eye(4), (len(times), 1, 1)))
-        else:
-            place = np.asarray(answer.frames[name].place)
-            known[-1] = known[-1] @ (place if place.ndim == 2 else place[times])
-    return _Way(known, unknown)
-
-
-def _sides(
-    camera: _Way, target: _Way, inverse: frozenset[str]
-) -> Iterator[tuple[Floats, str | None, Floats]]:
-    """Give what leads to the camera and to the target, from one frame, one unknown in each."""
-    if inverse.isdisjoint(camera.unknown + target.unknown):
-        yield from (camera.side, target.side)
-        return
-    leads, other = (camera, target) if camera.unknown else (target, camera)
-    rest = _Way(leads.known[1:], leads.unknown[1:])
-    still = np.broadcast_to(np.eye(4), leads.known[0].shape)
-    back = still, leads.unknown[0], invert(leads.known[0]) @ other.known[0]
-    yield from (rest.side, back) if leads is camera else (back, rest.side)
+def _turned(places: Mapping[str, Floats], root: str, answer: Answer) -> dict[str, Floats]:
+    """Return places, those that lead the other way from a root as their inverses."""
+    back = chain(answer.frames, root)
+    return {name: invert(place) if name in back else place for name, place in places.items()}
 
 
 # --- the sightings -------------------------------------------------------------------------------
 
 
-def _sightings(answer: Answer, inverse: frozenset[str]) -> Sightings:
-    each = [_of_pair(answer, ends, inverse) for ends in dict.fromkeys(answer.ends)]
-    columns = ([getattr(part, f.name) for part in each] for f in fields(Sightings))
-    return Sightings(*map(np.concatenate, columns))
-
-
-def _of_pair(answer: Answer, ends: tuple[str, str], inverse: frozenset[str]) -> Sightings:
-    rows = answer.of_pair(ends)
-    first, second = (_way(way, answer, answer.times[rows]) for way in answer.ways(ends))
-    (a, u, c), (b, v, d) = _sides(first, second, inverse)
-    camera, target = (
-        before @ _place(name, answer, inverse) @ after
-        for before, name, after in ((a, u, c), (b, v, d))
+def _sightings(answer: Answer, root: str) -> Sightings:
+    pairs = [_of_pair(answer, ends, root) for ends in dict.fromkeys(answer.ends)]
+    return Sightings(
+        _joined([p.camera for p in pairs]),
+        _joined([p.target for p in pairs]),
+        np.concatenate([p.weights for p in pairs]),
+        np.concatenate([p.freedoms for p in pairs]),
     )
-    turn = np.kron(np.eye(2), camera[:, :3, :3])
+
+
+def _joined(sides: Sequence[Side]) -> Side:
+    return Side(*(np.concatenate([getattr(s, f.name) for s in sides]) for f in fields(Side)))
+
+
+def _of_pair(answer: Answer, ends: tuple[str, str], root: str) -> Sightings:
+    rows = answer.of_pair(ends)
+    camera, target = (_side(answer, way, answer.times[rows]) for way in answer.ways(ends, root))
+    places = np.array(list(_turned(answer.places, root, answer).values()))
+    there, seen = camera.at(places), target.at(places)
+    turn = np.kron(np.eye(2), there[:, :3, :3])
     weights = turn @ answer.weights[rows] @ np.swapaxes(turn, 1, 2)
-    seen = _measured(invert(camera) @ target, answer.errors[rows])
+    measured = _measured(invert(there) @ seen, answer.errors[rows])
+    return Sightings(replace(camera, c=camera.c @ measured), target, weights, answer.freedoms[rows])
+
+
+def _side(answer: Answer, way: Sequence[Step], times: Indices) -> Side:
+    """Return a way as one side of sightings: of two unknown places at most."""
     index = {name: i for i, name in enumerate(answer.places)}
-    of = (np.full(len(rows), index.get(name or "", len(index))) for name in (u, v))
-    return Sightings(a, next(of), c @ seen, b, next(of), d, weights, answer.freedoms[rows])
-
-
-def _place(name: str | None, answer: Answer, inverse: frozenset[str]) -> Floats:
-    if name is None:
-        return np.eye(4)
-    return invert(answer.places[name]) if name in inverse else answer.places[name]
+    still = np.tile(np.eye(4), (len(times), 1, 1))
+    known, unknown = [still], list[int]()
+    for step in way:
+        if step.name in index:
+            unknown.append(index[step.name])
+            known.append(still)
+        else:
+            known[-1] = known[-1] @ answer.place(step, times)
+    # The last is after the last unknown; what is not there is none of them, and nothing between.
+    lacking = 2 - len(unknown)
+    (u, v), (a, b, c) = [len(index)] * lacking + unknown, [still] * lacking + known
+    return Side(a, np.full(len(times), u), b, np.full(len(times), v), c)
 
 
 def _measured(predicted: Floats, errors: Floats) -> Floats:

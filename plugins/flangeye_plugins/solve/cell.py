@@ -35,7 +35,7 @@ class CellParams(Params):
     certify: bool = Field(
         False,
         description="Say whether the answer is certified as globally optimal, by a dual "
-        "certificate, or not; or that it cannot be, as where a sighting leads over three unknown "
+        "certificate, or not; or that it cannot be, as where a sighting leads over five unknown "
         "places.",
     )
     required: Length | None = param(

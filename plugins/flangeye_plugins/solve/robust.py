@@ -119,7 +119,7 @@ class RobustParams(Params):
     certify: bool = Field(
         False,
         description="Say whether the answer is certified as globally optimal, by a dual "
-        "certificate, or not; or that it cannot be, as of three unknown places.",
+        "certificate, or not.",
     )
     required: Length | None = param(
         None,

@@ -1,0 +1,310 @@
+r"""Squared errors of sightings over unknown places as one quadratic. Arrays only.
+
+Where a sighting says ``A U B V C = A' U' B' V' C'``, with any of K unknown places or none for each
+of U, V, U' and V', either side is linear in the entries of V, of U, and in the products of U's
+rotation with V's entries: the features. Squares of the errors, each weighed by its own covariance,
+are then a quadratic ``r' Q r``, with ``r`` a one and all features. U may have several V after it;
+no place may be U here and V there. Without a U the features are V's rotation alone. Translations
+that stand in no product follow from the rest.
+
+An error is the turn and shift that take one side to the other, in the frame of both. Far from the
+answer a turn counts as its sine does, and what that misses as ``1 - cos``, with the mean weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.maths.geometry import hat, nearest_rotation, rigid, rotation_exp
+from flangeye.types import Floats, Indices, Mask
+
+STEPS, SETTLED = 50, 1e-12
+"""Of the descent to the bottom of a valley; a step as small [rad, m] is the last."""
+TOLD = 1e-7
+"""How well a turn is known at least, of the best known one: a circle's about itself is not."""
+STILL = np.append(np.append(np.eye(3), np.zeros(3)), 1.0)
+"""Entries of a place where nothing is unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One side of N sightings, ``A U B V C``; U is none where one place or none is unknown.
+
+    Attributes:
+        a: (N, 4, 4) before U.
+        u: (N,) which of the unknowns U is; their number, where it is none of them.
+        b: (N, 4, 4) between them.
+        v: (N,) which V is.
+        c: (N, 4, 4) after it.
+    """
+
+    a: Floats
+    u: Indices
+    b: Floats
+    v: Indices
+    c: Floats
+
+    def about(self, places: Floats) -> Side:
+        """Return the same with unknowns from those places (K, 4, 4) on."""
+        every = np.concatenate([places, np.eye(4)[None]])
+        return Side(self.a @ every[self.u], self.u, self.b @ every[self.v], self.v, self.c)
+
+    def at(self, places: Floats) -> Floats:
+        """Return what it comes to (N, 4, 4) with the unknowns at places (K, 4, 4)."""
+        moved = self.about(places)
+        return np.asarray(moved.a @ moved.b @ moved.c)
+
+    @property
+    def unknowns(self) -> Indices:
+        """Return (N, 2) which they are."""
+        return np.stack([self.u, self.v], axis=1)
+
+    def where(self, which: Mask) -> Side:
+        """Return some of them."""
+        return Side(*(getattr(self, f.name)[which] for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N sightings of which both sides are the same place.
+
+    Attributes:
+        camera: To the camera, and what it saw.
+        target: To the target.
+        weights: (N, 6, 6) of squared errors, turns [1/rad^2] before shifts [1/m^2].
+        freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal,
+            which is its z, 3 of a centre.
+    """
+
+    camera: Side
+    target: Side
+    weights: Floats
+    freedoms: Floats
+
+
+class Family(NamedTuple):
+    """An unknown place, those that come after it in products, and their features.
+
+    Attributes:
+        first: Which of the unknowns it is.
+        after: Which these C others are.
+        at: (10, 1 + 12 C) where products of a one and the first's rotation with a one and the
+            entries of the others stand among the features; the one is the first of all.
+        shift: (3,) where the first's translation stands, after all features.
+    """
+
+    first: int
+    after: tuple[int, ...]
+    at: Indices
+    shift: Indices
+
+    def columns(self, u: int, v: int) -> Indices:
+        """Return where entries of v and a one stand (13,), or products (169,) if u is the first."""
+        if v == self.first:
+            return np.concatenate([self.at[1:, 0], self.shift, [0]])
+        last = self.of(v)
+        if u != self.first:
+            return np.append(last[0], 0)
+        out = np.zeros((13, 13), dtype=np.intp)
+        out[:9, :12], out[:9, 12], out[9:12, 12], out[12, :12] = (
+            last[1:], self.at[1:, 0], self.shift, last[0]
+        )  # fmt: skip
+        return out.ravel()
+
+    def of(self, other: int) -> Indices:
+        """Return (10, 12) where products with the entries of one of the others stand."""
+        k = self.after.index(other)
+        return self.at[:, 1 + 12 * k : 13 + 12 * k]
+
+    def factors(self, places: Floats) -> tuple[Floats, Floats]:
+        """Return a one and the first's rotation, and a one and the entries of the others."""
+        each = [np.append(p[:3, :3], p[:3, 3]) for p in places[list(self.after)]]
+        return np.append(1.0, places[self.first, :3, :3]), np.concatenate([np.ones(1), *each])
+
+
+def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Family], int]:
+    """Return the families of K unknowns, of which some pairs come in products; and all features."""
+    firsts = {v: u for u, v in pairs}
+    members = {
+        k: tuple(sorted(v for v, u in firsts.items() if u == k))
+        for k in range(count)
+        if k not in firsts
+    }
+    ends = np.cumsum([1, *(size_of(len(after)) for after in members.values())])
+    size = int(ends[-1])
+    return [
+        Family(
+            k,
+            after,
+            np.append(0, np.arange(*ends[i : i + 2])).reshape(10, -1),
+            size + 3 * i + np.arange(3),
+        )
+        for i, (k, after) in enumerate(members.items())
+    ], size
+
+
+def size_of(after: int) -> int:
+    """Return how many features a family with so many others has, beside the one."""
+    return 10 * (1 + 12 * after) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """The squares of all errors as a quadratic of n features, about some places.
+
+    Attributes:
+        quadratic: (n, n), at the best translations of those F places that are first.
+        shifts: (3 F, n) these translations by the features.
+        families: F of them.
+    """
+
+    quadratic: Floats
+    shifts: Floats
+    families: Sequence[Family]
+
+    def features(self, places: Floats) -> Floats:
+        """Return the features (n,) of places (K, 4, 4)."""
+        out = np.ones(len(self.quadratic))
+        for family in self.families:
+            out[family.at] = np.outer(*family.factors(places))
+        return out
+
+    def cost(self, places: Floats) -> float:
+        """Return what the squared errors come to."""
+        at = self.features(places)
+        return max(float(at @ self.quadratic @ at), 0.0)
+
+    def moves(self, places: Floats) -> Floats:
+        """Return (n, 6 K) by how much features change with turns and shifts of places."""
+        out = np.zeros((len(self.quadratic), len(places), 6))
+        for family in self.families:
+            u, v = family.factors(places)
+            by = _moves(places[family.first])[:, :9]
+            out[family.at[1:].ravel(), family.first] = (by[:, :, None] * v).reshape(6, -1).T
+            for other in family.after:
+                by = _moves(places[other])
+                out[family.of(other).ravel(), other] = (u[:, None] * by[:, None]).reshape(6, -1).T
+        return out.reshape(len(out), -1)
+
+    def with_shifts(self, places: Floats) -> Floats:
+        """Return places (K, 4, 4) with the best translations of those that are first."""
+        out = places.copy()
+        firsts = [family.first for family in self.families]
+        out[firsts, :3, 3] = (self.shifts @ self.features(places)).reshape(-1, 3)
+        return out
+
+    def descend(self, places: Floats) -> Floats:
+        """Return the places (K, 4, 4) at the bottom of their valley (Gauss-Newton)."""
+        values, vectors = np.linalg.eigh(self.quadratic)
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        for _ in range(STEPS):
+            slopes, errors = root @ self.moves(places), root @ self.features(places)
+            step = -np.linalg.lstsq(slopes, errors, rcond=TOLD)[0].reshape(-1, 6)
+            places = _moved(places, step)
+            if np.abs(step).max() < SETTLED:
+                break
+        return self.with_shifts(places)
+
+
+def _moved(places: Floats, step: Floats) -> Floats:
+    turned = rotation_exp(step[:, :3]) @ places[:, :3, :3]
+    shifted = places[:, :3, 3] + step[:, 3:]
+    return np.array([rigid(nearest_rotation(r), t) for r, t in zip(turned, shifted, strict=True)])
+
+
+def _moves(place: Floats) -> Floats:
+    """Return (6, 12) by how much a place's entries change with its turns and shifts."""
+    out = np.zeros((6, 12))
+    out[:3, :9] = (hat(np.eye(3)) @ place[:3, :3]).reshape(3, 9)
+    out[3:, 9:] = np.eye(3)
+    return out
+
+
+# --- the quadratic -------------------------------------------------------------------------------
+
+
+def squares_of(sightings: Sightings, places: Floats) -> Squares:
+    """Return the squares by what the unknowns are beyond those places (K, 4, 4)."""
+    sides = [side.about(places) for side in (sightings.camera, sightings.target)]
+    index = np.concatenate([side.unknowns for side in sides], axis=1)
+    pairs = {(u, v) for u, v in index.reshape(-1, 2).tolist() if u < len(places)}
+    families, size = families_of(pairs, len(places))
+    weights = _of_entries(sightings, sightings.target.at(places)[:, :3, :3])
+    whole = np.zeros((size + 3 * len(families),) * 2)
+    for each in np.unique(index, axis=0):
+        of = (index == each).all(axis=1)
+        (left, right), columns = zip(*(_linear(s.where(of), families) for s in sides), strict=True)
+        rows, at = np.concatenate([left, -right], axis=2), np.concatenate(columns)
+        told = np.einsum("nri,nrs,nsj->ij", rows, weights[of], rows, optimize=True)
+        np.add.at(whole, np.ix_(at, at), told)
+    return Squares(*_without_shifts(whole, size), families)
+
+
+def _linear(side: Side, families: Sequence[Family]) -> tuple[Floats, Indices]:
+    """Return (N, 12, m) entries of one side by m features or translations, and which these are."""
+    u, v = (int(each) for each in side.unknowns[0])
+    family = next((f for f in families if v in (f.first, *f.after)), None)
+    if family is not None and u == family.first:
+        return _by_both(side.a, _entries(side.b, side.c)), family.columns(u, v)
+    by_last = _entries(side.a @ side.b, side.c)
+    if family is not None:
+        return by_last, family.columns(u, v)
+    return (by_last @ STILL)[:, :, None], np.zeros(1, dtype=np.intp)
+
+
+def _entries(before: Floats, after: Floats) -> Floats:
+    """Return (N, 12, 13): entries of ``before V after``, by those of V and a one.
+
+    Nine of the rotation, row by row, and three of the translation.
+    """
+    out, turns = np.zeros((len(before), 12, 13)), before[:, :3, :3]
+    # (A X M)_ik is the sum over j, l of A_ij X_jl M_lk.
+    out[:, :9, :9] = np.einsum("nij,nlk->nikjl", turns, after[:, :3, :3]).reshape(-1, 9, 9)
+    out[:, 9:, :9] = np.einsum("nij,nl->nijl", turns, after[:, :3, 3]).reshape(-1, 3, 9)
+    out[:, 9:, 9:12], out[:, 9:, 12] = turns, before[:, :3, 3]
+    return out
+
+
+def _by_both(before: Floats, entries: Floats) -> Floats:
+    """Return (N, 12, 169): entries of ``before U W``, by U's and a one times W's (N, 12, 13)."""
+    out, turns = np.zeros((len(before), 12, 13, 13)), before[:, :3, :3]
+    turned = np.einsum("nij,nlks->nikjls", turns, entries[:, :9].reshape(-1, 3, 3, 13))
+    out[:, :9, :9] = turned.reshape(-1, 9, 9, 13)
+    out[:, 9:, :9] = np.einsum("nij,nls->nijls", turns, entries[:, 9:]).reshape(-1, 3, 9, 13)
+    out[:, 9:, 9:12, 12], out[:, 9:, 12, 12] = turns, before[:, :3, 3]
+    return out.reshape(-1, 12, 169)
+
+
+def _of_entries(s: Sightings, turned: Floats) -> Floats:
+    """Return (N, 12, 12) weights of the entries by which one side differs from the other.
+
+    Args:
+        s: The sightings.
+        turned: (N, 3, 3) rotation of either side, as found.
+    """
+    errors, beyond = np.zeros((len(turned), 6, 12)), np.zeros((len(turned), 9, 9))
+    mean = np.trace(s.weights[:, :3, :3], axis1=1, axis2=2) / np.maximum(s.freedoms - 3, 1)
+    whole, normal = s.freedoms == 6, s.freedoms == 5
+    # The difference is that by a turn, hat(turn) @ turned, and symmetric beyond it.
+    turns = 0.5 * (hat(np.eye(3)) @ turned[whole, None]).reshape(-1, 3, 9)
+    errors[whole, :3, :9] = turns
+    beyond[whole] = 0.5 * np.eye(9) - np.swapaxes(turns, 1, 2) @ turns
+    axes = turned[normal, :, 2]
+    errors[normal, :3, 2:9:3] = hat(axes)
+    beyond[normal, 2:9:3, 2:9:3] = axes[:, :, None] * axes[:, None, :]
+    errors[:, 3:, 9:] = np.eye(3)
+    out = np.swapaxes(errors, 1, 2) @ s.weights @ errors
+    out[:, :9, :9] += mean[:, None, None] * beyond
+    return np.asarray(out)
+
+
+def _without_shifts(whole: Floats, size: int) -> tuple[Floats, Floats]:
+    """Return the quadratic of the features at the best translations, and these by the features."""
+    across = whole[:size, size:]
+    shifts = -np.linalg.pinv(whole[size:, size:], rcond=1e-12, hermitian=True) @ across.T
+    quadratic = whole[:size, :size] + across @ shifts
+    return (quadratic + quadratic.T) / 2, shifts
