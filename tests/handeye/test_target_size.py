@@ -8,6 +8,8 @@ import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye import target_size
+from flangeye.handeye.candidates import Model
+from flangeye.handeye.consensus import Consensus
 from flangeye.handeye.likelihood import with_noise
 from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.target_size import (
@@ -33,10 +35,14 @@ def resized(factor: float, focal: float = 1.0) -> LoopProblem:
     )
 
 
+def modelled(problem: LoopProblem) -> Model:
+    return Model(Consensus(problem, fitted(problem)))
+
+
 @pytest.mark.parametrize("factor", [1.02, 0.97])
 def test_a_factor_on_distances_is_found_beside_all_else(factor: float) -> None:
     problem = resized(factor)
-    told = estimated_factor(problem, fitted(problem), longer_distances(problem.measurements))
+    told = estimated_factor(modelled(problem), longer_distances(problem.measurements))
     assert told.share == pytest.approx(1 / factor - 1, abs=4 * told.sigma)
     assert told.sigma < 1e-3 and told.is_certain
     assert told.freedom > 14 and told.score == pytest.approx((told.share / told.sigma) ** 2)
@@ -70,21 +76,31 @@ def test_the_surer_of_size_and_focal_length_is_named(
     size: tuple[float, float], focal: tuple[float, float], told: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    def factor(problem: LoopProblem, found: Any, moves: Any) -> EstimatedFactor:
+    def factor(model: Model, moves: Any, arms: Any = ()) -> EstimatedFactor:
         return EstimatedFactor(*(size if moves[:, :5].any() else focal), freedom=50.0)
 
     monkeypatch.setattr(target_size, "estimated_factor", factor)
-    problem, nothing = resized(1.0), None
-    some: Any = nothing
+    model = modelled(resized(1.0))
     if told is None:
-        require_size(problem, some, 0.01)
+        require_size(model, 0.01, ())
         return
     with pytest.raises(CalibrationRefused) as refused:
-        require_size(problem, some, 0.01)
+        require_size(model, 0.01, ())
     assert told in str(refused.value)
-    require_size(problem, some, 0.05)
-    circles = given("eye-on-base, flange", "normal", 6)
-    require_size(circles, some, 0.01)
+    require_size(model, 0.05, ())
+    circles = modelled(given("eye-on-base, flange", "normal", 6))
+    require_size(circles, 0.01, ())
+
+
+def test_what_the_arm_may_be_off_by_is_in_the_deviation_before_anything_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arms: Any = [[None]]
+    monkeypatch.setattr(target_size, "last_unknown_by_arms", lambda *_: 0.02)
+    model = modelled(resized(1.03))
+    with pytest.raises(CalibrationRefused):
+        require_size(model, 0.01, ())
+    require_size(model, 0.01, arms)
 
 
 def test_scores_that_are_alike_in_time_vary_more_in_sum() -> None:
@@ -110,7 +126,7 @@ def test_a_factor_is_looked_for_beside_noise_in_depth_where_noise_is_not_stated(
         return with_noise(problem, found)
 
     monkeypatch.setattr(target_size, "with_noise", watched)
-    estimated_factor(problem, fitted(problem), longer_distances(problem.measurements))
+    estimated_factor(modelled(problem), longer_distances(problem.measurements))
     (free,) = seen
     assert free.in_depth == (not stated) and len(free.nuisance) == 3
     assert np.isinf(free.nuisance.prior[2]) and free.nuisance.mean[2] == 0.0

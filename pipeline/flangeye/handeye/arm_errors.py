@@ -47,6 +47,23 @@ def with_arm_errors(model: Model, arms: Arms, inflation: float) -> tuple[Floats,
     return sizes.mixed([own, *(followed @ followed.T for followed in each)]), sizes
 
 
+def last_unknown_by_arms(model: Model, arms: Arms) -> float:
+    """Return the standard deviation that the arms' errors give the last of the model's nuisances.
+
+    Args:
+        model: What was found for the arm as reported, that nuisance with it.
+        arms: As in :func:`evidence`; where they are not known, it is 0.
+    """
+    if _unknown(arms):
+        return 0.0
+    kinds = _kinds(arms)
+    last = model.found.at.before_nuisance + len(model.problem.nuisance) - 1
+    moved = following(model, reduce(Nuisance.and_also, kinds), last, 1)[0]
+    each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1])
+    squares = np.array([followed @ followed for followed in each])
+    return float(np.sqrt(_sizes(model, kinds).expected ** 2 @ squares))
+
+
 def evidence(model: Model, arms: Arms) -> float:
     """Return twice by how much likelier residuals are with errors of the arms than without.
 
@@ -55,9 +72,11 @@ def evidence(model: Model, arms: Arms) -> float:
         arms: Those that move camera or target; where the kinematics of one are not known, or do
             not reach its poses, it is 0.
     """
-    if any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms)):
-        return 0.0
-    return _sizes(model, _kinds(arms)).gain
+    return 0.0 if _unknown(arms) else _sizes(model, _kinds(arms)).gain
+
+
+def _unknown(arms: Arms) -> bool:
+    return any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms))
 
 
 def _sizes(model: Model, kinds: Sequence[Nuisance]) -> Sizes:

@@ -124,7 +124,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     if options.finds_size and model.problem.measurements.are_poses:
         cell, model = _with_size(cell, model, options, size)
     else:
-        require_size(model.problem, model.found, options.size_limit)
+        require_size(model, options.size_limit, cell.arms if options.joint_zeros else ())
     model = _with_depth(model)
     reported, model = (
         (_without(model, weak),) * 2 if weak.shape[1] else _with_arm(model, cell, options)
@@ -165,7 +165,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     """
     for _ in range(SIZES):
         longer = longer_distances(model.problem.measurements)
-        told = estimated_factor(model.problem, model.found, longer)
+        told = estimated_factor(model, longer)
         if not 0.1 < 1 + told.share < 10 or told.sigma > LOOSEST_SIZE:
             raise CalibrationRefused(
                 f"the target's size is told to {told.sigma:.1%} only: move the arm further between "

@@ -109,15 +109,16 @@ def considered(model: Model, further: Nuisance) -> Floats:
     return np.asarray(moved @ moved.T)
 
 
-def following(model: Model, further: Nuisance) -> Floats:
+def following(model: Model, further: Nuisance, first: int = 0, count: int = 18) -> Floats:
     """Return (18, k) by how much the transforms follow further errors, as the model found them.
 
-    A smooth error of the arm and a walk are found with them, and take their part.
+    Or others of the unknowns, from the first on. A smooth error of the arm and a walk are found
+    with them, and take their part.
     """
     k = len(further)
     fit = weighed_with(model.problem, model.found, further)
     moved = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
-    return np.asarray(fit.basis[:18, :-k] @ moved)
+    return np.asarray(fit.basis[first : first + count, :-k] @ moved)
 
 
 def weighed_with(problem: Problem, found: Solution, further: Nuisance) -> Solution:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.handeye.likelihood import Solution, weigh, with_noise
-from flangeye.handeye.loop import LoopProblem
+from flangeye.handeye.arm_errors import Arms, last_unknown_by_arms
+from flangeye.handeye.candidates import Model
+from flangeye.handeye.likelihood import weigh, with_noise
 from flangeye.handeye.measurements import Measurements
 from flangeye.handeye.nuisance import nuisance_of
 from flangeye.maths.statistics import f_quantile
@@ -22,25 +23,28 @@ CERTAIN = 1 - 1e-6
 """Probability with which a factor that is named is not noise's doing."""
 
 
-def require_size(problem: LoopProblem, found: Solution, limit: float) -> None:
+def require_size(model: Model, limit: float, arms: Arms) -> None:
     """Refuse poses of a target whose distances fit far better when all are longer or shorter.
 
     All distances, as those of a target of another size are; or those along the camera's axis alone,
     as a wrong focal length makes them. The one is named that is the surer.
 
     Args:
-        problem: What was given.
-        found: Its fit, whose inliers count.
+        model: What the poses agree on.
         limit: Share by which either may be off and nobody needs to know.
+        arms: Those whose errors may look like it, as large as the residuals show them.
 
     Raises:
         CalibrationRefused: Says how large the target, or how long the focal length is.
     """
-    if not problem.measurements.are_poses:
+    if not model.problem.measurements.are_poses:
         return
-    longer = longer_distances(problem.measurements)
-    size, focal = (estimated_factor(problem, found, moves) for moves in (longer, deeper(longer)))
+    longer = longer_distances(model.problem.measurements)
+    every = longer, deeper(longer)
+    size, focal = (estimated_factor(model, moves) for moves in every)
     told, is_size = (size, True) if size.score >= focal.score else (focal, False)
+    if abs(told.share) > limit and told.is_certain:
+        told = estimated_factor(model, every[not is_size], arms)
     if abs(told.share) <= limit or not told.is_certain:
         return
     factor = f"{1 + told.share:.4f} +- {told.sigma:.4f} times as"
@@ -82,17 +86,18 @@ class EstimatedFactor:
         return self.score > f_quantile(CERTAIN, 1, self.freedom)
 
 
-def estimated_factor(problem: LoopProblem, found: Solution, moves: Floats) -> EstimatedFactor:
+def estimated_factor(model: Model, moves: Floats, arms: Arms = ()) -> EstimatedFactor:
     """Return the factor that poses of a target tell, with all else unknown, the noise as well.
 
     The noise of a fit without the factor would take what the factor does for noise, and where only
     depth is wrong it would hide in the noise of depths.
 
     Args:
-        problem: What was given: whole poses.
-        found: Its fit, whose inliers count.
+        model: What whole poses agree on.
         moves: (N, 6, 1) by which a larger factor moves what is predicted.
+        arms: Those whose errors are to be in its deviation, as large as the residuals show them.
     """
+    problem, found = model.problem, model.found
     still = np.zeros_like(moves)
     nuisance = nuisance_of(still, still, np.inf, seen=moves)
     if len(problem.nuisance):
@@ -104,6 +109,9 @@ def estimated_factor(problem: LoopProblem, found: Solution, moves: Floats) -> Es
     told = (fit.weights[fit.inliers] @ linear.residuals[..., None])[..., 0]
     scores = np.einsum("nai,na->ni", linear.jacobian, told) @ row
     sigma = float(np.sqrt(row[-1] * correlation(scores)))
+    if arms:
+        freed = replace(model, consensus=replace(model.consensus, problem=free, found=fit))
+        sigma = float(np.hypot(sigma, last_unknown_by_arms(freed, arms)))
     return EstimatedFactor(float(fit.at.nuisance[-1]), sigma, fit.freedom)
 
 
