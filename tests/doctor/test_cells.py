@@ -55,7 +55,8 @@ def mounted_elsewhere(seen: Sequence[Observation], cell: Cell) -> Session:
 
 
 def mispaired(seen: Sequence[Observation], cell: Cell) -> Session:
-    return [replace(o, poses=seen[8].poses) if i == 3 else o for i, o in enumerate(seen)], cell
+    other = {"poses": seen[8].poses, "arm_joints": seen[8].arm_joints}
+    return [replace(o, **other) if i == 3 else o for i, o in enumerate(seen)], cell
 
 
 def swapped(seen: Sequence[Observation], cell: Cell) -> Session:
@@ -139,7 +140,9 @@ def test_what_the_recipe_states_wrongly_is_put_right(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cell", ["hand-and-wall", "arm-on-rail", "two-arms-three-scanners"])
+@pytest.mark.parametrize(
+    "cell", ["hand-and-wall", "arm-on-rail", "two-arms-three-scanners", "forearm-and-wall"]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_mistakes_are_named_in_every_cell(cell: str, seed: int) -> None:
     sound = session(cell, seed)
