@@ -178,10 +178,17 @@ def _scatter(left: Floats, noise: Floats, freedom: float) -> float:
     return max(found, (1e-6) ** 2)
 
 
-def identified(fit: ArmFit, prior: Floats) -> Mask:
-    """Return (n, 4) which parameters the poses identify singly."""
+def identified(fit: ArmFit, prior: Floats, apart: Floats | float = 0.0) -> Mask:
+    """Return (n, 4) which parameters the poses identify singly.
+
+    Args:
+        fit: What the poses tell.
+        prior: (n, 4) expected standard deviations.
+        apart: (n, 4) standard deviation between fits that are as likely.
+    """
     left = np.diag(_by_poses(fit, prior)).reshape(prior.shape)
-    return np.asarray((prior > 0) & (left <= KNOWN**2))
+    unknown = left * prior**2 + np.square(apart)
+    return np.asarray((prior > 0) & (unknown <= (KNOWN * prior) ** 2))
 
 
 def combinations(fit: ArmFit, prior: Floats) -> int:

@@ -29,7 +29,9 @@ from flangeye.maths.streams import (
 from flangeye.types import Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
+    PER_UNIT,
     ColumnsParams,
+    JointsParams,
     readings_of,
     table_with_rows,
     times_of,
@@ -37,7 +39,6 @@ from flangeye_plugins.reader.columns import (
 from flangeye_plugins.reader.pairing import Pair, PairingParams, pair
 from flangeye_plugins.reader.written import POINT
 
-PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 NUMBER = "Column of the pose's number, or name, by which tables are joined."
 
 
@@ -54,17 +55,11 @@ class OwnTableParams(ColumnsParams):
         return self
 
 
-class ArmTableParams(OwnTableParams):
+class ArmTableParams(OwnTableParams, JointsParams):
     """Where an arm's controller had its flange."""
 
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
         "base_T_flange", description="Whose pose it is: the flange's in the arm's base, or inverse."
-    )
-    joints: tuple[Column, ...] = Field(
-        (), description="Columns of the joint angles, from the base; a link's place needs them."
-    )
-    joint_unit: Literal["rad", "deg"] = Field(
-        "rad", description="Unit of the joint angles; with rad, joints that slide are in m."
     )
 
 
@@ -209,13 +204,7 @@ def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
         poses = np.array(found.values)
         poses = poses if given.pose == "base_T_flange" else inverted(poses)
         keys = _keys(text, given.number, found.times)
-        yield Moved(name, text, poses, keys, found.times, _joints(text, given))
-
-
-def _joints(text: Table, given: ArmTableParams) -> Floats | None:
-    if not given.joints:
-        return None
-    return text.numbers(text.indices(given.joints)) * PER_UNIT[given.joint_unit]
+        yield Moved(name, text, poses, keys, found.times, given.angles(text))
 
 
 def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:

@@ -10,11 +10,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from flangeye import StageError
+from flangeye import Params, StageError
 from flangeye.files.tables import Column, Table, read_table
 from flangeye.types import Floats
 from flangeye_plugins.reader.written import WrittenParams
 
+PER_UNIT = {"m": 1.0, "mm": 1e-3, "rad": 1.0, "deg": float(np.pi / 180)}
 PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -28,6 +29,25 @@ class ColumnsParams(WrittenParams):
     )  # fmt: skip
     time: Column | None = Field(None, description="Column of the time.")
     time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="Unit of the times.")
+
+
+class JointsParams(Params):
+    """Which columns hold the joint angles of the same poses."""
+
+    joints: tuple[Column, ...] = Field(
+        (),
+        description="Columns of the joint angles, from the base, where they were recorded: what is "
+        "wrong with an arm is told by them, and a link's place needs them.",
+    )
+    joint_unit: Literal["rad", "deg"] = Field(
+        "rad", description="Unit of the joint angles; with rad, joints that slide are in m."
+    )
+
+    def angles(self, text: Table) -> Floats | None:
+        """Return (N, n) joint angles [rad] of a table's rows; None where none are named."""
+        if not self.joints:
+            return None
+        return text.numbers(text.indices(self.joints)) * PER_UNIT[self.joint_unit]
 
 
 class Readings(NamedTuple):

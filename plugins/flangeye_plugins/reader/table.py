@@ -33,6 +33,7 @@ from flangeye.types import FLANGE, FLANGE2, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
     ColumnsParams,
+    JointsParams,
     Readings,
     readings_of,
     table_with_rows,
@@ -84,7 +85,7 @@ class SecondParams(OtherParams):
     )
 
 
-class TableParams(ColumnsParams):
+class TableParams(ColumnsParams, JointsParams):
     """The convention of the poses; nothing of it is guessed."""
 
     file: str = Field(
@@ -172,13 +173,14 @@ def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
     others = [o for o in (params.target, params.second) if o and o.file is None]
     taken = {at for other in others for at in text.indices(other.columns)}
     times = [o.time for o in (params, *others) if o.time is not None]
-    taken |= {text.index(time) for time in times} | ({scan} if scan is not None else set())
+    taken |= {text.index(time) for time in times} | set(text.indices(params.joints))
+    taken |= {scan} if scan is not None else set()
     return [i for i in range(len(text.rows[0][1])) if i not in taken]
 
 
 def _with_times(archive: Archive, text: Table, params: TableParams) -> Archive:
     """Return the archive with its times, and the second arm of the same rows."""
-    times = times_of(text, params.time, params.time_unit)
+    times, joints = times_of(text, params.time, params.time_unit), params.angles(text)
     second = _second(archive.root, text, params)
     if second is not None and second.table is not text:
         raise StageError(f"{second.table.file}: a second arm beside scans stands in the same table")
@@ -186,6 +188,7 @@ def _with_times(archive: Archive, text: Table, params: TableParams) -> Archive:
         replace(
             recording,
             time_ns=0 if times is None else round(times[i] * 1e9),
+            joints=None if joints is None else joints[i],
             poses=_poses(recording.base_T_flange, None if second is None else second.values[i]),
         )
         for i, recording in enumerate(archive.recordings)
@@ -207,10 +210,13 @@ def _measured(folder: Path, text: Table, params: TableParams) -> Archive:
     times = times_of(text, params.time, params.time_unit)
     if times is not None and target.times is not None and target.table is not text:
         recordings, notes = _joined((times, poses), target, second, params)
+        recordings = _with_joints(recordings, times, params.angles(text))
     else:
         for other in (target, *([second] if second else [])):
             _same_rows(text, other)
         recordings, notes = _row_by_row(times, poses, target, second), []
+        if (joints := params.angles(text)) is not None:
+            recordings = [replace(r, joints=at) for r, at in zip(recordings, joints, strict=True)]
     layout = f"table, {', '.join(dict.fromkeys(t.file.name for t in tables))}"
     return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
 
@@ -255,6 +261,20 @@ def _joined(
         for i, p in enumerate(pairs)
     ]
     return recordings, notes
+
+
+def _with_joints(
+    recordings: list[Recording], times: Floats, joints: Floats | None
+) -> list[Recording]:
+    """Return poses at which the arm stood with its joint angles; those it passed go without."""
+    if joints is None:
+        return recordings
+    return [
+        replace(r, joints=np.array([np.interp(r.time_ns * 1e-9, times, each) for each in joints.T]))
+        if r.motion is None
+        else r
+        for r in recordings
+    ]
 
 
 def _motion(arm: tuple[Floats, Floats], second: Readings | None, found: Pair) -> Motion | None:

@@ -43,6 +43,8 @@ CANDIDATES, SPREAD = 300, 0.6
 """Poses looked at for the next session, and their joints' largest change from the last [rad]."""
 NAMES = ("zero", "a", "d", "alpha")
 UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
+UNLIKELY = 0.01
+"""Probability of a branch that does not count among those that fit alike."""
 ONE_ORIENTATION = np.radians(10.0)
 
 
@@ -74,11 +76,21 @@ class ArmParams(Params):
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """One branch of the arm, fitted."""
+    """One branch of the arm, fitted.
+
+    Attributes:
+        session: The poses with the joint angles of the branch.
+        fit: What they tell.
+        used: (N,) those that take part.
+        alike: How many branches fit as well, where no joint angles were recorded.
+        apart: (n, 4) standard deviation of the parameters between these.
+    """
 
     session: ArmSession
     fit: ArmFit
     used: Mask
+    alike: int = 1
+    apart: Floats | float = 0.0
 
     @property
     def rms(self) -> float:
@@ -101,10 +113,11 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
     prior = deviations(arm.n, params.zeros, params.lengths, params.twists)
     found = _best(before, arm, prior)
     errors = _held_out(before, arm, found, prior)
-    known = identified(found.fit, prior)
+    known = identified(found.fit, prior, found.apart)
     about_arm = [
         _identifiability(known, combinations(found.fit, prior), found),
-        *_listed(known, found.fit, prior),
+        *_listed(known, found, prior),
+        *_branches_alike(found),
     ]
     about_arm += _proposed(arm, found, prior, params.propose)
     compared = f"held-out error {errors[1] * 1e3:.3f} mm with it, {errors[0] * 1e3:.3f} mm without"
@@ -127,7 +140,23 @@ def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
     if not found or used.sum() < 6:
         why = "the robot's model does not reach the poses" if not found else "6 poses are needed"
         raise StageError(f"refine.arm: {why}; name the arm that was recorded, or take more poses")
-    return min(found, key=lambda each: each.rms)
+    best = min(found, key=lambda each: each.rms)
+    shares = _shares(found, prior)
+    off = np.array([each.fit.parameters - best.fit.parameters for each in found])
+    apart = np.sqrt(np.einsum("b,bij->ij", shares, off**2))
+    return replace(best, alike=int((shares > UNLIKELY).sum()), apart=apart)
+
+
+def _shares(found: Sequence[_Found], prior: Floats) -> Floats:
+    """Return the probability of each branch by what it leaves of the poses."""
+    free = prior > 0
+    deviance = np.array([
+        3 * each.used.sum() * np.log(each.rms**2)
+        + ((each.fit.parameters[free] / prior[free]) ** 2).sum()
+        for each in found
+    ])  # fmt: skip
+    likely = np.exp((deviance.min() - deviance) / 2)
+    return np.asarray(likely / likely.sum())
 
 
 def _fitted(
@@ -222,9 +251,11 @@ def _identifiability(known: Mask, combined: int, found: _Found) -> str:
     )
 
 
-def _listed(known: Mask, fit: ArmFit, prior: Floats) -> list[str]:
+def _listed(known: Mask, found: _Found, prior: Floats) -> list[str]:
     """Name what is identified, with value and deviation, and what is not."""
-    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[6:], 0.0)).reshape(prior.shape)
+    fit = found.fit
+    own = np.maximum(np.diag(fit.covariance)[6:], 0.0).reshape(prior.shape)
+    sigma = np.sqrt(own + np.square(found.apart))
     single: list[str] = []
     combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(known):
@@ -237,6 +268,17 @@ def _listed(known: Mask, fit: ArmFit, prior: Floats) -> list[str]:
     return lines + ([f"not identified singly: {', '.join(combined_only)}"] if combined_only else [])
 
 
+def _branches_alike(found: _Found) -> list[str]:
+    """Say that the joints may have been otherwise, where nobody recorded them."""
+    if found.alike == 1:
+        return []
+    return [
+        f"the recordings have no joint angles, and the arm may have reached the poses in "
+        f"{found.alike} ways that fit alike: what they do not agree on is not identified, and the "
+        "corrected arm is that of the best of them; record the joint angles with the poses"
+    ]
+
+
 def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:
     """Propose poses that would tell more of the arm."""
     candidates = _candidates(arm, found)
@@ -247,8 +289,9 @@ def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:
         ", ".join(f"{x:.0f}" for x in np.degrees(candidates.joints[i])) for i in chosen
     )
     would = int(identified(after, prior).sum())
+    them = "them" if found.alike == 1 else "them, and all joint angles,"
     return [
-        f"poses that would tell more, joints in deg: {listed}; with them {would} of {prior.size} "
+        f"poses that would tell more, joints in deg: {listed}; with {them} {would} of {prior.size} "
         f"parameters are identified singly, and {combinations(after, prior)} combinations"
     ]
 

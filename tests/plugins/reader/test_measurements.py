@@ -114,6 +114,19 @@ def moving(times, still):
     return np.array([rigid(r, p) for r, p in zip(rotations, place, strict=True)])
 
 
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_joint_angles_stand_in_the_table(tmp_path: Path, unit: str) -> None:
+    joints = np.random.default_rng(5).uniform(-3, 3, (6, 6))
+    angles = joints if unit == "rad" else np.degrees(joints)
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw", "u", "v", "w", *(f"q{i}" for i in range(6))]
+    written(tmp_path / "a.csv", names, np.hstack([quaternions(ARM), SEEN[:, :3, 3], angles]))
+    target = {"columns": ["u", "v", "w"], "rotation": "point", "length": "m"}
+    given = params(file="a.csv", target=target, joints=names[10:], joint_unit=unit)
+    found = table(tmp_path, given).recordings
+    assert np.allclose([r.base_T_flange for r in found], ARM, atol=1e-12)
+    assert np.allclose([r.joints for r in found], joints, atol=1e-12)
+
+
 @pytest.mark.parametrize("still", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 0.18, -0.43])
 def test_two_streams_are_paired_and_their_clocks_compared(

@@ -1,5 +1,6 @@
 """``refine.arm``: the arm itself, from scans of its flange alone."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -114,6 +115,30 @@ def test_one_orientation_identifies_none_and_still_predicts() -> None:
     assert said.startswith("the poses identify none of the arm's 24 parameters singly (one orient")
     assert "the correction predicts at poses like these, and says nothing of any one joint" in said
     assert found.corrected is not None
+
+
+def told_singly(found):
+    """Return the parameters that are said to be identified, with value and deviation."""
+    (listed,) = [n for n in found.notes if n.startswith("identified: ")]
+    return {
+        each.rsplit(" ", 4)[0]: [float(x) for x in each.split(" ")[-4:-1:2]]
+        for each in listed.removeprefix("identified: ").split("; ")
+    }
+
+
+def test_without_joint_angles_only_what_all_ways_to_the_poses_agree_on_is_identified() -> None:
+    """An elbow that bends the other way explains the same scans by zeros of the other sign."""
+    observations = observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad"))
+    without = [replace(o, joints=None) for o in observations]
+    found = refine_arm(solved(without), ArmParams(propose=0), UR5)
+    (said,) = [n for n in found.notes if "joint angles" in n]
+    assert said.startswith("the recordings have no joint angles, and the arm may have reached the")
+    assert said.endswith("; record the joint angles with the poses")
+    sure, unsure = told_singly(refined()), told_singly(found)
+    assert set(unsure) < set(sure)
+    for name, (value, sigma) in unsure.items():
+        assert abs(value - sure[name][0]) < 2 * np.hypot(sigma, sure[name][1])
+    assert not any("joint angles" in note for note in refined().notes)
 
 
 def test_it_proposes_poses_that_would_tell_more() -> None:
