@@ -22,7 +22,9 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_emulators.acquire.planned_cell import CellSessionParams
 
-CELLS = ("two-scanners", "hand-and-wall", "arm-on-rail", "two-arms-three-scanners")
+CELLS = (
+    "two-scanners", "hand-and-wall", "forearm-and-wall", "arm-on-rail", "two-arms-three-scanners"
+)  # fmt: skip
 GRID_SIGHTINGS = 40
 
 

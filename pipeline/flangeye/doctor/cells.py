@@ -75,6 +75,8 @@ def examine_cell(
     some = _thinned(observations)
     before = foretold(some, cell)
     found = [] if before.ordinary else _likeliest(before, suspicions(some, cell, tables or {}))
+    if not (found or before.ordinary):
+        found = _likeliest(before, _of_links(some, cell))
     found = found or _mispaired(observations, cell)
     return Diagnosis(session, tuple(found), (), ("cell",), {})
 
@@ -170,24 +172,40 @@ def _of_arms(
 
 def _of_mountings(observations: Sequence[Observation], cell: Cell) -> Iterator[Suspicion]:
     """Yield cameras and targets that stand on something else than the recipe says."""
-    for group, names in (("cameras", cell.cameras), ("targets", cell.targets)):
-        for name in names:
-            stands = cell.frames[name].parent
-            others = {each: f"on: {each}" for each in ("base", *cell.movers)}
-            links = _links_beside(stands, observations, cell)
-            others |= {link.frame: f"on: {link.arm}, link: {link.number}" for link in links}
-            elsewhere = cell.with_links(links)
-            for other, line in others.items():
-                if other == stands or cell.frames[name].place is not None:
-                    continue
-                frame = replace(cell.frames[name], parent=other)
-                yield Suspicion(
-                    "mounting",
-                    f"{name} stands on {other}, not on {stands}",
-                    f"cell: {{{group}: {{{name}: {{{line}}}}}}}",
-                    observations,
-                    replace(elsewhere, frames={**elsewhere.frames, name: frame}),
-                )
+    for group, name in _to_find(cell):
+        for other in ("base", *cell.movers):
+            if other != cell.frames[name].parent:
+                on = f"cell: {{{group}: {{{name}: {{on: {other}}}}}}}"
+                yield _mounted(name, other, on, (observations, cell))
+
+
+def _of_links(observations: Sequence[Observation], cell: Cell) -> Iterator[Suspicion]:
+    """Yield cameras and targets that stand on another link of the same arm."""
+    for group, name in _to_find(cell):
+        for link in _links_beside(cell.frames[name].parent, observations, cell):
+            on = f"cell: {{{group}: {{{name}: {{on: {link.arm}, link: {link.number}}}}}}}"
+            yield _mounted(name, link.frame, on, (observations, cell.with_links([link])))
+
+
+def _to_find(cell: Cell) -> list[tuple[str, str]]:
+    """Return the cameras and targets whose places are not known, with their group."""
+    ends = [*(("cameras", x) for x in cell.cameras), *(("targets", x) for x in cell.targets)]
+    return [(group, name) for group, name in ends if cell.frames[name].place is None]
+
+
+def _mounted(
+    name: str, other: str, fix: str, given: tuple[Sequence[Observation], Cell]
+) -> Suspicion:
+    """Return that something stands on something else."""
+    observations, cell = given
+    frame = replace(cell.frames[name], parent=other)
+    return Suspicion(
+        "mounting",
+        f"{name} stands on {other}, not on {cell.frames[name].parent}",
+        fix,
+        observations,
+        replace(cell, frames={**cell.frames, name: frame}),
+    )
 
 
 def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) -> list[Link]:
@@ -198,7 +216,8 @@ def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) 
     arm = cell.links[stands].arm if stands in cell.links else stands
     if arm not in cell.joints(observations):
         return []
-    return [Link(arm, i) for i in range(1, len(cell.arms[arm].joints))]
+    links = [Link(arm, i) for i in range(1, len(cell.arms[arm].joints))]
+    return [link for link in links if link.frame != stands]
 
 
 def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]:
