@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 
 from flangeye.handeye import certified
-from flangeye.handeye.cell import answer_of
+from flangeye.handeye.cell import _at_best, answer_of, calibrate_cell
 from flangeye.handeye.cell_arms import Sighted
-from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, Answer, _sightings, certificate_note
+from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, Answer, _sightings, verdict_of
 from flangeye.handeye.graph import LIMITS, Sighting, Solved, linear_of, solve_graph
 from flangeye.maths.frame_graph import Frame, composed
 from flangeye.maths.geometry import basis_of_plane, invert, rigid, rotation_exp
 from flangeye.types import Floats, Observations, Source
 from flangeye_plugins.solve.cell import CellParams, solve_cell
+from tests.handeye.cells import ROBOT
 from tests.handeye.sightings import anywhere, squared
+from tests.handeye.test_cell_arm import seen_by
 from tests.handeye.test_cell_clock import CELL, seen
+from tests.plugins.solve.test_arm import simulate, solver
 
 NOISE = np.repeat([2e-3, 5e-4], 3) * [1.0, 3.0, 1.0, 1.0, 1.0, 4.0]
 """Of a sighting, about and along the camera's axes [rad, m]."""
@@ -121,13 +124,13 @@ def answered(
 @pytest.mark.parametrize("name", GRAPHS)
 def test_the_best_answer_of_a_graph_is_certified(name: str) -> None:
     for seed in range(3):
-        assert certificate_note(answered(made(name, seed))[1]) == OPTIMAL
+        assert verdict_of(answered(made(name, seed))[1]).note == OPTIMAL
 
 
 @pytest.mark.parametrize("kind", ["normal", "centre"])
 def test_circles_and_centres_are_certified_as_well(kind: str) -> None:
     for name in ("a camera alone", "two on the camera's way"):
-        assert certificate_note(answered(made(name, 1, kind, n=20))[1]) == OPTIMAL
+        assert verdict_of(answered(made(name, 1, kind, n=20))[1]).note == OPTIMAL
 
 
 @pytest.mark.parametrize("kind", ["pose", "normal", "centre"])
@@ -159,7 +162,7 @@ def test_another_valley_is_not_certified() -> None:
     best = answered(given)[0].squares.sum()
     for _ in range(8):
         found, answer = answered(given, {n: anywhere(rng) for n in given[2]})
-        note = certificate_note(answer)
+        note = verdict_of(answer).note
         if found.squares.sum() < 1.001 * best:
             assert note == OPTIMAL
         else:
@@ -167,6 +170,30 @@ def test_another_valley_is_not_certified() -> None:
             assert re.fullmatch(
                 NOT_CERTIFIED + ": with its weights the best .* 1.* deg from it", note
             )
+            moved, (told,) = _at_best(Sighted(*given[:2], {}, LIMITS), found)
+            assert moved.squares.sum() == pytest.approx(best, rel=1e-6)
+            said = re.fullmatch(
+                "what the search had found was not the best: the certificate led to an answer that "
+                r"leaves (\S+) times its squared errors",
+                told,
+            )
+            assert said is not None
+            assert float(said[1]) == pytest.approx(best / found.squares.sum(), rel=0.1)
+    assert wrong >= 2
+
+
+def test_an_answer_over_three_places_in_another_valley_is_left_for_the_best() -> None:
+    rng, wrong = np.random.default_rng(5), 0
+    given = made("three places between", 1, n=8)
+    sighted = Sighted(*given[:2], {}, LIMITS)
+    best = answered(given)[0]
+    assert _at_best(sighted, best) == (best, ())
+    for _ in range(12):
+        found = answered(given, {n: anywhere(rng) for n in given[2]})[0]
+        if found.squares.sum() > 1.001 * best.squares.sum():
+            wrong += 1
+            moved, _ = _at_best(sighted, found)
+            assert moved.squares.sum() == pytest.approx(best.squares.sum(), rel=1e-6)
     assert wrong >= 2
 
 
@@ -176,7 +203,7 @@ def test_noise_that_hides_the_answer_is_told_with_its_gap() -> None:
     for seed in range(4):
         frames, sightings, true = made("two on one way", seed, n=4, noise=noise)
         found = solve_graph(frames, sightings, limits=limits, start=true)
-        told.append(certificate_note(answer_of(Sighted(frames, sightings, {}, limits), found)))
+        told.append(verdict_of(answer_of(Sighted(frames, sightings, {}, limits), found)).note)
     less = "another answer may leave squared errors less by so much"
     wanted = re.compile(rf"{NOT_CERTIFIED} \(gap \d+\.\d%\): {less}")
     assert [note for note in told if wanted.fullmatch(note)]
@@ -201,7 +228,7 @@ def test_what_has_too_many_unknown_places_between_is_named() -> None:
                         {n: np.eye(6) for n in places}, nothing, np.tile(np.eye(6), (2, 1, 1)),
                         np.full(2, 6.0))  # fmt: skip
         if told:
-            assert certificate_note(answer) == told
+            assert verdict_of(answer).note == told
         else:
             assert certified._seen_from(answer) == "slide2"
 
@@ -210,5 +237,23 @@ def test_what_has_too_many_unknown_places_between_is_named() -> None:
 def test_solve_cell_says_so_where_it_is_asked(certify: bool) -> None:
     observations = seen({"left": 0.0, "right": 0.0})
     stream = Observations(observations, Source("cells"), len(observations))
-    notes = solve_cell(stream, CELL, CellParams(certify=certify)).notes
-    assert [note for note in notes if "globally optimal" in note] == [OPTIMAL] * certify
+    told = solve_cell(stream, CELL, CellParams(certify=certify))
+    assert [note for note in told.notes if "globally optimal" in note] == [OPTIMAL] * certify
+
+
+CORRECTED = f"for the corrected arm: {OPTIMAL}"
+
+
+def test_the_answer_for_the_corrected_arms_of_a_cell_is_certified_as_well() -> None:
+    observations, cell, _ = seen_by(1, "zeros: 2 mrad")
+    told = calibrate_cell(observations, cell, LIMITS, "solve.cell", certify=True)
+    assert told.corrected is not None
+    assert told.notes[-2:] == (OPTIMAL, CORRECTED)
+
+
+def test_the_answer_for_a_corrected_arm_is_certified_as_well() -> None:
+    offsets = np.array([0.0, 4.0, -3.0, 5.0, -4.0, 0.0]) * 1e-3
+    observations = simulate(ROBOT, 30, offsets=offsets, with_joints=True, tilt=0.6)
+    told = solver(ROBOT, joint_offsets="auto", tool_offset="off", certify=True)(observations)
+    assert told.corrected is not None
+    assert [note for note in told.notes if "optimal" in note] == [OPTIMAL, CORRECTED]

@@ -18,8 +18,9 @@ from flangeye.handeye.arm import (
 )
 from flangeye.handeye.arm_errors import evidence, with_arm_errors
 from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
-from flangeye.handeye.certified import answer_of, certificate_note
-from flangeye.handeye.consensus import find_consensus
+from flangeye.handeye.certificate import GAP
+from flangeye.handeye.certified import answer_of, certificate_notes, moved_note, verdict_of
+from flangeye.handeye.consensus import Consensus, begun_at, find_consensus
 from flangeye.handeye.distortion import distortion_of, edges_of
 from flangeye.handeye.estimates import (
     columns_of,
@@ -28,7 +29,7 @@ from flangeye.handeye.estimates import (
     transforms_of,
 )
 from flangeye.handeye.flange_roll import roll_note
-from flangeye.handeye.likelihood import Solution, freedom_of_sizes
+from flangeye.handeye.likelihood import Solution, freedom_of_sizes, weigh
 from flangeye.handeye.loop import ArmNoise, LoopProblem, meaningless_turns
 from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
@@ -41,11 +42,15 @@ from flangeye.handeye.observability import (
 from flangeye.handeye.observed import Cell
 from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.handeye.wander import with_walk
 from flangeye.maths.statistics import covariance_inflation, f_quantile
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
+    BASE2,
+    CAMERA,
     FLANGE,
+    TARGET,
     CorrectedArm,
     Floats,
     HandEye,
@@ -82,7 +87,7 @@ class Options:
         scanner_distortion: Whether the scanner's smooth distortion is part of the model.
         size_limit: Share by which a marker may be of another size.
         finds_size: Whether its size is found instead, from the arm's motion.
-        certify: Whether to say if the answer is the best of all.
+        certify: Whether to say if the answer is the best of all, and to look for a better one.
     """
 
     normals: bool
@@ -140,7 +145,9 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     if cell.scanner is not None and distortion is not None:
         notes = (*notes, _note_of_distortion(cell.scanner))
     if options.certify:
-        notes = (*notes, certificate_note(answer_of(reported.problem, reported.found)))
+        corrected = answer_of(model.problem, model.found) if model.corrects_joints else None
+        told = certificate_notes(answer_of(reported.problem, reported.found), corrected)
+        notes = (*notes, *told)
     return HandEye(
         camera,
         _pairs(reported, model, cell),
@@ -188,10 +195,27 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
 
 def _agreed(cell: Cell, options: Options, problem: LoopProblem | None = None) -> Model:
     """Return what the measurements agree on, with the time between two clocks if it was found."""
-    problem = problem or _problem(cell, options)
-    model = Model(find_consensus(problem, options.limits.rotation))
+    consensus = find_consensus(problem or _problem(cell, options), options.limits.rotation)
+    model = Model(_at_best(consensus) if options.certify else consensus)
     unknown = None if cell.delay is None else cell.unknown_delay()
     return model if unknown is None else with_nuisance(model, unknown) or model
+
+
+def _at_best(consensus: Consensus) -> Consensus:
+    """Return what is agreed on where the certificate leads, if that fits better, and say so."""
+    problem, found = consensus.problem, consensus.found
+    start = verdict_of(answer_of(problem, found)).better
+    if start is None:
+        return consensus
+    places = zip((CAMERA, BASE2, TARGET), found.at.places, strict=True)
+    there = begun_at(consensus, Unknowns.of_loop(*(start.get(*place) for place in places)))
+    before, after = (
+        weigh(problem, at, found.noise, found.inliers.astype(float)).cost
+        for at in (found.at, there.found.at)
+    )
+    if after >= (1 - GAP) * before:
+        return consensus
+    return replace(there, notes=(*there.notes, moved_note(after / before)))
 
 
 def _with_clock(cell: Cell, model: Model, options: Options) -> tuple[Cell, Model]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from flangeye.handeye.cell_arms import (
     correcting_zeros,
 )
 from flangeye.handeye.cell_clock import on_one_clock
-from flangeye.handeye.certified import Answer, certificate_note
+from flangeye.handeye.certificate import GAP
+from flangeye.handeye.certified import Answer, certificate_notes, moved_note, verdict_of
 from flangeye.handeye.estimates import estimate_at
 from flangeye.handeye.graph import Sighting, Solved
 from flangeye.handeye.measurements import measured
@@ -60,7 +62,7 @@ def calibrate_cell(
         method: Stage that solves it.
         joint_offsets: Whether to look for the zeros of the arms' joints, and to give the answer
             for arms so corrected, where that helps on sightings held out.
-        certify: Whether to say if the answer is the best of all.
+        certify: Whether to say if the answer is the best of all, and to look for a better one.
 
     Raises:
         StageError: No sighting, or one without the pose of something that moves.
@@ -68,7 +70,7 @@ def calibrate_cell(
             of them agree.
     """
     sighted = sighted_of(observations, cell, limits)
-    found = sighted.solved()
+    found, moved = _at_best(sighted, sighted.solved()) if certify else (sighted.solved(), ())
     _require_agreement(found, len(observations))
     timed = on_one_clock(observations, cell, sighted, found)
     observations, sighted, found = timed.observations, timed.sighted, timed.found
@@ -80,7 +82,8 @@ def calibrate_cell(
         corrected, told = correcting_zeros(found, sighted, branches, sizes)
         notes = (*notes, told)
     if certify:
-        notes = (*notes, certificate_note(answer_of(sighted, found)))
+        reported = answer_of(sighted, found)
+        notes = (*notes, *moved, *certificate_notes(reported, _corrected_of(sighted, corrected)))
     camera, *others = _estimates(known, observations, cell)
     return HandEye(
         camera,
@@ -164,6 +167,25 @@ def answer_of(sighted: Sighted, found: Solved) -> Answer:
         whiteners @ whiteners,
         np.array([np.trace(s.projector).round() for s in seen]),
     )
+
+
+def _corrected_of(sighted: Sighted, corrected: CorrectedArms | None) -> Answer | None:
+    if corrected is None:
+        return None
+    return answer_of(sighted.with_arms(corrected.arms), corrected.found)
+
+
+def _at_best(sighted: Sighted, found: Solved) -> tuple[Solved, tuple[str, ...]]:
+    """Return the answer to which the certificate leads, if that fits better, and what to say."""
+    start = verdict_of(answer_of(sighted, found)).better
+    if start is None:
+        return found, ()
+    there = sighted.solved(start)
+    before, after = (
+        float((sighted.linear(replace(found, places=each)).whitened[2] ** 2).sum())
+        for each in (found.places, there.places)
+    )
+    return (there, (moved_note(after / before),)) if after < (1 - GAP) * before else (found, ())
 
 
 def _require_agreement(found: Solved, count: int) -> None:

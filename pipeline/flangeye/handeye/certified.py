@@ -29,6 +29,18 @@ OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing p
 NOT_CERTIFIED = "not certified as globally optimal"
 
 
+class Verdict(NamedTuple):
+    """What is said of an answer.
+
+    Attributes:
+        note: In words.
+        better: (4, 4) of the unknown frames that fit better, as far as such were found.
+    """
+
+    note: str
+    better: Mapping[str, Floats] | None = None
+
+
 class Step(NamedTuple):
     """One frame on a way, or back from it to what it stands on."""
 
@@ -121,24 +133,48 @@ def answer_of(problem: LoopProblem, found: Solution) -> Answer:
     )
 
 
-def certificate_note(answer: Answer) -> str:
-    """Return in words whether the sightings that agree have no better answer than the one found."""
-    seen = _seen_from(answer)
-    if seen is None:
-        return _not_certifiable(answer)
-    places = np.array(list(_turned(answer.places, seen, answer).values()))
-    shown = certify(_sightings(answer, seen), places)
+def verdict_of(answer: Answer) -> Verdict:
+    """Return whether the sightings that agree have no better answer than the one found."""
+    root = _seen_from(answer)
+    if root is None:
+        return Verdict(_not_certifiable(answer))
+    shown = certify(_sightings(answer, root), _array(_turned(answer.places, root, answer)))
     if not shown.optimal:
         share = min(shown.missing / max(shown.cost, 1e-300), 1)
-        return (
+        note = (
             f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may leave squared errors less by "
             "so much"
         )
-    return _far_away(shown, places, answer) or OPTIMAL
+        return Verdict(note, _named(shown.better, root, answer))
+    away = _far_away(shown, root, answer)
+    return Verdict(away, _named(shown.places, root, answer)) if away else Verdict(OPTIMAL)
 
 
-def _far_away(shown: Certificate, places: Floats, answer: Answer) -> str | None:
+def certificate_notes(reported: Answer, corrected: Answer | None) -> tuple[str, ...]:
+    """Return in words whether there are better answers, for the arms as reported and corrected."""
+    note = verdict_of(reported).note
+    if corrected is None:
+        return (note,)
+    return note, f"for the corrected arm: {verdict_of(corrected).note}"
+
+
+def moved_note(share: float) -> str:
+    """Return what is said where the certificate led to an answer with a share of the errors."""
+    return (
+        f"what the search had found was not the best: the certificate led to an answer that leaves "
+        f"{share:.2g} times its squared errors"
+    )
+
+
+def _named(places: Floats | None, root: str, answer: Answer) -> dict[str, Floats] | None:
+    if places is None:
+        return None
+    return _turned(dict(zip(answer.places, places, strict=True)), root, answer)
+
+
+def _far_away(shown: Certificate, root: str, answer: Answer) -> str | None:
     """Return what is said where the bottom of the valley is not the answer."""
+    places = _array(_turned(answer.places, root, answer))
     turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
     away = np.linalg.norm(rotation_log(turns), axis=1)
     known = [np.linalg.eigvalsh(each[:3, :3])[-1] for each in answer.covariances.values()]
@@ -190,6 +226,10 @@ def _turned(places: Mapping[str, Floats], root: str, answer: Answer) -> dict[str
     return {name: invert(place) if name in back else place for name, place in places.items()}
 
 
+def _array(places: Mapping[str, Floats]) -> Floats:
+    return np.array(list(places.values()))
+
+
 # --- the sightings -------------------------------------------------------------------------------
 
 
@@ -210,7 +250,7 @@ def _joined(sides: Sequence[Side]) -> Side:
 def _of_pair(answer: Answer, ends: tuple[str, str], root: str) -> Sightings:
     rows = answer.of_pair(ends)
     camera, target = (_side(answer, way, answer.times[rows]) for way in answer.ways(ends, root))
-    places = np.array(list(_turned(answer.places, root, answer).values()))
+    places = _array(_turned(answer.places, root, answer))
     there, seen = camera.at(places), target.at(places)
     turn = np.kron(np.eye(2), there[:, :3, :3])
     weights = turn @ answer.weights[rows] @ np.swapaxes(turn, 1, 2)

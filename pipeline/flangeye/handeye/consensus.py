@@ -76,6 +76,12 @@ def again(consensus: Consensus, problem: LoopProblem) -> Consensus:
     return replace(consensus, problem=problem, found=agreeing(problem, consensus.found))
 
 
+def begun_at(consensus: Consensus, at: Unknowns) -> Consensus:
+    """Return what the measurements agree on near other values of the unknowns."""
+    problem = consensus.problem
+    return replace(consensus, found=settle(problem, at, _first_noise(problem, at)))
+
+
 def _of_points(problem: LoopProblem, rotation_limit: float) -> Consensus:
     """Return the camera's pose alone, of centres whose places its carrier knows."""
     s = problem.measurements

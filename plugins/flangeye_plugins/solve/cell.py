@@ -35,8 +35,7 @@ class CellParams(Params):
     certify: bool = Field(
         False,
         description="Say whether the answer is certified as globally optimal, by a dual "
-        "certificate, or not; or that it cannot be, as where a sighting leads over five unknown "
-        "places.",
+        "certificate, or not; where that leads to a better answer, that is given.",
     )
     required: Length | None = param(
         None,

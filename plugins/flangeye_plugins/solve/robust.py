@@ -119,7 +119,7 @@ class RobustParams(Params):
     certify: bool = Field(
         False,
         description="Say whether the answer is certified as globally optimal, by a dual "
-        "certificate, or not.",
+        "certificate, or not; where that leads to a better answer, that is given.",
     )
     required: Length | None = param(
         None,
