@@ -6,7 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.errors import StageError
 from flangeye.files.bundled import bundled
+from flangeye.handeye.cell import sighted_of
+from flangeye.handeye.cell_arms import branches_of
+from flangeye.handeye.graph import LIMITS
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
@@ -44,6 +48,17 @@ def test_arms_report_the_joints_that_they_report_the_poses_of(name: str) -> None
         reported = np.array([o.poses[arm].matrix for o in seen])
         assert Arm(cell.arms[arm]).flange(joints) == pytest.approx(reported, abs=1e-9)
     assert {*cell.joints(seen)} == {*cell.arms}
+
+
+def test_arms_may_keep_their_joints_to_themselves() -> None:
+    few = "steps.0.joints=false", "steps.0.sightings=12"
+    cell, seen = session("two-scanners", *few)
+    assert not cell.joints(seen)
+    (arm,) = {len(branches) for branches in branches_of(sighted_of(seen, cell, LIMITS), cell)}
+    assert arm > 1
+    cell, seen = session("forearm-and-wall", *few)
+    with pytest.raises(StageError, match="follows from the joint angles of 'arm', and there are n"):
+        cell.graph(seen)
 
 
 def test_a_link_truly_stands_where_the_arms_errors_put_it() -> None:

@@ -70,6 +70,10 @@ class CellSessionParams(Params):
     facing: Angle = param(
         "50 deg", gt=0, description="Largest angle between a target's z and the view."
     )
+    joints: bool = Field(
+        True,
+        description="Whether the arms report their joint angles; a camera on a link needs them.",
+    )
     robot_rotation: Angle = param(
         "0.01 deg",
         ge=0,
@@ -204,7 +208,7 @@ class Moments:
         cell: What stands on what.
         reported: (N, 4, 4) by what moves.
         actual: All frames with their true places.
-        joints: (N, n) by arm, as reported [rad].
+        joints: (N, n) by arm, as reported [rad]; none where they are not.
         angles: (N, n) by arm, as they are [rad].
     """
 
@@ -277,7 +281,7 @@ def _draw(cell: Cell, params: CellSessionParams, rng: np.random.Generator) -> Mo
         name: replace(frame, place=(still | actual).get(name, frame.place))
         for name, frame in cell.frames.items()
     }
-    joints = {name: drawn[name].joints for name in cell.arms}
+    joints = {name: drawn[name].joints for name in cell.arms if params.joints}
     angles = {name: drawn[name].angles for name in cell.arms}
     return Moments(cell, reported, frames, joints, angles)
 
