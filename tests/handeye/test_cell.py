@@ -9,16 +9,17 @@ import pytest
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.handeye import cell as room
 from flangeye.handeye.cell import _estimate, _note_of_sizes, _notes, _pairs, _require_agreement
+from flangeye.handeye.components import Noise
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.types import Transform
 
 
 def test_half_of_the_sightings_have_to_agree() -> None:
     for agree, count in ((3, 6), (4, 7), (1, 1)):
-        some: Any = SimpleNamespace(inliers=np.arange(count) < agree)
+        some: Any = SimpleNamespace(found=SimpleNamespace(inliers=np.arange(count) < agree))
         _require_agreement(some, count)
     for agree, count in ((2, 5), (3, 7), (0, 1)):
-        some = SimpleNamespace(inliers=np.arange(count) < agree)
+        some = SimpleNamespace(found=SimpleNamespace(inliers=np.arange(count) < agree))
         with pytest.raises(CalibrationRefused, match=f"only {agree} of {count} sightings agree"):
             _require_agreement(some, count)
 
@@ -26,7 +27,7 @@ def test_half_of_the_sightings_have_to_agree() -> None:
 def test_without_a_sighting_nothing_is_solved() -> None:
     nothing: Any = None
     with pytest.raises(StageError, match="no sighting to solve with: every capture was set aside"):
-        room.sighted_of([], nothing, (1.0, 1.0))
+        room.solve_cell([], nothing, (1.0, 1.0))
 
 
 def seen(camera: str, target: str, *centre: float) -> Any:
@@ -60,10 +61,12 @@ def test_sightings_set_aside_are_told_with_their_distance_turn_and_sigma(
     monkeypatch.setattr(room, "mapped_and_expected", lambda *_: (mapped, expected))
     monkeypatch.setattr(room, "_transforms", lambda *_: None)
     turn = np.radians(0.3), 0.0, np.radians(0.4)
-    found: Any = SimpleNamespace(
+    residuals = np.array([np.zeros(6), [*turn, 0.0, 3e-3, 4e-3]])
+    fit = SimpleNamespace(
         inliers=np.array([True, False]), squares=np.array([1.0, 144.0]),
-        residuals=np.array([np.zeros(6), [*turn, 0.0, 3e-3, 4e-3]]),
+        linear=SimpleNamespace(residuals=residuals),
     )  # fmt: skip
+    found: Any = SimpleNamespace(found=fit)
     cell: Any = SimpleNamespace(ends=lambda *_: None)
     first, second = _pairs([seen("left", "plate")] * 2, cell, found)
     assert first.used and first.reason is None
@@ -72,13 +75,16 @@ def test_sightings_set_aside_are_told_with_their_distance_turn_and_sigma(
     assert second.reason == "residual 5.0 mm and 0.5 deg, 12 sigma"
 
 
-def test_who_saw_whom_and_what_moves_is_noted_with_its_noise() -> None:
-    """In the ratio of a typical arm's: 0.05 mm to 0.01 deg."""
+def test_who_saw_whom_and_what_noise_there_is_is_noted() -> None:
+    """What the arms' noise does in the camera, and what is added evenly, per axis."""
     observations = [seen("left", "plate")] * 3 + [seen("right", "plate")]
-    found: Any = SimpleNamespace(movers=9.0)
+    of_arms = np.tile(np.diag([1e-8] * 3 + [4e-8] * 3), (4, 1, 1))
+    noise = Noise(pose=9e-8, tilt=3e-8, arms=4.0)
+    fit = SimpleNamespace(linear=SimpleNamespace(of_arms=of_arms), noise=noise)
+    found: Any = SimpleNamespace(found=fit)
     assert _notes(observations, found, None) == (
         "solved at once: left saw plate 3 times, right saw plate 1 times",
-        "noise of what moves: 0.150 mm and 0.030 deg per axis, as the residuals show it",
+        f"noise beyond the features' own: 0.500 mm and {np.degrees(np.sqrt(7e-8)):.3f} deg per axis",
     )
     sizes: Any = SimpleNamespace(expected=np.array([2.0, 1.0, 1.1, 1.2, 1.3, 1.4]))
     (note,) = _note_of_sizes(sizes)

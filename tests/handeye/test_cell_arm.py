@@ -1,7 +1,6 @@
 """A cell's covariance holds for arms whose joints are not where their controllers say."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 
 from flangeye.files.bundled import bundled
 from flangeye.handeye.arm_sizes import Sizes
-from flangeye.handeye.calibration import TYPICAL_ARM
-from flangeye.handeye.cell import _notes, calibrate_cell, solve_cell
+from flangeye.handeye.cell import _note_of_sizes, calibrate_cell, solve_cell
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import rotation_log
 from flangeye.models.cell import Cell
@@ -109,9 +107,8 @@ def test_both_answers_hold_for_two_arms_as_bad_as_real_ones() -> None:
 
 
 def test_the_size_of_every_kind_of_error_is_told() -> None:
-    found: Any = SimpleNamespace(movers=1.0)
     sizes = Sizes(np.ones(1), np.array([[5.0, 1.0, 2.0, 3.0, 4.0, 6.0]]), np.ones(1))
-    told = _notes([], found, sizes)[-1]
+    (told,) = _note_of_sizes(sizes)
     assert "counts joint zeros 5.0 times as large as the robots' files say" in told
     assert "encoders 1.0, sag 2.0, lengths 3.0, twists 4.0" in told
     assert "what is smooth over the workspace 6.0 times" in told
@@ -134,10 +131,3 @@ def test_the_covariance_holds_for_an_arm_far_worse_than_its_file_says() -> None:
     assert bare.mean() > 100
     assert 3 < considered.mean() < 10
     assert (considered < 12.6).mean() >= 0.8
-
-
-def test_the_noise_of_what_moves_is_told_in_millimetres_and_degrees() -> None:
-    found: Any = SimpleNamespace(movers=4.0)  # twice what is typical
-    _, note = _notes([], found, None)
-    shift, turn = 2e3 * TYPICAL_ARM.translation, 2.0 * np.degrees(TYPICAL_ARM.rotation)
-    assert f"{shift:.3f} mm and {turn:.3f} deg per axis" in note

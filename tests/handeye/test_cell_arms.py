@@ -1,104 +1,120 @@
-"""What a cell's sightings say of its arms' zeros: against least squares with all unknowns in it."""
+"""The zeros of a cell's arms: found about those before, on the likeliest branch, and told."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flangeye.handeye import cell_arms as rooms
-from flangeye.handeye.cell_arms import CorrectedArms, Linear, _explained, _known, _stepped, _told
-from flangeye.maths.statistics import covariance_inflation
+from flangeye.handeye import cell_arms as room
+from flangeye.handeye.bent import KINDS, Bent, BentArm
+from flangeye.handeye.cell_arms import CorrectedArms, _corrected, _kinds, _seen, _told
+from flangeye.handeye.graph import Solved, problem_of, solve_graph
+from flangeye.handeye.likelihood import agreeing
+from flangeye.maths.frame_graph import Frame
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from tests.handeye.test_graph import (
+    CELLS,
+    COVARIANCE,
+    HOME,
+    N,
+    error,
+    seen,
+    unknown_in,
+)
 
-N, P, K = 12, 6, 5
-RNG = np.random.default_rng(0)
-ROWS, ZEROS = RNG.normal(size=(N, 6, P)), RNG.normal(size=(N, 6, K))
-LEFT, KEPT = RNG.normal(size=(N, 6)), np.arange(N) != 4
-WHITENERS = RNG.uniform(0.5, 2.0, (N, 1, 1)) * np.eye(6)
-OFF = RNG.normal(size=(N, 6, 3))
-TWO = [SimpleNamespace(others=[np.eye(6)[:, :2]]), SimpleNamespace(others=[np.eye(6)[:, 3:4]])]
-MOVES: Any = [(TWO[0], RNG.normal(size=(N, 6, 6))), (TWO[1], RNG.normal(size=(N, 6, 6)))]
-LINEAR = Linear(LEFT, ROWS, ZEROS, MOVES, WHITENERS, KEPT, 66.0)
-
-
-def system(size: float, so_far: Any) -> Any:
-    """Return rows and sides of all unknowns and zeros, these expected to be none of a size."""
-    both = np.concatenate([ROWS, ZEROS], axis=2)
-    rows = (WHITENERS @ both)[KEPT].reshape(-1, P + K)
-    left = (WHITENERS @ LEFT[..., None])[KEPT].ravel()
-    known = np.concatenate([np.zeros((K, P)), np.eye(K) / size], axis=1)
-    return np.vstack([rows, known]), np.append(left, so_far / size)
-
-
-def test_zeros_of_a_size_are_told_beside_the_unknowns() -> None:
-    rows, left = system(0.7, np.zeros(K))
-    assert LINEAR.information(0.7) == pytest.approx(rows.T @ rows)
-    best, *_ = np.linalg.lstsq(rows, left, rcond=None)
-    explained = left @ left - ((left - rows @ best) ** 2).sum()
-    assert _explained(LINEAR, 0.7) == pytest.approx(explained)
-    fit = LINEAR.fit(0.7)
-    assert fit.covariance == pytest.approx(np.linalg.inv(rows.T @ rows))
-    assert fit.weights == pytest.approx(WHITENERS**2) and fit.inliers is KEPT
-    assert fit.jacobian.shape == (N, 6, P + K)
+UR5 = Arm(load_model("robots", "ur5"))
+OFF = np.array([0.0, 1.5e-3, -2e-3, 1e-3, 2e-3, -1e-3])
+"""Zeros [rad]; the first joint's is the base's."""
 
 
-def test_a_step_of_the_offsets_is_that_of_least_squares_with_what_was_corrected() -> None:
-    """In units of each arm's deviation; the first joint's zero is the base's."""
-    size, moved = 0.7, []
-
-    class Bent(SimpleNamespace):
-        def moved(self, by: Any) -> Any:
-            moved.append(by)
-            return self
-
-    arms: Any = [Bent(offsets=np.array([9.0, 2e-4, -4e-4]), deviation=2e-4, twists=np.zeros((N, 6, 2))),
-                 Bent(offsets=np.array([9.0, 3e-4, 0, 6e-4]), deviation=3e-4, twists=np.zeros((N, 6, 3)))]  # fmt: skip
-    rows, left = system(size, np.array([1.0, -2.0, 1.0, 0.0, 2.0]))
-    step = -np.linalg.lstsq(rows, left, rcond=None)[0][P:]
-    assert _stepped(LINEAR, arms, size) == arms
-    assert moved[0] == pytest.approx(step[:2]) and moved[1] == pytest.approx(step[2:])
+def a_cell(offsets: Any, names: tuple[str, ...] = ("flange",)) -> tuple[Solved, list[BentArm], Any]:
+    """Return two scanners' answer for an arm as reported, the arm, and where all truly is."""
+    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
+    joints = HOME + np.random.default_rng(1).uniform(-0.5, 0.5, (N, 6))
+    actual = {**frames, "flange": Frame("base", UR5.flange(joints + offsets))}
+    given, _ = unknown_in({**frames, "flange": Frame("base", UR5.flange(joints))}, unknown)
+    sightings = seen(actual, pairs, np.random.default_rng(0), 0.2)
+    found = solve_graph(given, sightings, dict.fromkeys(names, COVARIANCE))
+    return found, [BentArm([Bent("flange", UR5, joints, 3e-4, np.zeros(6))])], actual
 
 
-def test_unknowns_follow_errors_as_fits_to_them_would() -> None:
-    rows, _ = system(0.7, np.zeros(K))
-    errors = (WHITENERS @ OFF)[KEPT].reshape(-1, 3)
-    errors = np.vstack([errors, np.zeros((K, 3))])
-    moved = np.linalg.lstsq(rows, errors, rcond=None)[0][:P]
-    found = LINEAR.following(np.linalg.inv(rows.T @ rows), OFF)
-    assert found == pytest.approx(moved @ moved.T)
-    alone = rows[:-K, :P]
-    moved = np.linalg.lstsq(alone, errors[:-K], rcond=None)[0]
-    assert LINEAR.following(np.linalg.inv(alone.T @ alone), OFF) == pytest.approx(moved @ moved.T)
-    (others,) = LINEAR.others
-    assert others == pytest.approx(
-        np.concatenate([MOVES[0][1][:, :, :2], MOVES[1][1][:, :, 3:4]], 2)
+def test_zeros_are_found_with_the_unknowns_and_mend_these() -> None:
+    found, arms, actual = a_cell(OFF)
+    corrected = _corrected(found, arms, 10.0)
+    (arm,) = corrected.arms
+    # The last joint turns the marker about its own axis: hardly told from where the marker is.
+    assert arm.offsets[1:5] == pytest.approx(OFF[1:5], abs=4e-4)
+    for name in ("left", "right"):
+        before, after = (
+            np.linalg.norm(error(x.places[name], actual[name].place)[3:])
+            for x in (found, corrected.found)
+        )
+        assert after < 0.5 * before
+    assert corrected.found.problem.frames["flange"].place == pytest.approx(
+        UR5.flange(arms[0].joints + OFF), abs=3e-3
     )
 
 
-def test_the_covariance_beside_zeros_is_as_wide_as_the_residuals_say() -> None:
-    given: list[Any] = []
+def test_each_step_is_about_the_zeros_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left of them is expected to take them back: less offsets in all, and no drift."""
+    found, arms, _ = a_cell(OFF)
+    expected: list[Any] = []
 
-    def mixed(kinds: Any, scales: Any) -> Any:
-        given.append((kinds, scales))
-        return "joint"
+    def watched(problem: Any, fit: Any) -> Any:
+        expected.append(problem.nuisance.mean)
+        return agreeing(problem, fit)
 
-    sizes: Any = SimpleNamespace(
-        expected=np.array([0.7, 9.0]), weights=np.full(4, 0.25), mixed=mixed
-    )
-    found: Any = SimpleNamespace(with_joint=lambda joint: joint)
-    rows, left = system(0.7, np.zeros(K))
-    covariance = np.linalg.inv(rows.T @ rows)
-    for times in (1.0, 0.01):
-        linear = Linear(times * LEFT, ROWS, ZEROS, MOVES, WHITENERS, KEPT, 66.0)
-        known: Any = _known(found, linear, sizes)
-        assert known == "joint"
-        taken = K - np.trace(covariance[P:, P:]) / 0.49
-        freedom = 66 - P - taken
-        scale = max(times**2 * (left[:-K] ** 2).sum() / freedom, 1.0)
-        (own, off), scales = given.pop()
-        assert own == pytest.approx(scale * covariance_inflation(freedom, 6) * covariance[:P, :P])
-        assert off == pytest.approx(linear.following(covariance, linear.others[0]))
-        assert scales.tolist() == [1.0] * 4
+    monkeypatch.setattr(room, "agreeing", watched)
+    corrected = _corrected(found, arms, 10.0)
+    assert len(expected) == 3 and not expected[0].any()
+    assert expected[2] * 3e-4 == pytest.approx(-corrected.arms[0].offsets[1:], abs=2e-5)
+
+
+def test_errors_of_each_kind_move_what_is_seen_as_a_bent_arm_does() -> None:
+    found, (arm,), _ = a_cell(0 * OFF)
+    problem, fit = found.problem, found.found
+    kinds = _kinds(problem, fit, [arm])
+    assert len(kinds) == 1 + len(KINDS)
+    assert all((kind.prior == 1.0).all() for kind in kinds)
+    step = np.array([0.0, 0, 1, 0, 0])
+    bent = {
+        **problem.frames,
+        "flange": replace(problem.frames["flange"], place=arm.moved(step).poses["flange"]),
+    }
+    before, after = (replace(problem, frames=f).linearised(fit.at).residuals
+                     for f in (problem.frames, bent))  # fmt: skip
+    assert before - after == pytest.approx(kinds[0].seen @ step, abs=2e-6)
+
+
+def test_errors_of_two_arms_are_apart() -> None:
+    frames, unknown, pairs = CELLS["two arms with a scanner each and one between"]
+    given, at = unknown_in(frames, unknown)
+    problem = problem_of(given, seen(frames, pairs, np.random.default_rng(0)))
+    arms: Any = [SimpleNamespace(poses={name: None}) for name in ("flange", "flange2")]
+    twists = [np.ones((N, 6, k)) for k in (2, 3)]
+    fit: Any = SimpleNamespace(at=at)
+    both = _seen(problem, fit, arms, twists)
+    alone = [_seen(problem, fit, [arm], [twist]) for arm, twist in zip(arms, twists, strict=True)]
+    assert both.seen == pytest.approx(np.concatenate([x.seen for x in alone], axis=2))
+
+
+def chosen_by(gains: dict[str, float], branches: list[list[str]], monkeypatch: Any) -> Any:
+    """Return the branches that are taken where each explains so much, by itself."""
+    monkeypatch.setattr(room, "_gain", lambda found, arms: sum(gains[arm] for arm in arms))
+    given: Any = branches
+    nothing: Any = None
+    return room.likeliest(nothing, given)
+
+
+def test_each_arm_is_taken_on_the_likeliest_branch(monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = {"up": 1.0, "down": 5.0, "left": 3.0, "right": 2.0, "back": 4.0, "only": 0.0}
+    branches = [["up", "down"], ["only"], ["left", "right", "back"]]
+    assert chosen_by(gains, branches, monkeypatch) == ["down", "only", "back"]
+    gains["down"], gains["back"] = 0.5, 1.0
+    assert chosen_by(gains, branches, monkeypatch) == ["up", "only", "left"]
 
 
 def test_offsets_are_told_in_milliradians() -> None:
@@ -112,53 +128,3 @@ def test_offsets_are_told_in_milliradians() -> None:
     corrections = CorrectedArms(nothing, arms).corrections
     assert corrections["right"].tool_offset.tolist() == [0.0] * 3
     assert corrections["right"].joint_offsets is arms[1].offsets
-
-
-def chosen_by(
-    explains: dict[str, float], branches: list[list[str]], monkeypatch: pytest.MonkeyPatch
-) -> Any:
-    """Return the branches that are taken where each explains so much, by itself."""
-    sizes = SimpleNamespace(expected=np.array([3.0, 9.0]))
-    monkeypatch.setattr(rooms, "_sizes", lambda linear, zeros_alone: sizes)
-
-    def explained(linear: Any, size: float) -> float:
-        assert size == 3.0
-        return sum(explains[arm] for arm in linear)
-
-    monkeypatch.setattr(rooms, "_explained", explained)
-    sighted: Any = SimpleNamespace(linear=lambda found, arms: arms)
-    given: Any = branches
-    return rooms.likeliest(sighted, sighted, given)
-
-
-def test_each_arm_is_taken_on_the_branch_that_explains_most(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    explains = {"up": 1.0, "down": 5.0, "left": 3.0, "right": 2.0, "back": 4.0, "only": 0.0}
-    branches = [["up", "down"], ["only"], ["left", "right", "back"]]
-    assert chosen_by(explains, branches, monkeypatch) == ["down", "only", "back"]
-    explains["down"], explains["back"] = 0.5, 1.0
-    assert chosen_by(explains, branches, monkeypatch) == ["up", "only", "left"]
-
-
-def test_zeros_are_found_in_three_steps_each_about_those_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    class Seen(SimpleNamespace):
-        def linear(self, found: Any, arms: Any) -> Any:
-            return self.offset, found, arms
-
-        def with_arms(self, arms: Any) -> Any:
-            return Seen(offset=arms)
-
-        def solved(self, start: Any) -> Any:
-            return SimpleNamespace(places=(start, self.offset))
-
-    monkeypatch.setattr(rooms, "_stepped", lambda linear, arms, size: arms + size)
-    sighted: Any = Seen(offset=0)
-    begun: Any = 0
-    reported: Any = SimpleNamespace(places="as reported")
-    answer: Any = rooms._corrected(reported, sighted, begun, 2.0)
-    found, linear, arms = answer
-    assert arms == 6.0 and found.places == ((("as reported", 2.0), 4.0), 6.0)
-    assert linear == (6.0, found, 6.0)

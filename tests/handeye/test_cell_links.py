@@ -8,7 +8,7 @@ import pytest
 
 from flangeye.files.bundled import bundled
 from flangeye.handeye.bent import Bent, BentArm
-from flangeye.handeye.cell import calibrate_cell, sighted_of
+from flangeye.handeye.cell import calibrate_cell, solve_cell
 from flangeye.handeye.cell_arms import branches_of
 from flangeye.handeye.graph import LIMITS
 from flangeye.log.read import read_run
@@ -116,12 +116,12 @@ def test_zeros_move_the_flange_and_the_link_together() -> None:
 
 def test_recorded_joints_are_the_branch_and_move_the_links() -> None:
     cell, seen, _ = session("steps.0.sightings=12")
-    sighted = sighted_of(seen, cell, LIMITS)
-    ((arm,),) = branches_of(sighted, cell)
+    problem = solve_cell(seen, cell, LIMITS).problem
+    ((arm,),) = branches_of(problem, cell, cell.joints(seen))
     assert arm.joints == pytest.approx(np.array([o.arm_joints["arm"] for o in seen]))
     assert [part.name for part in arm.parts] == ["arm", "arm_link3"]
     for name, places in arm.poses.items():
-        assert places == pytest.approx(np.asarray(sighted.frames[name].place), abs=1e-9)
+        assert places == pytest.approx(np.asarray(problem.frames[name].place), abs=1e-9)
 
 
 def test_a_corrected_arm_has_its_links_where_its_joints_then_are() -> None:

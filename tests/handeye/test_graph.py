@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,22 +10,22 @@ import pytest
 
 from flangeye import CalibrationRefused, StageError
 from flangeye.handeye import graph as room
-from flangeye.handeye.graph import (
-    GATE,
-    SIZES,
-    Sighting,
-    _first_below,
-    _Graph,
-    information_of,
-    linear_of,
-    rows_of,
-    solve_graph,
-)
+from flangeye.handeye.calibration import TYPICAL_ARM
+from flangeye.handeye.components import Noise
+from flangeye.handeye.estimates import noise_beyond
+from flangeye.handeye.graph import Sighting, problem_of, roots_of, solve_graph
+from flangeye.handeye.likelihood import agreeing, first_noise, settle, weigh
+from flangeye.handeye.loop import LoopProblem
+from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.nuisance import nuisance_seen
+from flangeye.handeye.starts import start_of
+from flangeye.handeye.unknowns import Unknowns, weights_of
 from flangeye.maths.frame_graph import Frame, chain
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.statistics import chi2_quantile, covariance_inflation
+from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.loading import load_model
+from tests.handeye.cells import CONFIGURATIONS, session
 
 UR5 = Arm(load_model("robots", "ur5"))
 HOME = np.radians([0, -90, 90, -90, -90, 0])
@@ -141,7 +142,9 @@ def test_every_unknown_of_a_cell_is_found_with_its_covariance(name: str) -> None
         distance = off @ np.linalg.solve(found.covariances[each], off)
         assert distance < 22.5  # 99.9 % of chi-squared with six degrees of freedom
         assert np.linalg.norm(off[3:]) < 2e-3
-    assert np.sqrt((found.residuals[:, 3:] ** 2).mean()) == pytest.approx(SHIFT, rel=0.35)
+    assert np.sqrt((found.found.linear.residuals[:, 3:] ** 2).mean()) == pytest.approx(
+        SHIFT, rel=0.35
+    )
 
 
 def test_without_noise_it_is_exact() -> None:
@@ -291,8 +294,8 @@ def test_wrong_sightings_of_every_pair_are_set_aside() -> None:
     for i in wrong:
         sightings[i] = replace(sightings[i], pose=pose(0.3, 0, 0, 0.1, 0, 0) @ sightings[i].pose)
     found = solve_graph(given, sightings, arm_noise(frames))
-    assert set(wrong) <= set(np.flatnonzero(~found.inliers))
-    assert found.inliers.sum() >= len(sightings) - len(wrong) - 1
+    assert set(wrong) <= set(np.flatnonzero(~found.found.inliers))
+    assert found.found.inliers.sum() >= len(sightings) - len(wrong) - 1
     for each in unknown:
         assert np.linalg.norm(error(found.places[each], frames[each].place)[3:]) < 1e-3
 
@@ -307,7 +310,8 @@ def test_the_noise_of_what_moves_is_found_from_the_residuals() -> None:
     given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
     noise = {"flange": np.diag([1e-6**2] * 3 + [5e-5**2] * 3)}
     found = solve_graph(given, sightings, noise)
-    assert 5e-5 * np.sqrt(found.movers) == pytest.approx(5e-4, rel=0.35)
+    shift, _ = noise_beyond(found.found)
+    assert shift == pytest.approx(0.5, rel=0.35)
 
 
 def test_circles_on_the_flange_itself_tie_two_scanners() -> None:
@@ -352,6 +356,14 @@ def moved(frames, name, step):
 
 CELL: Any = CELLS["two arms with a scanner each and one between"]
 WORLD, SEEN = CELL[0], CELL[2]
+NOWHERE = Unknowns(np.zeros((0, 4, 4)))
+
+
+def unknown_in(frames, names):
+    """The frames as they are given, and the unknown ones' places."""
+    given = {n: Frame(f.parent) if n in names else f for n, f in frames.items()}
+    places = [frames[n].place for n in frames if n in names]
+    return given, Unknowns(np.array(places).reshape(-1, 4, 4))
 
 
 def test_what_is_predicted_moves_with_every_frame_as_differences_say() -> None:
@@ -360,123 +372,92 @@ def test_what_is_predicted_moves_with_every_frame_as_differences_say() -> None:
     for s in sightings[1::2]:
         assert np.trace(s.projector) == pytest.approx(5.0)
     names, step = list(WORLD), 1e-6
-    residuals, jacobian, _ = linear_of(WORLD, sightings, {}, {}, moved=names)
-    assert np.abs(residuals).max() < 4 * TURN
+    errors, effects = problem_of(WORLD, sightings).effects(NOWHERE, names)
+    assert np.abs(errors).max() < 4 * TURN
     for k in range(6 * len(names)):
         by = step * np.eye(6)[k % 6]
-        after = linear_of(moved(WORLD, names[k // 6], by), sightings, {}, {}, moved=[])[0]
-        assert (after - residuals) / step == pytest.approx(jacobian[:, :, k], abs=2e-3)
+        world = moved(WORLD, names[k // 6], by)
+        after, _ = problem_of(world, sightings).effects(NOWHERE, [])
+        assert (errors - after) / step == pytest.approx(effects[:, :, k], abs=2e-3)
+
+
+def test_it_is_linear_in_the_unknowns_and_in_what_is_common_to_all() -> None:
+    """As those of one camera's loop: in the same order, the tilt's columns left out."""
+    sightings = circled(seen(WORLD, SEEN, np.random.default_rng(2)))
+    given, at = unknown_in(WORLD, ["hand", "base2", "plate2"])
+    common = nuisance_seen(np.random.default_rng(3).normal(size=(len(sightings), 6, 2)), 1.0)
+    problem = problem_of(given, sightings, {"flange": COVARIANCE}).beside(common)
+    at = replace(at, nuisance=np.array([1e-4, -2e-4]))
+    linear = problem.linearised(at)
+    basis = problem.free(at)
+    assert linear.jacobian.shape == (len(sightings), 6, 22) and basis.shape == (22, 20)
+    for step in 1e-6 * basis.T:
+        after = problem.linearised(at.moved(step)).residuals
+        assert (linear.residuals - after) * 1e6 == pytest.approx(
+            linear.jacobian @ step * 1e6, abs=2e-3
+        )
 
 
 def test_what_carries_both_ends_adds_to_the_sightings_covariance() -> None:
     sightings = circled(seen(WORLD, SEEN, np.random.default_rng(2)))
     noise = {"flange": np.diag([1e-4**2] * 3 + [5e-5**2] * 3), "flange2": 4 * COVARIANCE}
-    places = {name: WORLD[name].place for name in ("hand", "plate2")}
-    residuals, jacobian, whiteners = linear_of(WORLD, sightings, places, noise)
-    effects = linear_of(WORLD, sightings, {}, {}, moved=list(noise))[1]
-    assert jacobian.shape == (len(sightings), 6, 12)
-    for s, effect, whitener in zip(sightings, effects, whiteners, strict=True):
+    given, at = unknown_in(WORLD, ["hand", "plate2"])
+    problem = problem_of(given, sightings, noise)
+    linear = problem.linearised(at)
+    roots = roots_of(weights_of(problem.measurements, linear, Noise(0.0, 0.0)))
+    _, effects = problem.effects(at, list(noise))
+    for s, effect, root in zip(sightings, effects, roots, strict=True):
         spread = s.projector @ COVARIANCE @ s.projector
         for covariance, moves in zip(noise.values(), np.split(effect, 2, axis=1), strict=True):
             spread = spread + moves @ covariance @ moves.T
-        assert whitener @ spread @ whitener.T == pytest.approx(s.projector, abs=1e-9)
-    rows, errors = rows_of(WORLD, sightings, places, noise)
-    assert rows == pytest.approx(whiteners @ jacobian)
-    assert errors == pytest.approx((whiteners @ residuals[..., None])[..., 0])
-    assert information_of(rows) == pytest.approx(rows.reshape(-1, 12).T @ rows.reshape(-1, 12))
+        assert root @ spread @ root.T == pytest.approx(s.projector, abs=1e-4)
 
 
 def test_a_solution_is_the_least_of_its_errors_with_the_covariance_of_that() -> None:
+    """Where the sightings' own covariances are all the noise there is."""
     name = "a scanner in the hand and one on the wall that never see the same thing"
     cell: Any = CELLS[name]
     frames, unknown, pairs = cell
-    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    given, _ = unknown_in(frames, unknown)
     sightings = seen(frames, pairs, np.random.default_rng(4))
     found = solve_graph(given, sightings)
-    rows, errors = rows_of(given, sightings, found.places, {})
-    information = information_of(rows)
+    rows, errors = found.told_by(given, sightings)
+    information = np.einsum("nij,nik->jk", rows, rows)
     slope = np.einsum("nij,ni->j", rows, errors)
     assert slope @ np.linalg.solve(information, slope) < 1e-9
-    wider = covariance_inflation(6 * len(sightings) - 24, 6)
-    assert found.joint == pytest.approx(np.linalg.inv(information) * wider, rel=1e-6)
+    assert found.joint == pytest.approx(np.linalg.inv(information), rel=1e-5)
     for k, each in enumerate(unknown):
         block = found.joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
         np.testing.assert_array_equal(found.covariances[each], block)
         np.testing.assert_array_equal(
             found.with_joint(2 * found.joint).covariances[each], 2 * block
         )
-    assert found.squares == pytest.approx((errors**2).sum(axis=1))
-    assert found.inliers.all() and found.movers == 1.0
+    assert found.found.inliers.all()
     begun = solve_graph(given, sightings, start={n: frames[n].place for n in unknown})
     for each in unknown:
-        assert begun.places[each] == pytest.approx(found.places[each], abs=1e-8)
-
-
-def test_the_size_of_noise_is_where_half_of_each_pair_then_all_within_the_gate_are_explained() -> (
-    None
-):
-    frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
-    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
-    sightings = [replace(s, covariance=1e-6 * COVARIANCE)
-                 for s in seen(frames, pairs, np.random.default_rng(4))]  # fmt: skip
-    graph = _Graph.of(given, sightings)
-    rng, carried = np.random.default_rng(1), np.tile(COVARIANCE, (2 * N, 1, 1))
-    residuals = 3 * rng.normal(size=(2 * N, 6)) * np.repeat([TURN, SHIFT], 3)
-    residuals[[3, 8]] *= 20
-    size, kept, whiteners = room._weighed(graph, residuals, carried)
-    assert np.flatnonzero(~kept).tolist() == [3, 8]
-    squares = (residuals**2 / np.diag(COVARIANCE)).sum(axis=1)
-    exact = squares[kept].sum() / (6 * kept.sum() - 18)
-    assert exact < size < exact * SIZES[1] / SIZES[0]
-    assert whiteners == pytest.approx(
-        np.tile(np.diag(1 / np.sqrt(np.diag((size + 1e-6) * COVARIANCE))), (2 * N, 1, 1))
-    )
-    edge = np.sqrt(chi2_quantile(GATE, 6) * size) * SHIFT
-    for off, inside in ((0.97, True), (1.03, False)):
-        residuals[5] = [0, 0, 0, off * edge, 0, 0]
-        assert room._weighed(graph, residuals, carried)[1][5] == inside
-    squares[5] = 1e6
-    middles = room._middles(graph, squares)
-    assert middles[[0, 1]] == pytest.approx([np.median(squares[::2]), np.median(squares[1::2])])
-
-
-def test_the_first_of_the_sizes_below_a_level_is_taken() -> None:
-    assert _first_below(lambda size: 1.0 / size, 1.0 / SIZES[60]) == SIZES[60]
-    assert _first_below(lambda size: 1.0 / size, 0.999 / SIZES[60]) == SIZES[61]
-    assert _first_below(lambda size: 0.0, 1.0) == SIZES[0] == pytest.approx(1e-3)
-    assert _first_below(lambda size: 2.0, 1.0) == SIZES[-1] == pytest.approx(1e4)
+        assert begun.places[each] == pytest.approx(found.places[each], abs=1e-7)
 
 
 def test_what_would_be_seen_again_is_what_is_told_with_it_moved_either_way() -> None:
     """By 20 deg, or by 0.1 m; errors alike in all directions turn with what is seen."""
     names = ["base2", "hand", "hand2", "between", "plate", "plate2"]
-    even = np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
-    sightings = [
-        replace(s, covariance=even) for s in seen(WORLD, SEEN, np.random.default_rng(0), 0.0)
-    ]
-    given = {n: Frame(f.parent) if n in names else f for n, f in WORLD.items()}
-    graph, places = _Graph.of(given, sightings), {n: WORLD[n].place for n in names}
-    told = graph.seen_again(places, linear_of(given, sightings, places, {})[2])
-    assert len(told) == 12
-    for name, twist in (("flange", np.eye(6)[1]), ("flange2", np.eye(6)[3])):
-        wanted = np.zeros((36, 36))
-        for sign in (1.0, -1.0):
-            step = sign * twist * np.repeat([np.radians(20), 0.1], 3)
-            rows, _ = rows_of(moved(given, name, step), sightings, places, {})
-            wanted = wanted + information_of(rows)
-        assert told[name, tuple(twist)] == pytest.approx(wanted, rel=1e-6, abs=1.0)
-    circles = circled(seen(WORLD, SEEN, np.random.default_rng(0), 0.0))
-    graph = _Graph.of(given, circles)
-    told = graph.seen_again(places, linear_of(given, circles, places, {})[2])
-    step = np.array([0, np.radians(20), 0, 0, 0, 0])
-    wanted = np.zeros((36, 36))
-    for sign in (1.0, -1.0):
-        frames = moved(WORLD, "flange", sign * step)
-        again = circled(seen(frames, SEEN, np.random.default_rng(0), 0.0))
-        wanted = wanted + information_of(
-            rows_of(moved(given, "flange", sign * step), again, places, {})[0]
-        )
-    assert told["flange", (0, 1, 0, 0, 0, 0)] == pytest.approx(wanted, rel=1e-6, abs=1.0)
+    given, at = unknown_in(WORLD, names)
+    for kind in (list, circled):
+        problem = problem_of(given, kind(seen(WORLD, SEEN, np.random.default_rng(0), 0.0)))
+        found = weigh(problem, at, Noise(0.0, 0.0), np.ones(len(problem.measurements)))
+        told = room._seen_again(problem, found, None)
+        assert len(told) == 12
+        for name, twist in (("flange", np.eye(6)[1]), ("flange2", np.eye(6)[3])):
+            wanted = np.zeros((36, 36))
+            for sign in (1.0, -1.0):
+                step = sign * twist * np.repeat([np.radians(20), 0.1], 3)
+                world = moved(WORLD, name, step)
+                again = kind(seen(world, SEEN, np.random.default_rng(0), 0.0))
+                there = problem_of(unknown_in(world, names)[0], again)
+                every = np.ones(len(again))
+                wanted = wanted + weigh(there, at, Noise(0.0, 0.0), every).information
+            scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+            assert told[name, tuple(twist)] / scale == pytest.approx(wanted / scale, abs=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -494,65 +475,64 @@ def test_of_many_descents_two_that_agree_on_the_lowest_end_the_search(
 ) -> None:
     """Of sixty at most, each of rotations first."""
     frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
-    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
-    graph = _Graph.of(given, seen(frames, pairs, np.random.default_rng(4)))
-    whiteners, asked = np.tile(np.eye(6), (2 * N, 1, 1)), list[Any]()
+    given, _ = unknown_in(frames, unknown)
+    problem, asked = problem_of(given, seen(frames, pairs, np.random.default_rng(4))), list[Any]()
 
-    def descend(graph: Any, places: Any, whiteners: Any, robust: bool = False) -> Any:
-        asked.append((whiteners, robust))
-        return {"after": len(asked)}
+    def descended(problem: Any, start: Any) -> Any:
+        asked.append(problem)
+        count = len(asked) // 2 - 1
+        return SimpleNamespace(at=count, squares=np.full(2 * N, costs[count] / (2 * N)))
 
-    monkeypatch.setattr(room, "_descend", descend)
-    monkeypatch.setattr(_Graph, "residuals", lambda self, places: places["after"] // 2 - 1)
-    monkeypatch.setattr(room, "_squares", lambda whiteners, k: np.full(2 * N, costs[k] / (2 * N)))
-    found: Any = room._best(graph, whiteners)
-    assert len(asked) == 2 * descents and found["after"] == 2 * (taken + 1)
-    assert all(robust for _, robust in asked)
-    assert asked[0][0][0] == pytest.approx(np.diag([1.0, 1, 1, 0, 0, 0]))
-    assert asked[1][0] is whiteners
+    monkeypatch.setattr(room, "_descended", descended)
+    found: Any = room._anywhere(problem)
+    assert len(asked) == 2 * descents and found == taken
+    turned = asked[0].measurements.projectors[0]
+    assert turned == pytest.approx(np.diag([1.0, 1, 1, 0, 0, 0]))
+    assert asked[1] is problem
 
 
-@pytest.mark.parametrize("robust", [False, True])
-def test_a_descent_never_rises_and_ends_within_few_steps(
-    robust: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From half a radian and 0.2 m away; what it counts as far off is told by each pair's middle."""
+def test_a_descent_ends_within_few_steps_from_half_a_radian_away() -> None:
     frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
-    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
-    graph = _Graph.of(given, seen(frames, pairs, np.random.default_rng(4)))
-    whiteners = room._whiteners(graph.covariances, graph.projectors)
-    rng, looked = np.random.default_rng(5), list[Any]()
-    away = {n: moved(frames, n, np.concatenate([rng.normal(0, 0.3, 3), rng.normal(0, 0.2, 3)]))[n].place
-            for n in unknown}  # fmt: skip
-    linearised = _Graph.linearised
-
-    def watched(self: Any, places: Any, moved: Any = None) -> Any:
-        looked.append(dict(places))
-        return linearised(self, places, moved)
-
-    with monkeypatch.context() as watching:
-        watching.setattr(_Graph, "linearised", watched)
-        found = room._descend(graph, away, whiteners, robust)
-    assert len(looked) <= 20
-    if not robust:
-        costs = [room._squares(whiteners, graph.residuals(p)).sum() for p in looked]
-        assert (np.diff(costs) <= 0).all()
-        for each in unknown:
-            assert np.abs(error(found[each], frames[each].place)).max() < 2e-3
+    given, at = unknown_in(frames, unknown)
+    problem = problem_of(given, seen(frames, pairs, np.random.default_rng(4)))
+    away = np.random.default_rng(5).normal(0, np.tile([0.3] * 3 + [0.2] * 3, 3))
+    found = room._descended(problem, at.moved(np.append(away, [0.0, 0.0])))
+    for each, place in zip(unknown, found.at.places, strict=True):
+        assert np.abs(error(place, frames[each].place)).max() < 2e-3
 
 
 def test_a_sighting_counts_less_the_further_it_is_beyond_most_of_its_pair() -> None:
-    """One of each pair is far off: the answer is nearly that of the others alone."""
+    """One of each pair is far off: the answer is that of the others alone."""
     frames, unknown, pairs = CELLS["two fixed scanners and one arm"]
-    given = {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()}
+    given, at = unknown_in(frames, unknown)
     sightings = seen(frames, pairs, np.random.default_rng(4))
     wrong = [replace(s, pose=pose(0.4, 0, 0, 0.1, 0.2, 0) @ s.pose) if i in (3, 8) else s
              for i, s in enumerate(sightings)]  # fmt: skip
-    exact: Any = {n: frames[n].place for n in unknown}
-    graph = _Graph.of(given, wrong)
-    own = room._whiteners(graph.covariances, graph.projectors)
-    found = room._descend(graph, exact, own, robust=True)
-    good = _Graph.of(given, [s for i, s in enumerate(sightings) if i not in (3, 8)])
-    alone = room._descend(good, exact, room._whiteners(good.covariances, good.projectors))
-    for each in unknown:
-        assert np.abs(error(found[each], alone[each])).max() < 1e-3
+    found = room._descended(problem_of(given, wrong), at)
+    good = [s for i, s in enumerate(sightings) if i not in (3, 8)]
+    alone = room._descended(problem_of(given, good), at)
+    for ours, theirs in zip(found.at.places, alone.at.places, strict=True):
+        assert np.abs(error(ours, theirs)).max() < 1e-3
+    middles = room._middles(problem_of(given, sightings), np.arange(2.0 * N))
+    assert middles[:2] == pytest.approx([np.median(np.arange(0, 2 * N, 2)),
+                                         np.median(np.arange(1, 2 * N, 2))])  # fmt: skip
+
+
+def test_one_camera_is_solved_as_its_loop_is() -> None:
+    """The same likelihood of the same sightings: a loop A X M = Y B Z is a graph."""
+    made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), 15)
+    loop = loop_of(made.configuration)
+    measured = measurements_of(made.observations, made.configuration, None)
+    problem = LoopProblem(measurements=measured, loop=loop, arms=TYPICAL_ARM)
+    start = start_of(measured, loop, np.random.default_rng(0))
+    whole = settle(problem, start, first_noise(problem, start))
+    whole = agreeing(replace(problem, in_depth=True), whole)
+    frames = {"hand": Frame("base", measured.a), "camera": Frame("hand"), "mark": Frame("base")}
+    sightings = [Sighting(i, "camera", "mark", measured.poses[i], measured.covariances[i])
+                 for i in range(15)]  # fmt: skip
+    found = solve_graph(frames, sightings, {"hand": TYPICAL_ARM.covariance})
+    for ours, theirs in ((found.places["camera"], whole.at.x), (found.places["mark"], whole.at.z)):
+        assert ours == pytest.approx(theirs, abs=2e-6)
+    columns = [*range(6), *range(12, 18)]
+    stated = whole.covariance[np.ix_(columns, columns)] * covariance_inflation(whole.freedom, 6)
+    assert np.sqrt(np.diag(found.joint)) == pytest.approx(np.sqrt(np.diag(stated)), rel=0.02)

@@ -17,8 +17,8 @@ import numpy as np
 from flangeye.doctor.diagnosis import Change, Finding, Misfit, RecordedSession
 from flangeye.doctor.examine import Diagnosis, require_enough
 from flangeye.errors import FlangeyeError
-from flangeye.handeye.candidates import by_folds
-from flangeye.handeye.cell import sighted_of
+from flangeye.handeye.candidates import held_out
+from flangeye.handeye.cell import solve_cell
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import invert, rigid
 from flangeye.models.cell import Cell, Link
@@ -223,11 +223,10 @@ def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) 
 def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]:
     """Return the sightings that do not belong to the poses beside them, if others agree."""
     try:
-        sighted = sighted_of(observations, cell, LIMITS)
-        found = sighted.solved()
+        found = solve_cell(observations, cell, LIMITS).found
     except (FlangeyeError, np.linalg.LinAlgError):
         return []
-    errors = np.linalg.norm(by_folds(sighted.linear(found).fit(1.0))[0], axis=1)
+    errors = np.linalg.norm(held_out(found)[0], axis=1)
     ordinary = GROSS * np.sqrt((errors[found.inliers] ** 2).mean())
     wrong = ~found.inliers & (errors > ordinary)
     far = [o.id for o, gone in zip(observations, wrong, strict=True) if gone]
@@ -271,12 +270,11 @@ class Foretold:
 def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
     """Return how well sightings are foretold by the others; infinite where there is no answer."""
     try:
-        sighted = sighted_of(observations, cell, LIMITS)
-        found = sighted.solved()
+        found = solve_cell(observations, cell, LIMITS).found
     except (FlangeyeError, np.linalg.LinAlgError):
         return Foretold(Misfit(np.inf), np.inf)
-    places = np.linalg.norm(by_folds(sighted.linear(found).fit(1.0))[0], axis=1)
-    turns = np.linalg.norm(found.residuals[:, :3], axis=1)
+    places = np.linalg.norm(held_out(found)[0], axis=1)
+    turns = np.linalg.norm(found.linear.residuals[:, :3], axis=1)
     centres = np.array([o.feature.centre for o in observations])
     of_pairs = []
     for of in _by_pair(observations).values():

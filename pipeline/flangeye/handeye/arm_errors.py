@@ -18,6 +18,7 @@ from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.arm_sizes import Sizes, sizes_told
 from flangeye.handeye.bent import Bent
 from flangeye.handeye.candidates import Model, following, weighed_with
+from flangeye.handeye.likelihood import Problem, Solution
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import Floats
 
@@ -39,11 +40,24 @@ def with_arm_errors(model: Model, arms: Arms, inflation: float) -> tuple[Floats,
     Raises:
         ValueError: The kinematics are not known, or do not reach the poses.
     """
-    kinds = _kinds(arms)
-    sizes = _sizes(model, kinds)
-    moved = following(model, reduce(Nuisance.and_also, kinds))
-    each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1], axis=1)
     own = inflation * model.found.covariance[:18, :18]
+    return with_errors(model.problem, model.found, _kinds(arms), own)
+
+
+def with_errors(
+    problem: Problem, found: Solution, kinds: Sequence[Nuisance], own: Floats
+) -> tuple[Floats, Sizes]:
+    """Return the (6 K, 6 K) covariance of the places with errors of some kinds in it, and sizes.
+
+    Args:
+        problem: What was given.
+        found: Its fit without them.
+        kinds: The errors of each kind, as large as was said.
+        own: (6 K, 6 K) covariance of the fit itself.
+    """
+    sizes = sizes_of(problem, found, kinds)
+    moved = following(problem, found, reduce(Nuisance.and_also, kinds))[: len(own)]
+    each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1], axis=1)
     return sizes.mixed([own, *(followed @ followed.T for followed in each)]), sizes
 
 
@@ -57,11 +71,10 @@ def last_unknown_by_arms(model: Model, arms: Arms) -> float:
     if _unknown(arms):
         return 0.0
     kinds = _kinds(arms)
-    last = model.found.at.before_nuisance + len(model.problem.nuisance) - 1
-    moved = following(model, reduce(Nuisance.and_also, kinds), last, 1)[0]
+    moved = following(model.problem, model.found, reduce(Nuisance.and_also, kinds))[-1]
     each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1])
     squares = np.array([followed @ followed for followed in each])
-    return float(np.sqrt(_sizes(model, kinds).expected ** 2 @ squares))
+    return float(np.sqrt(sizes_of(model.problem, model.found, kinds).expected ** 2 @ squares))
 
 
 def evidence(model: Model, arms: Arms) -> float:
@@ -72,21 +85,21 @@ def evidence(model: Model, arms: Arms) -> float:
         arms: Those that move camera or target; where the kinematics of one are not known, or do
             not reach its poses, it is 0.
     """
-    return 0.0 if _unknown(arms) else _sizes(model, _kinds(arms)).gain
+    return 0.0 if _unknown(arms) else sizes_of(model.problem, model.found, _kinds(arms)).gain
 
 
 def _unknown(arms: Arms) -> bool:
     return any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms))
 
 
-def _sizes(model: Model, kinds: Sequence[Nuisance]) -> Sizes:
-    """Return how large the arm's errors are, by a fit in which each is expected as the file says.
+def sizes_of(problem: Problem, found: Solution, kinds: Sequence[Nuisance]) -> Sizes:
+    """Return how large errors of some kinds are, by a fit in which each is as large as was said.
 
     Of the fit's information and slope, so that what walked has been taken out as well. A smooth
     error that was found is none of it: it would explain what the arm's do.
     """
-    bare = replace(model.problem, nuisance=model.problem.nuisance.without_sized())
-    fit = weighed_with(bare, model.found, reduce(Nuisance.and_also, kinds))
+    bare = replace(problem, nuisance=problem.nuisance.without_sized())
+    fit = weighed_with(bare, found, reduce(Nuisance.and_also, kinds))
     counts = [len(kind) for kind in kinds]
     p = fit.basis.shape[1] - sum(counts)
     known, across = np.linalg.inv(fit.information[:p, :p]), fit.information[:p, p:]
@@ -95,7 +108,7 @@ def _sizes(model: Model, kinds: Sequence[Nuisance]) -> Sizes:
     expected = np.eye(sum(counts))
     effects = fit.information[p:, p:] - expected - across.T @ known @ across
     gram = np.block([[effects, along[:, None]], [along, left]])
-    measured = np.trace(model.problem.measurements.projectors[fit.inliers], axis1=1, axis2=2).sum()
+    measured = np.trace(problem.measurements.projectors[fit.inliers], axis1=1, axis2=2).sum()
     return sizes_told(gram, counts, float(measured) - p)
 
 

@@ -25,6 +25,8 @@ from flangeye.handeye.distortion import distortion_of, edges_of
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
+    noise_beyond,
+    noise_note,
     points_of_interest,
     transforms_of,
 )
@@ -32,7 +34,7 @@ from flangeye.handeye.flange_roll import roll_note
 from flangeye.handeye.likelihood import Solution, freedom_of_sizes, weigh
 from flangeye.handeye.loop import ArmNoise, LoopProblem, meaningless_turns
 from flangeye.handeye.measurements import by_depth, loop_of, measurements_of, shared_errors
-from flangeye.handeye.nuisance import Nuisance, nuisance_of
+from flangeye.handeye.nuisance import Nuisance, nuisance_seen
 from flangeye.handeye.observability import (
     ObservabilityLimits,
     require_enough,
@@ -183,8 +185,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
         if abs(told.share) < EXACT_SIZE:
             break
     longer = longer_distances(model.problem.measurements)
-    still = np.zeros_like(longer)
-    known = with_nuisance(model, nuisance_of(still, still, np.inf, seen=longer)) or model
+    known = with_nuisance(model, nuisance_seen(longer, np.inf)) or model
     sigma = size * told.sigma
     digits = max(4, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 4
     return cell, known.noted(
@@ -266,10 +267,9 @@ def _clock_told(cell: Cell, further: float, sigma: float) -> str:
 def _with_shared(model: Model, cell: Cell, weak: Floats) -> tuple[Model, Floats]:
     """Return the model with the errors that all features share; the weak moves get as many more."""
     seen = shared_errors(cell.observations)
-    still = np.zeros_like(seen)
     if not seen.any():
         return model, weak
-    moved = with_nuisance(model, nuisance_of(still, still, 1.0, seen=seen, shared=True))
+    moved = with_nuisance(model, nuisance_seen(seen, 1.0, shared=True))
     if moved is None:
         return model, weak
     return moved, np.pad(weak, ((0, seen.shape[2]), (0, 0)))
@@ -544,11 +544,9 @@ def _noise_notes(model: Model, cell: Cell, weak: Floats) -> tuple[str, ...]:
 
 def _beyond(found: Solution, problem: LoopProblem) -> list[str]:
     """Say what noise there is beyond the features' own."""
-    of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
-    shift = np.sqrt(of_arms[3:].mean() + found.noise.pose + found.noise.depth / 3) * 1e3
-    turn = np.degrees(np.sqrt(of_arms[:3].mean() + found.noise.tilt))
     if problem.measurements.are_poses or problem.arms is not None:
-        return [f"noise beyond the features' own: {shift:.3f} mm and {turn:.3f} deg per axis"]
+        return [noise_note(found)]
+    shift, turn = noise_beyond(found)
     notes = [f"noise beyond the centres' own: {shift:.3f} mm per axis"]
     if problem.measurements.has_normal.any():
         notes.append(f"noise beyond the normals' own: {turn:.3f} deg per axis")

@@ -88,11 +88,10 @@ class Model:
 def with_nuisance(model: Model, nuisance: Nuisance) -> Model | None:
     """Return the model with more nuisances, those sized begun at the size of the residuals."""
     problem, found = model.problem, model.found
-    joined = problem.nuisance.and_also(nuisance) if len(problem.nuisance) else nuisance
     size = max(rms(found.linear.residuals[found.inliers][:, 3:]), 1e-7)
     noise = replace(found.noise, size=size) if nuisance.sized.any() else found.noise
     started = replace(model.consensus, found=replace(found, noise=noise))
-    return replace(model, consensus=started).with_problem(replace(problem, nuisance=joined))
+    return replace(model, consensus=started).with_problem(problem.beside(nuisance))
 
 
 def considered(model: Model, further: Nuisance) -> Floats:
@@ -105,28 +104,27 @@ def considered(model: Model, further: Nuisance) -> Floats:
         model: What was found without them; it stays.
         further: The errors, with what is known of their sizes.
     """
-    moved = following(model, further) * further.prior
+    places = following(model.problem, model.found, further)[: model.found.at.of_places]
+    moved = places * further.prior
     return np.asarray(moved @ moved.T)
 
 
-def following(model: Model, further: Nuisance, first: int = 0, count: int = 18) -> Floats:
-    """Return (18, k) by how much the transforms follow further errors, as the model found them.
+def following(problem: Problem, found: Solution, further: Nuisance) -> Floats:
+    """Return (6 K + 2 + k, m) by how much the unknowns follow m further errors, as a fit found them.
 
-    Or others of the unknowns, from the first on. A smooth error of the arm and a walk are found
-    with them, and take their part.
+    A smooth error of the arm and a walk are found with them, and take their part.
     """
-    k = len(further)
-    fit = weighed_with(model.problem, model.found, further)
-    moved = np.linalg.solve(fit.information[:-k, :-k], fit.information[:-k, -k:])
-    return np.asarray(fit.basis[first : first + count, :-k] @ moved)
+    m = len(further)
+    fit = weighed_with(problem, found, further)
+    moved = np.linalg.solve(fit.information[:-m, :-m], fit.information[:-m, -m:])
+    return np.asarray(fit.basis[:-m, :-m] @ moved)
 
 
 def weighed_with(problem: Problem, found: Solution, further: Nuisance) -> Solution:
     """Return what the agreeing measurements of a fit say of a model with further nuisances."""
-    joined = problem.nuisance.and_also(further) if len(problem.nuisance) else further
-    at = replace(found.at, nuisance=np.zeros(len(joined)))
-    shares = found.inliers.astype(float)
-    return weigh(replace(problem, nuisance=joined), at, found.noise, shares)
+    joined = problem.beside(further)
+    at = replace(found.at, nuisance=np.zeros(len(joined.nuisance)))
+    return weigh(joined, at, found.noise, found.inliers.astype(float))
 
 
 def better(model: Model, candidate: Model, what: str) -> Model:

@@ -15,17 +15,18 @@ from flangeye.handeye.bent import KINDS
 from flangeye.handeye.calibration import TYPICAL_ARM
 from flangeye.handeye.cell_arms import (
     CorrectedArms,
-    Sighted,
     branches_of,
-    considering_zeros,
+    considering_errors,
     correcting_zeros,
 )
 from flangeye.handeye.cell_clock import on_one_clock
 from flangeye.handeye.certificate import GAP
 from flangeye.handeye.certified import Answer, certificate_notes, moved_note, verdict_of
-from flangeye.handeye.estimates import estimate_at
-from flangeye.handeye.graph import Sighting, Solved
-from flangeye.handeye.measurements import measured
+from flangeye.handeye.estimates import estimate_at, noise_note
+from flangeye.handeye.graph import Sighting, Solved, solve_graph, solved_from, solved_of
+from flangeye.handeye.likelihood import agreeing, weigh
+from flangeye.handeye.measurements import measured, shared_errors
+from flangeye.handeye.nuisance import nuisance_seen
 from flangeye.maths.geometry import rigid
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
@@ -52,8 +53,8 @@ def calibrate_cell(
 ) -> HandEye:
     """Return every unknown of a cell with its covariance; the first camera's pose comes first.
 
-    What moves is measured with noise; its size is found from the residuals, and sightings beyond
-    that are set aside.
+    The noise of what moves, and what noise there is beside it, is found from the residuals, and
+    sightings beyond that are set aside.
 
     Args:
         observations: The sightings.
@@ -69,21 +70,21 @@ def calibrate_cell(
         CalibrationRefused: The sightings leave something unknown (it says what), or fewer than half
             of them agree.
     """
-    sighted = sighted_of(observations, cell, limits)
-    found, moved = _at_best(sighted, sighted.solved()) if certify else (sighted.solved(), ())
+    found = solve_cell(observations, cell, limits)
+    found, moved = _at_best(found) if certify else (found, ())
     _require_agreement(found, len(observations))
-    timed = on_one_clock(observations, cell, sighted, found)
-    observations, sighted, found = timed.observations, timed.sighted, timed.found
-    branches = branches_of(sighted, cell)
-    known, sizes = considering_zeros(found, sighted, branches)
+    timed = on_one_clock(observations, cell, _with_shared(found, observations))
+    observations, found = timed.observations, timed.found
+    branches = branches_of(found.problem, cell, cell.joints(observations))
+    known, sizes = considering_errors(found, branches)
     notes = (*_notes(observations, found, sizes), *timed.notes)
     corrected = None
     if sizes and joint_offsets:
-        corrected, told = correcting_zeros(found, sighted, branches, sizes)
+        corrected, told = correcting_zeros(found, branches, sizes)
         notes = (*notes, told)
     if certify:
-        reported = answer_of(sighted, found)
-        notes = (*notes, *moved, *certificate_notes(reported, _corrected_of(sighted, corrected)))
+        better = None if corrected is None else answer_of(corrected.found)
+        notes = (*notes, *moved, *certificate_notes(answer_of(found), better))
     camera, *others = _estimates(known, observations, cell)
     return HandEye(
         camera,
@@ -113,7 +114,11 @@ def solve_cell(
         StageError: No sighting, or one without the pose of something that moves.
         CalibrationRefused: The sightings leave something unknown: it says what.
     """
-    return sighted_of(observations, cell, limits).solved(start)
+    if not observations:
+        raise StageError("no sighting to solve with: every capture was set aside, for its reason")
+    sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
+    noise = {name: TYPICAL_ARM.covariance for name in cell.measured}
+    return solve_graph(cell.graph(observations), sightings, noise, limits, start, cell.freedoms)
 
 
 def solve_so_far(
@@ -129,23 +134,6 @@ def solve_so_far(
     return None
 
 
-def sighted_of(
-    observations: Sequence[Observation], cell: Cell, limits: tuple[float, float]
-) -> Sighted:
-    """Return observations of a cell as its graph takes them; see :func:`solve_cell`."""
-    if not observations:
-        raise StageError("no sighting to solve with: every capture was set aside, for its reason")
-    sightings = [sighting_of(i, o) for i, o in enumerate(observations)]
-    frames = cell.graph(observations)
-    noise, joints = mover_noise(cell), cell.joints(observations)
-    return Sighted(frames, sightings, noise, limits, cell.freedoms, joints)
-
-
-def mover_noise(cell: Cell) -> dict[str, Floats]:
-    """Return the (6, 6) covariance of what moves that is believed before anything is seen."""
-    return {name: TYPICAL_ARM.covariance for name in cell.measured}
-
-
 def sighting_of(i: int, observation: Observation) -> Sighting:
     """Return an observation as the graph takes it, at the i-th of its times."""
     rotation, covariance, projector = measured(observation, normals=True)
@@ -153,43 +141,50 @@ def sighting_of(i: int, observation: Observation) -> Sighting:
     return Sighting(i, observation.camera, observation.target, pose, covariance, projector)
 
 
-def answer_of(sighted: Sighted, found: Solved) -> Answer:
+def answer_of(found: Solved) -> Answer:
     """Return the answer for the sightings that agree, as certificates take it."""
-    seen = [s for s, kept in zip(sighted.sightings, found.inliers, strict=True) if kept]
-    whiteners = sighted.linear(found).whiteners[found.inliers]
+    problem, kept = found.problem, found.found.inliers
+    seen = problem.measurements.where(kept)
     return Answer(
-        sighted.frames,
-        [(s.camera, s.target) for s in seen],
-        np.array([s.time for s in seen]),
+        problem.frames,
+        [problem.ends[k] for k in seen.pairs],
+        seen.times,
         found.places,
         found.covariances,
-        -found.residuals[found.inliers],
-        whiteners @ whiteners,
-        np.array([np.trace(s.projector).round() for s in seen]),
+        found.found.linear.residuals[kept],
+        found.found.weights[kept],
+        seen.freedoms,
     )
 
 
-def _corrected_of(sighted: Sighted, corrected: CorrectedArms | None) -> Answer | None:
-    if corrected is None:
-        return None
-    return answer_of(sighted.with_arms(corrected.arms), corrected.found)
-
-
-def _at_best(sighted: Sighted, found: Solved) -> tuple[Solved, tuple[str, ...]]:
+def _at_best(found: Solved) -> tuple[Solved, tuple[str, ...]]:
     """Return the answer to which the certificate leads, if that fits better, and what to say."""
-    start = verdict_of(answer_of(sighted, found)).better
+    start = verdict_of(answer_of(found)).better
     if start is None:
         return found, ()
-    there = sighted.solved(start)
+    there, fit = solved_from(found.problem, start), found.found
     before, after = (
-        float((sighted.linear(replace(found, places=each)).whitened[2] ** 2).sum())
-        for each in (found.places, there.places)
+        weigh(found.problem, each.found.at, fit.noise, fit.inliers.astype(float)).cost
+        for each in (found, there)
     )
     return (there, (moved_note(after / before),)) if after < (1 - GAP) * before else (found, ())
 
 
+def _with_shared(found: Solved, observations: Sequence[Observation]) -> Solved:
+    """Return the solution with the errors that all features of a camera share found along."""
+    seen = shared_errors(observations)
+    if not seen.any():
+        return found
+    cameras = dict.fromkeys(o.camera for o in observations)
+    whose = np.array([[o.camera == camera for camera in cameras] for o in observations])
+    each = np.concatenate([seen * of[:, None, None] for of in whose.T], axis=2)
+    shared = nuisance_seen(each, 1.0, shared=True)
+    problem = found.problem.beside(shared)
+    return solved_of(problem, agreeing(problem, found.found))
+
+
 def _require_agreement(found: Solved, count: int) -> None:
-    agree = int(found.inliers.sum())
+    agree = int(found.found.inliers.sum())
     if 2 * agree < count:
         raise CalibrationRefused(
             f"only {agree} of {count} sightings agree with one another: check that each belongs to "
@@ -232,9 +227,10 @@ def _pairs(observations: Sequence[Observation], cell: Cell, found: Solved) -> tu
     ends = cell.ends(_transforms(found, cell), observations)
     mapped, expected = mapped_and_expected(ends, observations)
     pairs = []
-    for i, (o, used) in enumerate(zip(observations, found.inliers, strict=True)):
-        turn, shift = np.linalg.norm(found.residuals[i].reshape(2, 3), axis=1)
-        sigma = np.sqrt(found.squares[i])
+    fit = found.found
+    for i, (o, used) in enumerate(zip(observations, fit.inliers, strict=True)):
+        turn, shift = np.linalg.norm(fit.linear.residuals[i].reshape(2, 3), axis=1)
+        sigma = np.sqrt(fit.squares[i])
         far = f"residual {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} deg, {sigma:.0f} sigma"
         pairs.append(Pair(o, mapped[i] - expected[i], bool(used), None if used else far))
     return tuple(pairs)
@@ -245,13 +241,7 @@ def _notes(
 ) -> tuple[str, ...]:
     who = Counter((o.camera, o.target) for o in observations)
     sightings = ", ".join(f"{camera} saw {target} {n} times" for (camera, target), n in who.items())
-    noise = np.sqrt(found.movers)
-    return (
-        f"solved at once: {sightings}",
-        f"noise of what moves: {noise * TYPICAL_ARM.translation * 1e3:.3f} mm and "
-        f"{noise * np.degrees(TYPICAL_ARM.rotation):.3f} deg per axis, as the residuals show it",
-        *_note_of_sizes(sizes),
-    )
+    return f"solved at once: {sightings}", noise_note(found.found), *_note_of_sizes(sizes)
 
 
 def _note_of_sizes(sizes: Sizes | None) -> tuple[str, ...]:

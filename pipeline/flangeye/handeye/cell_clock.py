@@ -9,13 +9,17 @@ import numpy as np
 
 from flangeye.handeye.arm import SIGNIFICANT
 from flangeye.handeye.calibration import CLOCK_STEPS, EXACT_DELAY
-from flangeye.handeye.candidates import Fit, by_folds, judged, rms
-from flangeye.handeye.cell_arms import Sighted
-from flangeye.handeye.graph import Solved, information_of, linear_of
+from flangeye.handeye.candidates import following, held_out, judged, rms
+from flangeye.handeye.graph import Solved, solved_of
+from flangeye.handeye.likelihood import Solution, agreeing
+from flangeye.handeye.nuisance import nuisance_seen
 from flangeye.maths.statistics import f_quantile
 from flangeye.maths.streams import joints_at, later, pose_at, rates_of
 from flangeye.models.cell import Cell
 from flangeye.types import Floats, Motion, Observation
+
+UNKNOWN = 1e3
+"""Standard deviation of a time of which nothing is known [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,13 +28,11 @@ class Timed:
 
     Attributes:
         observations: N of them.
-        sighted: The same, as the graph takes them.
         found: The unknowns, with what is left of the times in their covariance.
         notes: For the person.
     """
 
     observations: Sequence[Observation]
-    sighted: Sighted
     found: Solved
     notes: tuple[str, ...] = ()
 
@@ -54,9 +56,7 @@ class _Delays:
     error: float
 
 
-def on_one_clock(
-    observations: Sequence[Observation], cell: Cell, sighted: Sighted, found: Solved
-) -> Timed:
+def on_one_clock(observations: Sequence[Observation], cell: Cell, found: Solved) -> Timed:
     """Return the sightings with the arms at the times they were seen, if that helps.
 
     Each camera has a clock of its own; those of all that moves agree. A time is taken over when it
@@ -65,10 +65,9 @@ def on_one_clock(
     Args:
         observations: N of them; nothing is looked for unless all say how the arms passed.
         cell: What stands on what.
-        sighted: The same, as the graph takes them.
         found: The answer for the times as they are.
     """
-    as_paired, linked = Timed(observations, sighted, found), {x.arm for x in cell.links.values()}
+    as_paired, linked = Timed(observations, found), {x.arm for x in cell.links.values()}
     if not all(_tells(o.motion, linked) for o in observations):
         return as_paired
     first = _delays(as_paired, cell)
@@ -85,7 +84,7 @@ def on_one_clock(
             break
     if moved is as_paired:
         return _considering(as_paired, first, first.values)
-    helps, told = judged(_error(as_paired, cell), left.error, _told(cell, total, left))
+    helps, told = judged(_error(found.found), left.error, _told(cell, total, left))
     chosen = (
         _considering(moved, left, 0 * total)
         if helps
@@ -115,59 +114,42 @@ def _delayed(
         at = {n: replace(x, matrix=pose_at(motion, 0.0, n)) for n, x in told.items()}
         joints = {n: q for n in o.arm_joints if (q := joints_at(motion, 0.0, n)) is not None}
         moved.append(replace(o, poses={**o.poses, **at}, motion=motion, arm_joints=joints))
-    sighted = replace(before.sighted, frames=cell.graph(moved), joints=cell.joints(moved))
-    return Timed(moved, sighted, sighted.solved(before.found.places))
+    problem = replace(before.found.problem, frames=cell.graph(moved))
+    return Timed(moved, solved_of(problem, agreeing(problem, before.found.found)))
 
 
 def _delays(timed: Timed, cell: Cell) -> _Delays:
     """Return what one more unknown for each camera's clock tells."""
-    linear = timed.sighted.linear(timed.found)
-    late = _lateness(timed, cell)
-    rows, _, errors = linear.whitened
-    clocks = linear.whiteners[linear.kept] @ late[linear.kept]
-    both, p = np.concatenate([rows, clocks], axis=2), rows.shape[2]
-    # A camera that nothing moved past tells nothing of its clock.
-    information = information_of(both) + np.diag(np.repeat([0.0, 1e-6], [p, late.shape[2]]))
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    values = -(covariance @ np.einsum("nij,ni->j", both, errors))[p:]
-    freedom = max(linear.freedom - len(covariance), 1.0)
-    left = float((errors**2).sum() - values @ np.linalg.solve(covariance[p:, p:], values))
-    known = max(left / freedom, 1.0) * covariance[p:, p:]
-    square = float(values @ np.linalg.solve(known, values)) / len(values)
-    weights = linear.whiteners @ linear.whiteners
-    jacobian = np.concatenate([linear.jacobian, late], axis=2)
-    held = by_folds(Fit(linear.residuals, jacobian, weights, covariance, linear.kept))[0]
+    found = timed.found
+    # A camera that nothing moved past tells nothing of its clock: a second is as good as many.
+    late = nuisance_seen(_lateness(timed, cell), UNKNOWN)
+    fit, count = agreeing(found.problem.beside(late), found.found), len(late)
+    values = fit.at.nuisance[-count:]
+    covariance = fit.covariance[-count:, -count:]
+    square = float(values @ np.linalg.solve(covariance, values)) / count
     return _Delays(
         values,
-        known,
-        square > f_quantile(SIGNIFICANT, len(values), freedom),
-        np.linalg.solve(information_of(rows), np.einsum("nij,nik->jk", rows, clocks)),
-        rms(held[linear.kept]),
+        covariance,
+        square > f_quantile(SIGNIFICANT, count, fit.freedom),
+        following(found.problem, found.found, late)[: len(found.joint)],
+        _error(fit),
     )
 
 
 def _lateness(timed: Timed, cell: Cell) -> Floats:
     """Return (N, 6, c) what a second by which each camera's poses are too early does."""
-    sighted, found = timed.sighted, timed.found
     motions = [cell.passing(o.motion) for o in timed.observations if o.motion is not None]
-    noise = {name: found.movers * covariance for name, covariance in sighted.noise.items()}
-    graph = sighted.frames, sighted.sightings, found.places, noise
     moved = np.zeros((len(motions), 6))
     for name in motions[0].others:
-        effects = linear_of(*graph, moved=[name])[1]
+        _, effects = timed.found.problem.effects(timed.found.found.at, [name])
         moved += np.einsum("nij,nj->ni", effects, rates_of(motions, name))
     whose = np.array([[o.camera == camera for camera in cell.cameras] for o in timed.observations])
     return np.asarray(moved[:, :, None] * whose[:, None, :])
 
 
-def _error(timed: Timed, cell: Cell) -> float:
-    """Return what a fit to other sightings leaves, the times taken as they are [m], rms."""
-    linear = timed.sighted.linear(timed.found)
-    weights = linear.whiteners @ linear.whiteners
-    information = information_of(linear.whitened[0])
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    fit = Fit(linear.residuals, linear.jacobian, weights, covariance, linear.kept)
-    return rms(by_folds(fit)[0][linear.kept])
+def _error(fit: Solution) -> float:
+    """Return what a fit to other sightings leaves [m], rms."""
+    return rms(held_out(fit)[0][fit.inliers])
 
 
 def _considering(timed: Timed, delays: _Delays, off: Floats) -> Timed:

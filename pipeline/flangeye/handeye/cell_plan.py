@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.handeye.cell import mover_noise, sighting_of
-from flangeye.handeye.graph import Solved, rows_of
+from flangeye.handeye.cell import sighting_of
+from flangeye.handeye.graph import Solved
 from flangeye.maths.frame_graph import composed
 from flangeye.maths.geometry import hat, invert, stack_rows
 from flangeye.maths.statistics import chi2_quantile, largest_error_quantile
@@ -127,9 +127,8 @@ def is_foretold(observation: Observation, found: Solved, cell: Cell) -> bool:
 
 def _rows(sightings: Sequence[Observation], found: Solved, cell: Cell) -> tuple[Floats, Floats]:
     """Return (M, 6, 6 K) rows of sightings, and (M, 6) their errors, of unit covariance."""
-    noise = {name: found.movers * covariance for name, covariance in mover_noise(cell).items()}
     measured = [sighting_of(i, o) for i, o in enumerate(sightings)]
-    return rows_of(cell.graph(sightings), measured, found.places, noise)
+    return found.told_by(cell.graph(sightings), measured)
 
 
 def _levers(found: Solved, cell: Cell, seen: Sequence[Observation]) -> Floats:

@@ -9,13 +9,12 @@ import numpy as np
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.handeye.components import SHIFT, TURN, Noise
 from flangeye.handeye.inliers import find_inliers
-from flangeye.handeye.likelihood import Solution, agreeing, gates, settle, weigh
+from flangeye.handeye.likelihood import Solution, agreeing, first_noise, gates, settle, weigh
 from flangeye.handeye.loop import LoopProblem, linearise
 from flangeye.handeye.observability import FINEST_NOISE, require_observable, spread_of
 from flangeye.handeye.starts import fewest, start_of
 from flangeye.handeye.unknowns import Unknowns, weights_of
 from flangeye.maths.geometry import invert, kabsch, rigid, rotation_log
-from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, Mask
 
 SUBSETS = 60
@@ -230,7 +229,7 @@ def _from_all(problem: LoopProblem, rng: np.random.Generator) -> Solution | None
         start = start_of(problem.measurements, problem.loop, rng)
     except np.linalg.LinAlgError:
         return None
-    return settle(problem, start, _first_noise(problem, start))
+    return settle(problem, start, first_noise(problem, start))
 
 
 def _from_subsets(problem: LoopProblem, rng: np.random.Generator) -> Solution | None:
@@ -246,25 +245,13 @@ def _from_subsets(problem: LoopProblem, rng: np.random.Generator) -> Solution | 
         median = float(np.median(_distances(problem, start)))
         if median < least:
             best, least = start, median
-    return None if best is None else settle(problem, best, _first_noise(problem, best))
+    return None if best is None else settle(problem, best, first_noise(problem, best))
 
 
 def _distances(problem: LoopProblem, at: Unknowns) -> Floats:
     """Return (N,) squared residuals, a degree weighing like 5 mm."""
     r = linearise(problem.measurements, problem.loop, at, None).residuals
     return np.asarray((r[:, :3] ** 2).sum(axis=1) * 0.3**2 + (r[:, 3:] ** 2).sum(axis=1))
-
-
-def _first_noise(problem: LoopProblem, at: Unknowns) -> Noise:
-    """Return the noise that the better half of the residuals at a start speaks for."""
-    if problem.stated:
-        return Noise(pose=0.0, tilt=0.0)
-    r = linearise(problem.measurements, problem.loop, at, None).residuals
-    turns, shifts = ((r[:, at] ** 2).sum(axis=1) for at in (TURN, SHIFT))
-    median = chi2_quantile(0.5, 3)
-    return Noise(
-        pose=float(np.median(shifts)) / median, tilt=float(np.median(turns)) / median
-    )  # fmt: skip
 
 
 def _cost(problem: LoopProblem, found: Solution) -> float:

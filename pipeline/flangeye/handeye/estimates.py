@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flangeye.handeye.likelihood import Solution
 from flangeye.maths.geometry import adjoint_shift
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import Configuration, mapped_and_expected
@@ -28,6 +29,22 @@ def columns_of(name: str, configuration: Configuration) -> slice:
     if name == configuration.unknowns[0]:
         return slice(0, 6)
     return slice(6, 12) if name == configuration.other_base else slice(12, 18)
+
+
+def noise_note(found: Solution) -> str:
+    """Say what noise there is beyond the features' own, of whole poses."""
+    shift, turn = noise_beyond(found)
+    return f"noise beyond the features' own: {shift:.3f} mm and {turn:.3f} deg per axis"
+
+
+def noise_beyond(found: Solution) -> tuple[float, float]:
+    """Return the noise per axis beyond the features' own, the arms' as the camera has it.
+
+    Of places [mm] and of turns [deg].
+    """
+    of_arms = np.diagonal(found.linear.of_arms, axis1=1, axis2=2).mean(axis=0) * found.noise.arms
+    shift = np.sqrt(of_arms[3:].mean() + found.noise.pose + found.noise.depth / 3) * 1e3
+    return float(shift), float(np.degrees(np.sqrt(of_arms[:3].mean() + found.noise.tilt)))
 
 
 def estimate_at(

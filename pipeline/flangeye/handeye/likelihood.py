@@ -31,7 +31,7 @@ from flangeye.handeye.smoothing import Smoothed, size_told, smoothed, steps_told
 from flangeye.handeye.unknowns import Linear, Unknowns, weights_of
 from flangeye.handeye.walk import Course, StepSize, Walk
 from flangeye.maths.geometry import stack_rows
-from flangeye.maths.statistics import f_quantile
+from flangeye.maths.statistics import chi2_quantile, f_quantile
 from flangeye.types import Floats, Mask
 
 ITERATIONS, SETTLED = 60, 1e-11
@@ -82,6 +82,11 @@ class Problem(ABC):
         """Return the problem of some of the measurements."""
         nuisance = self.nuisance.where(chosen) if len(self.nuisance) else self.nuisance
         return replace(self, measurements=self.measurements.where(chosen), nuisance=nuisance)
+
+    def beside(self, further: Nuisance) -> Self:
+        """Return the problem with further nuisances after its own."""
+        own = self.nuisance
+        return replace(self, nuisance=own.and_also(further) if len(own) else further)
 
     def prior(self, at: Unknowns, noise: Noise) -> tuple[Floats, Floats]:
         """Return information and mean known beforehand of (6 K + 2 + k,) moves.
@@ -251,7 +256,7 @@ def _step(here: Solution, damping: float) -> tuple[Unknowns, float]:
     return replace(there, course=walked), gain + here.course.gain
 
 
-def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
+def settle(problem: Problem, start: Unknowns, noise: Noise, agree: Mask | None = None) -> Solution:
     """Return the solution that most measurements agree on, its noise estimated with it.
 
     Truncated least squares by graduated non-convexity, and the noise of those that agree, until
@@ -261,9 +266,10 @@ def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
         problem: What is given.
         start: Where to begin.
         noise: First guess of the noise beyond the stated covariances.
+        agree: (N,) which agree with the start; all, where nothing is known of that.
     """
-    every = np.ones(len(problem.measurements))
-    found = climb(problem, weigh(problem, start, noise, every), noise, every)
+    shares = np.ones(len(problem.measurements)) if agree is None else agree.astype(float)
+    found = climb(problem, weigh(problem, start, noise, shares), noise, shares)
     inliers = np.zeros(len(problem.measurements), dtype=bool)
     for _ in range(GRADUATIONS):
         found = _graduate(problem, found)
@@ -272,6 +278,16 @@ def settle(problem: Problem, start: Unknowns, noise: Noise) -> Solution:
         inliers = found.inliers
         found = with_noise(problem, found)
     return agreeing(problem, found)
+
+
+def first_noise(problem: Problem, at: Unknowns) -> Noise:
+    """Return the noise that the better half of the residuals at a start speaks for."""
+    if problem.stated:
+        return Noise(pose=0.0, tilt=0.0)
+    r = problem.linearised(at).residuals
+    turns, shifts = ((r[:, at] ** 2).sum(axis=1) for at in (TURN, SHIFT))
+    median = chi2_quantile(0.5, 3)
+    return Noise(pose=float(np.median(shifts)) / median, tilt=float(np.median(turns)) / median)
 
 
 def agreeing(problem: Problem, found: Solution) -> Solution:

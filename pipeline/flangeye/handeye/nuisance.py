@@ -84,6 +84,12 @@ def no_nuisance(count: int) -> Nuisance:
     return nuisance_of(np.zeros((count, 6, 0)), np.zeros((count, 6, 0)), 1.0)
 
 
+def nuisance_seen(effects: Floats, deviation: float, shared: bool = False) -> Nuisance:
+    """Return numbers of mean zero and one deviation by what each does to what is seen (N, 6, k)."""
+    still = np.zeros_like(effects)
+    return nuisance_of(still, still, deviation, seen=effects, shared=shared)
+
+
 def nuisance_of(
     camera: Floats,
     target: Floats,

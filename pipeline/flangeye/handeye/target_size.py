@@ -15,7 +15,7 @@ from flangeye.handeye.arm_errors import Arms, last_unknown_by_arms
 from flangeye.handeye.candidates import Model
 from flangeye.handeye.likelihood import weigh, with_noise
 from flangeye.handeye.measurements import Measurements
-from flangeye.handeye.nuisance import nuisance_of
+from flangeye.handeye.nuisance import nuisance_seen
 from flangeye.maths.statistics import f_quantile
 from flangeye.types import Floats
 
@@ -98,11 +98,7 @@ def estimated_factor(model: Model, moves: Floats, arms: Arms = ()) -> EstimatedF
         arms: Those whose errors are to be in its deviation, as large as the residuals show them.
     """
     problem, found = model.problem, model.found
-    still = np.zeros_like(moves)
-    nuisance = nuisance_of(still, still, np.inf, seen=moves)
-    if len(problem.nuisance):
-        nuisance = problem.nuisance.and_also(nuisance)
-    free = replace(problem, nuisance=nuisance, in_depth=not problem.stated)
+    free = replace(problem, in_depth=not problem.stated).beside(nuisance_seen(moves, np.inf))
     at = replace(found.at, nuisance=np.append(found.at.nuisance, 0.0))
     fit = with_noise(free, weigh(free, at, found.noise, found.inliers.astype(float)))
     row, linear = fit.covariance[-1], fit.linear.where(fit.inliers)
