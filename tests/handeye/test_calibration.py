@@ -14,7 +14,8 @@ from flangeye.handeye import calibration
 from flangeye.handeye.calibration import TYPICAL_ARM, _beyond
 from flangeye.handeye.candidates import Model
 from flangeye.handeye.components import Noise
-from flangeye.handeye.consensus import Consensus, _first_noise
+from flangeye.handeye.consensus import Consensus
+from flangeye.handeye.likelihood import first_noise
 from flangeye.handeye.loop import ArmNoise, LoopProblem
 from flangeye.maths.statistics import covariance_inflation
 from tests.handeye.cells import CONFIGURATIONS, Session, fitted, given, session, two_numbers
@@ -49,7 +50,7 @@ def test_noise_beyond_the_features_own_is_the_arms_and_what_else_there_is(
 def test_noise_that_is_stated_is_all_there_is_from_the_start() -> None:
     stated: Any = SimpleNamespace(stated=True)
     nowhere: Any = None
-    assert _first_noise(stated, nowhere) == Noise(pose=0.0, tilt=0.0)
+    assert first_noise(stated, nowhere) == Noise(pose=0.0, tilt=0.0)
 
 
 def modelled(name: str = HAND, n: int = 9, **more: Any) -> Model:

@@ -11,10 +11,10 @@ from scipy import stats
 
 from flangeye import CalibrationRefused
 from flangeye.handeye import cell_clock as room
-from flangeye.handeye.cell import calibrate_cell
-from flangeye.handeye.cell_arms import Linear
+from flangeye.handeye.candidates import judged
+from flangeye.handeye.cell import calibrate_cell, solve_cell
 from flangeye.handeye.cell_clock import _told
-from flangeye.handeye.graph import LIMITS
+from flangeye.handeye.graph import LIMITS, roots_of
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import invert, rigid, rotation_exp
 from flangeye.maths.statistics import chi2_quantile
@@ -133,7 +133,10 @@ def test_arms_that_stood_still_have_no_clock() -> None:
 
 
 def test_a_camera_whose_sightings_all_disagree_is_named() -> None:
-    told = "where right is: .*; no sighting that agrees with others has right in it"
+    told = (
+        r"agree with one answer to \S+ mm and \S+ deg only, those of marker by right least: .*"
+        r"\(join: clock_offset, where the clock of right is another\)"
+    )
     with pytest.raises(CalibrationRefused, match=told):
         solved({"left": 0.0, "right": 0.5})
 
@@ -150,7 +153,7 @@ def left_over(values: Any, significant: bool = True, error: float = 1e-3) -> Any
     """Return what is left of two times, of standard deviations of 1 and 2 ms [s]."""
     return SimpleNamespace(
         values=np.array(values), covariance=np.diag([1e-6, 4e-6]), significant=significant,
-        followed=np.eye(12, 2), error=error,
+        followed=np.eye(12, 2), fit=error,
     )  # fmt: skip
 
 
@@ -158,7 +161,7 @@ class Joint(SimpleNamespace):
     """A solution that tells its covariance alone."""
 
     def with_joint(self, joint: Any) -> Any:
-        return Joint(joint=joint)
+        return Joint(joint=joint, found=None)
 
 
 def timed_by(
@@ -166,19 +169,17 @@ def timed_by(
 ) -> tuple[Any, list[Any]]:
     """Return the sightings on one clock where such times are left in turn, and the times tried."""
     tried, left_in_turn = list[Any](), iter(left)
-    here: Any = Joint(joint=np.zeros((12, 12)))
+    here: Any = Joint(joint=np.zeros((12, 12)), found=None)
 
     def delayed(observations: Any, cell: Any, before: Any, delays: Any) -> Any:
         tried.append(delays)
-        return None if np.abs(delays).max() > reach else room.Timed(tried[:], before.sighted, here)
+        return None if np.abs(delays).max() > reach else room.Timed(tried[:], here)
 
     monkeypatch.setattr(room, "_delays", lambda *_: next(left_in_turn))
     monkeypatch.setattr(room, "_delayed", delayed)
-    monkeypatch.setattr(room, "_error", lambda *_: error)
+    monkeypatch.setattr(room, "_judged", lambda _, after, what: judged(error, after, what))
     moving: Any = [SimpleNamespace(motion=SimpleNamespace(others=["flange"]))] * 3
-    some: Any = None
-    found: Any = here
-    return room.on_one_clock(moving, CELL, some, found), tried
+    return room.on_one_clock(moving, CELL, here), tried
 
 
 def test_times_add_up_until_what_is_left_is_ten_microseconds(
@@ -221,7 +222,14 @@ def test_clocks_are_looked_for_where_every_sighting_says_how_arms_passed(
     some: Any = None
     for last in (None, still):
         seen_: Any = [SimpleNamespace(motion=moved), SimpleNamespace(motion=last)]
-        assert room.on_one_clock(seen_, CELL, some, some).observations is seen_
+        assert room.on_one_clock(seen_, CELL, some).observations is seen_
+
+
+def told_of(observations: list[Observation], late: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what is told of clocks by sightings, each late by what is given of it."""
+    found = solve_cell(observations, CELL, LIMITS)
+    monkeypatch.setattr(room, "_lateness", lambda *_: late)
+    return room._delays(room.Timed(observations, found), CELL), found
 
 
 def test_times_are_told_as_by_least_squares_with_all_unknowns(
@@ -229,39 +237,38 @@ def test_times_are_told_as_by_least_squares_with_all_unknowns(
 ) -> None:
     """Their covariance is as wide as residuals say, which they are held against by Fisher's F."""
     rng = np.random.default_rng(0)
-    rows, late, kept = rng.normal(size=(9, 6, 4)), rng.normal(size=(9, 6, 2)), np.arange(9) != 2
-    whiteners = rng.uniform(0.5, 2.0, (9, 1, 1)) * np.eye(6)
-    monkeypatch.setattr(room, "_lateness", lambda *_: late)
-    for times, noise, significant in ((3.0, 2.0, True), (0.1, 2.0, False), (1.2, 0.1, True)):
-        left = noise * rng.normal(size=(9, 6)) + times * (late @ [1.0, -1.0])
-        own, counted = (whiteners @ rows)[kept].reshape(-1, 4), (whiteners @ left[..., None])[kept]
-        left = left - rows @ np.linalg.lstsq(own, counted.ravel(), rcond=None)[0]  # as a fit does
-        linear = Linear(left, rows, np.zeros((9, 6, 0)), [], whiteners, kept, 48.0)
-        sighted = SimpleNamespace(linear=lambda found, linear=linear: linear)
-        timed: Any = SimpleNamespace(sighted=sighted, found=None)
-        told = room._delays(timed, CELL)
-        both = (whiteners @ np.concatenate([rows, late], axis=2))[kept].reshape(-1, 6)
-        sides = (whiteners @ left[..., None])[kept].ravel()
-        values = np.linalg.lstsq(both, sides, rcond=None)[0]
-        assert told.values == pytest.approx(-values[4:], rel=1e-5)
-        rest = ((sides - both @ values) ** 2).sum() / (48 - 6)
-        known = max(rest, 1.0) * np.linalg.inv(both.T @ both)[4:, 4:]
-        assert told.covariance == pytest.approx(known, rel=1e-5)
-        square = values[4:] @ np.linalg.solve(known, values[4:]) / 2
-        assert told.significant == significant == (square > stats.f(2, 42).ppf(0.9999))
-        followed = np.linalg.lstsq(both[:, :4], both[:, 4:], rcond=None)[0]
-        assert told.followed == pytest.approx(followed)
+    late = rng.normal(size=(40, 6, 2))
+    told, found = told_of(seen({"left": 0.0, "right": 0.0}), late, monkeypatch)
+    fit = found.found
+    roots = roots_of(fit.weights)
+    rows = (roots @ fit.linear.jacobian[:, :, :18]).reshape(-1, 18)
+    clocks = (roots @ found.problem.measurements.projectors @ late).reshape(-1, 2)
+    sides = (roots @ fit.linear.residuals[..., None]).ravel()
+    both = np.hstack([rows, clocks])
+    values = np.linalg.lstsq(both, sides, rcond=None)[0]
+    assert told.values == pytest.approx(values[18:], rel=0.05, abs=1e-6)
+    known = np.linalg.inv(both.T @ both)[18:, 18:]
+    assert np.sqrt(np.diag(told.covariance)) == pytest.approx(np.sqrt(np.diag(known)), rel=0.05)
+    assert not told.significant
+    followed = np.linalg.lstsq(rows, clocks, rcond=None)[0]
+    assert told.followed == pytest.approx(followed, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(("delay", "significant"), [(0.02, True), (1e-5, False)])
+def test_a_time_is_significant_by_its_deviation(
+    delay: float, significant: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observations = seen({"left": 0.0, "right": delay})
+    found = solve_cell(observations, CELL, LIMITS)
+    told = room._delays(room.Timed(observations, found), CELL)
+    square = told.values @ np.linalg.solve(told.covariance, told.values) / 2
+    assert told.significant == significant == (square > stats.f(2, 200).ppf(0.9999))
 
 
 def test_a_camera_that_nothing_moved_past_has_a_clock_of_which_nothing_is_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A second is as good as a thousand: its deviation is."""
-    rng = np.random.default_rng(0)
-    late = rng.normal(size=(9, 6, 2)) * [1.0, 0.0]
-    monkeypatch.setattr(room, "_lateness", lambda *_: late)
-    linear = Linear(1e-3 * rng.normal(size=(9, 6)), rng.normal(size=(9, 6, 4)), np.zeros((9, 6, 0)),
-                    [], np.tile(np.eye(6), (9, 1, 1)), np.ones(9, bool), 54.0)  # fmt: skip
-    sighted = SimpleNamespace(linear=lambda found: linear)
-    timed: Any = SimpleNamespace(sighted=sighted, found=None)
-    assert np.sqrt(room._delays(timed, CELL).covariance[1, 1]) == pytest.approx(1e3)
+    late = np.random.default_rng(0).normal(size=(40, 6, 2)) * [1.0, 0.0]
+    told, _ = told_of(seen({"left": 0.0, "right": 0.0}), late, monkeypatch)
+    assert np.sqrt(told.covariance[1, 1]) == pytest.approx(1e3)

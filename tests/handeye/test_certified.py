@@ -9,9 +9,11 @@ import pytest
 
 from flangeye.handeye import certified
 from flangeye.handeye.cell import _at_best, answer_of, calibrate_cell
-from flangeye.handeye.cell_arms import Sighted
 from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, Answer, _sightings, verdict_of
-from flangeye.handeye.graph import LIMITS, Sighting, Solved, linear_of, solve_graph
+from flangeye.handeye.components import Noise
+from flangeye.handeye.graph import Sighting, Solved, problem_of, solve_graph, solved_of
+from flangeye.handeye.likelihood import climb, weigh
+from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.frame_graph import Frame, composed
 from flangeye.maths.geometry import basis_of_plane, invert, rigid, rotation_exp
 from flangeye.types import Floats, Observations, Source
@@ -118,7 +120,13 @@ def answered(
 ) -> tuple[Solved, Answer]:
     frames, sightings, true = given
     found = solve_graph(frames, sightings, start=start or true)
-    return found, answer_of(Sighted(frames, sightings, {}, LIMITS), found)
+    return found, answer_of(found)
+
+
+def squares(found: Solved) -> float:
+    """Return what the fit made small."""
+    r = found.found.linear.residuals[found.found.inliers]
+    return float(np.einsum("na,nab,nb->", r, found.found.weights[found.found.inliers], r))
 
 
 @pytest.mark.parametrize("name", GRAPHS)
@@ -142,58 +150,65 @@ def test_what_is_certified_are_the_squares_that_the_graph_made_small(name: str, 
     assert root is not None
     places = certified._turned(answer.places, root, answer)
     told = squared(_sightings(answer, root), np.array(list(places.values())))
-    assert told == pytest.approx(found.squares.sum(), rel=1e-6)
+    assert told == pytest.approx(squares(found), rel=1e-6)
 
 
-def _as_it_is(given: Any) -> tuple[Any, Answer]:
+def _as_it_is(given: Any) -> tuple[Solved, Answer]:
     """Return the true places as an answer: circles do not tell every place."""
     frames, sightings, true = given
-    residuals, _, whiteners = linear_of(frames, sightings, true, {})
-    squares = ((whiteners @ residuals[..., None])[..., 0] ** 2).sum(axis=1)
-    every = np.ones(len(sightings), bool)
-    found = Solved(true, {n: np.eye(6) for n in true}, np.eye(1), residuals, squares, every, 1.0)
-    return found, answer_of(Sighted(frames, sightings, {}, LIMITS), found)
+    problem, every = problem_of(frames, sightings), np.ones(len(sightings))
+    at = Unknowns(np.array([true[name] for name in problem.unknown]))
+    found = solved_of(problem, weigh(problem, at, Noise(0.0, 0.0), every))
+    return found, answer_of(found)
+
+
+def _valley(given: Any, rng: np.random.Generator) -> Solved:
+    """Return where a descent ends that begins anywhere, all sightings counting."""
+    frames, sightings, _ = given
+    problem, every = problem_of(frames, sightings), np.ones(len(sightings))
+    at = Unknowns(np.array([anywhere(rng) for _ in problem.unknown]))
+    exact = Noise(0.0, 0.0)
+    return solved_of(problem, climb(problem, weigh(problem, at, exact, every), exact, every))
 
 
 def test_another_valley_is_not_certified() -> None:
     """Descents that begin anywhere end in the answer, or in a valley that is not certified."""
     rng, wrong = np.random.default_rng(5), 0
     given = made("two cameras, two targets", 0, n=5)
-    best = answered(given)[0].squares.sum()
+    best = squares(answered(given)[0])
     for _ in range(8):
-        found, answer = answered(given, {n: anywhere(rng) for n in given[2]})
-        note = verdict_of(answer).note
-        if found.squares.sum() < 1.001 * best:
+        found = _valley(given, rng)
+        note = verdict_of(answer_of(found)).note
+        if squares(found) < 1.001 * best:
             assert note == OPTIMAL
         else:
             wrong += 1
             assert re.fullmatch(
                 NOT_CERTIFIED + ": with its weights the best .* 1.* deg from it", note
             )
-            moved, (told,) = _at_best(Sighted(*given[:2], {}, LIMITS), found)
-            assert moved.squares.sum() == pytest.approx(best, rel=1e-6)
+            moved, (told,) = _at_best(found)
+            assert squares(moved) == pytest.approx(best, rel=1e-6)
             said = re.fullmatch(
                 "what the search had found was not the best: the certificate led to an answer that "
                 r"leaves (\S+) times its squared errors",
                 told,
             )
             assert said is not None
-            assert float(said[1]) == pytest.approx(best / found.squares.sum(), rel=0.1)
+            assert float(said[1]) == pytest.approx(best / squares(found), rel=0.1)
     assert wrong >= 2
 
 
 def test_an_answer_over_three_places_in_another_valley_is_left_for_the_best() -> None:
     rng, wrong = np.random.default_rng(5), 0
     given = made("three places between", 1, n=8)
-    sighted = Sighted(*given[:2], {}, LIMITS)
     best = answered(given)[0]
-    assert _at_best(sighted, best) == (best, ())
+    assert _at_best(best) == (best, ())
     for _ in range(12):
-        found = answered(given, {n: anywhere(rng) for n in given[2]})[0]
-        if found.squares.sum() > 1.001 * best.squares.sum():
+        found = _valley(given, rng)
+        if squares(found) > 1.001 * squares(best):
             wrong += 1
-            moved, _ = _at_best(sighted, found)
-            assert moved.squares.sum() == pytest.approx(best.squares.sum(), rel=1e-6)
+            moved, _ = _at_best(found)
+            assert squares(moved) == pytest.approx(squares(best), rel=1e-6)
     assert wrong >= 2
 
 
@@ -203,7 +218,7 @@ def test_noise_that_hides_the_answer_is_told_with_its_gap() -> None:
     for seed in range(4):
         frames, sightings, true = made("two on one way", seed, n=4, noise=noise)
         found = solve_graph(frames, sightings, limits=limits, start=true)
-        told.append(verdict_of(answer_of(Sighted(frames, sightings, {}, limits), found)).note)
+        told.append(verdict_of(answer_of(found)).note)
     less = "another answer may leave squared errors less by so much"
     wanted = re.compile(rf"{NOT_CERTIFIED} \(gap \d+\.\d%\): {less}")
     assert [note for note in told if wanted.fullmatch(note)]

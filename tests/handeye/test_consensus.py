@@ -14,18 +14,17 @@ from flangeye.handeye import consensus
 from flangeye.handeye.consensus import (
     _cost,
     _distances,
-    _first_noise,
-    _plausible,
     _require_agreement,
     _require_half,
     _require_majority,
     _require_right_handed,
     find_consensus,
+    plausible,
     spread,
     targets_of,
 )
 from flangeye.handeye.inliers import gate
-from flangeye.handeye.likelihood import Solution
+from flangeye.handeye.likelihood import Solution, first_noise
 from flangeye.handeye.loop import LoopProblem, linearise
 from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.geometry import hat, rotation_exp, rotation_log
@@ -155,7 +154,7 @@ def test_scans_of_other_poses_agree_no_better_than_a_share_of_the_poses_extent(s
     for k, share in ((0, 0.99), (0, 1.01), (1, 0.99), (1, 1.01)):
         sizes = [0.5 * limits[0], 0.5 * limits[1]]
         sizes[k] = share * limits[k]
-        assert _plausible(problem, off_by(found, *sizes)) == (share < 1)
+        assert plausible(problem.measurements, off_by(found, *sizes)) == (share < 1)
 
 
 def test_a_start_that_is_off_is_that_far_off_and_speaks_for_as_much_noise() -> None:
@@ -168,10 +167,10 @@ def test_a_start_that_is_off_is_that_far_off_and_speaks_for_as_much_noise() -> N
     expected = (0.3 * 3e-3) ** 2 + (moved**2).sum(axis=1)
     assert _distances(problem, turned) == pytest.approx(expected, rel=1e-6)
     median = chi2_quantile(0.5, 3)
-    noise = _first_noise(problem, turned)
+    noise = first_noise(problem, turned)
     assert noise.tilt == pytest.approx(9e-6 / median, rel=1e-6)
     assert noise.pose == pytest.approx(np.median((moved**2).sum(axis=1)) / median)
-    stated = _first_noise(replace(problem, stated=True), turned)
+    stated = first_noise(replace(problem, stated=True), turned)
     assert (stated.pose, stated.tilt) == (0.0, 0.0)
 
 
@@ -197,7 +196,7 @@ def test_small_sets_are_tried_where_not_all_agree(monkeypatch: pytest.MonkeyPatc
     problem, found = exactly(n=10)
     costs = {0.6: 5.0, 0.7: 1.0, 0.8: 3.0}
     monkeypatch.setattr(consensus, "_cost", lambda _, s: costs[round(float(s.inliers.mean()), 1)])
-    monkeypatch.setattr(consensus, "_plausible", lambda *_: True)
+    monkeypatch.setattr(consensus, "plausible", lambda *_: True)
 
     def agreeing(count: int) -> Solution:
         return replace(found, inliers=np.arange(10) < count)
@@ -226,7 +225,7 @@ def test_a_mirror_that_leaves_a_tenth_is_named(monkeypatch: pytest.MonkeyPatch) 
     problem, found = exactly()
     rng = np.random.default_rng(0)
     ours = np.array([1.0, 4.0, 100.0, 4.0, 2.0]) * 1e-4
-    monkeypatch.setattr(consensus, "_plausible", lambda *_: False)
+    monkeypatch.setattr(consensus, "plausible", lambda *_: False)
     monkeypatch.setattr(consensus, "_from_all", lambda *_: found)
     for share in (0.0099, 0.0101):
 
@@ -341,7 +340,7 @@ def test_small_sets_are_sixty_of_one_more_than_a_start_needs(
     taken: Any = consensus._from_subsets(problem, np.random.default_rng(0))
     start, noise = taken
     assert asked == [4] * 60 and start.tilt[0] == 5
-    assert noise == _first_noise(problem, start)
+    assert noise == first_noise(problem, start)
     asked.clear()
     three = problem.where(np.arange(9) < 3)
     monkeypatch.setattr(consensus, "_distances", lambda *_: np.full(3, np.inf))

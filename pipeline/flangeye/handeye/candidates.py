@@ -110,7 +110,7 @@ def considered(model: Model, further: Nuisance) -> Floats:
 
 
 def following(problem: Problem, found: Solution, further: Nuisance) -> Floats:
-    """Return (6 K + 2 + k, m) by how much the unknowns follow m further errors, as a fit found them.
+    """Return (6 K + 2 + k, m) by how much a fit's unknowns follow m further errors.
 
     A smooth error of the arm and a walk are found with them, and take their part.
     """

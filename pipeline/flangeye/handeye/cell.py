@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from flangeye.handeye.certificate import GAP
 from flangeye.handeye.certified import Answer, certificate_notes, moved_note, verdict_of
 from flangeye.handeye.estimates import estimate_at, noise_note
 from flangeye.handeye.graph import Sighting, Solved, solve_graph, solved_from, solved_of
-from flangeye.handeye.likelihood import agreeing, weigh
+from flangeye.handeye.likelihood import Solution, agreeing, weigh
 from flangeye.handeye.measurements import measured, shared_errors
 from flangeye.handeye.nuisance import nuisance_seen
 from flangeye.maths.geometry import rigid
@@ -227,13 +226,17 @@ def _pairs(observations: Sequence[Observation], cell: Cell, found: Solved) -> tu
     ends = cell.ends(_transforms(found, cell), observations)
     mapped, expected = mapped_and_expected(ends, observations)
     pairs = []
-    fit = found.found
-    for i, (o, used) in enumerate(zip(observations, fit.inliers, strict=True)):
-        turn, shift = np.linalg.norm(fit.linear.residuals[i].reshape(2, 3), axis=1)
-        sigma = np.sqrt(fit.squares[i])
-        far = f"residual {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} deg, {sigma:.0f} sigma"
-        pairs.append(Pair(o, mapped[i] - expected[i], bool(used), None if used else far))
+    for i, (o, used) in enumerate(zip(observations, found.found.inliers, strict=True)):
+        reason = None if used else _aside(found.found, i)
+        pairs.append(Pair(o, mapped[i] - expected[i], bool(used), reason))
     return tuple(pairs)
+
+
+def _aside(fit: Solution, i: int) -> str:
+    """Return how far a sighting is from what the others say."""
+    turn, shift = np.linalg.norm(fit.linear.residuals[i].reshape(2, 3), axis=1)
+    sigma = np.sqrt(fit.squares[i])
+    return f"residual {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} deg, {sigma:.0f} sigma"
 
 
 def _notes(

@@ -46,14 +46,14 @@ class _Delays:
         covariance: (c, c) of them.
         significant: Whether they are, all together.
         followed: (P, c) how the unknowns follow them.
-        error: What a fit to other sightings leaves of each [m], rms.
+        fit: With them among the unknowns.
     """
 
     values: Floats
     covariance: Floats
     significant: bool
     followed: Floats
-    error: float
+    fit: Solution
 
 
 def on_one_clock(observations: Sequence[Observation], cell: Cell, found: Solved) -> Timed:
@@ -84,7 +84,7 @@ def on_one_clock(observations: Sequence[Observation], cell: Cell, found: Solved)
             break
     if moved is as_paired:
         return _considering(as_paired, first, first.values)
-    helps, told = judged(_error(found.found), left.error, _told(cell, total, left))
+    helps, told = _judged(found.found, left.fit, _told(cell, total, left))
     chosen = (
         _considering(moved, left, 0 * total)
         if helps
@@ -132,7 +132,7 @@ def _delays(timed: Timed, cell: Cell) -> _Delays:
         covariance,
         square > f_quantile(SIGNIFICANT, count, fit.freedom),
         following(found.problem, found.found, late)[: len(found.joint)],
-        _error(fit),
+        fit,
     )
 
 
@@ -147,9 +147,11 @@ def _lateness(timed: Timed, cell: Cell) -> Floats:
     return np.asarray(moved[:, :, None] * whose[:, None, :])
 
 
-def _error(fit: Solution) -> float:
-    """Return what a fit to other sightings leaves [m], rms."""
-    return rms(held_out(fit)[0][fit.inliers])
+def _judged(before: Solution, after: Solution, what: str) -> tuple[bool, str]:
+    """Return whether sightings held out, all that agree with either, speak for the times."""
+    either = before.inliers | after.inliers
+    without, with_them = (rms(held_out(fit)[0][either]) for fit in (before, after))
+    return judged(without, with_them, what)
 
 
 def _considering(timed: Timed, delays: _Delays, off: Floats) -> Timed:

@@ -11,6 +11,7 @@ from flangeye.handeye.components import SHIFT, TURN, Noise
 from flangeye.handeye.inliers import find_inliers
 from flangeye.handeye.likelihood import Solution, agreeing, first_noise, gates, settle, weigh
 from flangeye.handeye.loop import LoopProblem, linearise
+from flangeye.handeye.measurements import Seen
 from flangeye.handeye.observability import FINEST_NOISE, require_observable, spread_of
 from flangeye.handeye.starts import fewest, start_of
 from flangeye.handeye.unknowns import Unknowns, weights_of
@@ -211,7 +212,7 @@ def _of_any(problem: LoopProblem) -> Solution:
     """
     rng = np.random.default_rng(0)
     found = _from_all(problem, rng)
-    if found is None or found.inliers.mean() < 0.7 or not _plausible(problem, found):
+    if found is None or found.inliers.mean() < 0.7 or not plausible(problem.measurements, found):
         robust = _from_subsets(problem, rng)
         found = min(filter(None, (found, robust)), key=lambda s: _cost(problem, s), default=None)
     if found is None:
@@ -274,9 +275,9 @@ def spread(found: Solution) -> tuple[float, float]:
     return float(shift), float(turn)
 
 
-def _plausible(problem: LoopProblem, found: Solution) -> bool:
+def plausible(s: Seen, found: Solution) -> bool:
     """Whether most agree, and better than scans would that belong to other poses."""
-    s, (shift, turn) = problem.measurements, spread(found)
+    shift, turn = spread(found)
     extent = np.sqrt(s.centres.var(axis=0).sum())
     turns = rotation_log(s.rotations @ s.rotations[0].T)
     turned = np.sqrt(turns.var(axis=0).sum())
@@ -287,7 +288,7 @@ def _plausible(problem: LoopProblem, found: Solution) -> bool:
 
 
 def _require_right_handed(problem: LoopProblem, found: Solution, rng: np.random.Generator) -> None:
-    if _plausible(problem, found):
+    if plausible(problem.measurements, found):
         return
     mirrored = replace(problem, measurements=problem.measurements.mirrored())
     other = _from_all(mirrored, rng)
@@ -311,7 +312,7 @@ def _require_majority(problem: LoopProblem, found: Solution) -> None:
             f"only {agreeing} of {given} poses agree with one answer: check that each scan belongs "
             "to its robot pose, and " + CONFIGURED
         )
-    if not _plausible(problem, found):
+    if not plausible(problem.measurements, found):
         raise CalibrationRefused(
             f"the poses agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
             "deg only: check that each scan belongs to its robot pose, and " + CONFIGURED

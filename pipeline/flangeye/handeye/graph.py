@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.handeye.components import Noise
-from flangeye.handeye.inliers import truncated_weights
+from flangeye.handeye.consensus import LARGEST_NOISE, plausible, spread
+from flangeye.handeye.inliers import geman_mcclure
 from flangeye.handeye.likelihood import (
     Problem,
     Solution,
@@ -48,12 +49,12 @@ from flangeye.maths.geometry import (
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.types import Floats, Indices
 
-ITERATIONS, STARTS, TRIES = 60, 60, 6
-"""Of a descent towards most sightings, random starts of it, and steps of which one may help."""
+STARTS, ROUNDS, STEPS = 60, 30, 8
+"""Random starts at most, widths of what counts in a descent of each, and steps with one width."""
 AGREE = 1e-3
 """Two starts whose costs differ by this share ended in one valley, which then is the answer."""
-SOLVED = 1e-9
-"""Places that move by no more than this end a descent [rad, m]."""
+SETTLED = 1e-5
+"""Places that move by no more than this end a descent towards most sightings [rad, m]."""
 MOST = 4.0
 """Sightings beyond so many times the median square of their pair hardly count there."""
 LIMITS = float(np.radians(2)), 20e-3
@@ -273,8 +274,17 @@ def solve_graph(
     problem = problem_of(frames, sightings, noise)
     at = _anywhere(problem) if start is None else _started(problem, start)
     problem, found = _agreed(problem, at)
-    _require_told(problem, found, limits, freedoms)
+    scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
+    weak = bool(weak_moves(found.information, scale))
+    _require_agreement(problem, at, found, weak)
+    if weak:
+        raise CalibrationRefused(_told_unknown(problem, found, scale, freedoms))
     return solved_of(problem, found)
+
+
+def solved_from(problem: GraphProblem, start: Mapping[str, Floats]) -> Solved:
+    """Return the unknowns near a start (4, 4) of each."""
+    return solved_of(*_agreed(problem, _started(problem, start)))
 
 
 def solved_of(problem: GraphProblem, found: Solution) -> Solved:
@@ -292,31 +302,53 @@ def _agreed(problem: GraphProblem, start: Unknowns) -> tuple[GraphProblem, Solut
 
     What noise there is in depth comes last, as of one camera; the problem says if it does.
     """
-    noise = first_noise(problem, start)
+    noise = _first_noise(problem, start)
     begun = weigh(problem, start, noise, np.ones(len(problem.measurements)))
-    found = settle(problem, start, noise, begun.squares <= gates(problem, np.inf))
+    agree = begun.squares <= gates(problem, np.inf)
+    found = settle(problem, start, noise, agree if agree.mean() >= 0.5 else None)
     if problem.stated or not problem.measurements.are_poses:
         return problem, found
     problem = replace(problem, in_depth=True)
     return problem, agreeing(problem, found)
 
 
-def _require_told(
-    problem: GraphProblem,
-    found: Solution,
-    limits: tuple[float, float],
-    freedoms: Mapping[str, Floats] | None,
-) -> None:
-    """Refuse sightings that leave a place unknown: by its name, and what would tell it."""
-    scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
-    information = found.information[: len(scale), : len(scale)]
-    if not weak_moves(information, scale):
+def _first_noise(problem: GraphProblem, start: Unknowns) -> Noise:
+    """Return the noise at which of every pair the better half agrees: each has outliers alone."""
+    noises = _noises(problem, start)
+    return Noise(max(noise.pose for noise in noises), max(noise.tilt for noise in noises))
+
+
+def _noises(problem: GraphProblem, start: Unknowns) -> list[Noise]:
+    """Return the noise of each pair that the better half of its residuals speaks for."""
+    pairs = problem.measurements.pairs
+    return [first_noise(problem.where(pairs == k), start) for k in range(len(problem.ends))]
+
+
+def _require_agreement(problem: GraphProblem, start: Unknowns, found: Solution, weak: bool) -> None:
+    """Refuse sightings whose noise is too large for one answer, or hides what is unknown."""
+    shift, turn = spread(found)
+    hidden = weak and (shift > LARGEST_NOISE[0] or turn > LARGEST_NOISE[1])
+    if problem.stated or (plausible(problem.measurements, found) and not hidden):
         return
+    sizes = [noise.pose for noise in _noises(problem, start)]
+    camera, target = problem.ends[int(np.argmax(sizes))]
+    raise CalibrationRefused(
+        f"the sightings agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
+        f"deg only, those of {target} by {camera} least: check that each belongs to the poses "
+        f"beside it (join: clock_offset, where the clock of {camera} is another), and that the "
+        "cell stands as the recipe says"
+    )
+
+
+def _told_unknown(
+    problem: GraphProblem, found: Solution, scale: Floats, freedoms: Mapping[str, Floats] | None
+) -> str:
+    """Return which places stay unknown, by their names, and what would tell them."""
     agree = problem.where(found.inliers)
     seen = [problem.ends[k] for k in dict.fromkeys(agree.measurements.pairs.tolist())]
     again = _seen_again(agree, found, freedoms)
     loops = Loops(problem.frames, seen, problem.unknown, scale)
-    raise CalibrationRefused(loops.told_unknown(information, again))
+    return loops.told_unknown(found.information, again)
 
 
 # --- what is predicted ---------------------------------------------------------------------------
@@ -451,16 +483,19 @@ def _drawn(rng: np.random.Generator) -> Floats:
 
 
 def _descended(problem: GraphProblem, start: Unknowns) -> Solution:
-    """Return where a start leads, sightings counting less the further they are beyond most."""
-    noise, shares = Noise(0.0, 0.0), np.ones(len(problem.measurements))
-    found = weigh(problem, start, noise, shares)
-    for _ in range(ITERATIONS):
+    """Return where a start leads, sightings counting less the further they are beyond most.
+
+    The width of what counts follows each pair's median, so that it narrows as the fit improves.
+    Weights are the features' own: those of the arms' noise change with their levers.
+    """
+    noise, every = Noise(0.0, 0.0, arms=0.0), np.ones(len(problem.measurements))
+    found = weigh(problem, start, noise, every)
+    for _ in range(ROUNDS):
+        before = found
         widths = np.maximum(MOST * _middles(problem, found.squares), 1e-12)
-        shares = truncated_weights(found.squares / widths, 1.0, 1.0)
-        after = climb(problem, found, noise, shares, iterations=TRIES)
-        moved = np.abs(after.at.places - found.at.places).max()
-        found = after
-        if moved < SOLVED:
+        kernel = partial(geman_mcclure, widths)
+        found = climb(problem, found, noise, kernel(found.squares)[0], STEPS, kernel)
+        if np.abs(found.at.places - before.at.places).max() < SETTLED:
             break
     return found
 

@@ -175,5 +175,18 @@ def truncated_weights(squares: Floats, limit: float, mu: float) -> Floats:
     return weights
 
 
+def geman_mcclure(widths: Floats, squares: Floats) -> tuple[Floats, float]:
+    """Return the weights (N,) and the cost of Geman & McClure (1987): all count, the far hardly.
+
+    For the search of a start: truncated least squares have more valleys.
+
+    Args:
+        widths: (N,) squares of residuals that count a quarter.
+        squares: (N,) of the residuals.
+    """
+    beyond = 1.0 + squares / widths
+    return beyond**-2.0, float((squares / beyond).sum())
+
+
 def _squares(centres: Floats, tcps: Floats, motion: tuple[Floats, Floats]) -> Floats:
     return np.asarray(((centres @ motion[0].T + motion[1] - tcps) ** 2).sum(axis=1))

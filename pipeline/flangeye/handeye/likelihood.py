@@ -7,6 +7,7 @@ non-convexity, then by how far each measurement is from what the others say. Arr
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
@@ -168,8 +169,17 @@ class Solution:
         return int(self.basis.shape[1] - len(self.at.nuisance))
 
 
+Kernel = Callable[[Floats], tuple[Floats, float]]
+"""From (N,) squares to the shares by which they count, and what is to be made small of all."""
+
+
 def climb(
-    problem: Problem, found: Solution, noise: Noise, shares: Floats, iterations: int = ITERATIONS
+    problem: Problem,
+    found: Solution,
+    noise: Noise,
+    shares: Floats,
+    iterations: int = ITERATIONS,
+    kernel: Kernel | None = None,
 ) -> Solution:
     """Return the most likely unknowns near a start, each measurement counting by its share.
 
@@ -179,14 +189,21 @@ def climb(
         noise: Noise beyond the stated covariances; not estimated here.
         shares: (N,) from 0 to 1.
         iterations: Steps at most.
+        kernel: Tells the shares from the squares at every step; these are the first then.
     """
     # While the noise is as before, so are the weights.
     weights = found.weights if noise == found.noise else None
     here = _weighed(problem, found.at, found.linear, noise, shares, weights)
-    return _climb_on(problem, here, shares, iterations)
+    return _climb_on(problem, here, shares, iterations, kernel)
 
 
-def _climb_on(problem: Problem, here: Solution, shares: Floats, iterations: int) -> Solution:
+def _climb_on(
+    problem: Problem,
+    here: Solution,
+    shares: Floats,
+    iterations: int,
+    kernel: Kernel | None = None,
+) -> Solution:
     """Return the most likely unknowns near what is weighed with these shares already."""
     noise, damping = here.noise, LEAST_DAMPING
     for _ in range(iterations):
@@ -194,8 +211,12 @@ def _climb_on(problem: Problem, here: Solution, shares: Floats, iterations: int)
         if gain < SETTLED * max(1.0, here.cost) or damping > 1e8:
             break
         there = weigh(problem, step, noise, shares)
-        better = there.cost <= here.cost * (1 + 1e-12)
+        before, after = (x.cost if kernel is None else kernel(x.squares)[1] for x in (here, there))
+        better = after <= before * (1 + 1e-12)
         here = there if better else here
+        if better and kernel is not None:
+            shares, _ = kernel(here.squares)
+            here = _weighed(problem, here.at, here.linear, noise, shares, here.weights)
         damping = max(damping / 100, LEAST_DAMPING) if better else max(1e-4, damping * 10)
     return here
 
