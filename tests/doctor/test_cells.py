@@ -55,8 +55,8 @@ def mounted_elsewhere(seen: Sequence[Observation], cell: Cell) -> Session:
 
 
 def mispaired(seen: Sequence[Observation], cell: Cell) -> Session:
-    other = {"poses": seen[8].poses, "arm_joints": seen[8].arm_joints}
-    return [replace(o, **other) if i == 3 else o for i, o in enumerate(seen)], cell
+    other = replace(seen[3], poses=seen[8].poses, arm_joints=seen[8].arm_joints)
+    return [other if i == 3 else o for i, o in enumerate(seen)], cell
 
 
 def swapped(seen: Sequence[Observation], cell: Cell) -> Session:
