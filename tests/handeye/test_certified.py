@@ -11,7 +11,7 @@ from flangeye.handeye import certified
 from flangeye.handeye.cell import _at_best, answer_of, calibrate_cell
 from flangeye.handeye.certified import NOT_CERTIFIED, OPTIMAL, Answer, _sightings, verdict_of
 from flangeye.handeye.components import Noise
-from flangeye.handeye.graph import Sighting, Solved, problem_of, solve_graph, solved_of
+from flangeye.handeye.graph import LIMITS, Sighting, Solved, problem_of, solve_graph, solved_of
 from flangeye.handeye.likelihood import climb, weigh
 from flangeye.handeye.unknowns import Unknowns
 from flangeye.maths.frame_graph import Frame, composed

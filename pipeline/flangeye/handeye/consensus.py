@@ -79,7 +79,7 @@ def again(consensus: Consensus, problem: LoopProblem) -> Consensus:
 def begun_at(consensus: Consensus, at: Unknowns) -> Consensus:
     """Return what the measurements agree on near other values of the unknowns."""
     problem = consensus.problem
-    return replace(consensus, found=settle(problem, at, _first_noise(problem, at)))
+    return replace(consensus, found=settle(problem, at, first_noise(problem, at)))
 
 
 def _of_points(problem: LoopProblem, rotation_limit: float) -> Consensus:
