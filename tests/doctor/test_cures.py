@@ -167,3 +167,35 @@ def test_the_line_cures(tmp_path: Path, fault: Any) -> None:
     assert examine(open_session(archive, REGISTRY, corrected_session), CHECKS).findings == ()
     before = apart(calibrated(recipe, archive), truth)
     assert fault in HARMLESS or before[0] > 5 * shift
+
+
+def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path: Path) -> None:
+    """The tip of a tool was recorded: ``place: unknown`` finds it, with a scanner's file too."""
+    rng = np.random.default_rng(2)
+    session = clean(rng, N, "centres", turn=0.4)
+    offset = np.array([0.02, 0.03, 0.08])
+    tips = np.array(session.poses)
+    tips[:, :3, 3] += tips[:, :3, :3] @ offset
+    rows = np.hstack([tips.reshape(N, 16), session.centres])
+    (tmp_path / "poses.csv").write_text("\n".join(",".join(map(repr, r)) for r in rows.tolist()))
+    target = {"columns": [17, 18, 19], "rotation": "point", "length": "m"}
+    table = {
+        "rotation": "matrix", "length": "m", "pose": "base_T_flange",
+        "columns": list(range(1, 17)), "target": target,
+    }  # fmt: skip
+    step = {"acquire.centres": {"reader": {"table": table}, "centre_noise": "0.1 mm"}}
+    recipe = {
+        "title": "Tip",
+        "robot": "ur5e",
+        "scanner": "phoxi-m",
+        "steps": [step, "solve.robust"],
+    }
+    told = []
+    for more in ({}, {"configuration": {"name": "eye-on-base", "place": "unknown"}}):
+        path = tmp_path / "recipe.yaml"
+        path.write_text(yaml.safe_dump({**recipe, **more}))
+        told.append(Runner(load_recipe(path, REGISTRY), REGISTRY, ArchivePath(tmp_path)).run())
+    assert "configuration: {place: unknown} finds it" in told[0].refused
+    assert told[1].refused is None
+    found = np.array(told[1].transforms["flange_T_target"].matrix)[:3, 3]
+    assert found == pytest.approx(-offset, abs=1e-3)

@@ -17,6 +17,7 @@ from flangeye.handeye.components import Noise
 from flangeye.handeye.consensus import Consensus
 from flangeye.handeye.likelihood import first_noise
 from flangeye.handeye.loop import ArmNoise, LoopProblem
+from flangeye.handeye.target_size import EstimatedFactor
 from flangeye.maths.statistics import covariance_inflation
 from tests.handeye.cells import CONFIGURATIONS, Session, fitted, given, session, two_numbers
 
@@ -295,7 +296,7 @@ def sized_by(
 
     def factor(*_: Any) -> Any:
         share, sigma = next(left)
-        return SimpleNamespace(share=share, sigma=sigma)
+        return EstimatedFactor(share, sigma, np.inf)
 
     monkeypatch.setattr(calibration, "estimated_factor", factor)
     monkeypatch.setattr(calibration, "_agreed", lambda *_: fit)

@@ -70,6 +70,7 @@ def test_a_factor_is_certain_beyond_what_chance_gives_once_in_a_million() -> Non
         ((-0.03, 1e-3), (0.02, 1e-3), "the target is 0.9700 +- 0.0010 times as large as was said"),
         ((0.009, 1e-4), (0.02, 1e-3), None),  # within the limit
         ((0.03, 2e-2), (0.02, 2e-2), None),  # not certain
+        ((-1.0, 1e-3), (0.02, 1e-3), None),  # of no size at all
     ],
 )
 def test_the_surer_of_size_and_focal_length_is_named(

@@ -175,7 +175,7 @@ def _with_size(cell: Cell, model: Model, options: Options, size: float) -> tuple
     for _ in range(SIZES):
         longer = longer_distances(model.problem.measurements)
         told = estimated_factor(model, longer)
-        if not 0.1 < 1 + told.share < 10 or told.sigma > LOOSEST_SIZE:
+        if not told.is_believable or told.sigma > LOOSEST_SIZE:
             raise CalibrationRefused(
                 f"the target's size is told to {told.sigma:.1%} only: move the arm further between "
                 "poses, or say target_size: known"

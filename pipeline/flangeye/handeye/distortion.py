@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from flangeye.handeye.measurements import Measurements
-from flangeye.handeye.nuisance import Nuisance, nuisance_of
+from flangeye.handeye.nuisance import Nuisance, no_nuisance, nuisance_of
 from flangeye.maths.geometry import hat, stack_rows
 from flangeye.maths.smooth_field import features
 from flangeye.models.scanners import ScannerModel
@@ -72,9 +72,9 @@ def edges_of(measurements: Measurements, seen: Mask) -> Nuisance:
     across = np.einsum("na,nab,nb->n", normals, own, normals)
     in_face = np.trace(own, axis1=1, axis2=2) - across
     tilts = (along[seen] ** 2).sum()
-    size = (
-        float(np.sqrt(in_face[seen].sum() / tilts)) if tilts > LEAST_TILT**2 * seen.sum() else 0.0
-    )
+    if tilts <= LEAST_TILT**2 * seen.sum():  # centres without a face, too
+        return no_nuisance(len(s))
+    size = float(np.sqrt(in_face[seen].sum() / tilts))
     moves = np.zeros((len(s), 6, 1))
     moves[seen, 3:, 0] = along[seen]
     still = np.zeros_like(moves)

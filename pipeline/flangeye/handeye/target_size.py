@@ -21,6 +21,8 @@ from flangeye.types import Floats
 
 CERTAIN = 1 - 1e-6
 """Probability with which a factor that is named is not noise's doing."""
+BELIEVABLE = 0.1, 10.0
+"""Factors that a wrong size comes to."""
 
 
 def require_size(model: Model, limit: float, arms: Arms) -> None:
@@ -45,7 +47,7 @@ def require_size(model: Model, limit: float, arms: Arms) -> None:
     told, is_size = (size, True) if size.score >= focal.score else (focal, False)
     if abs(told.share) > limit and told.is_certain:
         told = estimated_factor(model, every[not is_size], arms)
-    if abs(told.share) <= limit or not told.is_certain:
+    if abs(told.share) <= limit or not told.is_certain or not told.is_believable:
         return
     factor = f"{1 + told.share:.4f} +- {told.sigma:.4f} times as"
     if is_size:
@@ -79,6 +81,11 @@ class EstimatedFactor:
     def score(self) -> float:
         """How sure it is that the factor is not one: squared, in standard deviations."""
         return (self.share / self.sigma) ** 2
+
+    @property
+    def is_believable(self) -> bool:
+        """Whether a target may be of such a size: an arm that only turns tells of none at all."""
+        return BELIEVABLE[0] < 1 + self.share < BELIEVABLE[1]
 
     @property
     def is_certain(self) -> bool:

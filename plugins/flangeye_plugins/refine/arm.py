@@ -114,6 +114,8 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
     found = _best(before, arm, prior)
     errors = _held_out(before, arm, found, prior)
     known = identified(found.fit, prior, found.apart)
+    if before.correction is not None and before.correction.tool_offset.any():
+        known[-1, NAMES.index("a") : NAMES.index("d") + 1] = False  # moves the circle likewise
     about_arm = [
         _identifiability(known, combinations(found.fit, prior), found),
         *_listed(known, found, prior),
