@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from flangeye.handeye.likelihood import Problem, Solution, weigh
 from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.maths.geometry import stack_rows
-from flangeye.types import ArmCorrection, Floats, Mask
+from flangeye.types import ArmCorrection, Floats
 
 LEAST_KEPT = 1e-9
 """Singular values below this share of the largest are left out."""
@@ -143,24 +142,6 @@ def judged(before: float, after: float, what: str) -> tuple[bool, str]:
     return True, f"{what} ({compared})"
 
 
-class Fit(NamedTuple):
-    """A fit, linear about its answer.
-
-    Attributes:
-        residuals: (N, 6) rotation before translation.
-        jacobian: (N, 6, P).
-        weights: (N, 6, 6) inverse covariances.
-        covariance: (P, P) of the unknowns.
-        inliers: (N,) which took part.
-    """
-
-    residuals: Floats
-    jacobian: Floats
-    weights: Floats
-    covariance: Floats
-    inliers: Mask
-
-
 def held_out(found: Solution) -> tuple[Floats, Floats]:
     """Return (N, 3) errors of the centres, each of a fit to the other folds, in ``camera`` [m].
 
@@ -170,21 +151,13 @@ def held_out(found: Solution) -> tuple[Floats, Floats]:
     """
     if found.course is not None:
         return _each_left_out(found)
-    linear = found.linear
-    return by_folds(
-        Fit(linear.residuals, linear.jacobian, found.weights, found.covariance, found.inliers)
-    )
-
-
-def by_folds(fit: Fit) -> tuple[Floats, Floats]:
-    """Return the same of any fit whose measurements are independent; see :func:`held_out`."""
-    errors, covariances = fit.residuals.copy(), np.zeros((len(fit.residuals), 3, 3))
-    kept = np.flatnonzero(fit.inliers)
+    errors = found.linear.residuals.copy()
+    covariances, kept = np.zeros((len(errors), 3, 3)), np.flatnonzero(found.inliers)
     folds = max(FOLDS, len(kept) // LARGEST_FOLD)
     order = np.random.default_rng(0).permutation(kept)
     for fold in range(min(folds, len(kept))):
         part = np.sort(order[fold::folds])
-        error, covariance = _without(fit, part)
+        error, covariance = _without(found, part)
         errors[part], n = error, len(part)
         covariances[part] = covariance.reshape(n, 6, n, 6)[np.arange(n), 3:, np.arange(n), 3:]
     return errors[:, 3:], covariances
@@ -198,16 +171,17 @@ def _each_left_out(found: Solution) -> tuple[Floats, Floats]:
     return errors, np.where(kept, share @ noise, 0.0)[:, 3:, 3:]
 
 
-def _without(fit: Fit, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _without(found: Solution, part: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Return (n, 6) errors of a part by a fit to the rest, and their (6 n, 6 n) covariance."""
     size = 6 * len(part)
-    jacobian = stack_rows(fit.jacobian[part])
-    weighted = stack_rows(fit.weights[part] @ fit.jacobian[part])
-    noise = np.linalg.pinv(fit.weights[part], rcond=1e-12, hermitian=True)
+    linear, weights = found.linear, found.weights[part]
+    jacobian = stack_rows(linear.jacobian[part])
+    weighted = stack_rows(weights @ linear.jacobian[part])
+    noise = np.linalg.pinv(weights, rcond=1e-12, hermitian=True)
     own = np.zeros((len(part), 6, len(part), 6))
     own[np.arange(len(part)), :, np.arange(len(part))] = noise
-    right = np.column_stack([fit.residuals[part].ravel(), own.reshape(size, size)])
-    share = np.eye(size) - jacobian @ fit.covariance @ weighted.T
+    right = np.column_stack([linear.residuals[part].ravel(), own.reshape(size, size)])
+    share = np.eye(size) - jacobian @ found.covariance @ weighted.T
     left = _solved(share, right)
     return left[:, 0].reshape(-1, 6), left[:, 1:]
 
