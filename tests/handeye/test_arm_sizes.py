@@ -10,12 +10,24 @@ from flangeye.handeye.arm_sizes import (
     RATIOS,
     SMALLEST,
     TOGETHER,
-    Sizes,
+    Answer,
+    _region,
     _shapes,
-    likely_sizes,
+    sizes_told,
+    stated,
 )
+from flangeye.maths.geometry import stack_rows
+from flangeye.types import Floats
 
 FREEDOM = 240.0
+
+
+def likely_sizes(rows, kinds, errors, freedom):
+    """Return the sizes of some kinds of errors, by what sightings tell of unknowns and of them."""
+    known = np.linalg.qr(stack_rows(rows))[0]
+    told = stack_rows(np.concatenate([*kinds, errors[..., None]], axis=2))
+    told = told - known @ (known.T @ told)
+    return sizes_told(told.T @ told, [kind.shape[2] for kind in kinds], freedom - rows.shape[2])
 
 
 def drawn(rng, size, beside, count=20):
@@ -36,19 +48,17 @@ def test_each_size_is_the_one_that_made_the_errors(beside: float) -> None:
     assert np.mean(told, axis=0) == pytest.approx([4.0, 4.0 * beside], rel=0.3)
 
 
-def test_what_the_errors_leave_of_the_noise_is_told() -> None:
+def test_a_smaller_noise_than_was_said_leaves_smaller_errors() -> None:
     rows, kinds, errors = drawn(np.random.default_rng(1), 8.0, 1.0)
     sizes = likely_sizes(rows, kinds, errors / 2, FREEDOM)
-    assert sizes.weights @ sizes.noise == pytest.approx(0.25, rel=0.4)
     assert sizes.expected[0] == pytest.approx(4.0, rel=0.4)
-    assert (likely_sizes(rows, kinds, 3 * errors, FREEDOM).noise == 1.0).all()  # at most
 
 
 def test_errors_are_neither_far_smaller_nor_far_larger_than_was_said() -> None:
     rows, kinds, errors = drawn(np.random.default_rng(2), 0.0, 1.0)
     sizes = likely_sizes(rows, kinds, errors, FREEDOM)
     assert (sizes.factors[:, 0] >= SMALLEST).all()
-    assert sizes.expected[0] < 0.6
+    assert sizes.expected[0] < 1.2
     far = likely_sizes(rows, kinds, errors + 25.0 * kinds[0][:, :, 0], FREEDOM)
     assert (far.factors[:, 0] <= LARGEST).all()
     for scale in (1e-6, 1e6):  # none of those is likely: it is taken as was said
@@ -66,17 +76,59 @@ def test_sizes_that_nothing_tells_stay_open() -> None:
 
 
 def test_a_region_holds_its_share_of_all_that_is_likely() -> None:
-    sizes = Sizes(np.array([0.7, 0.3]), np.array([[1.0], [5.0]]), np.ones(2))
-    parts = [np.eye(6), 4 * np.eye(6)]
-    covariance = sizes.mixed(parts)
+    weights, sizes = np.array([0.7, 0.3]), np.array([5.0, 101.0])
+    covariance = _region(weights, sizes[:, None, None] * np.eye(6), np.zeros((2, 6)))
     rng = np.random.default_rng(4)
-    factor = np.where(rng.random(20000) < 0.7, 1.0, 5.0)
-    errors = np.sqrt(1 + 4 * factor**2)[:, None] * rng.standard_normal((20000, 6))
+    factor = np.where(rng.random(20000) < 0.7, *sizes)
+    errors = np.sqrt(factor)[:, None] * rng.standard_normal((20000, 6))
+    assert inside(errors, covariance) == pytest.approx(0.95, abs=0.01)
+    alone = _region(np.ones(1), 16.5 * np.eye(6)[None], np.zeros((1, 6)))
+    assert alone == pytest.approx(16.5 * np.eye(6), rel=1e-6)
+
+
+def test_a_region_holds_its_share_about_an_answer_that_is_known_to_be_off() -> None:
+    offsets = np.array([[8.0, 0, 0, 0, 0, 0], [0, 3.0, 0, 0, 0, 0]])
+    covariances, weights = np.array([np.eye(6), 4 * np.eye(6)]), np.array([0.6, 0.4])
+    covariance = _region(weights, covariances, offsets)
+    rng = np.random.default_rng(4)
+    case = (rng.random(20000) > 0.6).astype(int)
+    errors = offsets[case] + (1.0 + case)[:, None] * rng.standard_normal((20000, 6))
+    assert inside(errors, covariance) == pytest.approx(0.95, abs=0.015)
+
+
+def inside(errors, covariance):
+    """Return how many of some errors lie in the 95 % region."""
     squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors.T).T)
-    assert (squares < 12.59).mean() == pytest.approx(0.95, abs=0.01)
-    alone = Sizes(np.ones(1), np.array([[2.0]]), np.array([0.5]))
-    assert alone.mixed(parts) == pytest.approx(16.5 * np.eye(6), rel=1e-6)
-    assert alone.mixed(parts, np.ones(1)) == pytest.approx(17 * np.eye(6), rel=1e-6)
+    return (squares < 12.59).mean()
+
+
+def test_what_residuals_tell_of_errors_is_no_more_unknown() -> None:
+    """Six unknowns and twenty errors, against the posterior of them all at once."""
+    rng = np.random.default_rng(6)
+    rows, kind = rng.normal(size=(240, 6)), rng.normal(size=(240, 20))
+    errors = rng.normal(size=240) + kind @ (4.0 * rng.normal(size=20))
+    known: Floats = np.asarray(np.linalg.inv(rows.T @ rows), dtype=np.float64)
+    left = np.column_stack([kind, errors])
+    left = left - rows @ (known @ (rows.T @ left))
+    answer = Answer(np.zeros(6), known, known @ rows.T @ kind)
+    covariance, sizes = stated(left.T @ left, [20], 234.0, answer)
+    prior = np.diag(np.repeat([0.0, 1 / sizes.expected[0] ** 2], [6, 20]))
+    both = np.hstack([rows, kind])
+    told = np.linalg.inv(both.T @ both + prior)
+    off = (told @ both.T @ left[:, -1])[:6]
+    expected = told[:6, :6] + np.outer(off, off)
+    apart = np.linalg.solve(expected, covariance)
+    assert np.linalg.eigvals(apart).real == pytest.approx(np.ones(6), rel=0.25)
+    unheard = known + (sizes.expected[0] * answer.moved) @ (sizes.expected[0] * answer.moved).T
+    assert np.trace(covariance) < 1.1 * np.trace(expected) < 0.8 * np.trace(unheard)
+
+
+def test_where_no_size_is_likely_errors_are_as_was_said() -> None:
+    gram = np.diag([0.0, 0.0, 1e14])
+    answer = Answer(np.zeros(6), np.eye(6), np.eye(6)[:, :2])
+    covariance, sizes = stated(gram, [2], 100.0, answer)
+    assert covariance == pytest.approx(np.diag([2.0, 2.0, 1, 1, 1, 1]), rel=1e-6)
+    assert sizes.expected == pytest.approx([1.0]) and sizes.gain == 0.0
 
 
 def test_sizes_weigh_as_much_as_they_are_likely() -> None:
@@ -112,21 +164,17 @@ def test_others_are_larger_or_smaller_one_at_a_time_or_all_together() -> None:
 
 def test_a_region_of_errors_along_one_axis_holds_its_share() -> None:
     """Whose squares spread more than those of six."""
-    sizes = Sizes(np.ones(1), np.array([[10.0]]), np.ones(1))
-    along = np.diag([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    covariance = sizes.mixed([1e-2 * np.eye(6), along])
-    errors = np.random.default_rng(5).standard_normal((20000, 6)) * np.sqrt(
-        np.diag(1e-2 * np.eye(6) + 100 * along)
-    )
-    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors.T).T)
-    assert (squares < 12.59).mean() == pytest.approx(0.95, abs=0.01)
+    one = np.diag([100.01, 0.01, 0.01, 0.01, 0.01, 0.01])
+    covariance = _region(np.ones(1), one[None], np.zeros((1, 6)))
+    errors = np.random.default_rng(5).standard_normal((20000, 6)) * np.sqrt(np.diag(one))
+    assert inside(errors, covariance) == pytest.approx(0.95, abs=0.01)
 
 
 def test_each_place_has_a_region_of_its_own() -> None:
     """One of two follows the errors; what is no unknown stays so."""
-    sizes = Sizes(np.array([0.7, 0.3]), np.array([[1.0], [5.0]]), np.ones(2))
+    weights, sizes = np.array([0.7, 0.3]), np.array([5.0, 101.0])[:, None, None]
     first, second = np.diag([1.0] * 6 + [0.0] * 6), np.diag([0.0] * 6 + [1.0] * 5 + [0.0])
-    covariance = sizes.mixed([first + second, 4 * first])
-    alone = sizes.mixed([np.eye(6), 4 * np.eye(6)])
+    covariance = _region(weights, sizes * first + second, np.zeros((2, 12)))
+    alone = _region(weights, sizes * np.eye(6), np.zeros((2, 6)))
     assert covariance[:6, :6] == pytest.approx(alone)
     assert covariance[6:, 6:] == pytest.approx(second[6:, 6:], rel=1e-6)

@@ -80,14 +80,14 @@ def test_weight_beyond_a_joint_pulls_by_its_horizontal_lever() -> None:
 
 
 def test_kinds_of_errors_are_as_large_beside_a_zero_of_one_radian_as_is_said() -> None:
-    """Lengths 0.1 m, twists 0.2 rad, waves 0.4 rad, and 2 rad a metre of lever."""
+    """Lengths 0.2 m, twists 0.2 rad, waves 0.4 rad, and 2 rad a metre of lever."""
     kinds = by_kind()
     columns = ARM.jacobian(JOINTS)
     levers = _levers(ARM, JOINTS)
     assert kinds["sag"][:, :, :6] == pytest.approx(SIZE * 2.0 * columns * levers[:, None])
     cosines = kinds["encoders"][:, :, 6:]
     assert cosines == pytest.approx(SIZE * 0.4 * columns * np.cos(JOINTS)[:, None])
-    for kind, which, step in (("lengths", 5, [0, 0.1, 0]), ("twists", 3, [0, 0, 0.2])):
+    for kind, which, step in (("lengths", 5, [0, 0.2, 0]), ("twists", 3, [0, 0, 0.2])):
         change = np.zeros((6, 3))
         change[2 if kind == "lengths" else 3] = 1e-6 * np.array(step)
         built = twists(ARM.altered(change).flange(JOINTS), ARM.flange(JOINTS)) * SIZE / 1e-6

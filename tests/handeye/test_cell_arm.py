@@ -107,7 +107,7 @@ def test_both_answers_hold_for_two_arms_as_bad_as_real_ones() -> None:
 
 
 def test_the_size_of_every_kind_of_error_is_told() -> None:
-    sizes = Sizes(np.ones(1), np.array([[5.0, 1.0, 2.0, 3.0, 4.0, 6.0]]), np.ones(1))
+    sizes = Sizes(np.ones(1), np.array([[5.0, 1.0, 2.0, 3.0, 4.0, 6.0]]))
     (told,) = _note_of_sizes(sizes)
     assert "counts joint zeros 5.0 times as large as the robots' files say" in told
     assert "encoders 1.0, sag 2.0, lengths 3.0, twists 4.0" in told

@@ -2,7 +2,9 @@
 
 As for a cell's arms (``cell_arms``): zeros of joints, encoders, sag, lengths, twists, and what is
 smooth over the workspace. They move neighbouring poses alike, so that the answer follows them where
-independent noise would average out. ("Consider" covariance, Schmidt 1966.)
+independent noise would average out ("consider" covariance, Schmidt 1966). Of what it followed,
+residuals tell most: they say where the truth is to be looked for, and a region is about the answer
+as it was given.
 """
 
 from __future__ import annotations
@@ -11,14 +13,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
 from flangeye.handeye.arm import MovedFlange
-from flangeye.handeye.arm_sizes import Sizes, sizes_told
+from flangeye.handeye.arm_sizes import Answer, Sizes, sizes_told, stated
 from flangeye.handeye.bent import Bent
 from flangeye.handeye.candidates import Model, following, weighed_with
-from flangeye.handeye.likelihood import Problem, Solution
+from flangeye.handeye.components import Noise
+from flangeye.handeye.likelihood import Problem, Solution, with_noise
 from flangeye.handeye.nuisance import Nuisance
 from flangeye.types import Floats
 
@@ -40,12 +44,11 @@ def with_arm_errors(model: Model, arms: Arms, inflation: float) -> tuple[Floats,
     Raises:
         ValueError: The kinematics are not known, or do not reach the poses.
     """
-    own = inflation * model.found.covariance[:18, :18]
-    return with_errors(model.problem, model.found, _kinds(arms), own)
+    return with_errors(model.problem, model.found, _kinds(arms), inflation)
 
 
 def with_errors(
-    problem: Problem, found: Solution, kinds: Sequence[Nuisance], own: Floats
+    problem: Problem, found: Solution, kinds: Sequence[Nuisance], inflation: float
 ) -> tuple[Floats, Sizes]:
     """Return the (6 K, 6 K) covariance of the places with errors of some kinds in it, and sizes.
 
@@ -53,12 +56,11 @@ def with_errors(
         problem: What was given.
         found: Its fit without them.
         kinds: The errors of each kind, as large as was said.
-        own: (6 K, 6 K) covariance of the fit itself.
+        inflation: Factor on the covariance of the fit itself, for its noise was estimated.
     """
     sizes = sizes_of(problem, found, kinds)
-    moved = following(problem, found, reduce(Nuisance.and_also, kinds))[: len(own)]
-    each = np.split(moved, np.cumsum([len(kind) for kind in kinds])[:-1], axis=1)
-    return sizes.mixed([own, *(followed @ followed.T for followed in each)]), sizes
+    beside = _noise_beside(problem, found, kinds, sizes.expected)
+    return _told(problem, replace(found, noise=beside), kinds).stated(inflation)
 
 
 def last_unknown_by_arms(model: Model, arms: Arms) -> float:
@@ -93,23 +95,82 @@ def _unknown(arms: Arms) -> bool:
 
 
 def sizes_of(problem: Problem, found: Solution, kinds: Sequence[Nuisance]) -> Sizes:
-    """Return how large errors of some kinds are, by a fit in which each is as large as was said.
+    """Return how large errors of some kinds are, by a fit in which each is as large as was said."""
+    return _told(problem, found, kinds).sizes
 
-    Of the fit's information and slope, so that what walked has been taken out as well. A smooth
-    error that was found is none of it: it would explain what the arm's do.
+
+class _Told(NamedTuple):
+    """What agreeing measurements tell of the unknowns, and of errors as large as was said.
+
+    Attributes:
+        fit: Both, at what was found of the former without the latter.
+        counts: How many errors each kind has.
+        freedom: How many numbers the residuals are, less the unknowns.
     """
-    bare = replace(problem, nuisance=problem.nuisance.without_sized())
-    fit = weighed_with(bare, found, reduce(Nuisance.and_also, kinds))
+
+    fit: Solution
+    counts: list[int]
+    freedom: float
+
+    @property
+    def sizes(self) -> Sizes:
+        """How large the errors are."""
+        return sizes_told(self._gram, self.counts, self.freedom)
+
+    def stated(self, inflation: float) -> tuple[Floats, Sizes]:
+        """Return the (6 K, 6 K) covariance of the places, and the sizes."""
+        p, known, across = self._unknowns
+        places = self.fit.basis[: self.fit.at.of_places, :p]
+        own = inflation * places @ known @ places.T
+        answer = Answer(places @ known @ self.fit.slope[:p], own, places @ known @ across)
+        return stated(self._gram, self.counts, self.freedom, answer)
+
+    @property
+    def _gram(self) -> Floats:
+        p, known, across = self._unknowns
+        information, slope = self.fit.information, self.fit.slope
+        along = slope[p:] - across.T @ known @ slope[:p]
+        left = self.fit.cost - slope[:p] @ known @ slope[:p]
+        expected = np.eye(len(along))
+        effects = information[p:, p:] - expected - across.T @ known @ across
+        return np.block([[effects, along[:, None]], [along, left]])
+
+    @property
+    def _unknowns(self) -> tuple[int, Floats, Floats]:
+        """How many there are, their (p, p) covariance, and (p, k) what they share with errors."""
+        p = self.fit.basis.shape[1] - sum(self.counts)
+        information = self.fit.information
+        return p, np.asarray(np.linalg.inv(information[:p, :p])), information[:p, p:]
+
+
+def _told(problem: Problem, found: Solution, kinds: Sequence[Nuisance]) -> _Told:
+    """Return what the measurements that agree tell of errors of some kinds.
+
+    By the fit's information and slope, so that what walked has been taken out as well.
+    """
+    fit = weighed_with(_bare(problem), found, reduce(Nuisance.and_also, kinds))
     counts = [len(kind) for kind in kinds]
-    p = fit.basis.shape[1] - sum(counts)
-    known, across = np.linalg.inv(fit.information[:p, :p]), fit.information[:p, p:]
-    along = fit.slope[p:] - across.T @ known @ fit.slope[:p]
-    left = fit.cost - fit.slope[:p] @ known @ fit.slope[:p]
-    expected = np.eye(sum(counts))
-    effects = fit.information[p:, p:] - expected - across.T @ known @ across
-    gram = np.block([[effects, along[:, None]], [along, left]])
     measured = np.trace(problem.measurements.projectors[fit.inliers], axis1=1, axis2=2).sum()
-    return sizes_told(gram, counts, float(measured) - p)
+    return _Told(fit, counts, float(measured) - fit.basis.shape[1] + sum(counts))
+
+
+def _noise_beside(
+    problem: Problem, found: Solution, kinds: Sequence[Nuisance], sizes: Floats
+) -> Noise:
+    """Return the noise that is left beside errors of those sizes.
+
+    As long as they are not known they look like noise, and more like that of places than of turns.
+    """
+    sized = [
+        replace(kind, prior=size * kind.prior) for kind, size in zip(kinds, sizes, strict=True)
+    ]
+    errors, bare = reduce(Nuisance.and_also, sized), _bare(problem)
+    return with_noise(bare.beside(errors), weighed_with(bare, found, errors)).noise
+
+
+def _bare(problem: Problem) -> Problem:
+    """Return the problem without a smooth error found: it would explain what the arm's do."""
+    return replace(problem, nuisance=problem.nuisance.without_sized())
 
 
 def _kinds(arms: Arms) -> list[Nuisance]:

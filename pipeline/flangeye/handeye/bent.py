@@ -12,11 +12,12 @@ from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import effects, field_over
 from flangeye.types import Floats
 
-LENGTH, TWIST, WAVE, SAG = 0.1, 0.2, 0.4, 2.0
+LENGTH, TWIST, WAVE, SAG = 0.2, 0.2, 0.4, 2.0
 """Of an arm whose zeros are off by 1 rad: how far its lengths [m], twists [rad] and encoders once a
-turn [rad], are, and by what a joint gives way for a metre of lever [rad]. Zeros, lengths and twists
-are as ``refine.arm`` expects them of each other; each kind may be larger or smaller beside them."""
-FIELD = LENGTH
+turn [rad], are, and by what a joint gives way for a metre of lever [rad]. Zeros and twists are as
+``refine.arm`` expects them of each other, lengths twice that, for most of them are taken up by
+places and stay unseen; each kind may be larger or smaller beside them."""
+FIELD = 0.1
 """Likewise what none of these explains, smooth over the workspace [m]."""
 KINDS = "encoders", "sag", "lengths", "twists", "what is smooth over the workspace"
 """Errors beside those of the zeros; each has a size of its own."""

@@ -16,7 +16,7 @@ from flangeye.handeye.arm import MovedFlange
 from flangeye.handeye.arm_errors import sizes_of, with_errors
 from flangeye.handeye.arm_sizes import Sizes
 from flangeye.handeye.bent import Bent, BentArm
-from flangeye.handeye.candidates import following, held_out, judged, rms
+from flangeye.handeye.candidates import held_out, judged, rms
 from flangeye.handeye.graph import GraphProblem, Solved, solved_of
 from flangeye.handeye.likelihood import Solution, agreeing
 from flangeye.handeye.nuisance import Nuisance, nuisance_seen
@@ -105,7 +105,7 @@ def considering_errors(
     if not branches:
         return found, None
     kinds = _kinds(found.problem, found.found, likeliest(found, branches))
-    joint, sizes = with_errors(found.problem, found.found, kinds, found.joint)
+    joint, sizes = with_errors(found.problem, found.found, kinds, found.inflation)
     return found.with_joint(joint), sizes
 
 
@@ -131,7 +131,7 @@ def correcting_zeros(
     either = fits[0].inliers | fits[1].inliers
     before, after = (rms(held_out(fit)[0][either]) for fit in fits)
     helps, told = judged(before, after, _told(corrected.arms))
-    return (_considering(corrected, sizes) if helps else None), told
+    return (_considering(corrected) if helps else None), told
 
 
 def _corrected(found: Solved, arms: Sequence[BentArm], size: float) -> CorrectedArms:
@@ -163,18 +163,11 @@ def _stepped(arms: Sequence[BentArm], fit: Solution) -> list[BentArm]:
     return [arm.moved(x) for arm, x in zip(arms, values, strict=True)]
 
 
-def _considering(corrected: CorrectedArms, sizes: Sizes) -> CorrectedArms:
-    """Return the same with what else the arms may be off by in its covariance.
-
-    As large as the residuals of the arms as reported show it: those of corrected arms show less of
-    it than there is, for zeros took some up.
-    """
+def _considering(corrected: CorrectedArms) -> CorrectedArms:
+    """Return the same with what is still unknown of the arms in its covariance."""
     found = corrected.found
-    _, *others = _kinds(found.problem, found.found, corrected.arms)
-    every = [following(found.problem, found.found, kind) for kind in others]
-    moved = [followed[: len(found.joint)] for followed in every]
-    parts = [found.joint, *(followed @ followed.T for followed in moved)]
-    joint = sizes.mixed(parts, np.ones(len(sizes.weights)))
+    kinds = _kinds(found.problem, found.found, corrected.arms)
+    joint, _ = with_errors(found.problem, found.found, kinds, found.inflation)
     return replace(corrected, found=found.with_joint(joint))
 
 

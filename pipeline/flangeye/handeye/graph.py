@@ -198,6 +198,11 @@ class Solved:
             for i, name in enumerate(self.places)
         }
 
+    @property
+    def inflation(self) -> float:
+        """Factor on a covariance whose noise was estimated with the unknowns."""
+        return covariance_inflation(self.found.freedom, 6)
+
     def with_joint(self, joint: Floats) -> Solved:
         """Return the same with another (6 K, 6 K) covariance."""
         return replace(self, joint=joint)
@@ -290,7 +295,8 @@ def solved_from(problem: GraphProblem, start: Mapping[str, Floats]) -> Solved:
 def solved_of(problem: GraphProblem, found: Solution) -> Solved:
     """Return the unknowns of a fit, with the covariance that it leaves."""
     known = found.covariance[: found.at.of_places, : found.at.of_places]
-    return Solved(problem, found, np.asarray(known * covariance_inflation(found.freedom, 6)))
+    bare = Solved(problem, found, np.asarray(known))
+    return bare.with_joint(bare.inflation * bare.joint)
 
 
 def _started(problem: GraphProblem, start: Mapping[str, Floats]) -> Unknowns:
