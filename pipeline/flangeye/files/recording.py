@@ -127,17 +127,24 @@ def check_ids(archive: Archive) -> None:
         seen.add(recording.id)
 
 
-def check_poses(root: Path, recordings: Sequence[Recording], whole: bool = False) -> None:
+def check_poses(
+    root: Path,
+    recordings: Sequence[Recording],
+    whole: bool = False,
+    fewest: int = MIN_CAPTURES,
+) -> None:
     """Refuse poses that cannot all be true, or that no calibration can be made from.
 
     Args:
         root: What messages begin with.
         recordings: Those that are to be used, verification included.
         whole: Whether the target's whole pose was seen: then turning alone is motion too.
+        fewest: How many there have to be to calibrate with; of fewer than three nothing is
+            calibrated, and they may be at one place.
 
     Raises:
-        StageError: A pose out of any arm's reach, one given twice, fewer than three to calibrate
-            with, or all of those at one place.
+        StageError: A pose out of any arm's reach, one given twice, too few to calibrate with, or
+            all of those at one place.
     """
     for recording in recordings:
         distance = float(np.linalg.norm(recording.base_T_flange[:3, 3]))
@@ -147,7 +154,8 @@ def check_poses(root: Path, recordings: Sequence[Recording], whole: bool = False
                 "arm; are the positions in millimetres?"
             )
     _check_distinct(root, recordings)
-    _check_motion(root, [r for r in recordings if r.role == "calibration"], whole)
+    calibration = [r for r in recordings if r.role == "calibration"]
+    _check_motion(root, calibration, whole or fewest < MIN_CAPTURES, fewest)
 
 
 def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
@@ -170,15 +178,15 @@ def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
     )
 
 
-def _check_motion(root: Path, recordings: Sequence[Recording], whole: bool) -> None:
-    if len(recordings) < MIN_CAPTURES:
+def _check_motion(root: Path, recordings: Sequence[Recording], anywhere: bool, fewest: int) -> None:
+    if len(recordings) < fewest:
         raise StageError(
-            f"{root}: {len(recordings)} captures to calibrate with; at least {MIN_CAPTURES} are "
-            "needed, at different places"
+            f"{root}: {len(recordings)} captures to calibrate with; at least {fewest} are needed, "
+            "at different places"
         )
     places = np.array([recording.base_T_flange[:3, 3] for recording in recordings])
     spread = float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
-    if spread < MIN_SPREAD and not whole:
+    if spread < MIN_SPREAD and not anywhere:
         raise StageError(
             f"{root}: all {len(places)} poses have the flange within {spread * 1e3:.2g} mm of one "
             "place; move it through the workspace"

@@ -92,7 +92,7 @@ def acquire_archive(
         return _replay(path, cell)
     recorded = open_archive(path, params)
     usable, notes = _usable(recorded, params.unreadable)
-    check_usable(recorded.root, usable, cell)
+    check_usable(recorded.root, usable, cell, fewest=params.fewest)
     digests = digests_of(r.cloud for r in usable if r.cloud)
     check_distinct_clouds(usable, digests)
     scanner = scanner or ScannerData(model="the scanner")

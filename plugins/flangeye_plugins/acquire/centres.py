@@ -66,7 +66,7 @@ def acquire_centres(
         return Observations(fitted, log_source(log, recordings, cell), total=len(fitted))
     recorded = open_archive(path, params)
     usable = _usable(recorded)
-    check_usable(recorded.root, usable, cell)
+    check_usable(recorded.root, usable, cell, fewest=params.fewest)
     behind = flange.behind if flange else 0.0
     source = source_of(recorded, _notes(recorded, len(usable), params.centre_noise, behind))
     circles = (

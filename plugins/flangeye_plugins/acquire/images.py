@@ -66,7 +66,7 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
     usable = [r for r in recorded.recordings if r.image is not None]
     if not usable:
         raise StageError(f"{recorded.root}: holds no images ({recorded.layout})")
-    check_poses(recorded.root, usable, whole=True)
+    check_poses(recorded.root, usable, whole=True, fewest=params.fewest)
     cameras, told = _cameras(recorded.root, usable, params)
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     skipped = skipped_note(recorded, lambda r: r.image is not None, "image")

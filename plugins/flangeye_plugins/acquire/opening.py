@@ -12,6 +12,7 @@ from pydantic import Field
 from flangeye import BoundPart, Choose, Params, RecipePath, StageError
 from flangeye.files.elsewhere import with_urls
 from flangeye.files.recording import (
+    MIN_CAPTURES,
     Archive,
     Recording,
     check_ids,
@@ -51,6 +52,12 @@ class OpeningParams(Params):
         "auto", description="Layout of the archive; auto detects and reports it."
     )
     leave_out: tuple[str, ...] = Field((), description="Ids of poses to leave out.")
+    fewest: int = Field(
+        MIN_CAPTURES,
+        ge=1,
+        description="Refuse fewer captures; of fewer than three no calibration is made, but one "
+        "can be checked.",
+    )
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
@@ -146,7 +153,11 @@ def observation_of(recording: Recording, feature: Feature, cell: Cell | None = N
 
 
 def check_usable(
-    root: Path, recordings: Sequence[Recording], cell: Cell | None, whole: bool = False
+    root: Path,
+    recordings: Sequence[Recording],
+    cell: Cell | None,
+    whole: bool = False,
+    fewest: int = MIN_CAPTURES,
 ) -> None:
     """Refuse recordings that no calibration of one camera, or of a cell, can be made from.
 
@@ -155,6 +166,7 @@ def check_usable(
         recordings: Those that are to be used, verification included.
         cell: The recipe's, where it has one.
         whole: Whether the target's whole pose was seen: then turning alone is motion too.
+        fewest: Captures there have to be.
 
     Raises:
         StageError: See :func:`check_poses` and :func:`check_cell`.
@@ -166,7 +178,7 @@ def check_usable(
         raise StageError(
             f"{root}: holds recordings of a cell; describe it in the recipe: cell: {{arms: …}}"
         )
-    check_poses(root, recordings, whole)
+    check_poses(root, recordings, whole, fewest)
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None = None) -> Source:

@@ -56,7 +56,7 @@ def acquire_samples(
     ]
     if not usable:
         raise StageError(f"{recorded.root}: holds no poses of a marker ({recorded.layout})")
-    check_usable(recorded.root, usable, cell, whole=True)
+    check_usable(recorded.root, usable, cell, whole=True, fewest=params.fewest)
     skipped = skipped_note(recorded, lambda r: r.camera_T_target is not None, "marker")
     source = source_of(recorded, skipped)
     return Observations(_observations(usable, params, cell), source, total=len(usable))

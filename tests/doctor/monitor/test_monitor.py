@@ -22,6 +22,7 @@ from flangeye.errors import FlangeyeError, StageError
 from flangeye.handeye.drift import DriftTest
 from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.doctor.monitor.cell import calibrate, check
+from tests.doctor.sessions import clean
 
 
 @pytest.fixture(scope="module")
@@ -245,3 +246,45 @@ def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Pa
     found = CliRunner().invoke(app, [*words, "--set", reader])
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout)["state"] == "OK"
+
+
+def table_of(folder: Path, count: int) -> None:
+    """Write centres that another program found, as a table."""
+    folder.mkdir()
+    session = clean(np.random.default_rng(0), count, "centres", turn=0.4)
+    rows = np.hstack([session.poses.reshape(count, 16), session.centres])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (folder / "poses.csv").write_text("\n".join(lines))
+
+
+TABLE = """
+title: Centres
+robot: ur5e
+steps:
+  - acquire.centres:
+      path: calibrated
+      reader:
+        table:
+          rotation: matrix
+          length: m
+          pose: base_T_flange
+          columns: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
+          target: {columns: [17, 18, 19], rotation: point, length: m}
+  - solve.robust
+"""
+
+
+def test_a_calibration_from_a_table_is_checked_with_tables_of_a_single_row(tmp_path: Path) -> None:
+    table_of(tmp_path / "calibrated", 20)
+    (tmp_path / "recipe.yaml").write_text(TABLE)
+    words = ["run", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "calibration")]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    row = (tmp_path / "calibrated" / "poses.csv").read_text().splitlines()[3]
+    for name, aside in (("fine", 0.0), ("moved", 0.02)):
+        (tmp_path / name).mkdir()
+        *pose, x, y, z = map(float, row.split(","))
+        numbers = [*pose, x + aside, y, z]
+        (tmp_path / name / "poses.csv").write_text(",".join(map(repr, numbers)) + "\n")
+    done = monitor(tmp_path, tmp_path / "h.parquet", "fine", "moved")
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [(each["state"], each["sightings"]) for each in told] == [("OK", 1), ("MOVED", 1)]

@@ -22,6 +22,9 @@ from flangeye.run.recorded import recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.run.session import record_scans
 
+READS_RECORDINGS = ("acquire.archive", "acquire.centres")
+"""First steps that read later recordings as they read the calibration's."""
+
 
 def from_archive(
     path: Path, stored: StoredCalibration, registry: Registry, overrides: Sequence[str] = ()
@@ -87,8 +90,10 @@ def _of_log(log: RunLog) -> tuple[list[t.Observation], int]:
 def _from_archive(stored: StoredCalibration) -> str:
     """Return the calibration's recipe, made to read recordings."""
     data = _steps(stored)
-    if "acquire.archive" not in data["steps"][0]:
-        data["steps"][0] = "acquire.archive"
+    first = data["steps"][0]
+    name = next((name for name in READS_RECORDINGS if name in first), None)
+    params = first[name] if name and isinstance(first, dict) else None
+    data["steps"][0] = {name or READS_RECORDINGS[0]: {**(params or {}), "fewest": 1}}
     return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
 
 
