@@ -17,6 +17,7 @@ from flangeye.handeye.graph import Sighting, problem_of, roots_of, solve_graph
 from flangeye.handeye.likelihood import agreeing, first_noise, settle, weigh
 from flangeye.handeye.loop import LoopProblem
 from flangeye.handeye.measurements import loop_of, measurements_of
+from flangeye.handeye.moments import between
 from flangeye.handeye.nuisance import nuisance_seen
 from flangeye.handeye.starts import start_of
 from flangeye.handeye.unknowns import Unknowns, weights_of
@@ -312,6 +313,42 @@ def test_the_noise_of_what_moves_is_found_from_the_residuals() -> None:
     found = solve_graph(given, sightings, noise)
     shift, _ = noise_beyond(found.found)
     assert shift == pytest.approx(0.5, rel=0.35)
+
+
+@pytest.mark.parametrize(("shared", "share"), [(True, (0.8, 1.0)), (False, (0.0, 0.5))])
+def test_sightings_of_one_moment_share_the_noise_of_what_moves(shared: bool, share: Any) -> None:
+    """As much of it as their residuals say: what both see is known less well by so much."""
+    cell: Any = CELLS["two fixed scanners and one arm"]
+    frames, unknown, pairs = cell
+    given, rng = (
+        {n: Frame(f.parent) if n in unknown else f for n, f in frames.items()},
+        np.random.default_rng(4),
+    )
+    sightings = []
+    for pair in pairs if not shared else [pairs]:
+        shaken = frames["flange"].place.copy()
+        shaken[:, :3, 3] += 5e-4 * rng.standard_normal((N, 3))
+        actual = {**frames, "flange": Frame("base", shaken)}
+        sightings += seen(actual, pair if shared else [pair], rng)
+    noise = {"flange": np.diag([1e-6**2] * 3 + [5e-5**2] * 3)}
+    found = solve_graph(given, sightings, noise)
+    p = found.found.at.of_places
+    own = found.found.covariance[:p, :p] * covariance_inflation(found.found.freedom, 6)
+    wider = np.diag(found.joint - own) / np.diag(own)
+    low, high = share
+    assert low < wider[-3:].mean() < high  # the marker's place, which both see
+    assert np.linalg.eigvalsh(found.joint)[0] > 0
+
+
+def test_what_is_shared_is_summed_over_all_two_of_a_moment() -> None:
+    moments, each = np.array([0, 1, 0, 2, 1, 0]), np.random.default_rng(0).normal(size=(6, 4, 3))
+    expected = sum(
+        each[i].T @ each[j]
+        for i in range(6)
+        for j in range(6)
+        if i != j and moments[i] == moments[j]
+    )
+    assert between(moments, each) == pytest.approx(expected)
 
 
 def test_circles_on_the_flange_itself_tie_two_scanners() -> None:

@@ -106,7 +106,7 @@ def considering_errors(
         return found, None
     kinds = _kinds(found.problem, found.found, likeliest(found, branches))
     joint, sizes = with_errors(found.problem, found.found, kinds, found.inflation)
-    return found.with_joint(joint), sizes
+    return found.with_joint(joint + found.shared), sizes
 
 
 def correcting_zeros(
@@ -168,7 +168,7 @@ def _considering(corrected: CorrectedArms) -> CorrectedArms:
     found = corrected.found
     kinds = _kinds(found.problem, found.found, corrected.arms)
     joint, _ = with_errors(found.problem, found.found, kinds, found.inflation)
-    return replace(corrected, found=found.with_joint(joint))
+    return replace(corrected, found=found.with_joint(joint + found.shared))
 
 
 def _zeros(problem: GraphProblem, fit: Solution, arms: Sequence[BentArm]) -> Nuisance:

@@ -35,6 +35,7 @@ from flangeye.handeye.likelihood import (
 )
 from flangeye.handeye.measurements import Seen
 from flangeye.handeye.missing import Loops, Move
+from flangeye.handeye.moments import alike, moves_of, shared_noise
 from flangeye.handeye.observability import weak_moves
 from flangeye.handeye.unknowns import Linear, Unknowns, weights_of
 from flangeye.maths.frame_graph import Frame, chain, composed, root_of
@@ -117,6 +118,14 @@ class GraphProblem(Problem):
     def unknown(self) -> list[str]:
         """Frames whose place is to be found."""
         return [name for name, frame in self.frames.items() if frame.place is None]
+
+    @property
+    def moments(self) -> Indices:
+        """(N,) at which moment each sighting was: where controllers had everything alike."""
+        s, moving = self.measurements, [np.asarray(self.frames[name].place) for name in self.noise]
+        if not moving:
+            return np.arange(len(s))
+        return alike(np.hstack([place[s.times].reshape(len(s), -1) for place in moving]))
 
     def linearised(self, at: Unknowns) -> Linear:
         """Return what is predicted at some values of the unknowns."""
@@ -202,6 +211,14 @@ class Solved:
     def inflation(self) -> float:
         """Factor on a covariance whose noise was estimated with the unknowns."""
         return covariance_inflation(self.found.freedom, 6)
+
+    @cached_property
+    def shared(self) -> Floats:
+        """(6 K, 6 K) that the noise which sightings of one moment share adds to a covariance."""
+        problem, found = self.problem, self.found
+        effects = problem.effects(found.at, [*problem.noise])[1]
+        moves = moves_of(effects, [*problem.noise.values()], found.noise)
+        return self.inflation * shared_noise(found, moves, problem.moments)
 
     def with_joint(self, joint: Floats) -> Solved:
         """Return the same with another (6 K, 6 K) covariance."""
@@ -296,7 +313,7 @@ def solved_of(problem: GraphProblem, found: Solution) -> Solved:
     """Return the unknowns of a fit, with the covariance that it leaves."""
     known = found.covariance[: found.at.of_places, : found.at.of_places]
     bare = Solved(problem, found, np.asarray(known))
-    return bare.with_joint(bare.inflation * bare.joint)
+    return bare.with_joint(bare.inflation * bare.joint + bare.shared)
 
 
 def _started(problem: GraphProblem, start: Mapping[str, Floats]) -> Unknowns:
