@@ -17,10 +17,12 @@ from flangeye.handeye.closed.motions import motions_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye_plugins.solve.closed_forms import ClosedFormParams
 from flangeye_plugins.solve.named import CLOSED_FORMS
+from tests.handeye.arms import REAL, drawn
 from tests.handeye.cells import (
     CONFIGURATIONS,
     ROBOT,
     Noise,
+    Session,
     errors,
     moves,
     rotation,
@@ -191,6 +193,31 @@ def test_the_region_of_a_closed_form_holds_its_share(name: str) -> None:
         error = errors(found, made.truth[found.transform.name])
         inside.append(error @ np.linalg.solve(found.covariance, error) < 12.592)
     assert np.mean(inside) >= 0.75
+
+
+@pytest.mark.parametrize(
+    ("name", "configuration"),
+    [("park_martin", "eye-in-hand, marker"), ("linear", "eye-on-base, flange")],
+)
+def test_the_region_of_a_closed_form_holds_for_an_arm_as_bad_as_real_ones(
+    name: str, configuration: str
+) -> None:
+    told, kinds = [], CONFIGURATIONS[configuration]
+    for seed in range(8):
+        seen, truth = drawn(kinds, seed, REAL)
+        told.append(solve(name, Session(kinds, seen, dict(enumerate(truth)))))
+        error = errors(told[-1].camera, truth[0])
+        assert error @ np.linalg.solve(told[-1].camera.covariance, error) < 30
+    assert all("as large as the residuals show it" in each.notes[0] for each in told)
+
+
+def test_a_closed_form_says_that_an_unknown_arm_is_not_in_its_region() -> None:
+    made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), n=8)
+    stage = STAGES["solve.park_martin"]
+    told = stage(made.stream(), ClosedFormParams(), made.configuration, None)
+    assert told.notes[0].startswith("what the arm does wrong alike at all poses is not in")
+    known = solve("park_martin", made)
+    assert known.notes[0].startswith("what the arm does wrong alike at all poses is in the cov")
 
 
 @pytest.mark.slow

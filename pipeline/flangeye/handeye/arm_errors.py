@@ -70,7 +70,7 @@ def last_unknown_by_arms(model: Model, arms: Arms) -> float:
         model: What was found for the arm as reported, that nuisance with it.
         arms: As in :func:`evidence`; where they are not known, it is 0.
     """
-    if _unknown(arms):
+    if are_unknown(arms):
         return 0.0
     kinds = _kinds(arms)
     moved = following(model.problem, model.found, reduce(Nuisance.and_also, kinds))[-1]
@@ -87,10 +87,22 @@ def evidence(model: Model, arms: Arms) -> float:
         arms: Those that move camera or target; where the kinematics of one are not known, or do
             not reach its poses, it is 0.
     """
-    return 0.0 if _unknown(arms) else sizes_of(model.problem, model.found, _kinds(arms)).gain
+    return 0.0 if are_unknown(arms) else sizes_of(model.problem, model.found, _kinds(arms)).gain
 
 
-def _unknown(arms: Arms) -> bool:
+def note_of_errors(arms: Arms, sizes: Sizes) -> str:
+    """Say what is in the covariance, and how large it was found."""
+    zeros = arms[0][0].deviation * 1e3 * float(sizes.expected[0])
+    return (
+        f"what the arm does wrong alike at all poses is in the covariance, as large as the "
+        f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "
+        "twists and a smooth error beside them; at poses like these most of it cancels, and "
+        "held-out errors show what does not"
+    )
+
+
+def are_unknown(arms: Arms) -> bool:
+    """Whether the kinematics of some arm are not known, or do not reach its poses."""
     return any(moved.kinematics is None or moved.some_joints is None for moved in chain(*arms))
 
 

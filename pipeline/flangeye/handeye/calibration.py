@@ -16,7 +16,7 @@ from flangeye.handeye.arm import (
     with_joint_offsets,
     with_tool_offset,
 )
-from flangeye.handeye.arm_errors import evidence, with_arm_errors
+from flangeye.handeye.arm_errors import evidence, note_of_errors, with_arm_errors
 from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
 from flangeye.handeye.certificate import GAP
 from flangeye.handeye.certified import answer_of, certificate_notes, moved_note, verdict_of
@@ -390,7 +390,7 @@ def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated
     if not cell.arms or not options.joint_zeros:
         return _Stated(own, own)
     if any(moved.kinematics is None for moved in chain(*cell.arms)):
-        return _Stated(own, own, (_note_of_unknown_arm(cell),))
+        return _Stated(own, own, (note_of_unknown_arm(cell),))
     deviation = cell.arms[0][0].deviation * 1e3
     each = f"unknown joint zeros ({deviation:g} mrad each)"
     if any(moved.some_joints is None for moved in chain(*cell.arms)):
@@ -405,14 +405,7 @@ def _stated(model: Model, cell: Cell, options: Options, weak: Floats) -> _Stated
     if weak.shape[1]:
         return _Stated(own, own, notes)
     covariance, sizes = with_arm_errors(model, cell.arms, _inflation(model))
-    zeros = deviation * float(sizes.expected[0])
-    note = (
-        f"what the arm does wrong alike at all poses is in the covariance, as large as the "
-        f"residuals show it: joint zeros of about {zeros:.1f} mrad, and encoders, sag, lengths, "
-        "twists and a smooth error beside them; at poses like these most of it cancels, and "
-        "held-out errors show what does not"
-    )
-    return _Stated(covariance, own, (note,))
+    return _Stated(covariance, own, (note_of_errors(cell.arms, sizes),))
 
 
 def _scattered(
@@ -424,7 +417,8 @@ def _scattered(
     return _estimates(model, cell, weak, stated.of_scatter, distortion)[0].covariance
 
 
-def _note_of_unknown_arm(cell: Cell) -> str:
+def note_of_unknown_arm(cell: Cell) -> str:
+    """Say that what the arm does wrong is not in the covariance."""
     which, where = ("arm", "robot") if cell.robot is None else ("second arm", "second_robot")
     return (
         f"what the {which} does wrong alike at all poses is not in the covariance, for its "

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from flangeye import CalibrationRefused, Params, StageError
+from flangeye.handeye.arm_errors import are_unknown, note_of_errors, with_arm_errors
+from flangeye.handeye.calibration import TYPICAL_ARM, note_of_unknown_arm
+from flangeye.handeye.candidates import Model
 from flangeye.handeye.closed.motions import Motions, motions_of, place_of
 from flangeye.handeye.components import Noise
+from flangeye.handeye.consensus import Consensus
 from flangeye.handeye.estimates import (
     columns_of,
     estimate_at,
@@ -18,7 +22,7 @@ from flangeye.handeye.estimates import (
     points_of_interest,
     transforms_of,
 )
-from flangeye.handeye.likelihood import weigh, with_noise
+from flangeye.handeye.likelihood import Solution, weigh, with_noise
 from flangeye.handeye.loop import LoopProblem, meaningless_turns
 from flangeye.handeye.measurements import Loop, Measurements, loop_of, measurements_of
 from flangeye.handeye.observability import (
@@ -27,19 +31,15 @@ from flangeye.handeye.observability import (
     require_turns,
     unobservable,
 )
+from flangeye.handeye.observed import Cell
 from flangeye.handeye.unknowns import Unknowns
-from flangeye.maths.geometry import invert, rotation_exp, rotation_log
-from flangeye.maths.kinematics import Arm
+from flangeye.maths.geometry import invert
 from flangeye.maths.statistics import covariance_inflation
-from flangeye.models.configuration import DEFAULT, Configuration
-from flangeye.types import Floats, HandEye, Observation
+from flangeye.types import Floats, HandEye
 from flangeye.units import Angle, Length, param
 
 ClosedForm = Callable[[Measurements, Loop], tuple[Floats, Floats, Floats]]
 """Gives X, Y and Z (4, 4)."""
-
-STEP = 1e-6
-"""Of the numerical derivatives [rad, m]."""
 
 
 class ClosedFormParams(Params):
@@ -53,45 +53,38 @@ class ClosedFormParams(Params):
     )
 
 
-def solve_closed(
-    method: str,
-    solver: ClosedForm,
-    pulled: Sequence[Observation],
-    params: ClosedFormParams,
-    cell: tuple[Configuration | None, Arm | None],
-) -> HandEye:
+def solve_closed(method: str, solver: ClosedForm, cell: Cell, params: ClosedFormParams) -> HandEye:
     """Return a closed form's calibration; every observation takes part.
 
-    Its covariance is the noise that the residuals show, taken through the closed form itself by
-    numerical derivatives.
+    Its covariance is about the closed form's answer, and holds what the likeliest one is away from
+    it: the noise that residuals show, and where the arm is known what it does wrong.
 
     Args:
         method: Name of the stage.
         solver: The closed form.
-        pulled: The observations.
+        cell: What was observed.
         params: Limits of what counts as observable.
-        cell: The configuration, and the arm's kinematics where there are any.
 
     Raises:
         StageError: Too few poses, or all the same.
         CalibrationRefused: The motion leaves something unknown: it says which motion is missing.
     """
-    configuration, arm = cell[0] or DEFAULT, cell[1]
+    configuration, arm, pulled = cell.configuration, cell.arm, cell.observations
     loop, measurements = loop_of(configuration), measurements_of(pulled, configuration, arm)
-    problem = LoopProblem(measurements=measurements, loop=loop, arms=None)
+    typical = TYPICAL_ARM if loop.y or loop.z or measurements.are_poses else None
+    problem = LoopProblem(measurements=measurements, loop=loop, arms=typical)
     require_enough(problem)
     require_turns(problem)
     try:
         values = solver(measurements, loop)
     except np.linalg.LinAlgError:
         raise CalibrationRefused(f"{method}: its equations have no solution here") from None
-    at, everyone = Unknowns.of_loop(*values), np.ones(len(pulled))
-    found = with_noise(problem, weigh(problem, at, Noise(0.0, 0.0), everyone), refit=False)
+    at = Unknowns.of_loop(*values)
+    found = _weighed(problem, at)
     unobservable(
         problem, found, ObservabilityLimits(params.rotation_limit, params.translation_limit, False)
     )
-    covariance = _propagated(solver, measurements, loop, found.weights)
-    covariance *= covariance_inflation(found.freedom, found.basis.shape[1])
+    covariance, notes = _stated(problem, found, cell)
     transforms = transforms_of(configuration, *values)
     points = points_of_interest(configuration, transforms, pulled, arm)
     arbitrary = meaningless_turns(measurements, loop, at)
@@ -103,33 +96,27 @@ def solve_closed(
         for n, t in transforms.items()
     ]
     pairs = pairs_of(configuration, transforms, pulled, arm, [None] * len(pulled))
-    return hand_eye_of(estimates, pairs, method)
+    return replace(hand_eye_of(estimates, pairs, method), notes=notes)
 
 
-def _propagated(solver: ClosedForm, s: Measurements, loop: Loop, weights: Floats) -> Floats:
-    """Return the (18, 18) covariance of X, Y, Z by the noise of every measurement."""
-    nominal = solver(s, loop)
-    noise = np.linalg.pinv(weights, rcond=1e-12, hermitian=True)
-    out = np.zeros((18, 18))
-    for i in range(len(s)):
-        moved = [solver(_disturbed(s, i, step), loop) for step in STEP * np.eye(6)]
-        slope = np.array([_moves(nominal, values) for values in moved]).T / STEP
-        out += slope @ noise[i] @ slope.T
-    return out
+def _weighed(problem: LoopProblem, at: Unknowns) -> Solution:
+    """Return an answer weighed by the noise that the likeliest one near it leaves."""
+    everyone = np.ones(len(problem.measurements))
+    likeliest = with_noise(problem, weigh(problem, at, Noise(0.0, 0.0), everyone))
+    return replace(weigh(problem, at, likeliest.noise, everyone), freedom=likeliest.freedom)
 
 
-def _disturbed(s: Measurements, i: int, step: Floats) -> Measurements:
-    rotations, centres = s.rotations.copy(), s.centres.copy()
-    rotations[i] = rotation_exp(step[:3]) @ rotations[i]
-    centres[i] += step[3:]
-    return replace(s, rotations=rotations, centres=centres)
-
-
-def _moves(before: Sequence[Floats], after: Sequence[Floats]) -> Floats:
-    """Return the (18,) rotations and translations from some values to others."""
-    first, second = np.array(before), np.array(after)
-    turns = rotation_log(second[:, :3, :3] @ np.swapaxes(first[:, :3, :3], 1, 2))
-    return np.concatenate([turns, second[:, :3, 3] - first[:, :3, 3]], axis=1).ravel()
+def _stated(problem: LoopProblem, found: Solution, cell: Cell) -> tuple[Floats, tuple[str, ...]]:
+    """Return the (18, 18) covariance of X, Y, Z about an answer, and what is to be said of it."""
+    inflation = covariance_inflation(found.freedom, found.basis.shape[1])
+    if cell.arms and not are_unknown(cell.arms):
+        model = Model(Consensus(problem, found))
+        covariance, sizes = with_arm_errors(model, cell.arms, inflation)
+        return covariance, (note_of_errors(cell.arms, sizes),)
+    notes = (note_of_unknown_arm(cell),) if cell.arms else ()
+    to_likeliest = found.basis[:18] @ found.known @ found.slope
+    off = np.outer(to_likeliest, to_likeliest)
+    return inflation * found.covariance[:18, :18] + off, notes
 
 
 def by_motions(method: Callable[[Motions], Floats]) -> ClosedForm:

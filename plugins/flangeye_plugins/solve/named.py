@@ -19,10 +19,10 @@ from flangeye.handeye.closed.separable import (
     tsai_lenz,
 )
 from flangeye.handeye.measurements import Loop, Measurements
+from flangeye.handeye.observed import Cell
 from flangeye.handeye.starts import start_of
-from flangeye.maths.kinematics import Arm
-from flangeye.models.configuration import EVERY, Configuration
-from flangeye.models.robots import RobotModel
+from flangeye.models.configuration import DEFAULT, EVERY, Configuration
+from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.plugin.stage import Stage
 from flangeye.types import Floats, HandEye, Observations
 from flangeye_plugins.solve.closed_forms import (
@@ -41,10 +41,13 @@ def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:
         params: ClosedFormParams,
         configuration: Configuration | None = None,
         robot: RobotModel | None = None,
+        second: SecondRobot | None = None,
     ) -> HandEye:
-        arm = Arm(robot) if robot else None
+        other = second.model if second else None
+        seen = list(observations)
+        cell = Cell(seen, configuration or DEFAULT, robot, second_robot=other)
         try:
-            return solve_closed(name, solver, list(observations), params, (configuration, arm))
+            return solve_closed(name, solver, cell, params)
         except StageError as error:
             raise StageError(f"{name}: {error}") from None
 
