@@ -1,21 +1,22 @@
 r"""Whether an answer is the best of all, not only of its neighbourhood. Arrays only.
 
 Squared errors are a quadratic ``r' Q r`` of features of the unknown places
-(:mod:`flangeye.handeye.lifted`). Many other quadratics are naught for all places: that rotations
-are such, and that products are products. Where one of them, C, leaves
+(:mod:`flangeye.handeye.lifted`). Many other quadratics are naught for all places, since rotations
+are rotations and products are products. Where one of them, C, leaves
 
     L = Q - C - f E,   positive semidefinite,
 
 no place costs less than ``f``, for E picks the one: Lagrangian duality, as used for many cameras
-and targets in arXiv 2507.23045. Of every choice of places the rotations' features, m of them, are
-as long, so an ``e`` that has to be added to these features' diagonal bounds what may be missing by
-``e`` times that length squared. Translations may be any: nothing is added to them.
+and targets in arXiv 2507.23045. All rotations' features have one length: if L is semidefinite with
+``e`` more on their diagonal, nothing better than ``f`` by more than ``e`` times its square exists.
+Translations have any length, and get no more. That it is semidefinite, a Cholesky decomposition
+shows, to what it rounds.
 
-The products of two places' features are products of what one place's features span, so that the
-projection onto all such C is one of small tensors. C is sought by quasi-Newton steps that bring L
-to the matrices that are positive semidefinite and leave the answer as it is: no solver of
-semidefinite programs. Where there is none, the part of L that is negative is like the features of a
-better place: where it leads to one, that is given.
+What is naught for all products of two places' features is what products of two bases do not span,
+one of either place: all C are one projection by small matrices. C is sought by quasi-Newton steps
+that bring L to the matrices that are semidefinite and leave the answer as it is: no solver of
+semidefinite programs. Where there is none, the part of L that is negative is like the features of
+better places: where it leads to such, they are given.
 """
 
 from __future__ import annotations
@@ -173,9 +174,8 @@ class _Dual(NamedTuple):
             if self.shows(multipliers, GAP):
                 raise StopIteration
 
-        begin = (
-            np.zeros(sum(len(block.at) ** 2 for block in self.blocks)) if start is None else start
-        )
+        none = np.zeros(sum(len(block.at) ** 2 for block in self.blocks))
+        begin = none if start is None else start
         options = {"maxiter": tries, "ftol": 0.0, "gtol": 0.0}
         found = minimize(apart, begin, jac=True, method="L-BFGS-B", callback=ended, options=options)
         return np.asarray(found.x)

@@ -94,7 +94,7 @@ class Family(NamedTuple):
         after: Which these C others are.
         at: (10, 1 + 12 C) where products of a one and the first's rotation with a one and the
             entries of the others stand among the features; the one is the first of all.
-        shift: (3,) where the first's translation stands, after all features.
+        shift: (3,) where the first's translation stands, after all features: from the end.
     """
 
     first: int
@@ -129,27 +129,14 @@ class Family(NamedTuple):
 def families_of(pairs: Collection[tuple[int, int]], count: int) -> tuple[list[Family], int]:
     """Return the families of K unknowns, of which some pairs come in products; and all features."""
     firsts = {v: u for u, v in pairs}
-    members = {
-        k: tuple(sorted(v for v, u in firsts.items() if u == k))
-        for k in range(count)
-        if k not in firsts
-    }
-    ends = np.cumsum([1, *(size_of(len(after)) for after in members.values())])
-    size = int(ends[-1])
-    return [
-        Family(
-            k,
-            after,
-            np.append(0, np.arange(*ends[i : i + 2])).reshape(10, -1),
-            size + 3 * i + np.arange(3),
-        )
-        for i, (k, after) in enumerate(members.items())
-    ], size
-
-
-def size_of(after: int) -> int:
-    """Return how many features a family with so many others has, beside the one."""
-    return 10 * (1 + 12 * after) - 1
+    out, size, shifts = list[Family](), 1, 3 * (count - len(firsts))
+    for k in sorted({*range(count)} - firsts.keys()):
+        after = tuple(sorted(v for v, u in firsts.items() if u == k))
+        more = 10 * (1 + 12 * len(after)) - 1
+        at = np.append(0, size + np.arange(more)).reshape(10, -1)
+        out.append(Family(k, after, at, 3 * len(out) - shifts + np.arange(3)))
+        size += more
+    return out, size
 
 
 @dataclass(frozen=True, eq=False)
