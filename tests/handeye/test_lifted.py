@@ -103,3 +103,19 @@ def test_near_the_answer_the_quadratic_is_the_sum_of_squares_with_all_their_cova
         turned[:, :3, :3] = rotation_exp(1e-3 * rng.standard_normal((2, 3)))
         least = least_of(lambda at: squared(s, places @ at), turned)
         assert squares.cost(turned) == pytest.approx(least, rel=1e-3)
+
+
+def test_places_that_nothing_tells_apart_are_those_of_a_circle_turned_about_itself() -> None:
+    """Of Z, which ends in the circle: a one, a cosine and a sine of its turn."""
+    sightings, places = of_three((1e-3, 5e-4), 1)
+    squares = squares_of(sightings, places)
+    at = squares.descend(np.tile(np.eye(4), (3, 1, 1)))
+    assert len(squares.alike(at)) == 1
+    circles = replace(sightings, freedoms=np.full(15, 5.0))
+    squares = squares_of(circles, places)
+    at = squares.descend(np.tile(np.eye(4), (3, 1, 1)))
+    alike = squares.alike(at)
+    assert len(alike) == 21
+    for each in alike:
+        assert each @ squares.quadratic @ each == pytest.approx(squares.cost(at), rel=1e-5)
+    assert np.linalg.matrix_rank(alike, tol=1e-4) == 3

@@ -66,12 +66,12 @@ def certify(sightings: Sightings, places: Floats) -> Certificate:
     """Return what can be shown of the valley in which the unknowns (K, 4, 4) lie."""
     squares = squares_of(sightings, places)
     found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))
-    cost, at = squares.cost(found), squares.features(found)
+    cost = squares.cost(found)
     size = max(cost, ROUNDING / GAP * float(np.trace(squares.quadratic)))
     bare = squares.quadratic / size
     bare[0, 0] -= cost / size
     dual = _Dual.of(bare, squares.families)
-    sought = dual.sought(np.eye(len(at)) - np.outer(at, at) / (at @ at), TRIES)
+    sought = dual.sought(_across(squares.alike(found)), TRIES)
     share = dual.missing(sought)
     if share <= GAP:
         return Certificate(places @ found, cost, share * size, True)
@@ -79,6 +79,13 @@ def certify(sightings: Sightings, places: Floats) -> Certificate:
     lower = squares.cost(elsewhere) < cost - GAP * size
     better = places @ elsewhere if lower else None
     return Certificate(places @ found, cost, share * size, False, better)
+
+
+def _across(features: Floats) -> Floats:
+    """Return the (n, n) projector onto what is across (m, n) features."""
+    _, sizes, ways = np.linalg.svd(features, full_matrices=False)
+    along = ways[sizes > 1e-6 * sizes[0]]
+    return np.asarray(np.eye(features.shape[1]) - along.T @ along)
 
 
 def _elsewhere(squares: Squares, lack: Floats, count: int) -> Floats:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ STEPS, SETTLED = 50, 1e-12
 """Of the descent to the bottom of a valley; a step as small [rad, m] is the last."""
 TOLD = 1e-7
 """How well a turn is known at least, of the best known one: a circle's about itself is not."""
+DRAWS, ALIKE = 20, 1e-6
+"""Places that may be alike, and the share by which their costs differ at most if they are."""
 STILL = np.append(np.append(np.eye(3), np.zeros(3)), 1.0)
 """Entries of a place where nothing is unknown."""
 
@@ -184,13 +187,33 @@ class Squares:
         out[firsts, :3, 3] = (self.shifts @ self.features(places)).reshape(-1, 3)
         return out
 
+    @cached_property
+    def root(self) -> Floats:
+        """(n, n) whose square is the quadratic."""
+        values, vectors = np.linalg.eigh(self.quadratic)
+        return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+
+    def alike(self, places: Floats) -> Floats:
+        """Return features (m, n) of places that nothing tells apart from those at a bottom.
+
+        A circle may be turned about itself, and what is seen as a point about any axis.
+        """
+        moves = self.moves(places)
+        able = np.flatnonzero(np.abs(moves).max(axis=0))
+        _, sizes, ways = np.linalg.svd(self.root @ moves[:, able])
+        untold = ways[int((sizes > TOLD * sizes[0]).sum()) :]
+        steps = np.zeros((DRAWS if len(untold) else 0, len(places), 6))
+        drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (len(steps), len(untold)))
+        steps.reshape(-1, 6 * len(places))[:, able] = drawn @ untold
+        others = [self.descend(_moved(places, step)) for step in steps]
+        most = self.cost(places) * (1 + ALIKE)
+        return np.array([self.features(p) for p in (places, *others) if self.cost(p) <= most])
+
     def descend(self, places: Floats) -> Floats:
         """Return the places (K, 4, 4) at the bottom of their valley (Gauss-Newton)."""
-        values, vectors = np.linalg.eigh(self.quadratic)
-        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
         for _ in range(STEPS):
-            slopes, errors = root @ self.moves(places), root @ self.features(places)
-            step = -np.linalg.lstsq(slopes, errors, rcond=TOLD)[0].reshape(-1, 6)
+            slopes, errors = self.root @ self.moves(places), self.root @ self.features(places)
+            step = -np.asarray(np.linalg.lstsq(slopes, errors, rcond=TOLD)[0]).reshape(-1, 6)
             places = _moved(places, step)
             if np.abs(step).max() < SETTLED:
                 break
