@@ -43,6 +43,8 @@ CANDIDATES, SPREAD = 300, 0.6
 """Poses looked at for the next session, and their joints' largest change from the last [rad]."""
 NAMES = ("zero", "a", "d", "alpha")
 UNITS = (("mrad", 1e3), ("mm", 1e3), ("mm", 1e3), ("mrad", 1e3))
+ENOUGH = 6
+"""An arm of more joints reaches a pose in any number of ways."""
 UNLIKELY = 0.01
 """Probability of a branch that does not count among those that fit alike."""
 ONE_ORIENTATION = np.radians(10.0)
@@ -82,6 +84,7 @@ class _Found:
         session: The poses with the joint angles of the branch.
         fit: What they tell.
         used: (N,) those that take part.
+        offset: (3,) where the circle was taken to be in the flange [m].
         alike: How many branches fit as well, where no joint angles were recorded.
         apart: (n, 4) standard deviation of the parameters between these.
     """
@@ -89,6 +92,7 @@ class _Found:
     session: ArmSession
     fit: ArmFit
     used: Mask
+    offset: Floats
     alike: int = 1
     apart: Floats | float = 0.0
 
@@ -114,7 +118,7 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
     found = _best(before, arm, prior)
     errors = _held_out(before, arm, found, prior)
     known = identified(found.fit, prior, found.apart)
-    if before.correction is not None and before.correction.tool_offset.any():
+    if _offset_of(before).any():
         known[-1, NAMES.index("a") : NAMES.index("d") + 1] = False  # moves the circle likewise
     about_arm = [
         _identifiability(known, combinations(found.fit, prior), found),
@@ -132,13 +136,18 @@ def refine_arm(calibration: HandEye, params: ArmParams, robot: RobotModel) -> Ha
 
 
 def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
-    """Fit on every branch the arm may be on, and return the one that fits best."""
+    """Fit on every branch the arm may be on, and return the one that fits best.
+
+    With the offset of the circle that was found, and without: an arm that is off looks like one.
+    """
     observations = [pair.observation for pair in calibration.pairs]
-    used = np.array([pair.used for pair in calibration.pairs])
+    offset = _offset_of(calibration)
     found = [
-        _fitted(_session(observations, joints, calibration), used, calibration, arm, prior)
+        _fitted(observations, joints, each, calibration, arm, prior)
         for joints in _branches(observations, arm)
+        for each in ([offset, 0 * offset] if offset.any() else [offset])
     ]
+    used = np.array([pair.used for pair in calibration.pairs])
     if not found or used.sum() < 6:
         why = "the robot's model does not reach the poses" if not found else "6 poses are needed"
         raise StageError(f"refine.arm: {why}; name the arm that was recorded, or take more poses")
@@ -146,7 +155,17 @@ def _best(calibration: HandEye, arm: Arm, prior: Floats) -> _Found:
     shares = _shares(found, prior)
     off = np.array([each.fit.parameters - best.fit.parameters for each in found])
     apart = np.sqrt(np.einsum("b,bij->ij", shares, off**2))
-    return replace(best, alike=int((shares > UNLIKELY).sum()), apart=apart)
+    if arm.n > ENOUGH and any(o.joints is None for o in observations):
+        apart = np.full_like(apart, np.inf)  # the ways that were looked at are a few of a continuum
+    likely = [each for each, share in zip(found, shares, strict=True) if share > UNLIKELY]
+    alike = len({id(each.session.joints) for each in likely})
+    return replace(best, alike=alike, apart=apart)
+
+
+def _offset_of(calibration: HandEye) -> Floats:
+    """Return (3,) where the circle was found to be in the flange [m]."""
+    correction = calibration.correction
+    return np.zeros(3) if correction is None else np.asarray(correction.tool_offset)
 
 
 def _shares(found: Sequence[_Found], prior: Floats) -> Floats:
@@ -162,17 +181,20 @@ def _shares(found: Sequence[_Found], prior: Floats) -> Floats:
 
 
 def _fitted(
-    session: ArmSession, used: Mask, calibration: HandEye, arm: Arm, prior: Floats
+    observations: Sequence[Observation],
+    joints: Floats,
+    offset: Floats,
+    calibration: HandEye,
+    arm: Arm,
+    prior: Floats,
 ) -> _Found:
-    start = calibration.base_T_camera.transform.matrix
-    fit = fit_arm(arm, session.where(used), start, prior, (0.2e-3) ** 2)
-    return _Found(session, fit, used)
+    used = np.array([pair.used for pair in calibration.pairs])
+    session = _session(observations, joints, offset)
+    fit = fit_arm(arm, session.where(used), _start(calibration), prior, (0.2e-3) ** 2)
+    return _Found(session, fit, used, offset)
 
 
-def _session(
-    observations: Sequence[Observation], joints: Floats, calibration: HandEye
-) -> ArmSession:
-    offset = calibration.correction.tool_offset if calibration.correction else np.zeros(3)
+def _session(observations: Sequence[Observation], joints: Floats, offset: Floats) -> ArmSession:
     return ArmSession(
         joints,
         np.array([o.base_T_flange.matrix for o in observations]),
@@ -200,14 +222,16 @@ def _branches(observations: Sequence[Observation], arm: Arm) -> Iterator[Floats]
 def _held_out(calibration: HandEye, arm: Arm, found: _Found, prior: Floats) -> tuple[float, float]:
     """Return the rms error on poses held out, without and with the arm's parameters [m]."""
     session = found.session.where(found.used)
+    reported = replace(session, mounts=session.mounts + _offset_of(calibration) - found.offset)
     order = np.random.default_rng(0).permutation(len(session.joints))
     squares = np.zeros((2, len(order)))
     for fold in range(FOLDS):
         part = np.isin(np.arange(len(order)), order[fold::FOLDS])
         for row, allowed in enumerate((0 * prior, prior)):
             start = found.fit.base_T_camera if row else _start(calibration)
-            fit = fit_arm(arm, session.where(~part), start, allowed, found.fit.scatter)
-            squares[row, part] = (residuals(arm, session.where(part), fit) ** 2).sum(axis=1)
+            given = session if row else reported
+            fit = fit_arm(arm, given.where(~part), start, allowed, found.fit.scatter)
+            squares[row, part] = (residuals(arm, given.where(part), fit) ** 2).sum(axis=1)
     without, with_it = np.sqrt(squares.mean(axis=1))
     return float(without), float(with_it)
 
@@ -222,6 +246,7 @@ def _corrected(calibration: HandEye, found: _Found, arm: Arm) -> CorrectedArm:
     before = calibration.correction or ArmCorrection(np.zeros(3))
     correction = replace(
         before,
+        tool_offset=found.offset,
         joint_offsets=fit.parameters[:, 0],
         lengths=fit.parameters[:, 1:],
         joints=found.session.joints[0],
@@ -272,11 +297,13 @@ def _listed(known: Mask, found: _Found, prior: Floats) -> list[str]:
 
 def _branches_alike(found: _Found) -> list[str]:
     """Say that the joints may have been otherwise, where nobody recorded them."""
-    if found.alike == 1:
+    endless = bool(np.isinf(found.apart).any())
+    if found.alike == 1 and not endless:
         return []
+    ways = "any number of" if endless else found.alike
     return [
-        f"the recordings have no joint angles, and the arm may have reached the poses in "
-        f"{found.alike} ways that fit alike: what they do not agree on is not identified, and the "
+        "the recordings have no joint angles, and the arm may have reached the poses in "
+        f"{ways} ways that fit alike: what they do not agree on is not identified, and the "
         "corrected arm is that of the best of them; record the joint angles with the poses"
     ]
 
@@ -291,7 +318,7 @@ def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:
         ", ".join(f"{x:.0f}" for x in np.degrees(candidates.joints[i])) for i in chosen
     )
     would = int(identified(after, prior).sum())
-    them = "them" if found.alike == 1 else "them, and all joint angles,"
+    them = "them" if not _branches_alike(found) else "them, and all joint angles,"
     return [
         f"poses that would tell more, joints in deg: {listed}; with {them} {would} of {prior.size} "
         f"parameters are identified singly, and {combinations(after, prior)} combinations"

@@ -16,6 +16,7 @@ from flangeye.types import (
     BASE,
     CAMERA,
     FLANGE,
+    ArmCorrection,
     CalibratedPose,
     CircleFeature,
     Observation,
@@ -139,6 +140,40 @@ def test_without_joint_angles_only_what_all_ways_to_the_poses_agree_on_is_identi
     for name, (value, sigma) in unsure.items():
         assert abs(value - sure[name][0]) < 2 * np.hypot(sigma, sure[name][1])
     assert not any("joint angles" in note for note in refined().notes)
+
+
+def test_an_offset_of_the_circle_that_the_arm_explains_better_is_not_kept() -> None:
+    """Else the arm's parameters make up for it, each stated as sure."""
+    calibration = solved(observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad")))
+    taken = replace(calibration, correction=ArmCorrection(np.array([0.6e-3, 0.0, -0.4e-3])))
+    found = refine_arm(taken, ArmParams(propose=0), UR5)
+    correction, sure = found.corrected.correction, refined().corrected.correction
+    assert not correction.tool_offset.any()
+    assert correction.joint_offsets == pytest.approx(sure.joint_offsets, abs=1e-5)
+    singly = told_singly(found)
+    assert "joint 6 a" not in singly and "joint 6 d" not in singly  # they move the circle likewise
+    assert "joint 3 zero" in singly
+
+
+def test_an_arm_of_seven_joints_without_their_angles_tells_no_parameter_singly() -> None:
+    panda = load_model("robots", "franka-panda")
+    arm, rng = Arm(panda), np.random.default_rng(0)
+    joints = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8]) + rng.uniform(-0.3, 0.3, (20, 7))
+    observations = [
+        Observation(
+            f"{i:02d}",
+            CircleFeature(
+                np.linalg.inv(BASE_T_CAMERA)[:3] @ pose[:, 3], None, {}, NOISE**2 * np.eye(3),
+                None, 1.0,
+            ),
+            by_frame(Transform(BASE, FLANGE, pose)),
+        )
+        for i, pose in enumerate(arm.flange(joints))
+    ]  # fmt: skip
+    calibration = solve_robust(Observations(observations, Source("")), RobustParams(), robot=panda)
+    found = refine_arm(calibration, ArmParams(propose=0), panda)
+    assert any("parameters singly" in n and "identify none" in n for n in found.notes)
+    assert any("in any number of ways that fit alike" in n for n in found.notes)
 
 
 def test_it_proposes_poses_that_would_tell_more() -> None:
