@@ -54,6 +54,8 @@ def test_the_scale_has_an_end_and_without_freedom_nothing_is_found() -> None:
 def test_less_than_one_free_number_counts_as_one() -> None:
     one = Residuals(np.array([[3e-4, 0.0, 0.0]]), EYE[:1], 0.25)
     assert one.extra(OWN[:1])[0] == pytest.approx(9e-8 - 1e-8 - FINEST**2, rel=1e-6)
+    none = Residuals(np.array([[1e-9, 0.0, 0.0]]), EYE[:1], 0.25)
+    assert none.extra(OWN[:1]) == (0.0, 1.0)  # taken up by the fit: nothing against them
 
 
 def test_only_what_was_measured_counts() -> None:

@@ -131,14 +131,17 @@ class Residuals:
         return _factor(*self._along(own, further), wanted)
 
     def extra(self, own: Floats) -> tuple[float, float]:
-        """Return the variance to add, and the scale of the covariances, at most one."""
+        """Return the variance to add, and the scale of the covariances, at most one.
+
+        One, where less than one number is free: a fit that takes up all says nothing against them.
+        """
         if np.isinf(self.freedom):
             return 0.0, 1.0
         freedom, unit = max(self.freedom, 1.0), max(float((self.errors**2).mean()), FINEST**2)
         squares, shares = self._beside(own, unit)
         explained = float(squares.sum())
         if explained <= freedom:
-            return 0.0, max(explained / freedom, 1e-6)
+            return 0.0, max(explained / freedom, 1e-6) if self.freedom >= 1.0 else 1.0
         return unit * _factor(squares, shares, freedom), 1.0
 
     def _beside(self, own: Floats, variance: float) -> tuple[Floats, Floats]:
