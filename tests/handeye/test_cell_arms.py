@@ -9,7 +9,14 @@ import pytest
 
 from flangeye.handeye import cell_arms as room
 from flangeye.handeye.bent import KINDS, Bent, BentArm
-from flangeye.handeye.cell_arms import CorrectedArms, _corrected, _kinds, _seen, _told
+from flangeye.handeye.cell_arms import (
+    CorrectedArms,
+    _corrected,
+    _kinds,
+    _seen,
+    _told,
+    considering_errors,
+)
 from flangeye.handeye.graph import Solved, problem_of, solve_graph
 from flangeye.handeye.likelihood import agreeing
 from flangeye.maths.frame_graph import Frame
@@ -128,3 +135,12 @@ def test_offsets_are_told_in_milliradians() -> None:
     corrections = CorrectedArms(nothing, arms).corrections
     assert corrections["right"].tool_offset.tolist() == [0.0] * 3
     assert corrections["right"].joint_offsets is arms[1].offsets
+
+
+def test_what_was_considered_before_stays_in_the_covariance() -> None:
+    found, arms, _ = a_cell(OFF)
+    before, sizes = considering_errors(found, [arms])
+    clocks = 1e-6 * np.diag(np.arange(1.0, 19.0))
+    after, _ = considering_errors(found.with_joint(found.joint + clocks), [arms])
+    assert sizes is not None
+    assert after.joint - before.joint == pytest.approx(clocks, abs=1e-12)

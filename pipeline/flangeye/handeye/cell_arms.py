@@ -106,7 +106,8 @@ def considering_errors(
         return found, None
     kinds = _kinds(found.problem, found.found, likeliest(found, branches))
     joint, sizes = with_errors(found.problem, found.found, kinds, found.inflation)
-    return found.with_joint(joint + found.shared), sizes
+    # What was considered before stays: noise that moments share, and clocks.
+    return found.with_joint(joint + found.joint - found.own), sizes
 
 
 def correcting_zeros(

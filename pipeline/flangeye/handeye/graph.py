@@ -212,6 +212,12 @@ class Solved:
         """Factor on a covariance whose noise was estimated with the unknowns."""
         return covariance_inflation(self.found.freedom, 6)
 
+    @property
+    def own(self) -> Floats:
+        """(6 K, 6 K) covariance that the fit itself leaves, sightings being independent."""
+        count = self.found.at.of_places
+        return np.asarray(self.inflation * self.found.covariance[:count, :count])
+
     @cached_property
     def shared(self) -> Floats:
         """(6 K, 6 K) that the noise which sightings of one moment share adds to a covariance."""
@@ -311,9 +317,8 @@ def solved_from(problem: GraphProblem, start: Mapping[str, Floats]) -> Solved:
 
 def solved_of(problem: GraphProblem, found: Solution) -> Solved:
     """Return the unknowns of a fit, with the covariance that it leaves."""
-    known = found.covariance[: found.at.of_places, : found.at.of_places]
-    bare = Solved(problem, found, np.asarray(known))
-    return bare.with_joint(bare.inflation * bare.joint + bare.shared)
+    solved = Solved(problem, found, np.zeros((0, 0)))
+    return solved.with_joint(solved.own + solved.shared)
 
 
 def _started(problem: GraphProblem, start: Mapping[str, Floats]) -> Unknowns:
