@@ -560,7 +560,7 @@ def test_one_camera_is_solved_as_its_loop_is() -> None:
     made = session(CONFIGURATIONS["eye-in-hand, marker"], np.random.default_rng(3), 15)
     loop = loop_of(made.configuration)
     measured = measurements_of(made.observations, made.configuration, None)
-    problem = LoopProblem(measurements=measured, loop=loop, arms=TYPICAL_ARM)
+    problem = LoopProblem(measurements=measured, loop=loop, arms=TYPICAL_ARM, overstated=False)
     start = start_of(measured, loop, np.random.default_rng(0))
     whole = settle(problem, start, first_noise(problem, start))
     whole = agreeing(replace(problem, in_depth=True), whole)

@@ -264,9 +264,14 @@ def problem_of(
         times=np.array([s.time for s in sightings], dtype=np.intp),
         pairs=np.array([ends.index((s.camera, s.target)) for s in sightings], dtype=np.intp),
     )
-    stated = noise is None
+    # Of many unknowns and few sightings little is left that could tell of less noise.
     return GraphProblem(
-        measurements=seen, frames=frames, ends=ends, noise=noise or {}, stated=stated
+        measurements=seen,
+        frames=frames,
+        ends=ends,
+        noise=noise or {},
+        overstated=False,
+        stated=noise is None,
     )
 
 

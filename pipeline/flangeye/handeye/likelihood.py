@@ -55,8 +55,9 @@ class Problem(ABC):
     Attributes:
         measurements: N of them.
         tilt: Standard deviation of a tilt common to all normals [rad], or None.
+        overstated: Whether the features' own covariances may be larger than their noise.
         stated: Whether that is all the noise there is beside the measurements' own; else more is
-            estimated, or all of it scaled down.
+            estimated, or all of it scaled down (see overstated).
         nuisance: Errors of the arms that are estimated along.
         pose_noise: Variance of each coordinate beyond the features' own [m^2], where it is known.
         in_depth: Whether there may be more noise along the camera's axis than across it.
@@ -65,6 +66,7 @@ class Problem(ABC):
 
     measurements: Seen
     tilt: float | None = None
+    overstated: bool = True
     stated: bool = False
     nuisance: Nuisance = field(default_factory=lambda: no_nuisance(0))
     pose_noise: float | None = None
@@ -415,6 +417,8 @@ def _components(problem: Problem, found: Solution) -> tuple[Noise, float, float]
         noises.append(without_arms(turned, shifted, own))
         if problem.in_depth:
             noises += _in_depth(found, turned, (own, arms))
+    if not problem.overstated:
+        noises = [replace(each, centre_scale=1.0, normal_scale=1.0) for each in noises]
     noise = noises[0]
     if len(noises) > 1:
         noise = max(noises, key=lambda each: _likelihood(problem, found, each))
