@@ -27,8 +27,10 @@ CHECKS = "checks"
 
 HEADER = """\
 # Maps child coordinates to parent coordinates; metres and radians.
-# For the arm as its controller reports it; what stands under corrected_arm holds for the arm with
-# that correction alone, and never without it.
+# For the arm as its controller reports it.
+"""
+CORRECTED_HEADER = """\
+# What stands under corrected_arm holds for the arm with that correction alone, never without it.
 """
 
 
@@ -113,7 +115,8 @@ def calibration_yaml(result: Result) -> str:
             **_corrections(answers.corrected),
         }
     document["recipe_hash"] = result.provenance.recipe_hash
-    return HEADER + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
+    header = HEADER + (CORRECTED_HEADER if "corrected_arm" in document else "")
+    return header + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
 
 
 def _poses(transforms: Mapping[str, TransformResult]) -> dict[str, Any]:
