@@ -5,6 +5,7 @@ import pytest
 
 from flangeye.handeye.arm_sizes import (
     BESIDE,
+    GROWTH,
     LARGEST,
     LIKELY,
     RATIOS,
@@ -146,7 +147,7 @@ def test_sizes_weigh_as_much_as_they_are_likely() -> None:
         if SMALLEST <= ratio * np.sqrt(noise) <= LARGEST:
             logs.append(-0.5 * (54 * np.log(noise) + np.linalg.slogdet(shape)[1]))
             factors.append(ratio * np.sqrt(noise))
-    weights = np.exp(np.array(logs) - max(logs))
+    weights = np.exp(np.array(logs) - max(logs)) * np.array(factors) ** GROWTH
     kept = weights > LIKELY
     assert 5 < kept.sum() < len(kept)
     assert sizes.factors[:, 0] == pytest.approx(np.array(factors)[kept])
