@@ -16,7 +16,7 @@ from flangeye.models.cell import Cell, Link
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
-from flangeye.types import ArchivePath, Observation
+from flangeye.types import ArchivePath, CircleFeature, Observation, Transform
 
 REGISTRY = load_registry()
 Session = tuple[Sequence[Observation], Cell]
@@ -82,6 +82,33 @@ def test_each_mistake_is_named_with_the_line_that_cures_it(
 ) -> None:
     (finding,) = examine_cell(*mistake(*session("two-scanners"))).findings
     assert (finding.name, finding.fix) == (name, fix)
+
+
+def centres_of_a_table() -> Session:
+    """Return centres of the flange that two scanners beside an arm saw, as tables have them."""
+    path = bundled("recipes") / "configurations" / "two-scanners_flange_most-likely_simulated.yaml"
+    cell = load_recipe(path, REGISTRY).context[Cell]
+    rng = np.random.default_rng(0)
+    seen = []
+    for camera in cell.cameras:
+        stands = rigid(rotation_exp(rng.normal(0, 0.5, 3)), np.array([0.5, 0.0, -0.6]))
+        for i in range(12):
+            turn, place = rotation_exp(rng.normal(0, 0.4, 3)), rng.uniform(-0.2, 0.2, 3)
+            pose = rigid(turn, np.array([0.5, 0.0, 0.3]) + place)
+            centre = (invert(stands) @ pose)[:3, 3] + rng.normal(0, 1e-4, 3)
+            feature = CircleFeature(centre, None, {}, 1e-8 * np.eye(3), None, 1.0)
+            at = {"arm": Transform("arm_base", "arm", pose)}
+            seen.append(Observation(f"{i}-{camera}", feature, at, camera=camera, target="flange"))
+    return seen, cell
+
+
+def test_centres_of_a_table_in_another_unit_are_named() -> None:
+    seen, cell = centres_of_a_table()
+    assert examine_cell(seen, cell).findings == ()
+    (finding,) = examine_cell(*in_millimetres(seen, cell)).findings
+    name = cell.cameras[0]
+    assert finding.what == f"what {name} saw of flange is in mm"
+    assert finding.fix == f"sightings: [{{camera: {name}, target: flange, length: mm}}]"
 
 
 def on_the_wrong_link(link: str) -> Session:

@@ -22,7 +22,15 @@ from flangeye.handeye.cell import solve_cell
 from flangeye.handeye.graph import LIMITS
 from flangeye.maths.geometry import invert, rigid
 from flangeye.models.cell import Cell, Link
-from flangeye.types import CAMERA, TARGET, Floats, Observation, PoseFeature, Transform
+from flangeye.types import (
+    CAMERA,
+    TARGET,
+    CircleFeature,
+    Floats,
+    Observation,
+    PoseFeature,
+    Transform,
+)
 
 HELPS = 0.5
 """A mistake that is one leaves at most this share of the errors held out once it is mended."""
@@ -107,22 +115,23 @@ def _of_sightings(
 ) -> Iterator[Suspicion]:
     """Yield inverted markers and wrong units of what cameras saw."""
     stated = {(each["camera"], each["target"]): each.get("pose") for each in tables}
-    pairs = {(o.camera, o.target) for o in observations if isinstance(o.feature, PoseFeature)}
-    for camera, target in sorted(pairs):
+    pairs = {(o.camera, o.target): _whole(o) for o in observations if _whole(o) or _is_point(o)}
+    for (camera, target), whole in sorted(pairs.items()):
 
         def mended(change: Change, pair: tuple[str, str] = (camera, target)) -> list[Observation]:
             return [_seen(o, change) if (o.camera, o.target) == pair else o for o in observations]
 
         of = f"{{camera: {camera}, target: {target}, "
         seen = f"what {camera} saw of {target}"
-        pose = _other(stated.get((camera, target)), "camera_T_target", "target_T_camera")
-        yield Suspicion(
-            "inverted marker",
-            f"{seen} are poses {pose}, not the other way round",
-            f"sightings: [{of}pose: {pose}}}]",
-            mended(invert),
-            cell,
-        )
+        if whole:
+            pose = _other(stated.get((camera, target)), "camera_T_target", "target_T_camera")
+            yield Suspicion(
+                "inverted marker",
+                f"{seen} are poses {pose}, not the other way round",
+                f"sightings: [{of}pose: {pose}}}]",
+                mended(invert),
+                cell,
+            )
         for unit, factor in UNITS.items():
             yield Suspicion(
                 "unit",
@@ -131,6 +140,16 @@ def _of_sightings(
                 mended(partial(_scaled, factor=factor)),
                 cell,
             )
+
+
+def _whole(observation: Observation) -> bool:
+    return isinstance(observation.feature, PoseFeature)
+
+
+def _is_point(observation: Observation) -> bool:
+    """Whether a table told a centre; one of a scan has a normal, and the scanner's unit."""
+    feature = observation.feature
+    return isinstance(feature, CircleFeature) and feature.normal is None
 
 
 def _other(stated: str | None, usual: str, otherwise: str) -> str:
@@ -324,10 +343,11 @@ def _session(observations: Sequence[Observation]) -> RecordedSession:
 
 
 def _seen(observation: Observation, change: Change) -> Observation:
-    """Return an observation of a marker whose pose was another one."""
+    """Return an observation of a marker whose pose was another one, or of a point elsewhere."""
     feature = observation.feature
-    if not isinstance(feature, PoseFeature):
-        return observation
+    if isinstance(feature, CircleFeature):
+        centre = change(rigid(np.eye(3), feature.centre))[:3, 3]
+        return replace(observation, feature=replace(feature, centre=centre))
     pose = Transform(CAMERA, TARGET, change(feature.camera_T_target.matrix))
     return replace(observation, feature=replace(feature, camera_T_target=pose))
 
