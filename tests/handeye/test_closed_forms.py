@@ -1,5 +1,6 @@
 """Closed forms: exact on exact data, within their known errors on noise, no worse than OpenCV 4's."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from flangeye.handeye.closed.comanipulation import (
 from flangeye.handeye.closed.daniilidis import _ratios
 from flangeye.handeye.closed.motions import motions_of
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
+from flangeye.models.loading import load_model
 from flangeye_plugins.solve.closed_forms import ClosedFormParams
 from flangeye_plugins.solve.named import CLOSED_FORMS
 from tests.handeye.arms import REAL, drawn
@@ -218,6 +220,18 @@ def test_a_closed_form_says_that_an_unknown_arm_is_not_in_its_region() -> None:
     assert told.notes[0].startswith("what the arm does wrong alike at all poses is not in")
     known = solve("park_martin", made)
     assert known.notes[0].startswith("what the arm does wrong alike at all poses is in the cov")
+
+
+def test_the_scanner_s_distortion_is_in_what_a_closed_form_states() -> None:
+    made = session(CONFIGURATIONS["eye-on-base, flange"], np.random.default_rng(4), n=8)
+    made = replace(made, observations=drawn(made.configuration, 4, REAL, n=8)[0])
+    stage, scanner = STAGES["solve.linear"], load_model("scanners", "phoxi-m", None)
+    given = made.stream(), ClosedFormParams(), made.configuration, ROBOT
+    bare, told = stage(*given), stage(*given, scanner)
+    assert told.notes[:-1] == bare.notes
+    assert told.notes[-1].startswith("the scanner's smooth distortion")
+    wider = told.camera.covariance - bare.camera.covariance
+    assert np.linalg.eigvalsh(wider)[0] > -1e-9 and np.trace(wider[3:, 3:]) > 1e-9
 
 
 @pytest.mark.slow

@@ -145,7 +145,7 @@ def calibrate(cell: Cell, options: Options, method: str) -> HandEye:
     told = *stated.notes, *_note_of_shared(_shared_of(reported))
     notes = (*_noise_notes(model, cell, weak), *told)
     if cell.scanner is not None and distortion is not None:
-        notes = (*notes, _note_of_distortion(cell.scanner))
+        notes = (*notes, note_of_distortion(cell.scanner))
     if options.certify:
         corrected = answer_of(model.problem, model.found) if model.corrects_joints else None
         told = certificate_notes(answer_of(reported.problem, reported.found), corrected)
@@ -454,21 +454,26 @@ def _estimates(
 
 
 def _distortion(model: Model, cell: Cell, options: Options, weak: Floats) -> Nuisance | None:
+    """Return the scanner's distortion where it is asked for; worse is what is not observable."""
+    asked = options.scanner_distortion and not weak.shape[1]
+    return distortion_seen(model, cell) if asked else None
+
+
+def distortion_seen(model: Model, cell: Cell) -> Nuisance | None:
     """Return the scanner's distortion; None where nothing is known of it, or none is seen.
 
-    None too where moves are not observable, which is worse. With what it does to edges, where a
-    circle's place is unknown: elsewhere that is a few percent.
+    With what it does to edges, where a circle's place is unknown: elsewhere that is a few percent.
     """
     seen = np.array([by_depth(o.feature) for o in cell.observations])
-    asked = options.scanner_distortion and not weak.shape[1]
-    if cell.scanner is None or not asked or not seen.any():
+    if cell.scanner is None or not seen.any():
         return None
     s = model.problem.measurements
     distortion = distortion_of(cell.scanner, s, seen)
     return distortion.and_also(edges_of(s, seen)) if model.problem.loop.z else distortion
 
 
-def _note_of_distortion(scanner: ScannerModel) -> str:
+def note_of_distortion(scanner: ScannerModel) -> str:
+    """Say that the scanner's distortion is in the covariance."""
     return (
         f"the scanner's smooth distortion ({scanner.calibration_error * 1e3:g} mm rms over "
         "its volume, by its file) is in the covariance: it is the same at every pose, which "

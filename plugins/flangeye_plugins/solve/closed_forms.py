@@ -9,8 +9,13 @@ import numpy as np
 
 from flangeye import CalibrationRefused, Params, StageError
 from flangeye.handeye.arm_errors import are_unknown, note_of_errors, with_arm_errors
-from flangeye.handeye.calibration import TYPICAL_ARM, note_of_unknown_arm
-from flangeye.handeye.candidates import Model
+from flangeye.handeye.calibration import (
+    TYPICAL_ARM,
+    distortion_seen,
+    note_of_distortion,
+    note_of_unknown_arm,
+)
+from flangeye.handeye.candidates import Model, considered
 from flangeye.handeye.closed.motions import Motions, motions_of, place_of
 from flangeye.handeye.components import Noise
 from flangeye.handeye.consensus import Consensus
@@ -57,7 +62,7 @@ def solve_closed(method: str, solver: ClosedForm, cell: Cell, params: ClosedForm
     """Return a closed form's calibration; every observation takes part.
 
     Its covariance is about the closed form's answer, and holds what the likeliest one is away from
-    it: the noise that residuals show, and where the arm is known what it does wrong.
+    it: the noise that residuals show, and where arm and scanner are known what these do wrong.
 
     Args:
         method: Name of the stage.
@@ -108,9 +113,19 @@ def _weighed(problem: LoopProblem, at: Unknowns) -> Solution:
 
 def _stated(problem: LoopProblem, found: Solution, cell: Cell) -> tuple[Floats, tuple[str, ...]]:
     """Return the (18, 18) covariance of X, Y, Z about an answer, and what is to be said of it."""
+    model = Model(Consensus(problem, found))
+    covariance, notes = _by_arms(model, cell)
+    distortion = distortion_seen(model, cell)
+    if cell.scanner is None or distortion is None:
+        return covariance, notes
+    return covariance + considered(model, distortion), (*notes, note_of_distortion(cell.scanner))
+
+
+def _by_arms(model: Model, cell: Cell) -> tuple[Floats, tuple[str, ...]]:
+    """Return the same with what the arms do wrong, if they are known, and with noise."""
+    found = model.found
     inflation = covariance_inflation(found.freedom, found.basis.shape[1])
     if cell.arms and not are_unknown(cell.arms):
-        model = Model(Consensus(problem, found))
         covariance, sizes = with_arm_errors(model, cell.arms, inflation)
         return covariance, (note_of_errors(cell.arms, sizes),)
     notes = (note_of_unknown_arm(cell),) if cell.arms else ()

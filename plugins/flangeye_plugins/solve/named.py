@@ -23,6 +23,7 @@ from flangeye.handeye.observed import Cell
 from flangeye.handeye.starts import start_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
+from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.types import Floats, HandEye, Observations
 from flangeye_plugins.solve.closed_forms import (
@@ -41,11 +42,11 @@ def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:
         params: ClosedFormParams,
         configuration: Configuration | None = None,
         robot: RobotModel | None = None,
+        scanner: ScannerModel | None = None,
         second: SecondRobot | None = None,
     ) -> HandEye:
-        other = second.model if second else None
-        seen = list(observations)
-        cell = Cell(seen, configuration or DEFAULT, robot, second_robot=other)
+        seen, other = list(observations), second.model if second else None
+        cell = Cell(seen, configuration or DEFAULT, robot, scanner, second_robot=other)
         try:
             return solve_closed(name, solver, cell, params)
         except StageError as error:
