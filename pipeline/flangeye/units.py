@@ -73,6 +73,7 @@ def parse_quantity(value: object, kind: str) -> float:
 
 def format_quantity(si: float, kind: str) -> str:
     """Return ``si`` as text that :func:`parse_quantity` reads back to the same float."""
+    si = float(si)  # NumPy's floats have another repr
     for unit, factor in _UNITS[kind].items():
         text = f"{float(f'{Decimal(repr(si)) / factor:.12g}'):.12g} {unit}"
         if parse_quantity(text, kind) == si:

@@ -122,3 +122,12 @@ def test_a_recipe_starts_from_the_arm_as_built(tmp_path: Path) -> None:
     (tmp_path / "calibration.conf").unlink()
     with pytest.raises(RecipeError, match="no such file; copy calibration.conf"):
         load_recipe(tmp_path / "r.yaml", load_registry())
+
+
+def test_an_arm_as_built_is_written_beside_its_run(tmp_path: Path) -> None:
+    """With its kinematics from either file: their numbers are NumPy's in part."""
+    for file in (written(tmp_path, CONF), ros_file(tmp_path, 1e-3)):
+        given = RECIPE.replace("calibration.conf", file.name)
+        recipe = load_recipe(written(tmp_path, given, "r.yaml"), load_registry())
+        (model,) = (text for name, text in recipe.files.items() if name.startswith("models/"))
+        assert "joints:" in str(model)
