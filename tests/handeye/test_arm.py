@@ -13,6 +13,7 @@ from flangeye.handeye import arm as rooms
 from flangeye.handeye.arm import MovedFlange, _not_told_apart, _significant
 from flangeye.handeye.candidates import Model, weighed_with
 from flangeye.handeye.consensus import Consensus
+from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.geometry import invert, rigid, rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import f_quantile
@@ -109,13 +110,32 @@ def test_an_arm_of_another_model_keeps_its_joints() -> None:
     assert told == "joint offsets left out: the arm's model does not reach these poses"
 
 
-@pytest.mark.parametrize(("inliers", "corrects"), [(11, False), (40, True)])
-def test_a_field_is_not_looked_for_in_few_poses_nor_beside_joint_offsets(
-    inliers: int, corrects: bool
-) -> None:
-    found = SimpleNamespace(inliers=np.arange(40) < inliers)
-    model: Any = SimpleNamespace(corrects_joints=corrects, found=found)
-    assert rooms.with_field(model, MovedFlange(POSES, None, False)) is model
+def test_a_field_is_found_in_what_joint_offsets_leave() -> None:
+    """The offsets are as those of the arm that has only them; both together hold the arm best."""
+    offsets = np.array([0.0, 4.0, -3.0, 5.0, -4.0, 0.0]) * 1e-3
+    seen = simulate(ROBOT, 60, offsets=offsets, with_joints=True, tilt=0.8)
+    bent = []
+    for o in seen:
+        x, y, z = o.base_T_flange.translation
+        aside = 1.5 * MM * np.array([np.sin(4 * y), np.sin(4 * z), np.sin(4 * x)])
+        centre = o.circle.centre + TRUTH.inverse().rotation @ aside
+        bent.append(replace(o, feature=replace(o.circle, centre=centre)))
+    found = solver(ROBOT, joint_offsets="auto", joint_zeros="ignore")(bent)
+    alone = solver(ROBOT, joint_offsets="auto", joint_zeros="ignore", smooth_error="off")(bent)
+    assert found.corrected is not None and alone.corrected is not None
+    both, bare = found.corrected.correction, alone.corrected.correction
+    assert both.field is not None and bare.field is None
+    assert any("the arm is off by a smooth error" in note for note in found.notes)
+
+    def off(correction: Any, camera: Any) -> float:
+        errors = [
+            camera.transform.apply(o.circle.centre[None])[0]
+            - corrected_flange(o.base_T_flange.matrix, o.joints, correction, ARM)[:3, 3]
+            for o in bent
+        ]
+        return float(np.sqrt(np.mean(np.square(errors).sum(axis=1))))
+
+    assert off(both, found.corrected.camera) < 0.5 * off(bare, alone.corrected.camera)
 
 
 def test_an_offset_counts_beyond_what_chance_gives_once_in_ten_thousand() -> None:

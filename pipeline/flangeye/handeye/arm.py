@@ -94,9 +94,9 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
     """Estimate a smooth error of the arm over the workspace, if that helps.
 
     Its size is found with it. It is without a rigid part, so the camera's pose stays the best for
-    the arm as reported. Not beside joint offsets, which explain the same.
+    the arm as reported; where joint offsets are corrected, it is what these leave.
     """
-    if model.corrects_joints or int(model.found.inliers.sum()) < FEWEST_FOR_FIELD:
+    if int(model.found.inliers.sum()) < FEWEST_FOR_FIELD:
         return model
     places = flange.poses[:, :3, 3]
     field = field_over(places[model.found.inliers])
@@ -113,11 +113,27 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
         size=found.noise.size,
     )
     size = rms(moves[found.inliers] @ field.weights) * 1e3
-    before = len(model.problem.nuisance)
-    tool = np.zeros(3) if model.correction is None else found.at.nuisance[before - 3 : before]
     what = f"the arm is off by a smooth error over the workspace, {size:.3f} mm rms"
-    chosen = better(model, replace(candidate, correction=ArmCorrection(tool, field=field)), what)
+    correction = replace(_refitted(model, candidate), field=field)
+    chosen = better(model, replace(candidate, correction=correction), what)
     return model if chosen.found is model.found else chosen
+
+
+def _refitted(model: Model, candidate: Model) -> ArmCorrection:
+    """Return the model's correction with what a candidate with further errors has of it."""
+    before, own = model.correction, model.found.at.nuisance
+    if before is None:
+        return ArmCorrection(np.zeros(3))
+    change = candidate.found.at.nuisance[: len(own)] - own
+    of_joints, tool = np.zeros(0), before.tool_offset
+    if before.joint_offsets is not None:
+        change, of_joints = np.split(change, [len(own) - len(before.joint_offsets) + 2])
+    if tool.any():
+        tool = tool + change[-3:]
+    if before.joint_offsets is None:
+        return replace(before, tool_offset=tool)
+    offsets = before.joint_offsets + np.pad(of_joints, 1)
+    return replace(before, tool_offset=tool, joint_offsets=offsets)
 
 
 def with_tool_offset(model: Model, flange: MovedFlange) -> Model:

@@ -17,7 +17,14 @@ from flangeye.handeye.arm import (
     with_tool_offset,
 )
 from flangeye.handeye.arm_errors import evidence, note_of_errors, with_arm_errors
-from flangeye.handeye.candidates import Model, better, considered, understated, with_nuisance
+from flangeye.handeye.candidates import (
+    Model,
+    better,
+    considered,
+    following,
+    understated,
+    with_nuisance,
+)
 from flangeye.handeye.certificate import GAP
 from flangeye.handeye.certified import answer_of, certificate_notes, moved_note, verdict_of
 from flangeye.handeye.consensus import Consensus, begun_at, find_consensus
@@ -46,6 +53,7 @@ from flangeye.handeye.starts import size_of
 from flangeye.handeye.target_size import estimated_factor, longer_distances, require_size
 from flangeye.handeye.unknowns import Unknowns
 from flangeye.handeye.wander import with_walk
+from flangeye.maths.geometry import stack_rows
 from flangeye.maths.statistics import covariance_inflation, f_quantile
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import (
@@ -331,7 +339,7 @@ def _with_arm(model: Model, cell: Cell, options: Options) -> tuple[Model, Model]
     if options.joint_offsets and flange.kinematics is not None:
         candidate = with_joint_offsets(model, flange, options.joint_prior)
         if candidate.corrects_joints:
-            return model, candidate
+            return model, with_field(candidate, flange) if options.smooth_error else candidate
         model = candidate
     if options.smooth_error:
         model = with_field(model, flange)
@@ -345,13 +353,31 @@ def _corrected(model: Model, cell: Cell, options: Options, weak: Floats) -> Corr
     distortion = _distortion(model, cell, options, weak)
     stated = _stated(model, cell, options, weak)
     camera, *others = _estimates(model, cell, weak, stated.covariance, distortion)
+    together = stated._replace(of_scatter=_together(model, distortion))
     return CorrectedArm(
         camera,
         model.correction,
         tuple(others),
         shared=_shared_of(model),
-        scatter=_scattered(model, cell, weak, stated, distortion),
+        scatter=_scattered(model, cell, weak, together, None),
     )
+
+
+def _together(model: Model, distortion: Nuisance | None) -> Floats:
+    """Return the (18, 18) covariance of the camera's pose with the offsets that go with it.
+
+    The pose alone is known worse: offsets take back what it is off by. What is left of both at the
+    poses is a rigid motion and little else; this is the covariance of that.
+    """
+    found, out = model.found, np.zeros((18, 18))
+    rows = stack_rows(found.linear.jacobian[found.inliers][:, 3:])
+    together = np.linalg.pinv(rows[:, :6]) @ rows
+    spread = found.covariance * _inflation(model)
+    if distortion is not None:
+        moved = following(model.problem, found, distortion) * distortion.prior
+        spread = spread + moved @ moved.T
+    out[:6, :6] = together @ spread @ together.T
+    return out
 
 
 def _inflation(model: Model) -> float:
