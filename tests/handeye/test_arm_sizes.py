@@ -5,7 +5,7 @@ import pytest
 
 from flangeye.handeye.arm_sizes import (
     BESIDE,
-    GROWTH,
+    DOUBT,
     LARGEST,
     LIKELY,
     RATIOS,
@@ -117,18 +117,20 @@ def test_what_residuals_tell_of_errors_is_no_more_unknown() -> None:
     both = np.hstack([rows, kind])
     told = np.linalg.inv(both.T @ both + prior)
     off = (told @ both.T @ left[:, -1])[:6]
-    expected = told[:6, :6] + np.outer(off, off)
+    expected = known + DOUBT * (told[:6, :6] - known + np.outer(off, off))
     apart = np.linalg.solve(expected, covariance)
     assert np.linalg.eigvals(apart).real == pytest.approx(np.ones(6), rel=0.25)
     unheard = known + (sizes.expected[0] * answer.moved) @ (sizes.expected[0] * answer.moved).T
-    assert np.trace(covariance) < 1.1 * np.trace(expected) < 0.8 * np.trace(unheard)
+    heard = known + (covariance - known) / DOUBT
+    assert np.trace(heard) < 0.8 * np.trace(unheard)
 
 
 def test_where_no_size_is_likely_errors_are_as_was_said() -> None:
     gram = np.diag([0.0, 0.0, 1e14])
     answer = Answer(np.zeros(6), np.eye(6), np.eye(6)[:, :2])
     covariance, sizes = stated(gram, [2], 100.0, answer)
-    assert covariance == pytest.approx(np.diag([2.0, 2.0, 1, 1, 1, 1]), rel=1e-6)
+    doubted = 1.0 + DOUBT
+    assert covariance == pytest.approx(np.diag([doubted, doubted, 1, 1, 1, 1]), rel=1e-6)
     assert sizes.expected == pytest.approx([1.0]) and sizes.gain == 0.0
 
 
@@ -147,7 +149,7 @@ def test_sizes_weigh_as_much_as_they_are_likely() -> None:
         if SMALLEST <= ratio * np.sqrt(noise) <= LARGEST:
             logs.append(-0.5 * (54 * np.log(noise) + np.linalg.slogdet(shape)[1]))
             factors.append(ratio * np.sqrt(noise))
-    weights = np.exp(np.array(logs) - max(logs)) * np.array(factors) ** GROWTH
+    weights = np.exp(np.array(logs) - max(logs))
     kept = weights > LIKELY
     assert 5 < kept.sum() < len(kept)
     assert sizes.factors[:, 0] == pytest.approx(np.array(factors)[kept])

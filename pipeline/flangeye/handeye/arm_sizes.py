@@ -23,9 +23,9 @@ RATIOS = np.logspace(-1.5, 2.5, 61)
 SMALLEST, LARGEST = 1.0, 20.0
 """Size of errors of the first kind, in what was said. No arm is known to be better than its file
 says, and a joint that is off by a quarter of a degree is mastered anew."""
-GROWTH = 0.5
-"""Power of its size by which a larger one is likelier beforehand, by its logarithm: most arms are
-far worse than their files say (the joints of the published Aubo by 13 to 37 times)."""
+DOUBT = 2.0
+"""Factor on squares of what residuals tell of errors, for arms are off by other kinds as well, and
+by these where joints had to be guessed: of foreign arms truths were so far away in the mean."""
 BESIDE = (1 / 3, 1.0, 3.0)
 """How large errors of one kind may be beside those of the first, in what was said of both."""
 TOGETHER = (0.1, 1 / 3, 3.0)
@@ -129,7 +129,7 @@ class _Cases:
     def weighed(self, largest: float) -> _Cases:
         """Return those that are likely beside the likeliest of all."""
         sizes = self.factors[:, 0]
-        weights = np.exp((self.gains - largest) / 2) * sizes**GROWTH
+        weights = np.exp((self.gains - largest) / 2)
         some = (weights > LIKELY) & (sizes >= SMALLEST) & (sizes <= LARGEST)
         return replace(
             self,
@@ -148,9 +148,9 @@ class _Cases:
         """
         moved = answer.moved @ self.axes
         squares = (moved[:, None] * moved).reshape(-1, moved.shape[1])
-        followed = (self.unknown @ squares.T).reshape(-1, *answer.own.shape)
+        followed = DOUBT * (self.unknown @ squares.T).reshape(-1, *answer.own.shape)
         covariances = followed + self.noise[:, None, None] * answer.own
-        return answer.offset - self.told @ moved.T, covariances
+        return np.sqrt(DOUBT) * (answer.offset - self.told @ moved.T), covariances
 
 
 def _cases(gram: Floats, counts: Sequence[int], freedom: float) -> list[_Cases]:
