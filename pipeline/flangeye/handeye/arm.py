@@ -9,7 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
-from flangeye.handeye.candidates import Model, better, considered, rms, weighed_with, with_nuisance
+from flangeye.handeye.candidates import (
+    Model,
+    better,
+    considered,
+    held_out,
+    rms,
+    weighed_with,
+    with_nuisance,
+)
 from flangeye.handeye.nuisance import Nuisance, nuisance_of
 from flangeye.maths.arm_correction import follow
 from flangeye.maths.geometry import rotation_log
@@ -98,13 +106,32 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
     """
     if int(model.found.inliers.sum()) < FEWEST_FOR_FIELD:
         return model
+    begun = [model] if model.found.inliers.all() else [model, _with_all(model)]
+    fitted = [each for start in begun if (each := _with_field_from(start, flange))]
+    if not fitted:
+        return model
+    kept = np.any([each.found.inliers for each in (model, *(m for m, _ in fitted))], axis=0)
+    best, size = min(fitted, key=lambda each: rms(held_out(each[0].found)[0][kept]))
+    what = f"the arm is off by a smooth error over the workspace, {size * 1e3:.3f} mm rms"
+    chosen = better(model, best, what)
+    return model if chosen.found is model.found else chosen
+
+
+def _with_all(model: Model) -> Model:
+    """Return the model with every measurement in it: a smooth error may have set some aside."""
+    found = replace(model.found, inliers=np.ones_like(model.found.inliers))
+    return replace(model, consensus=replace(model.consensus, found=found))
+
+
+def _with_field_from(model: Model, flange: MovedFlange) -> tuple[Model, float] | None:
+    """Return the model with a smooth error, begun with those that agree, and its rms [m]."""
     places = flange.poses[:, :3, 3]
     field = field_over(places[model.found.inliers])
     moves = effects(field, places)
     twists = np.concatenate([np.zeros_like(moves), moves], axis=1)
     candidate = with_nuisance(model, flange.nuisance(twists, 1.0, sized=True))
     if candidate is None:
-        return model
+        return None
     k, found = len(field.weights), candidate.found
     field = replace(
         field,
@@ -112,11 +139,9 @@ def with_field(model: Model, flange: MovedFlange) -> Model:
         covariance=found.covariance[-k:, -k:],
         size=found.noise.size,
     )
-    size = rms(moves[found.inliers] @ field.weights) * 1e3
-    what = f"the arm is off by a smooth error over the workspace, {size:.3f} mm rms"
     correction = replace(_refitted(model, candidate), field=field)
-    chosen = better(model, replace(candidate, correction=correction), what)
-    return model if chosen.found is model.found else chosen
+    size = rms(moves[found.inliers] @ field.weights)
+    return replace(candidate, correction=correction), size
 
 
 def _refitted(model: Model, candidate: Model) -> ArmCorrection:
