@@ -129,7 +129,7 @@ class _Cases:
     def weighed(self, largest: float) -> _Cases:
         """Return those that are likely beside the likeliest of all."""
         sizes = self.factors[:, 0]
-        weights = np.exp((self.gains - largest) / 2)
+        weights = np.exp(np.minimum(self.gains - largest, 0.0) / 2)
         some = (weights > LIKELY) & (sizes >= SMALLEST) & (sizes <= LARGEST)
         return replace(
             self,
