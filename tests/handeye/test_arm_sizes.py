@@ -134,14 +134,6 @@ def test_where_no_size_is_likely_errors_are_as_was_said() -> None:
     assert sizes.expected == pytest.approx([1.0]) and sizes.gain == 0.0
 
 
-def test_sizes_beyond_the_bounds_may_be_likelier_by_any_factor() -> None:
-    """Where poses are all but exact no size between them is near the likeliest of all."""
-    rng = np.random.default_rng(7)
-    rows, kind = rng.normal(size=(100, 6, 6)), rng.normal(size=(100, 6, 12))
-    errors = 1e-2 * kind @ rng.normal(size=12) + 1e-8 * rng.normal(size=(100, 6))
-    assert np.isfinite(likely_sizes(rows, [kind], errors, 600.0).weights).all()
-
-
 def test_sizes_weigh_as_much_as_they_are_likely() -> None:
     """Against the restricted likelihood of each, by the whole covariance of what is left."""
     rng = np.random.default_rng(5)
