@@ -50,12 +50,15 @@ from flangeye.maths.geometry import (
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.types import Floats, Indices
 
-STARTS, ROUNDS, STEPS = 60, 30, 8
+STARTS, ROUNDS, STEPS = 60, 12, 6
 """Random starts at most, widths of what counts in a descent of each, and steps with one width."""
+PATIENCE = 12
+"""Starts in turn that find nothing lower end the search: where places are not told no two agree."""
 AGREE = 1e-3
 """Two starts whose costs differ by this share ended in one valley, which then is the answer."""
-SETTLED = 1e-5
-"""Places that move by no more than this end a descent towards most sightings [rad, m]."""
+SETTLED = 1e-4
+"""A descent towards most sightings ends where their squares change by no more than this share:
+places may go on along what nothing tells."""
 MOST = 4.0
 """Sightings beyond so many times the median square of their pair hardly count there."""
 LIMITS = float(np.radians(2)), 20e-3
@@ -486,18 +489,23 @@ def _moved_tells(
 
 
 def _anywhere(problem: GraphProblem) -> Unknowns:
-    """Return the lowest of many descents that leave outliers behind; two that agree end it.
+    """Return the lowest of many descents that leave outliers behind.
+
+    Two that agree end it, and so many in turn that find nothing lower.
 
     Rotations go first: without the places they have far fewer valleys to end in.
     """
     rng, best, least = np.random.default_rng(0), Unknowns(np.zeros((0, 4, 4))), np.inf
-    turns_alone = _turns_alone(problem)
+    turns_alone, since = _turns_alone(problem), 0
     for _ in range(STARTS):
         start = Unknowns(np.array([_drawn(rng) for _ in problem.unknown]).reshape(-1, 4, 4))
         found = _descended(problem, _descended(turns_alone, start).at)
         cost = float(_middles(problem, found.squares).sum())
         if abs(cost - least) <= AGREE * cost + 1e-12:
             return found.at
+        since = 0 if cost < least else since + 1
+        if since >= PATIENCE:
+            break
         if cost < least:
             best, least = found.at, cost
     return best
@@ -524,11 +532,12 @@ def _descended(problem: GraphProblem, start: Unknowns) -> Solution:
     noise, every = Noise(0.0, 0.0, arms=0.0), np.ones(len(problem.measurements))
     found = weigh(problem, start, noise, every)
     for _ in range(ROUNDS):
-        before = found
-        widths = np.maximum(MOST * _middles(problem, found.squares), 1e-12)
+        middles = _middles(problem, found.squares)
+        widths = np.maximum(MOST * middles, 1e-12)
         kernel = partial(geman_mcclure, widths)
         found = climb(problem, found, noise, kernel(found.squares)[0], STEPS, kernel)
-        if np.abs(found.at.places - before.at.places).max() < SETTLED:
+        after = _middles(problem, found.squares)
+        if abs(after.sum() - middles.sum()) <= SETTLED * middles.sum() + 1e-12:
             break
     return found
 
