@@ -503,11 +503,12 @@ def _anywhere(problem: GraphProblem) -> Unknowns:
         cost = float(_middles(problem, found.squares).sum())
         if abs(cost - least) <= AGREE * cost + 1e-12:
             return found.at
-        since = 0 if cost < least else since + 1
+        if cost < least:
+            best, least, since = found.at, cost, 0
+            continue
+        since += 1
         if since >= PATIENCE:
             break
-        if cost < least:
-            best, least = found.at, cost
     return best
 
 
