@@ -16,10 +16,10 @@ from flangeye.errors import StageError
 from flangeye.files import matlab_parser
 from flangeye.files.arrays import read_arrays
 from flangeye.files.children import python_command
+from flangeye.files.pairs import natural
 from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import MAX_TEXT, read_regular, read_text
-from flangeye.files.tables import natural
 from flangeye.types import Floats
 
 MAX_MATLAB = 1_000_000

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from glob import escape
+from itertools import chain
 from pathlib import Path
 
 from flangeye.errors import StageError
+from flangeye.files.pairs import in_order, natural, partners
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats
 
@@ -18,19 +20,128 @@ VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "
 
 
 def scans_in(folder: Path, stem: str = "*") -> list[Path]:
-    """Return the scans of a folder by name, clouds before images of the same name.
+    """Return the scans of a folder in natural order, clouds before images of the same name.
 
     Raises:
         StageError: There are only scans that their maker alone can read.
     """
-    found = sorted(p for p in folder.glob(f"{stem}.*") if p.suffix.lower() in (*CLOUDS, *IMAGES))
-    foreign = sorted(p for p in folder.glob(f"{stem}.*") if p.suffix.lower() in VENDOR)
+    files = sorted(folder.glob(f"{stem}.*"), key=lambda p: (natural(p.stem), p.suffix))
+    found = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES)]
+    foreign = [p for p in files if p.suffix.lower() in VENDOR]
     if foreign and not found:
         first = foreign[0]
         raise StageError(
             f"{first}: only {VENDOR[first.suffix.lower()]} reads it; export it as .ply or .pcd"
         )
     return found
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The poses that scans are looked for.
+
+    Attributes:
+        where: The file or pattern they are from, which messages begin with.
+        count: How many there are.
+        files: The file of each, where each has its own; else empty.
+        names: What each is called, where they have names; else empty.
+    """
+
+    where: str
+    count: int
+    files: Sequence[Path] = ()
+    names: Sequence[str] = ()
+
+    @property
+    def apart(self) -> bool:
+        """Whether each pose has a folder of its own."""
+        return len({file.parent for file in self.files}) == self.count > 1
+
+
+def scans_of(
+    folder: Path, poses: Poses, taken: Collection[Path] = ()
+) -> tuple[list[list[Path]], list[str]]:
+    """Return the scans of each pose, and notes of how they were paired.
+
+    The scans lie in the folder, in folders in it (``images/``, ``clouds/``), or in a folder for
+    each pose. Those with names are paired by the name or the number in common, rows of a table by
+    their order.
+
+    Args:
+        folder: Where the scans are.
+        poses: What they belong to.
+        taken: Files that hold poses, and are no scans.
+
+    Raises:
+        StageError: The names differ, there are not as many, or two folders hold scans for all.
+    """
+    if poses.apart:
+        lone = next((file for file in poses.files if not scans_in(file.parent)), None)
+        if lone is not None:
+            raise StageError(f"{lone}: no scan lies beside it; put it there, or take the pose away")
+        return [scans_in(file.parent) for file in poses.files], []
+    all_places = {p: _scans_by_stem(p, taken) for p in (folder, *sorted(folder.glob("*/")))}
+    places = {p: found for p, found in all_places.items() if found} or {folder: {}}
+    fitting, failed = {}, []
+    for place, scans in places.items():
+        try:
+            fitting[place] = _paired(poses, scans)
+        except StageError as error:
+            failed.append((len(scans), error))
+    if not fitting:
+        raise max(failed, key=lambda pair: pair[0])[1]
+    return _together(folder, [fitting[folder]] if folder in fitting else list(fitting.values()))
+
+
+def _scans_by_stem(folder: Path, taken: Collection[Path]) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for scan in scans_in(folder):
+        if scan not in taken:
+            found.setdefault(scan.stem, []).append(scan)
+    return found
+
+
+def _paired(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
+    """Return the scans of each pose: of one name, or a cloud and an image of one number."""
+    kinds = [
+        {stem: [p for p in found if p.suffix.lower() in kind] for stem, found in scans.items()}
+        for kind in (CLOUDS, IMAGES)
+    ]
+    split = [{stem: found for stem, found in kind.items() if found} for kind in kinds]
+    try:
+        return _by_name(poses, scans)
+    except StageError:
+        if not all(split):
+            raise
+        return _together(Path(poses.where), [_by_name(poses, kind) for kind in split])
+
+
+def _by_name(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
+    stems = list(scans)
+    if not poses.names:
+        note = in_order(poses.where, poses.count, "poses", [scans[stem][0].name for stem in stems])
+        return list(scans.values()), [note]
+    order, note = partners(poses.where, poses.names, stems)
+    return [scans[stems[i]] for i in order], [note]
+
+
+def _together(
+    where: Path, found: Sequence[tuple[list[list[Path]], list[str]]]
+) -> tuple[list[list[Path]], list[str]]:
+    """Return the clouds of one place with the images of another."""
+    scans = [list(chain.from_iterable(each)) for each in zip(*(s for s, _ in found), strict=True)]
+    twice = next((paths for paths in scans if len(_kinds(paths)) < len(paths)), None)
+    if twice is not None:
+        named = " and ".join(str(path.relative_to(path.parent.parent)) for path in twice)
+        raise StageError(
+            f"{where}: {named} could both belong to one pose; name the scan of each pose in a "
+            "column called scan, or take one folder away"
+        )
+    return scans, list(dict.fromkeys(note for _, notes in found for note in notes))
+
+
+def _kinds(scans: Sequence[Path]) -> set[bool]:
+    return {path.suffix.lower() in CLOUDS for path in scans}
 
 
 def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:

@@ -18,8 +18,9 @@ from pydantic import Field
 from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.named_arrays import arrays_at
+from flangeye.files.pairs import partners
 from flangeye.files.recording import Archive, Recording
-from flangeye.files.scans import recording_of, scans_in
+from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.maths.pose_corrections import inverted
 from flangeye.types import FLANGE, FLANGE2, Floats
 from flangeye_plugins.reader.written import POINT, WrittenParams
@@ -71,11 +72,13 @@ def matrices(path: Path, params: MatricesParams) -> Archive:
     folder = path.parent if path.is_file() else path
     files, arm = _joined(folder, params.robot, params.translation)
     poses = _values(folder, arm, params, params.pose == "flange_T_base")
-    recordings = _with_scans(folder, files, poses) if params.target is None else []
-    if params.target is not None:
+    if params.target is None:
+        recordings, notes = _with_scans(folder, files, poses)
+    else:
         more, seen = _joined(folder, params.target.at, params.target.translation)
         turned = params.target.pose == "target_T_camera"
-        recordings = _with_target(folder, poses, _values(folder, seen, params.target, turned))
+        seen = _values(folder, seen, params.target, turned)
+        recordings, notes = _with_target(folder, poses, seen)
         files += more
     if params.second is not None:
         more, second = arrays_at(folder, params.second)
@@ -83,7 +86,7 @@ def matrices(path: Path, params: MatricesParams) -> Archive:
         files += more
     files = list(dict.fromkeys(files))
     layout = f"arrays, {files[0].name}" + (f" and {len(files) - 1} more" if files[1:] else "")
-    return Archive(layout, folder, recordings, files, params.cloud_unit)
+    return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
 
 
 def _joined(folder: Path, place: str, translation: str | None) -> tuple[list[Path], Named]:
@@ -115,35 +118,39 @@ def _values(folder: Path, named: Named, written: WrittenParams, turned: bool) ->
     return [(n, inverted(v) if turned and v.shape == (4, 4) else v) for n, v in found]
 
 
-def _with_scans(folder: Path, files: list[Path], poses: Named) -> list[Recording]:
-    homes = [file.parent for file in files]
-    if len(poses) == len(set(homes)) > 1:  # a folder for each capture
-        return [
-            recording_of(home.name, pose, scans_in(home))
-            for home, (_, pose) in zip(homes, poses, strict=True)
-        ]
-    scans: dict[str, list[Path]] = {}
-    for scan in scans_in(folder):
-        scans.setdefault(scan.stem, []).append(scan)
-    scans = {stem: found for stem, found in scans.items() if found[0].suffix.lower() != ".npy"}
-    _require_as_many(folder, len(scans), "scans", len(poses))
-    return [
-        recording_of(found[0].stem, pose, found)
-        for (_, pose), found in zip(poses, scans.values(), strict=True)
+def _with_scans(folder: Path, files: list[Path], poses: Named) -> tuple[list[Recording], list[str]]:
+    own = files if len(files) == len(poses) else []
+    named = Poses(str(files[0]), len(poses), own, _names(poses))
+    found, notes = scans_of(folder, named, files)
+    recordings = [
+        recording_of((scans[0].parent if named.apart else scans[0]).stem, pose, scans)
+        for (_, pose), scans in zip(poses, found, strict=True)
     ]
+    return recordings, notes
 
 
-def _with_target(folder: Path, poses: Named, seen: Named) -> list[Recording]:
+def _with_target(folder: Path, poses: Named, seen: Named) -> tuple[list[Recording], list[str]]:
     _require_as_many(folder, len(seen), "targets", len(poses))
-    return [
+    order, notes = list(range(len(poses))), []
+    if _names(poses) and _names(seen):
+        order, note = partners(str(folder), _names(poses), _names(seen))
+        notes = [note]
+    recordings = [
         Recording(
             name,
             {FLANGE: pose},
             centre_in_camera=target if target.shape == (3,) else None,
             camera_T_target=target if target.shape == (4, 4) else None,
         )
-        for (name, pose), (_, target) in zip(poses, seen, strict=True)
+        for (name, pose), (_, target) in zip(poses, [seen[i] for i in order], strict=True)
     ]
+    return recordings, notes
+
+
+def _names(poses: Named) -> list[str]:
+    """Return what poses are called; empty where they are only counted."""
+    names = [name for name, _ in poses]
+    return [] if names == [f"{i:04}" for i in range(len(poses))] else names
 
 
 def _with_second(folder: Path, recordings: list[Recording], second: Named) -> list[Recording]:

@@ -16,10 +16,10 @@ import numpy as np
 
 from flangeye import StageError
 from flangeye.files.images import decode_image
+from flangeye.files.pairs import natural
 from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
-from flangeye.files.tables import natural
 from flangeye.log.records import Channel, LogFile
 from flangeye.types import Singles
 

@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.scans import recording_of, scans_in
+from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, passed, turning
@@ -136,12 +136,15 @@ def table(path: Path, params: TableParams) -> Archive:
 
 
 def _of_rows(folder: Path, text: Table, rows: Sequence[Row], params: TableParams) -> Archive:
+    found, notes = _scans(folder, text, rows)
+    poses = [_arm_pose(row.where, row.numbers, params) for row in rows]
+    apart = len({at[0].parent for at in found}) == len(found) > 1  # a folder for each pose
     recordings = [
-        recording_of(scans[0].stem, _arm_pose(row.where, row.numbers, params), scans)
-        for row, scans in zip(rows, _scans(folder, text.file, rows), strict=True)
+        recording_of((at[0].parent if apart else at[0]).stem, pose, at)
+        for at, pose in zip(found, poses, strict=True)
     ]
     layout = f"table, {text.file.name}"
-    return Archive(layout, folder, recordings, text.files, cloud_unit=params.cloud_unit)
+    return Archive(layout, folder, recordings, text.files, params.cloud_unit, notes)
 
 
 def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
@@ -343,19 +346,13 @@ def _other(folder: Path, text: Table, given: OtherParams, turned: bool) -> Readi
 # --- the scans of rows
 
 
-def _scans(folder: Path, file: Path, rows: Sequence[Row]) -> list[list[Path]]:
-    """Return the scans of each row: the named one, or all of one name in the order of names."""
+def _scans(folder: Path, text: Table, rows: Sequence[Row]) -> tuple[list[list[Path]], list[str]]:
+    """Return the scans of each row: the named one, or those that belong to it; and notes."""
     if any(row.scan for row in rows):
-        return [_named(folder, row) for row in rows]
-    stems: dict[str, list[Path]] = {}
-    for scan in scans_in(folder):
-        stems.setdefault(scan.stem, []).append(scan)
-    if len(stems) != len(rows):
-        raise StageError(
-            f"{file}: has {len(rows)} poses, but the folder {len(stems)} scans; name the scan of "
-            "each pose in the first column"
-        )
-    return list(stems.values())
+        return [_named(folder, row) for row in rows], []
+    files = text.files if len(text.files) == len(rows) > 1 else ()
+    poses = Poses(str(text.file), len(rows), files, [file.stem for file in files])
+    return scans_of(folder, poses, text.files)
 
 
 def _named(folder: Path, row: Row) -> list[Path]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from flangeye import RecipeError, StageError
+from flangeye.files.pairs import natural
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.yaml_lines import Document, read_yaml
 from flangeye.types import Floats
@@ -26,7 +27,9 @@ def documents_at(path: Path) -> Iterator[tuple[Path, Document]]:
     if path.is_file():
         candidates = [path] if path.suffix in SUFFIXES else []
     else:
-        candidates = sorted(p for p in path.glob("*") if p.suffix in SUFFIXES)
+        candidates = sorted(
+            (p for p in path.glob("*") if p.suffix in SUFFIXES), key=lambda p: natural(p.name)
+        )
     if not candidates:
         raise NotThisLayout(f"{path}: holds no YAML file")
     for candidate in candidates:

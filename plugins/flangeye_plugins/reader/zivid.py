@@ -15,6 +15,7 @@ from pydantic import Field
 
 from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import LengthUnit
+from flangeye.files.pairs import natural
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import read_text
 from flangeye.files.scans import recording_of, scans_in
@@ -39,7 +40,8 @@ class ZividParams(Params):
 @part("reader.zivid")
 def zivid(path: Path, params: ZividParams) -> Archive:
     """Read a folder of posNN.yaml with clouds or images imgNN beside them."""
-    files = {m[1]: p for p in sorted(path.glob("pos*.y*ml")) if (m := _POSE.fullmatch(p.name))}
+    found = sorted(path.glob("pos*.y*ml"), key=lambda file: natural(file.name))
+    files = {m[1]: file for file in found if (m := _POSE.fullmatch(file.name))}
     if not files:
         raise NotThisLayout(f"{path}: holds no pos01.yaml")
     factor = 1e-3 if params.length == "mm" else 1.0

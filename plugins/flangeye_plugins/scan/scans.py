@@ -10,6 +10,7 @@ from pydantic import Field
 from flangeye import Params, RecipePath, StageError, stage
 from flangeye.devices import ScannerDriver
 from flangeye.files.clouds import CLOUD_SUFFIXES, LengthUnit, read_cloud
+from flangeye.files.pairs import natural
 from flangeye.types import CAMERA, PointCloud, WorkpieceScan
 
 
@@ -41,7 +42,10 @@ def _files(path: Path) -> list[Path]:
         raise StageError(f"{path}: does not exist")
     if path.is_file():
         return [path]
-    found = sorted(p for p in path.iterdir() if p.suffix.lower() in CLOUD_SUFFIXES)
+    found = sorted(
+        (p for p in path.iterdir() if p.suffix.lower() in CLOUD_SUFFIXES),
+        key=lambda p: natural(p.name),
+    )
     if not found:
         raise StageError(f"{path}: holds no cloud; known: {', '.join(CLOUD_SUFFIXES)}")
     return found

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, TactileSensor
 from flangeye.errors import StageError
 from flangeye.files.images import MAX_FILE, ImageError, decode_image
+from flangeye.files.pairs import natural
 from flangeye.files.paths import RecipePath
 from flangeye.files.regular import read_regular
 from flangeye.log.read import read_notes
@@ -81,7 +82,8 @@ def sensor_image_folder(
     finger: Finger, robot: StateSource, seed: Seed, params: ImageFolderParams
 ) -> TactileSensor:
     """A folder of images, one after the other."""
-    files = sorted(p for p in _listed(params.path) if p.suffix.lower() in SUFFIXES)
+    found = (p for p in _listed(params.path) if p.suffix.lower() in SUFFIXES)
+    files = sorted(found, key=lambda path: natural(path.name))
     if not files:
         raise StageError(f"{params.path}: holds no image; known: {', '.join(SUFFIXES)}")
     timed = ((i * params.period, _read(file, finger)) for i, file in enumerate(files))

@@ -4,7 +4,7 @@ A new kind of file is a module here, and a row in :mod:`~flangeye.files.tables.r
 """
 
 from flangeye.files.tables.positions import holds_positions
-from flangeye.files.tables.read import KINDS, files_at, natural, read_table
+from flangeye.files.tables.read import KINDS, files_at, read_table
 from flangeye.files.tables.table import Column, Table, number_of
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "Table",
     "files_at",
     "holds_positions",
-    "natural",
     "number_of",
     "read_table",
 ]

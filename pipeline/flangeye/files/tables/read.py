@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from flangeye.errors import StageError
+from flangeye.files.pairs import natural
 from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import json_lines_rows, json_rows, yaml_rows
 from flangeye.files.tables.positions import position_rows
@@ -49,11 +49,6 @@ def read_table(folder: Path, name: str) -> Table:
             raise StageError(f"{file}: its columns are not those of {files[0].name}")
     rows = [row for _, found in tables for row in found]
     return Table(name, folder / name, tables[0][0], tuple(rows), tuple(files))
-
-
-def natural(text: str) -> list[tuple[int, str]]:
-    """Return a key that sorts pose_2 before pose_10."""
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", text)]
 
 
 def _rows(file: Path, single: bool) -> Rows:
