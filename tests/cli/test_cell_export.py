@@ -72,8 +72,7 @@ def test_one_camera_is_chosen_where_a_format_carries_one(run: Any, command: Call
         assert np.allclose(np.loadtxt(path / "exports" / f"{camera}.txt"), wanted, atol=1e-8)
     words = ("--to", "ros2_launch", "--camera", "right", "--out", "-")
     _, launched, _ = command("export", path, *words)
-    assert '"--frame-id", "base"' in launched
-    assert '"--child-frame-id", "right"' in launched
+    assert "'--frame-id', 'base', '--child-frame-id', 'right'" in launched
     assert "left" not in launched
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_plugins.export.controllers import export_kuka
-from flangeye_plugins.export.programs import export_matrix, export_zivid
+from flangeye_plugins.export import EXPORTS
 from tests.conftest import TOY_RECIPE
+from tests.crafted import rewritten
 
 REFUSED = TOY_RECIPE.replace("max_rms: 2 mm", "max_rms: 0.001 mm")
 
@@ -17,7 +17,7 @@ REFUSED = TOY_RECIPE.replace("max_rms: 2 mm", "max_rms: 0.001 mm")
 @pytest.fixture
 def exporting(flangeye: Any, toy_registry: Any, tmp_path: Path) -> Any:
     """Run a recipe into ``here`` with exports on offer; return the command line."""
-    for stage in (export_kuka, export_matrix, export_zivid):
+    for stage in EXPORTS:
         toy_registry.stages[stage.name] = stage
 
     def ran(text):
@@ -91,7 +91,11 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
             (),
             "6.export.matrix: an earlier step writes camera.txt already; give this one another name",
         ),
-        (TOY_RECIPE, ("--to", "kukka"), "no stage 'export.kukka'; did you mean export.kuka?"),
+        (
+            TOY_RECIPE,
+            ("--to", "kukka"),
+            "no stage 'export.kukka'; did you mean export.kuka or export.ur or export.abb?",
+        ),
         (
             TOY_RECIPE,
             ("--to", "kuka", "--set", "number=x"),
@@ -105,7 +109,7 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (
             TOY_RECIPE,
             ("--to", "matrix", "--set", "name=../../x"),
-            "--set name: string should match pattern '^[A-Za-z][A-Za-z0-9_]{0,31}$', not '../../x'",
+            "--set name: string should match pattern '^[A-Za-z][A-Za-z0-9_]{0,23}$', not '../../x'",
         ),
     ],
 )
@@ -118,3 +122,45 @@ def test_what_cannot_be_exported_is_one_line(
     assert code == 2
     assert f"error: {message}" in err
     assert "Traceback" not in err
+
+
+def renamed(name: str) -> Any:
+    def edit(result: Any) -> None:
+        result["transforms"] = {name: result["transforms"].pop("base_T_camera")}
+
+    return edit
+
+
+def stretched(result: Any) -> None:
+    result["transforms"]["base_T_camera"]["matrix"][0][0] = 2.0
+
+
+def judged(result: Any) -> None:
+    result["status"] = "very verified"
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (renamed("base_T_cam; touch PWNED;"), "'cam; touch PWNED;' is no name of a frame"),
+        (renamed("x"), "'' is no name of a frame"),
+        (renamed("base_T_" + "c" * 99), "is no name of a frame"),
+        (stretched, "base_T_camera is not a rigid transform"),
+        (judged, "status: Input should be 'verified', 'unverified', 'refused' or 'incomplete'"),
+    ],
+)
+def test_a_hostile_log_is_one_line(exporting: Any, tmp_path: Path, edit: Any, message: str) -> None:
+    exporting.ran(TOY_RECIPE)
+
+    def changed(name: str, data: bytes) -> tuple[str, bytes]:
+        if name != "result.json":
+            return name, data
+        result = json.loads(data)
+        edit(result)
+        return name, json.dumps(result).encode()
+
+    crafted = rewritten(tmp_path / "here" / "run.mcap", tmp_path / "crafted.mcap", changed)
+    code, out, err = exporting("export", crafted, "--to", "ros2_command", "--out", "-")
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1

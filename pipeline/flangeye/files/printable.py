@@ -4,12 +4,31 @@ from __future__ import annotations
 
 import re
 
+from flangeye.errors import RecipeError
+
 LONGEST = 160
 """What is quoted of a parser's message [characters]: some quote the file."""
 _CONTROLS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 """All but tab and line feed: escape sequences begin with them, and directions hide what is said."""
+
+_NAME = re.compile(r"\w[\w ./:+()\-]{0,127}")
+"""A link, joint or frame in another program's file: no quote, no line break, no markup."""
+
+
+def require_name(where: str, name: str) -> str:
+    """Return a name that a file gives to a link, a joint or a frame.
+
+    Raises:
+        RecipeError: It has other characters than names have, or more than 128.
+    """
+    if not _NAME.fullmatch(name):
+        raise RecipeError(
+            f"{where}: {name[:LONGEST]!a} is no name: letters, digits and _ . / : + - ( ) or a "
+            "space are allowed, 128 at most; rename it in the file"
+        )
+    return name
 
 
 def printable(text: str) -> str:

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
+from pydantic import ValidationError
+
 if TYPE_CHECKING:
     from mcap.records import Chunk
 
@@ -269,7 +271,9 @@ def reason_of(error: Exception) -> str:
         return "it is nested too deeply"
     if isinstance(error, UnicodeDecodeError):
         return "it is not UTF-8 text"
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        return ": ".join(filter(None, (where, first["msg"].removeprefix("Value error, "))))[:200]
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    if type(error).__name__ == "ValidationError" and len(lines) > 2:
-        lines = [f"{lines[1]}: {lines[2].partition(' [type=')[0]}"]
     return (lines[0] if lines else type(error).__name__)[:200]

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flangeye.errors import RecipeError
+from flangeye.files.printable import require_name
 from flangeye.files.regular import read_text
 from flangeye.maths.geometry import invert, rigid, rotation_from_rpy, rpy_from_rotation
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
@@ -48,7 +49,7 @@ class Urdf:
         joints: list[ET.Element] = []
         while link in self.above:
             joints.insert(0, self.above[link])
-            link = _end(joints[0], "parent")
+            link = end_of(joints[0], "parent")
             if len(joints) > len(self.links):
                 raise RecipeError(f"{self.path}: its joints go round in a circle at '{link}'")
         return joints
@@ -105,8 +106,11 @@ def read_urdf(path: Path) -> Urdf:
     if any("xacro" in element.tag for element in root.iter()):
         raise RecipeError(f"{path}: is xacro, not yet a URDF; expand it: xacro {path} > arm.urdf")
     links = {link.get("name", ""): link for link in root.findall("link")}
-    above = {_end(joint, "child"): joint for joint in root.findall("joint")}
-    return Urdf(path, root.get("name") or path.stem, links, above)
+    above = {end_of(joint, "child"): joint for joint in root.findall("joint")}
+    name = root.get("name") or path.stem
+    for each in (name, *links, *above, *(end_of(joint, "parent") for joint in above.values())):
+        require_name(str(path), each)
+    return Urdf(path, name, links, above)
 
 
 def _assemble(
@@ -120,7 +124,7 @@ def _assemble(
     volumes: list[Volume] = []
     missing = ""
     before = base_T_first  # from the last moving link, or the base, to the link that is reached
-    reached = _end(chain[0], "parent") if chain else ""
+    reached = end_of(chain[0], "parent") if chain else ""
     for joint in [*chain, None]:
         try:
             for volume in _volumes(urdf, reached, len(joints), before, packages):
@@ -129,8 +133,8 @@ def _assemble(
             missing = str(error)
         if joint is None:
             break
-        before = before @ _origin(urdf.path, joint)
-        reached = _end(joint, "child")
+        before = before @ origin_of(urdf.path, joint)
+        reached = end_of(joint, "child")
         if joint.get("type") in MOVES:
             joints.append(_joint(urdf, joint, before))
             before = np.eye(4)
@@ -185,7 +189,7 @@ def _volumes(
         geometry = collision.find("geometry")
         if geometry is None or not len(geometry):
             continue
-        placed = pose @ _origin(urdf.path, collision)
+        placed = pose @ origin_of(urdf.path, collision)
         capsule = capsule_of(geometry[0], urdf.path, packages)
         ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
         start, end = (tuple(map(SI, point)) for point in ends)
@@ -217,7 +221,7 @@ def _flange(urdf: Urdf, asked: str | None) -> str:
         named = [name for name in urdf.links if name.endswith(ending)]
         if len(named) == 1:
             return named[0]
-    parents = {_end(joint, "parent") for joint in urdf.above.values()}
+    parents = {end_of(joint, "parent") for joint in urdf.above.values()}
     moved = [n for n in urdf.links if any(j.get("type") in MOVES for j in urdf.chain(n))]
     ends = [name for name in moved if name not in parents]
     if len(ends) == 1:
@@ -248,11 +252,16 @@ def _shared(first: list[ET.Element], second: list[ET.Element]) -> int:
 def _fixed(path: Path, joints: list[ET.Element]) -> Floats:
     pose = np.eye(4)
     for joint in joints:
-        pose = pose @ _origin(path, joint)
+        pose = pose @ origin_of(path, joint)
     return pose
 
 
-def _origin(path: Path, element: ET.Element) -> Floats:
+def origin_of(path: Path, element: ET.Element) -> Floats:
+    """Return the pose (4, 4) [m] that an element's ``origin`` has in its parent.
+
+    Raises:
+        RecipeError: An attribute is not three finite numbers.
+    """
     origin = element.find("origin")
     rpy = numbers_of(path, origin, "rpy", "0 0 0")
     xyz = numbers_of(path, origin, "xyz", "0 0 0")
@@ -264,6 +273,7 @@ def _pose(pose: Floats) -> dict[str, Any]:
     return {"xyz": tuple(map(SI, pose[:3, 3])), "rpy": tuple(map(SI, rpy))}
 
 
-def _end(joint: ET.Element, which: str) -> str:
+def end_of(joint: ET.Element, which: str) -> str:
+    """Return a joint's ``parent`` or ``child`` link, empty where it names none."""
     end = joint.find(which)
     return "" if end is None else end.get("link", "")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from flangeye.log.read import RunLog
 from flangeye.models.workspace import work_of
 from flangeye.units import parse_quantity
 
-INCOMPLETE = "incomplete"
+INCOMPLETE: Literal["incomplete"] = "incomplete"
 UNSOLVED = "the run ended before the solver"
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from flangeye.types import Transform
 
 PARTLY = 0.01
 """An axis with a larger share in a direction that was not measured has no deviation of its own."""
@@ -43,6 +45,7 @@ class TransformResult(_Part):
             raise ValueError("'about' has not 3 coordinates")
         if any(len(direction) != 6 for direction in self.unobservable or []):
             raise ValueError("a direction of 'unobservable' has not 6 components")
+        Transform.named("base_T_camera", self.matrix)  # which refuses what is not rigid
         return self
 
     @property
@@ -261,7 +264,9 @@ class Result(_Part):
 
     format: int = Field(1, description="Version of this contract.")
     title: str
-    status: str = Field(description="verified, unverified (no verify step) or refused.")
+    status: Literal["verified", "unverified", "refused", "incomplete"] = Field(
+        description="unverified: there was no verify step; incomplete: of a run that was killed."
+    )
     refused: str | None = Field(None, description="Why.")
     method: str | None = Field(None, description="The solve step.")
     transforms: dict[str, TransformResult] = Field(
@@ -289,3 +294,10 @@ class Result(_Part):
     )
     timing: dict[str, StageTiming]
     provenance: Provenance
+
+    @model_validator(mode="after")
+    def _names_are_of_transforms(self) -> Self:
+        """Check the names that exports write into other programs' files."""
+        for name, found in self.transforms.items():
+            Transform.named(name, found.matrix)
+        return self

@@ -125,4 +125,4 @@ def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
         said.append("NOT VERIFIED: nothing has judged this calibration")
     if partly:
         said.append("NOT OBSERVABLE in part: some directions of this pose are arbitrary")
-    return tuple(" ".join(line.encode("ascii", "replace").decode().split()) for line in said)
+    return tuple(said)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Outcome:
     exports: list[t.ExportedFile] = field(default_factory=list)
 
     @property
-    def status(self) -> str:
+    def status(self) -> Literal["refused", "verified", "unverified"]:
         """``refused``, ``verified`` or ``unverified``."""
         if self.refused:
             return "refused"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,9 @@ from flangeye.types.arrays import Array, FloatArray, Floats, freeze, frozen
 from flangeye.types.clouds import PointCloud
 
 BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"
+
+FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
+"""Names of frames are identifiers: they reach recipes, logs and other programs' files."""
 
 BASE2, FLANGE2 = "base2", "flange2"
 
@@ -35,6 +39,9 @@ class Transform:
     matrix: Array
 
     def __post_init__(self) -> None:
+        for frame in (self.parent, self.child):
+            if not FRAME_NAME.fullmatch(frame):
+                raise ValueError(f"{frame[:80]!a} is no name of a frame: letters, digits and _")
         freeze(self, matrix=(4, 4))
         rotation = self.matrix[:3, :3]
         # Not np.allclose: poses come 500 times a second, and it takes 30 us.
@@ -44,7 +51,11 @@ class Transform:
 
     @classmethod
     def named(cls, name: str, matrix: Any) -> Transform:
-        """Return the transform of a name such as ``base_T_camera``."""
+        """Return the transform of a name such as ``base_T_camera``.
+
+        Raises:
+            ValueError: The name is not of that form, or the matrix is not rigid.
+        """
         parent, _, child = name.partition("_T_")
         return cls(parent, child, matrix)
 

@@ -1,44 +1,53 @@
-"""``export.*``: the camera pose as another program takes it. Add a format: with its like here."""
+"""``export.*``: the camera pose as another program takes it.
 
-from flangeye_plugins.export.controllers import (
-    export_abb,
-    export_doosan,
-    export_fanuc,
-    export_kuka,
-    export_staubli,
-    export_ur,
-    export_yaskawa,
-)
-from flangeye_plugins.export.easy_handeye2 import export_easy_handeye2
-from flangeye_plugins.export.programs import (
-    export_halcon,
-    export_matrix,
-    export_mech_mind,
-    export_opencv,
-    export_robodk,
-    export_zivid,
-)
-from flangeye_plugins.export.ros2 import export_moveit, export_ros2_command, export_ros2_launch
-from flangeye_plugins.export.urdf import export_urdf
+Add a format: a row of ``controllers.CONTROLLERS``, or a writer in ``documents`` where names have to
+be quoted. ``export.robot`` writes the arm, and is none of the formats.
+"""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flangeye import stage
+from flangeye.models.configuration import CELL
+from flangeye.plugin.stage import Stage
+from flangeye.types import CalibratedPose, ExportedFile
+from flangeye_plugins.export import documents
+from flangeye_plugins.export.controllers import CONTROLLERS
+from flangeye_plugins.export.urdf import UrdfParams, urdf
+from flangeye_plugins.export.writing import FramesParams, LengthParams, NamedParams, ZividParams
+
+
+def _declared(
+    name: str, write: Callable[..., ExportedFile], params: type[NamedParams], meaning: str
+) -> Stage:
+    def export(pose: CalibratedPose, params: Any) -> ExportedFile:
+        params.require_unnamed(pose)
+        return write(pose, params)
+
+    export.__doc__ = meaning
+    export.__annotations__["params"] = params
+    serves = (CELL,) if name in OF_CELLS else ()
+    return stage(f"export.{name}", serves=serves)(export)
+
+
+OF_CELLS = ("ros2_command", "ros2_launch", "urdf")
+"""Formats that carry every transform of a cell."""
+
+_WRITERS: tuple[tuple[Callable[..., ExportedFile], type[NamedParams]], ...] = (
+    (documents.ros2_command, FramesParams),
+    (documents.ros2_launch, FramesParams),
+    (urdf, UrdfParams),
+    (documents.moveit, FramesParams),
+    (documents.easy_handeye2, FramesParams),
+    (documents.opencv, LengthParams),
+    (documents.zivid, ZividParams),
+    (documents.robodk, NamedParams),
+    (documents.matrix, LengthParams),
+)
 EXPORTS = (
-    export_ros2_command,
-    export_ros2_launch,
-    export_urdf,
-    export_moveit,
-    export_easy_handeye2,
-    export_opencv,
-    export_ur,
-    export_kuka,
-    export_abb,
-    export_fanuc,
-    export_yaskawa,
-    export_staubli,
-    export_doosan,
-    export_zivid,
-    export_mech_mind,
-    export_halcon,
-    export_robodk,
-    export_matrix,
+    *(_declared(write.__name__, write, params, write.__doc__ or "") for write, params in _WRITERS),
+    *(_declared(name, row.write, row.params, row.meaning) for name, row in CONTROLLERS.items()),
 )
-"""The formats of the camera's pose; ``export.robot`` writes the arm, and is none of them."""
+"""The formats of the camera's pose."""

@@ -1,90 +1,182 @@
-"""Frames and tools of robot controllers, each as its maker writes a pose.
+"""Formats that are a template and a convention: robot controllers, and plain numbers.
 
-ABB's RAPID: a work object, mm, quaternion with its real part first. Doosan's DRL: ``posx(x, y, z,
-A, B, C)``, mm and degrees, Rz(A) Ry(B) Rz(C). Fanuc: a user frame, mm and degrees, Rz(R) Ry(P)
-Rx(W). KUKA, KSS ``$config.dat``: a base or tool, mm and degrees, Rz(A) Ry(B) Rx(C). Staubli's VAL
-3: mm and degrees, Rx Ry Rz about turned axes. Universal Robots: a feature ``p[x, y, z, rx, ry,
-rz]``, metres, rotation vector. Yaskawa: a user frame, mm and degrees, Rz Ry Rx about fixed axes.
+A template's ``{0}``, ``{1}``, … are the numbers of the pose in the format's convention, ``{sort}``
+is the first or the second of two words: for a camera beside the robot, or on the arm.
+
+Sources: ABB RAPID reference (wobjdata, identifiers); Doosan DRL manual (posx); FANUC operator's
+manual (direct entry); KUKA KSS ``$config.dat``; Staubli VAL 3 reference (trsf); URScript manual
+(pose); Yaskawa operator's manual (user frames); MVTec HALCON ``write_pose``, whose Rodriguez form
+(``f 1``) is the tangent of half the angle and ends at half a turn, so angles are written. The keys
+of Mech-Mind's ``extri_param.json`` are not public: its numbers are to be typed in.
 """
 
 from __future__ import annotations
 
-from flangeye import stage
-from flangeye.maths.pose_formats import CONVENTIONS
+import keyword
+from dataclasses import dataclass
+
+from flangeye.maths.pose_formats import CONVENTIONS, PoseConvention
 from flangeye.types import CalibratedPose, ExportedFile
-from flangeye_plugins.export.writing import NamedParams, NumberedParams, fixed, labelled, numbers_of
+from flangeye_plugins.export.writing import (
+    NamedParams,
+    NumberedParams,
+    numbers_of,
+    require_identifier,
+)
 
 
-@stage("export.abb")
-def export_abb(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
-    """Write a RAPID module with the pose as the user frame of a work object."""
-    numbers = numbers_of("abb", pose)
-    held = "FALSE" if pose.stands else "TRUE"
-    frame = f"[[{','.join(numbers[:3])}],[{','.join(numbers[3:])}]]"
-    text = (
-        f"{pose.comment('!')}MODULE {params.name}_data\n"
-        f'  PERS wobjdata {params.name}:=[{held},TRUE,"",{frame},[[0,0,0],[1,0,0,0]]];\n'
-        "ENDMODULE\n"
-    )
-    use = "load the module; robhold is TRUE where the arm carries the camera"
-    return ExportedFile(f"{params.name}.mod", text, use)
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.lower().split())
 
 
-@stage("export.doosan")
-def export_doosan(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
-    """Write the pose as a DRL variable, as user coordinates and tools take it."""
-    text = f"{pose.comment('#')}{params.name} = posx({', '.join(numbers_of('doosan', pose))})\n"
-    carrier = "DR_BASE" if pose.stands else "the flange"
-    return ExportedFile(f"{params.name}.drl", text, f"a line of DRL; relative to {carrier}")
+_PYTHON = _words(" ".join(keyword.kwlist))
+_URSCRIPT = _PYTHON | _words("end halt local then thread")
+_RAPID = _words(
+    "alias and backward case connect const default div do else elseif endfor endfunc endif "
+    "endmodule endproc endrecord endtest endtrap endwhile error exit false for from func goto if "
+    "inout local mod module nostepin not noview or pers proc raise readonly record retry return "
+    "step sysmodule test then to trap true trynext undo var viewonly while with xor"
+)
+_VAL3 = _words(
+    "and begin bool call case default dio do else elseif end endfor endif endswitch endwhile false "
+    "for frame if joint mdesc not num or point program return sio start stop string switch then to "
+    "tool trsf true until wait while xor"
+)
 
 
-@stage("export.fanuc")
-def export_fanuc(pose: CalibratedPose, params: NumberedParams) -> ExportedFile:
-    """Write the numbers of a Fanuc user frame, or of a tool frame where the arm carries it."""
-    sort = "UFRAME" if pose.stands else "UTOOL"
-    lines = "\n".join(labelled("fanuc", pose, ": "))
-    text = f"{pose.comment('!')}{sort}[{params.number}] ({params.name}), mm and deg\n{lines}\n"
-    use = f"enter under SETUP, Frames, {sort} {params.number}, Direct Entry"
-    return ExportedFile(f"{params.name}.fanuc.txt", text, use)
+@dataclass(frozen=True)
+class Controller:
+    """One such format.
+
+    Attributes:
+        meaning: First line of its documentation.
+        file: Name of the file.
+        mark: What begins a comment line.
+        text: The template, behind the remarks.
+        use: Where the file goes in the other program.
+        convention: How the numbers are written.
+        sort: ``{sort}`` of a camera beside the robot, and of one on the arm.
+        params: ``NamedParams``, or ``NumberedParams`` for ``{number}``.
+        reserved: Words of the language, in small letters, that no pose may be called.
+    """
+
+    meaning: str
+    file: str
+    mark: str
+    text: str
+    use: str
+    convention: str | PoseConvention
+    sort: tuple[str, str] = ("", "")
+    params: type[NamedParams] = NamedParams
+    reserved: frozenset[str] = frozenset()
+
+    def write(self, pose: CalibratedPose, params: NamedParams) -> ExportedFile:
+        """Return the file of a pose."""
+        numbers = numbers_of(self.convention, pose.transform.matrix)
+        words = {
+            "name": require_identifier(params.name, self.reserved),
+            "number": getattr(params, "number", None),
+            "sort": self.sort[0 if pose.stands else 1],
+            "remarks": pose.comment(self.mark),
+        }
+        name, text, use = (x.format(*numbers, **words) for x in (self.file, self.text, self.use))
+        return ExportedFile(name, text, use)
 
 
-@stage("export.kuka")
-def export_kuka(pose: CalibratedPose, params: NumberedParams) -> ExportedFile:
-    """Write a KUKA base, or a tool where the arm carries the camera."""
-    sort = "BASE" if pose.stands else "TOOL"
-    frame = f"{{{','.join(labelled('kuka', pose))}}}"
-    text = (
-        f"{pose.comment(';')}{sort}_DATA[{params.number}]={frame}\n"
-        f'{sort}_NAME[{params.number},]="{params.name}"\n'
-    )
-    use = f"the lines of {sort.lower()} {params.number} in R1/System/$config.dat"
-    return ExportedFile(f"{params.name}.kuka.dat", text, use)
-
-
-@stage("export.staubli")
-def export_staubli(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
-    """Write the pose as the transformation of a VAL 3 frame or tool."""
-    numbers = ",".join(numbers_of("staubli", pose))
-    text = f"{pose.comment('//')}{params.name}.trsf={{{numbers}}}\n"
-    sort = "frame, its father world" if pose.stands else "tool, its father flange"
-    return ExportedFile(f"{params.name}.val3.txt", text, f"a line of VAL 3; declare it a {sort}")
-
-
-@stage("export.ur")
-def export_ur(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
-    """Write the pose as a URScript variable, as features and pose_trans take it."""
-    in_metres = CONVENTIONS["ur"].in_units("m", "rad")
-    numbers = ", ".join(fixed(in_metres.numbers(pose.transform.matrix)))
-    text = f"{pose.comment('#')}{params.name} = p[{numbers}]\n"
-    carrier = "the base" if pose.stands else "the flange: pose_trans(get_actual_tcp_pose(), …)"
-    use = f"a URScript file; the pose of a feature, relative to {carrier}"
-    return ExportedFile(f"{params.name}.script", text, use)
-
-
-@stage("export.yaskawa")
-def export_yaskawa(pose: CalibratedPose, params: NumberedParams) -> ExportedFile:
-    """Write the numbers of a Yaskawa user frame, or of a tool where the arm carries the camera."""
-    sort = "USER FRAME" if pose.stands else "TOOL"
-    lines = "\n".join(labelled("yaskawa", pose, ": "))
-    text = f"{pose.comment(chr(39))}{sort} {params.number} ({params.name}), mm and deg\n{lines}\n"
-    return ExportedFile(f"{params.name}.yaskawa.txt", text, "enter under ROBOT, " + sort)
+CONTROLLERS = {
+    "ur": Controller(
+        "Write the pose as a URScript variable, as features and pose_trans take it.",
+        "{name}.script",
+        "#",
+        "{remarks}{name} = p[{0}, {1}, {2}, {3}, {4}, {5}]\n",
+        "a URScript file; the pose of a feature, relative to {sort}",
+        CONVENTIONS["ur"].in_units("m", "rad"),
+        ("the base", "the flange: pose_trans(get_actual_tcp_pose(), …)"),
+        reserved=_URSCRIPT,
+    ),
+    "kuka": Controller(
+        "Write a KUKA base, or a tool where the arm carries the camera.",
+        "{name}.kuka.dat",
+        ";",
+        "{remarks}{sort}_DATA[{number}]={{X {0},Y {1},Z {2},A {3},B {4},C {5}}}\n"
+        '{sort}_NAME[{number},]="{name}"\n',
+        "the lines of {sort} {number} in R1/System/$config.dat",
+        "kuka",
+        ("BASE", "TOOL"),
+        NumberedParams,
+    ),
+    "abb": Controller(
+        "Write a RAPID module with the pose as the user frame of a work object.",
+        "{name}.mod",
+        "!",
+        "{remarks}MODULE {name}_data\n  PERS wobjdata {name}:="
+        '[{sort},TRUE,"",[[{0},{1},{2}],[{3},{4},{5},{6}]],[[0,0,0],[1,0,0,0]]];\nENDMODULE\n',
+        "load the module; robhold is TRUE where the arm carries the camera",
+        "abb",
+        ("FALSE", "TRUE"),
+        reserved=_RAPID,
+    ),
+    "fanuc": Controller(
+        "Write the numbers of a Fanuc user frame, or of a tool frame where the arm carries it.",
+        "{name}.fanuc.txt",
+        "!",
+        "{remarks}{sort}[{number}] ({name}), mm and deg\n"
+        "X: {0}\nY: {1}\nZ: {2}\nW: {3}\nP: {4}\nR: {5}\n",
+        "enter under SETUP, Frames, {sort} {number}, Direct Entry",
+        "fanuc",
+        ("UFRAME", "UTOOL"),
+        NumberedParams,
+    ),
+    "yaskawa": Controller(
+        "Write the numbers of a Yaskawa user frame, or of a tool where the arm carries the camera.",
+        "{name}.yaskawa.txt",
+        "'",
+        "{remarks}{sort} {number} ({name}), mm and deg\n"
+        "X: {0}\nY: {1}\nZ: {2}\nRX: {3}\nRY: {4}\nRZ: {5}\n",
+        "enter under ROBOT, {sort}",
+        "yaskawa",
+        ("USER FRAME", "TOOL"),
+        NumberedParams,
+    ),
+    "staubli": Controller(
+        "Write the pose as the transformation of a VAL 3 frame or tool.",
+        "{name}.val3.txt",
+        "//",
+        "{remarks}{name}.trsf={{{0},{1},{2},{3},{4},{5}}}\n",
+        "a line of VAL 3; declare it a {sort}",
+        "staubli",
+        ("frame, its father world", "tool, its father flange"),
+        reserved=_VAL3,
+    ),
+    "doosan": Controller(
+        "Write the pose as a DRL variable, as user coordinates and tools take it.",
+        "{name}.drl",
+        "#",
+        "{remarks}{name} = posx({0}, {1}, {2}, {3}, {4}, {5})\n",
+        "a line of DRL; relative to {sort}",
+        "doosan",
+        ("DR_BASE", "the flange"),
+        reserved=_PYTHON,
+    ),
+    "mech_mind": Controller(
+        "Write position and quaternion for Mech-Mind's dialogs; not a file of its own format.",
+        "{name}.mech_mind.txt",
+        "#",
+        "{remarks}{name}: metres, quaternion w x y z\n"
+        "X: {0}\nY: {1}\nZ: {2}\nQW: {3}\nQX: {4}\nQY: {5}\nQZ: {6}\n",
+        "type the numbers in, and mind the unit that the dialog shows",
+        "quaternion_wxyz",
+    ),
+    "halcon": Controller(
+        "Write a pose file that HALCON's read_pose reads.",
+        "{name}.halcon.dat",
+        "#",
+        "# 3D POSE PARAMETERS: rotation and translation\n{remarks}\n"
+        "# Used representation type:\nf 0\n\n"
+        "# Rotation angles [deg] or Rodriguez vector:\nr {3} {4} {5}\n\n"
+        "# Translation vector (x y z [m]):\nt {0} {1} {2}\n",
+        "read_pose ('{name}.halcon.dat', Pose)",
+        "halcon",
+    ),
+}
+"""By name."""

@@ -6,21 +6,20 @@ Calibrations find the optical frame (z along the view); a camera's own URDF hang
 
 from __future__ import annotations
 
-from html import escape  # that of xml.sax imports Python's HTTP client
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field
 
-from flangeye import Params, StageError, stage
+from flangeye import Params, StageError
 from flangeye.files.paths import RecipePath
 from flangeye.maths.geometry import rigid, rotation_from_rpy
-from flangeye.maths.pose_formats import CONVENTIONS
-from flangeye.models.configuration import CELL
+from flangeye.models.urdf import end_of, origin_of, read_urdf
 from flangeye.types import CAMERA, CalibratedPose, ExportedFile, Floats
 from flangeye.units import Angle, Length, param
-from flangeye_plugins.export.writing import FRAME, FramesParams, fixed
+from flangeye_plugins.export.writing import FRAME, FramesParams, numbers_of
 
 
 class OpticalParams(Params):
@@ -61,17 +60,25 @@ class UrdfParams(FramesParams):
     )
 
 
-@stage("export.urdf", serves=(CELL,))
-def export_urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
+def urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
     """Write URDF joints: the mount link's, where the camera's URDF is known, and the optical's."""
-    params.require_unnamed(pose)
-    joints = "".join(_joints(each, params) for each in pose.each)
-    remarks = "".join(f"  <!-- {line.replace('--', '- -')} -->\n" for line in pose.remarks)
-    text = f'<?xml version="1.0"?>\n<robot name="{params.name}">\n{remarks}{joints}</robot>\n'
-    return ExportedFile(f"{params.name}.urdf", text, "copy the joints, or include the file")
+    robot = ElementTree.Element("robot", name=params.name)
+    for line in pose.remarks:
+        # No "--" may stand in a comment, nor "-" at its end (XML 1.0, 2.5).
+        robot.append(ElementTree.Comment(f" {re.sub('-(?=-)', '- ', line)} "))
+    for each in pose.each:
+        robot.extend(_joints(each, params))
+    ElementTree.indent(robot)
+    text = ElementTree.tostring(robot, "unicode")
+    try:
+        ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:  # a control character, which XML cannot hold
+        raise StageError(f"export.urdf: a name cannot be written as XML: {error}") from None
+    file = f'<?xml version="1.0"?>\n{text}\n'
+    return ExportedFile(f"{params.name}.urdf", file, "copy the joints, or include the file")
 
 
-def _joints(pose: CalibratedPose, params: UrdfParams) -> str:
+def _joints(pose: CalibratedPose, params: UrdfParams) -> list[ElementTree.Element]:
     alone = pose.transform.child == CAMERA
     optical = params.child or (f"{CAMERA}_optical_frame" if alone else pose.transform.child)
     mount = params.mount or f"{pose.transform.child}_link"
@@ -85,15 +92,13 @@ def _joints(pose: CalibratedPose, params: UrdfParams) -> str:
     return joints
 
 
-def _joint(parent: str, child: str, matrix: Floats) -> str:
-    numbers = fixed(CONVENTIONS["rpy"].numbers(matrix))
-    return f"""  <link name="{escape(child)}"/>
-  <joint name="{escape(child)}_joint" type="fixed">
-    <parent link="{escape(parent)}"/>
-    <child link="{escape(child)}"/>
-    <origin xyz="{" ".join(numbers[:3])}" rpy="{" ".join(numbers[3:])}"/>
-  </joint>
-"""
+def _joint(parent: str, child: str, matrix: Floats) -> list[ElementTree.Element]:
+    numbers = numbers_of("rpy", matrix)
+    joint = ElementTree.Element("joint", name=f"{child}_joint", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    ElementTree.SubElement(joint, "origin", xyz=" ".join(numbers[:3]), rpy=" ".join(numbers[3:]))
+    return [ElementTree.Element("link", name=child), joint]
 
 
 def _mount_T_optical(params: UrdfParams, mount: str, optical: str) -> Floats | None:
@@ -106,36 +111,21 @@ def _chain(file: Path, mount: str, optical: str) -> Floats:
     """Return ``mount_T_optical`` (4, 4) along the fixed joints of a URDF.
 
     Raises:
-        StageError: The file cannot be read, or no fixed joints lead from one link to the other.
+        FlangeyeError: The file is no URDF, or no fixed joints lead from one link to the other.
     """
-    try:
-        joints = ElementTree.parse(file).getroot().findall("joint")
-    except (OSError, ElementTree.ParseError) as error:
-        raise StageError(f"{file}: cannot be read: {error}") from None
-    above = {_link(joint, "child"): joint for joint in joints if joint.get("type") == "fixed"}
+    above = {
+        child: joint
+        for child, joint in read_urdf(file).above.items()
+        if joint.get("type") == "fixed"
+    }
     pose, link = np.eye(4), optical
     while link != mount:
         if link not in above:
             known = ", ".join(sorted(above)) or "none"
             raise StageError(
                 f"{file}: no fixed joints lead from '{mount}' to '{optical}'; links with a fixed "
-                f"joint: {known}; run xacro first if the file holds macros"
+                f"joint: {known}"
             )
         joint = above.pop(link)
-        pose, link = _origin(file, joint) @ pose, _link(joint, "parent")
+        pose, link = origin_of(file, joint) @ pose, end_of(joint, "parent")
     return pose
-
-
-def _link(joint: ElementTree.Element, end: str) -> str:
-    found = joint.find(end)
-    return "" if found is None else found.get("link", "")
-
-
-def _origin(file: Path, joint: ElementTree.Element) -> Floats:
-    origin = joint.find("origin")
-    given = {} if origin is None else origin.attrib
-    text = f"{given.get('xyz', '0 0 0')} {given.get('rpy', '0 0 0')}"
-    try:
-        return CONVENTIONS["rpy"].matrix([float(number) for number in text.split()])
-    except ValueError as error:
-        raise StageError(f"{file}: joint '{joint.get('name')}': {error}; run xacro first") from None

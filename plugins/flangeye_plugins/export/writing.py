@@ -1,7 +1,8 @@
-"""What the formats share: how numbers and names are written."""
+"""Parameters and number formats that the export formats share."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Literal
 
@@ -9,11 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError
-from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.maths.pose_formats import CONVENTIONS, PoseConvention
 from flangeye.types import CalibratedPose, Floats
 
-NAME = r"^[A-Za-z][A-Za-z0-9_]{0,31}$"
+NAME = r"^[A-Za-z][A-Za-z0-9_]{0,23}$"
+"""An identifier in every controller's language; KUKA's names have 24 characters at most."""
 FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
+"""A tf2 frame or a URDF link."""
 PER_METRE = {"m": 1.0, "mm": 1e3}
 
 
@@ -25,6 +28,19 @@ class NamedParams(Params):
         pattern=NAME,
         description="Name of the pose in the other program, and of the file.",
     )
+
+    def require_unnamed(self, pose: CalibratedPose) -> None:
+        """Refuse names of two frames for the many of a cell.
+
+        Raises:
+            StageError: Some are given.
+        """
+        given = self.model_fields_set - {"name"}
+        if pose.others and given:
+            raise StageError(
+                f"{' and '.join(sorted(given))}: of one camera, and the cell's frames have names "
+                "of their own; leave it out, or choose one with --camera"
+            )
 
 
 class NumberedParams(NamedParams):
@@ -56,49 +72,49 @@ class FramesParams(NamedParams):
         """Return the name of the camera's own frame."""
         return self.child or pose.transform.child
 
-    def require_unnamed(self, pose: CalibratedPose) -> None:
-        """Refuse names of two frames for the many of a cell.
-
-        Raises:
-            StageError: Some are given.
-        """
-        given = self.model_fields_set - {"name"}
-        if pose.others and given:
-            raise StageError(
-                f"{' and '.join(sorted(given))}: of one camera, and the cell's frames have names "
-                "of their own; leave it out, or choose one with --camera"
-            )
-
 
 class LengthParams(NamedParams):
     """What the pose is called, and its unit."""
 
     length: Literal["m", "mm"] = Field("m", description="Unit of the translation.")
 
-    def matrix(self, pose: CalibratedPose) -> Floats:
-        """Return the pose (4, 4), its translation in that unit."""
+    def matrix(self, pose: CalibratedPose) -> list[list[float]]:
+        """Return the rows of the pose (4, 4), its translation in that unit, to nine places."""
         scaled = np.array(pose.transform.matrix)
         scaled[:3, 3] *= PER_METRE[self.length]
-        return scaled
+        return [[rounded(number) for number in row] for row in scaled]
+
+
+class ZividParams(LengthParams):
+    """What the pose is called, and its unit."""
+
+    length: Literal["m", "mm"] = Field("mm", description="Unit; Zivid's points are in mm.")
+
+
+def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:
+    """Return a name that is an identifier in a controller's language.
+
+    Raises:
+        StageError: It is none, or a word of that language.
+    """
+    if not re.fullmatch(NAME, name):
+        raise StageError(f"--set name: {name!a} is no identifier; allowed: {NAME}")
+    if name.lower() in reserved:
+        raise StageError(f"--set name: '{name}' is a word of that language; choose another")
+    return name
+
+
+def rounded(number: float) -> float:
+    """Return a number to nine places, zero without a sign."""
+    return round(float(number), 9) + 0.0
 
 
 def fixed(numbers: Iterable[float]) -> list[str]:
     """Return numbers with nine places, without exponents: controllers do not know them all."""
-    return [f"{round(float(number), 9) + 0.0:.9f}" for number in numbers]
+    return [f"{rounded(number):.9f}" for number in numbers]
 
 
-def numbers_of(convention: str, pose: CalibratedPose) -> list[str]:
-    """Return the pose as a maker writes it; ``convention`` is one of ``CONVENTIONS``."""
-    return fixed(CONVENTIONS[convention].numbers(pose.transform.matrix))
-
-
-def labelled(convention: str, pose: CalibratedPose, mark: str = " ") -> list[str]:
-    """Return ``X 12.5`` and so on, each number behind its label."""
-    labels = CONVENTIONS[convention].labels
-    pairs = zip(labels, numbers_of(convention, pose), strict=True)
-    return [f"{label}{mark}{number}" for label, number in pairs]
-
-
-def rows(matrix: Floats) -> list[str]:
-    """Return the rows of a matrix, numbers separated by commas."""
-    return [", ".join(fixed(row)) for row in matrix]
+def numbers_of(convention: str | PoseConvention, matrix: Floats) -> list[str]:
+    """Return a pose (4, 4) [m] as a maker writes it; a name is one of ``CONVENTIONS``."""
+    chosen = CONVENTIONS[convention] if isinstance(convention, str) else convention
+    return fixed(chosen.numbers(matrix))

@@ -5,6 +5,7 @@ elementary rotations, not with the code that wrote the file.
 """
 
 import re
+import subprocess
 import sys
 import types
 import warnings
@@ -21,6 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
+from flangeye import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.testing import ExportConformance
 from flangeye.types import BASE, CAMERA, FLANGE, CalibratedPose, Transform
@@ -81,8 +83,12 @@ def ros_message(values):
     return at((move.x, move.y, move.z), of_robodk(mat))
 
 
+def flags_of(words):
+    return dict(zip(words[::2], words[1::2], strict=True))
+
+
 def of_flags(words):
-    told = dict(zip(words[::2], words[1::2], strict=True))
+    told = flags_of(words)
     assert told.pop("--frame-id") in ("base", "flange")
     assert told.pop("--child-frame-id") == "camera"
     return ros_message(
@@ -90,14 +96,25 @@ def of_flags(words):
     )
 
 
-def read_command(text):
-    command = next(line for line in text.splitlines() if not line.startswith("#"))
-    words = command.split()
+def words_of_command(text):
+    """Run the command in a shell, where ros2 is a function that prints its arguments."""
+    script = f"ros2() {{ printf '%s\\0' ros2 \"$@\"; }}\n{text}"
+    ran = subprocess.run(["sh", "-c", script], capture_output=True, check=True, cwd="/proc/self")
+    assert ran.stderr == b""
+    words = ran.stdout.decode().split("\0")[:-1]
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    return of_flags(words[4:])
+    return words[4:]
+
+
+def read_command(text):
+    return of_flags(words_of_command(text))
 
 
 def read_launch(text):
+    return of_flags(words_of_launch(text))
+
+
+def words_of_launch(text):
     """Run the launch file with stand-ins for ROS's two packages."""
     nodes: list[Any] = []
 
@@ -118,7 +135,7 @@ def read_launch(text):
         for name, module in before.items():
             sys.modules.pop(name) if module is None else sys.modules.update({name: module})
     assert nodes[0]["executable"] == "static_transform_publisher"
-    return of_flags(nodes[0]["arguments"])
+    return nodes[0]["arguments"]
 
 
 def joints_of(text):
@@ -278,10 +295,12 @@ def poses(draw):
     return CalibratedPose(Transform(parent, CAMERA, rigid(draw(rotations()), move)), REMARKS)
 
 
-def written(name, pose, **params):
-    stage = BY_NAME[name]
-    assert stage.params is not None
-    return stage(pose=pose, params=stage.params(**params))
+def params_of(name: str) -> Any:
+    return BY_NAME[name].params
+
+
+def written(format_name, pose, **params):
+    return BY_NAME[format_name](pose=pose, params=params_of(format_name)(**params))
 
 
 def require_same(found, pose):
@@ -355,15 +374,15 @@ CAMERA_URDF = """<robot name="eye">
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no xml", "{}: cannot be read: syntax error: line 1, column 0"),
+        ("no xml", "{}:1: not valid XML: syntax error: line 1, column 0"),
         (
             "<robot/>",
             "{}: no fixed joints lead from 'camera_link' to 'camera_optical_frame'; links with a "
-            "fixed joint: none; run xacro first if the file holds macros",
+            "fixed joint: none",
         ),
         (
             CAMERA_URDF.replace("0 0 0.02", "${x} 0 0"),
-            "{}: joint 'a': could not convert string to float: '${{x}}'; run xacro first",
+            '{}: rpy="${{x}} 0 0" is not three finite numbers',
         ),
     ],
 )
@@ -384,6 +403,95 @@ def test_every_format_keeps_to_the_kit() -> None:
         kit = type("Kit", (ExportConformance,), {"stage": stage})()
         for check in checks:
             getattr(kit, check)()
+
+
+HOSTILE = (
+    "cam; touch PWNED;",
+    "$(touch PWNED)",
+    "`touch PWNED` & '",
+    '"); raise SystemExit; ("',
+    "'''\nraise SystemExit\n'''",
+    '"""\nraise SystemExit\n"""',
+    "x: !!python/object/apply:os.abort []",
+    "a\nb: {c: [d]}",
+    "--->",
+    "--><link name='x'/><!-",
+    "]]>&<x/>",
+    "\x1b[2J\x9b1A",
+    "\u2028raise SystemExit\u202e",
+    "ENDMODULE\r\nMODULE x",
+    "FOLD\n halt() end",
+    "../../x",
+    "%s {0} {name} \\",
+    "%YAML:1.0 # *a &b",
+)
+BENIGN = Transform(BASE, CAMERA, rigid(rotation_exp(np.array([0.1, 0.2, 0.3])), [0.1, 0.2, 0.3]))
+OF_FRAMES = {
+    "ros2_command": words_of_command,
+    "ros2_launch": words_of_launch,
+    "moveit": words_of_launch,
+    "easy_handeye2": lambda text: yaml.safe_load(text)["parameters"],
+    "urdf": joints_of,
+}
+
+
+@pytest.mark.parametrize("frame", HOSTILE)
+@pytest.mark.parametrize("name", OF_FRAMES)
+def test_a_hostile_frame_stays_a_string(name: str, frame: str) -> None:
+    """What the target's own parser finds is the very name; XML refuses what it cannot hold."""
+    stage, params = BY_NAME[name], params_of(name).model_construct(child=frame)
+    try:
+        text = stage(pose=CalibratedPose(BENIGN), params=params).text
+    except StageError as error:
+        assert name == "urdf"
+        assert str(error).startswith("export.urdf: a name cannot be written as XML: ")
+        return
+    found = OF_FRAMES[name](text)
+    if name == "urdf":
+        assert [*found] == [frame]
+    elif name == "easy_handeye2":
+        assert found["tracking_base_frame"] == frame
+    else:
+        assert flags_of(found)["--child-frame-id"] == frame
+
+
+@pytest.mark.parametrize("remark", HOSTILE)
+@pytest.mark.parametrize("name", READERS)
+def test_a_hostile_remark_stays_a_comment(name: str, remark: str) -> None:
+    """The target's parser finds the pose; what is no comment is the same for any remark."""
+    mark = "<!--" if name == "urdf" else written(name, CalibratedPose(BENIGN, ("x",))).text[0]
+
+    def without_comments(pose: CalibratedPose) -> list[str]:
+        text = written(name, pose).text
+        assert text.isascii()
+        assert text.replace("\n", "").isprintable()
+        require_same(READERS[name](text), pose)
+        lines = [line.strip() for line in text.split("\n")]
+        return [line for line in lines if not line.startswith((mark, "#", "/"))]
+
+    hostile = without_comments(CalibratedPose(BENIGN, ("flangeye: ok", remark)))
+    assert hostile == without_comments(CalibratedPose(BENIGN, ("flangeye: ok",)))
+
+
+@pytest.mark.parametrize("text", [*HOSTILE, "", "a" * 65])
+@pytest.mark.parametrize("name", READERS)
+def test_a_hostile_name_is_refused(name: str, text: str) -> None:
+    stage = BY_NAME[name]
+    with pytest.raises((StageError, ValueError)):
+        written(name, CalibratedPose(BENIGN), name=text)
+    if text in HOSTILE:
+        with pytest.raises((StageError, ValueError)):
+            stage(pose=CalibratedPose(BENIGN), params=params_of(name).model_construct(name=text))
+    with pytest.raises(ValueError, match="is no name of a frame"):
+        Transform(BASE, text, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "word"), [("ur", "end"), ("abb", "Module"), ("doosan", "while"), ("staubli", "tool")]
+)
+def test_a_word_of_the_controller_s_language_is_no_name(name: str, word: str) -> None:
+    with pytest.raises(StageError, match="is a word of that language; choose another"):
+        written(name, CalibratedPose(BENIGN), name=word)
 
 
 def test_each_format_is_explained_in_the_docs() -> None:

@@ -1,0 +1,172 @@
+"""Formats with a grammar of their own: YAML, Python and shell, each quoted by its own library.
+
+ROS 2's ``static_transform_publisher``: metres, quaternion xyzw. MoveIt's hand-eye panel saves a
+launch file of one; ``sensors_3d.yaml`` holds topics and no pose, MoveIt takes the pose from tf.
+easy_handeye2's ``.calib`` (``handeye_calibration.py``): metres, xyzw. OpenCV's FileStorage and
+Zivid's ``Matrix4x4``: 4x4, row by row. RoboDK: a script that adds a frame, or a tool of the arm.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from flangeye.types import CAMERA, CalibratedPose, ExportedFile
+from flangeye_plugins.export.writing import (
+    FramesParams,
+    LengthParams,
+    NamedParams,
+    fixed,
+    numbers_of,
+)
+
+FLAGS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+"""Of ``static_transform_publisher``, in the order of ``quaternion_xyzw``."""
+
+
+def ros2_command(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
+    """Write the command that publishes the pose as a ROS 2 static transform."""
+    command = ("ros2", "run", "tf2_ros", "static_transform_publisher")
+    lines = [shlex.join([*command, *_arguments(each, params)]) for each in pose.each]
+    text = pose.comment("#") + " &\n".join(lines) + "\n"
+    return ExportedFile(f"{params.name}.ros2.sh", text, "run it in a shell that knows ROS 2")
+
+
+def ros2_launch(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
+    """Write a ROS 2 launch file that publishes the pose as a static transform."""
+    name = f"{params.name}.launch.py"
+    return ExportedFile(name, _launch_file(pose, params), f"ros2 launch ./{name}")
+
+
+def moveit(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
+    """Write the launch file that MoveIt's hand-eye calibration panel would save."""
+    sort = "EYE-TO-HAND" if pose.stands else "EYE-IN-HAND"
+    use = "include it in your MoveIt launch file; sensors_3d.yaml then needs the topic only"
+    text = f"# Static transform publisher of the camera, {sort}.\n{_launch_file(pose, params)}"
+    return ExportedFile(f"{params.name}_moveit.launch.py", text, use)
+
+
+def _arguments(pose: CalibratedPose, params: FramesParams) -> list[str]:
+    numbers = numbers_of("quaternion_xyzw", pose.transform.matrix)
+    frames = ("--frame-id", params.carrier(pose), "--child-frame-id", params.carried(pose))
+    return [word for pair in zip(FLAGS, numbers, strict=True) for word in pair] + [*frames]
+
+
+def _launch_file(pose: CalibratedPose, params: FramesParams) -> str:
+    nodes = "".join(_node(each, params) for each in pose.each)
+    return f"""{pose.comment("#")}
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription([
+{nodes}    ])
+"""
+
+
+def _node(pose: CalibratedPose, params: FramesParams) -> str:
+    name = params.name if pose.transform.child == CAMERA else pose.transform.child
+    return f"""        Node(
+            package="tf2_ros",
+            executable="static_transform_publisher",
+            name={f"{name}_static_transform"!r},
+            arguments={_arguments(pose, params)!r},
+        ),
+"""
+
+
+def easy_handeye2(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
+    """Write a calibration that easy_handeye2's publisher loads."""
+    numbers = [float(n) for n in numbers_of("quaternion_xyzw", pose.transform.matrix)]
+    carrier = params.carrier(pose)
+    document = {
+        "parameters": {
+            "name": params.name,
+            "calibration_type": "eye_on_base" if pose.stands else "eye_in_hand",
+            "robot_base_frame": carrier if pose.stands else "base",
+            "robot_effector_frame": "flange" if pose.stands else carrier,
+            "tracking_base_frame": params.carried(pose),
+            "tracking_marker_frame": "target",
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": {
+            "translation": dict(zip("xyz", numbers[:3], strict=True)),
+            "rotation": dict(zip("xyzw", numbers[3:], strict=True)),
+        },
+    }
+    use = "copy it to ~/.ros2/easy_handeye2/calibrations/, then publish it by its name"
+    return ExportedFile(f"{params.name}.calib", pose.comment("#") + _yaml(document), use)
+
+
+class _Matrix(dict[str, Any]):
+    """A matrix of OpenCV's FileStorage."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's safe writer, with OpenCV's tag."""
+
+
+_Dumper.add_representer(
+    _Matrix, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:opencv-matrix", data)
+)
+
+
+def _yaml(document: Mapping[str, Any]) -> str:
+    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
+    return text
+
+
+def opencv(pose: CalibratedPose, params: LengthParams) -> ExportedFile:
+    """Write an OpenCV FileStorage (YAML) with the pose as a 4x4 matrix."""
+    key = pose.transform.name
+    numbers = [number for row in params.matrix(pose) for number in row]
+    document = {key: _Matrix(rows=4, cols=4, dt="d", data=numbers)}
+    text = f"%YAML:1.0\n---\n{pose.comment('#')}{_yaml(document)}"
+    use = f"cv2.FileStorage(file, cv2.FILE_STORAGE_READ).getNode({key!r}).mat()"
+    return ExportedFile(f"{params.name}.opencv.yml", text, use)
+
+
+def zivid(pose: CalibratedPose, params: LengthParams) -> ExportedFile:
+    """Write the pose as a Zivid Matrix4x4."""
+    document = {
+        "__version__": {"serializer": 1, "data": 1},
+        "FloatMatrix": {"Data": params.matrix(pose)},
+    }
+    name = f"{params.name}.zivid.yaml"
+    return ExportedFile(name, pose.comment("#") + _yaml(document), f"zivid.Matrix4x4({name!r})")
+
+
+def robodk(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
+    """Write a Python script that adds the pose to the open RoboDK station."""
+    rows = LengthParams(length="mm").matrix(pose)
+    matrix = "".join(f"    {row!r},\n" for row in rows)
+    name = params.name
+    added = (
+        f"STATION.AddFrame({name!r}, ROBOT.Parent()).setPose(POSE)"
+        if pose.stands
+        else f"ROBOT.AddTool(POSE, {name!r})"
+    )
+    text = f"""{pose.comment("#")}from robodk import robolink, robomath
+
+POSE = robomath.Mat([
+{matrix}])  # millimetres
+
+if __name__ == "__main__":
+    STATION = robolink.Robolink()
+    ROBOT = STATION.Item("", robolink.ITEM_TYPE_ROBOT)
+    {added}
+"""
+    return ExportedFile(f"{params.name}_robodk.py", text, "run it beside the open station")
+
+
+def matrix(pose: CalibratedPose, params: LengthParams) -> ExportedFile:
+    """Write the plain 4x4 matrix as text, in metres or millimetres."""
+    lines = "".join(" ".join(fixed(row)) + "\n" for row in params.matrix(pose))
+    text = f"{pose.comment('#')}{lines}"
+    return ExportedFile(f"{params.name}.txt", text, "numpy.loadtxt reads it")
