@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nicegui import app, ui
+from nicegui import ui
 
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
@@ -17,6 +17,7 @@ from flangeye.log.read import RunLog
 from flangeye.report.units import millimetres
 from flangeye.result import Result
 from flangeye_ui.charts import FAINT, USED
+from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.run_page import FLANGE, SCAN
@@ -35,10 +36,7 @@ ROWS = 5_000
 
 
 def add(project: Project) -> None:
-    """Add the page, and serve the folder's own reports to it."""
-    for name in ("runs", "batches"):
-        (project.folder / name).mkdir(exist_ok=True)
-        app.add_static_files(f"/{name}", project.folder / name)
+    """Add the page."""
 
     @ui.page("/archive")
     def archive() -> None:
@@ -109,9 +107,7 @@ def _watch(project: Project) -> None:
     ui.label("Keeping watch").classes("text-h6")
     charts = sorted(project.folder.glob("runs/*/monitor.html"))
     for path in charts:
-        where = path.relative_to(project.folder).as_posix()
-        frame = ui.element("iframe").props(f'src="/{where}" title="Checks of {path.parent.name}"')
-        frame.classes("w-full").style("height: 720px; border: 0; background: #fff")
+        link(project, path)
     if not charts:
         ui.label("No calibration of this folder is watched yet.")
     names = [run.name for run in project.runs() if (run / "calibration.yaml").exists()]
@@ -140,8 +136,13 @@ def _reports(project: Project) -> None:
     pages = [*project.folder.glob("runs/*/report.html"), *project.folder.glob("batches/*/*.html")]
     with ui.row().classes("gap-4"):
         for path in sorted(pages):
-            where = path.relative_to(project.folder)
-            ui.link(str(where), f"/{where}", new_tab=True)
+            link(project, path)
+
+
+def link(project: Project, path: Path) -> None:
+    """Let a file of the folder be opened, in a tab and an origin of its own."""
+    name = path.relative_to(project.folder).as_posix()
+    ui.link(name, address_of(project.folder, path), new_tab=True)
 
 
 class Scrubber:

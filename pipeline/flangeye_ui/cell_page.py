@@ -198,7 +198,7 @@ class Import:
         return words
 
     def _changed(self) -> None:
-        self._line.content = self._project.command(*self._words())
+        self._line.text = self._project.command(*self._words())
 
     async def _import(self) -> None:
         said = await asyncio.to_thread(self._project.run_command, self._words())

@@ -26,10 +26,13 @@ def page(title: str) -> Iterator[None]:
         yield
 
 
-def command_line(text: str) -> ui.code:
+def command_line(text: str) -> ui.label:
     """Show a command that does the same, with a button that copies it."""
     with ui.row().classes("items-center gap-2 no-wrap w-full"):
-        return ui.code(text, language="sh").classes("grow overflow-x-auto")
+        shown = code(text)
+        copy = ui.button(icon="content_copy", on_click=lambda: ui.clipboard.write(shown.text))
+        copy.props('flat dense size=sm aria-label="Copy the command"')
+    return shown
 
 
 def warning(text: str) -> ui.label:
@@ -42,11 +45,21 @@ def mistake(text: str) -> ui.label:
     return ui.label(text).classes("text-negative").props('role="alert"')
 
 
-async def confirmed(question: str, yes: str) -> bool:
-    """Ask, and return whether the person agreed."""
+async def code_from_terminal() -> str:
+    """Ask for the code that the terminal shows; return it, empty where nobody gave one."""
     with ui.dialog() as dialog, ui.card():
-        ui.label(question)
+        ui.label("The arm will move. Is its workspace clear of people?")
+        ui.label("The terminal of 'flangeye ui' shows a code for this move.").classes(
+            "text-caption"
+        )
+        box = ui.input("Code from the terminal").props("autofocus inputmode=numeric")
+        box.on("keydown.enter", lambda: dialog.submit(box.value))
         with ui.row():
-            ui.button(yes, on_click=lambda: dialog.submit(True), color="negative")
-            ui.button("No", on_click=lambda: dialog.submit(False)).props("autofocus outline")
-    return bool(await dialog)
+            ui.button("Move the arm", on_click=lambda: dialog.submit(box.value), color="negative")
+            ui.button("No", on_click=lambda: dialog.submit("")).props("outline")
+    return str(await dialog or "")
+
+
+def code(text: str) -> ui.label:
+    """Show text as it is written: never as markup, whatever is in it."""
+    return ui.label(text).classes("font-mono whitespace-pre w-full overflow-x-auto text-caption")

@@ -14,7 +14,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.layout import code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
 
@@ -169,7 +169,7 @@ class Planner:
             motion = f", {plan['seconds']:.0f} s of motion" if plan["seconds"] else ""
             label = ui.label(f"{stops} poses{motion}")
             label.classes("text-subtitle1").props('role="status"')
-        ui.code(plan["text"], language="text").classes("w-full overflow-x-auto")
+        code(plan["text"])
         for row in rows:
             with self._scene:
                 colour = "#d64545" if row["why_not"] else "#2e9e5b"

@@ -19,6 +19,7 @@ from flangeye.log.read import read_run
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye.report.facts import Facts, facts_of
+from flangeye_ui.permission import MoveCodes
 from flangeye_ui.process import RunProcess
 
 QUIET = 10.0
@@ -56,12 +57,13 @@ class Project:
     Attributes:
         folder: Where recipes and runs are.
         registry: The plugins.
+        codes: What the terminal shows and a move asks for.
         run: The run that was started here last, if any.
         owner: The page that started it.
     """
 
-    def __init__(self, folder: Path, registry: Registry) -> None:
-        self.folder, self.registry = folder, registry
+    def __init__(self, folder: Path, registry: Registry, codes: MoveCodes) -> None:
+        self.folder, self.registry, self.codes = folder, registry, codes
         self.run: RunProcess | None = None
         self.owner = ""
         if not self.recipe_path.exists():
@@ -169,9 +171,21 @@ class Project:
                 return run
         return None
 
-    def begin(self, words: Sequence[str], move: bool, owner: str) -> None:
-        """Start ``flangeye run`` with words of its command line, for a page."""
-        self.run, self.owner = RunProcess(self.folder, words, move, self.registry), owner
+    def begin(self, words: Sequence[str], owner: str, code: str | None = None) -> None:
+        """Start ``flangeye run`` with words of its command line, for a page.
+
+        Args:
+            words: Of the command, without ``--move``.
+            owner: The page.
+            code: From the terminal, which lets the run move an arm; without one nothing moves.
+
+        Raises:
+            StageError: The code is not that of this command and page.
+        """
+        if code is not None:
+            self.codes.spend(code, words, owner)
+        self.run = RunProcess(self.folder, words, code is not None, self.registry)
+        self.owner = owner
 
     def page_gone(self, page: str, why: str = "the page was closed") -> None:
         """Stop an arm that moves for a page that is not there any more."""

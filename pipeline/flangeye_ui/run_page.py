@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from nicegui import Client, ui
 
+from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
-from flangeye_ui.layout import command_line, confirmed, mistake, page
+from flangeye_ui.layout import code_from_terminal, command_line, mistake, page
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_cloud, new_scene, outline_of
@@ -113,10 +114,17 @@ class Panel:
         if self._running or self._project.elsewhere():
             ui.notify("a run is under way; stop it first", type="warning")
             return
-        question = "The arm will move. Is its workspace clear of people?"
-        if not moves or await confirmed(question, "Move the arm"):
-            self._project.begin(words, moves, self._me)
-            self._shown = -1
+        code = None
+        if moves:
+            self._project.codes.ask(words, self._me)
+            code = await code_from_terminal()
+            if not code:
+                return
+        try:
+            self._project.begin(words, self._me, code)
+        except StageError as error:
+            ui.notify(str(error), type="negative")
+        self._shown = -1
 
     @property
     def project(self) -> Project:

@@ -18,7 +18,8 @@ from flangeye.report.facts import Facts
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
 from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye_ui.charts import coverage_drawing
-from flangeye_ui.layout import command_line, mistake, page, warning
+from flangeye_ui.foreign import address_of
+from flangeye_ui.layout import code, command_line, mistake, page, warning
 from flangeye_ui.project import Project
 
 TONES = {"verified": "text-positive", "unverified": "text-warning"}
@@ -99,7 +100,7 @@ def _matrix(facts: Facts) -> None:
     for name, estimate in facts.result.transforms.items():
         text = transform_text(name, estimate)
         ui.label(f"{text.name} {text.meaning}")
-        ui.code(text.matrix, language="text").classes("w-full overflow-x-auto")
+        code(text.matrix)
     for note in facts.result.provenance.notes:
         ui.label(note).classes("text-caption")
 
@@ -162,7 +163,7 @@ class Doctor:
 
     def _show(self, found: Finding) -> None:
         warning(f"{found.name}: {found.what}")
-        ui.code("\n# or:\n".join(found.choices), language="yaml").classes("w-full overflow-x-auto")
+        code("\n# or:\n".join(found.choices))
         with ui.row().classes("gap-2"):
             for number, line in enumerate(found.lines, 1):
                 which = f" (choice {number})" if len(found.lines) > 1 else ""
@@ -194,14 +195,15 @@ def _certificate(project: Project, run: Path) -> None:
         if said.startswith("error: "):
             mistake(said.removeprefix("error: "))
             return
-        line.content = project.command(*words())
+        line.text = project.command(*words())
         link.set_visibility(True)
 
     with ui.row().classes("w-full gap-4"):
         for key, label in asked.items():
             boxes[key] = ui.input(label).classes("w-64")
     ui.button("Write the certificate", on_click=write)
-    link = ui.link("Open the certificate", f"/{where}/certificate.html", new_tab=True)
+    there = address_of(project.folder, run / "certificate.html")
+    link = ui.link("Open the certificate", there, new_tab=True)
     link.set_visibility((run / "certificate.html").exists())
     line = command_line(project.command(*words()))
 
@@ -213,8 +215,8 @@ def _exports(project: Project, run: Path) -> None:
 
     async def show(event: ValueChangeEventArguments[Any]) -> None:
         words = ["export", where, "--to", str(event.value)]
-        code.content = await asyncio.to_thread(project.run_command, [*words, "--out", "-"])
-        line.content = project.command(*words)
+        preview.text = await asyncio.to_thread(project.run_command, [*words, "--out", "-"])
+        line.text = project.command(*words)
 
     async def save() -> None:
         if tabs.value:
@@ -225,6 +227,6 @@ def _exports(project: Project, run: Path) -> None:
     with tabs:
         for name in names:
             ui.tab(name)
-    code = ui.code("choose a program above", language="text").classes("w-full overflow-x-auto")
+    preview = code("choose a program above")
     ui.button("Write the file", on_click=save)
     line = command_line(project.command("export", where, "--to", "PROGRAM"))

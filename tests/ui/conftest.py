@@ -8,9 +8,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,40 @@ from tests.chromium import chromium
 
 @dataclass
 class Served:
-    """A running ``flangeye ui``."""
+    """A running ``flangeye ui``, and what its terminal says."""
 
     folder: Path
-    address: str
     port: int
     process: subprocess.Popen
+    said: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as lines:
+            for line in lines:
+                self.said.append(line.rstrip())
+
+    def last(self, pattern: str) -> str:
+        """Return what a pattern finds in the newest line of the terminal that has it."""
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and self.process.poll() is None:
+            for line in reversed(self.said):
+                if found := re.search(pattern, line):
+                    return found[1]
+            time.sleep(0.05)
+        raise AssertionError(f"the terminal does not show {pattern}: {self.said}")
+
+    @property
+    def address(self) -> str:
+        """The address that lets the next browser in."""
+        return self.last(r"(http://\S+\?token=\S+)")
+
+    def code(self) -> str:
+        """Return the code of the move that was asked for last."""
+        return self.last(r"^code (\d{6}) moves the arm: ")
 
 
 def free_port() -> int:
@@ -43,12 +72,10 @@ def serve(folder: Path) -> Served:
         [sys.executable, "-P", "-m", "flangeye.cli", *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
     )  # fmt: skip
-    assert process.stdout is not None
-    for line in process.stdout:
-        if found := re.match(r"open (\S+)", line):
-            wait_for(port)
-            return Served(folder, found[1], port, process)
-    raise AssertionError("the server did not start")
+    served = Served(folder, port, process)
+    assert served.address
+    wait_for(port)
+    return served
 
 
 def wait_for(port: int) -> None:
@@ -68,8 +95,6 @@ def ended(served: Served) -> None:
     except subprocess.TimeoutExpired:
         served.process.kill()
         served.process.wait(10)
-    if served.process.stdout:
-        served.process.stdout.close()
 
 
 @pytest.fixture(scope="module")

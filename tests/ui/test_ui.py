@@ -30,7 +30,8 @@ from flangeye.errors import StageError
 from flangeye.maths.pose_corrections import inverted
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.recipe.find import find_recipe
-from flangeye_ui import archive_page, cell_page, plan_page, run_page, server, verdict_page
+from flangeye_ui import run_page, server
+from flangeye_ui.permission import MoveCodes
 from flangeye_ui.plan_page import plan_in
 from flangeye_ui.project import Project, _mistake
 from flangeye_ui.server import require_free
@@ -94,6 +95,11 @@ def opened(browser: Any, served: Served, **options: Any) -> Any:
 def go(page: Any, name: str) -> None:
     page.get_by_role("link", name=name, exact=True).click()
     page.get_by_role("heading", name=name, exact=True).wait_for()
+
+
+def move(page: Any, served: Served) -> None:
+    page.get_by_label("Code from the terminal").fill(served.code())
+    page.get_by_role("button", name="Move the arm").click()
 
 
 def write_recipe(page: Any, text: str) -> None:
@@ -303,14 +309,14 @@ def test_the_archive_compares_runs_batches_and_checks(
     browser: Any, served: Served, finished: Path
 ) -> None:
     batch = served.folder / "batches" / "nights"
-    batch.mkdir(exist_ok=True)
+    batch.mkdir(parents=True, exist_ok=True)
     (batch / "sessions.csv").write_text("session,status,held_out_rms\nmonday,verified,0.0004\n")
     (finished / "monitor.html").write_text("<h1>OK</h1>")
     page = opened(browser, served)
     go(page, "Archive")
     page.get_by_role("cell", name=finished.name).wait_for()
     page.get_by_role("cell", name="monday").wait_for()
-    page.frame_locator("iframe").get_by_role("heading", name="OK").wait_for()
+    page.get_by_role("link", name=f"runs/{finished.name}/monitor.html").wait_for()
     page.get_by_text(f"flangeye monitor runs/{finished.name} --archive NEW").wait_for()
     page.get_by_label("Run", exact=True).click()
     page.get_by_role("option", name=finished.name).click()
@@ -406,24 +412,13 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     page.get_by_role("button", name="Start", exact=True).click()
     page.get_by_text("runs.").wait_for()
     second = page.context.new_page()
-    second.goto(f"http://127.0.0.1:{served.port}/run")
+    second.goto(page.url)
     second.get_by_text("another page started it").wait_for()
     page.reload()  # the run is found again, and nothing was started by it
     page.get_by_text("another page started it").wait_for()
     page.locator("body").press(" ")
     page.get_by_text("stopped on this page").wait_for()
     assert len(list(served.folder.glob("runs/*"))) <= before + 1
-
-
-def test_without_the_token_nobody_gets_in(served: Served) -> None:
-    for path in ("/", "/run", "/?token=wrong", "/_nicegui/x", "/runs/x"):
-        with pytest.raises(urllib.error.HTTPError) as denied:
-            urllib.request.urlopen(f"http://127.0.0.1:{served.port}{path}")
-        with denied.value as answer:
-            assert answer.code == 403
-            assert answer.read().decode().splitlines() == [
-                "wrong or missing token: open the address that 'flangeye ui' printed"
-            ]
 
 
 def test_a_log_that_cannot_be_read_is_one_line(browser: Any, served: Served) -> None:
@@ -457,23 +452,24 @@ def test_a_folder_that_is_not_there_is_one_line(
     assert capsys.readouterr().err == f"error: {tmp_path / 'nowhere'}: is not a folder\n"
 
 
-def test_without_a_browser_the_address_is_printed(
+def test_a_browser_is_started_without_the_token_in_its_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("flangeye_ui.server.webbrowser.open", lambda address: False)
-    monkeypatch.setattr(server, "require_free", lambda host, port: None)
-    monkeypatch.setattr("flangeye_ui.server.ui.run", lambda **options: None)
-    monkeypatch.setattr("flangeye_ui.server.app.add_middleware", lambda *a, **k: None)
-    for each in (cell_page, plan_page, run_page, verdict_page, archive_page):
-        monkeypatch.setattr(each, "add", lambda project: None)
-    server.serve(tmp_path, Registry(PluginManager("flangeye")), "127.0.0.1", 8090, browser=True)
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("open http://127.0.0.1:8090/?token=")
-    assert second == "no browser was found here; open the address yourself"
+    address = "http://127.0.0.1:8090/?token=secret"
+    asked: list[str] = []
+    monkeypatch.setattr("flangeye_ui.server.webbrowser.open", asked.append)  # and finds none
+    with server.way_in(tmp_path, address) as file:
+        server.show(file)
+        assert address in file.read_text()
+        assert file.stat().st_mode & 0o077 == 0
+    assert asked == [file.as_uri()]
+    assert "secret" not in asked[0]
+    assert not list(tmp_path.iterdir())
+    assert capsys.readouterr().out == "no browser was found here; open the address yourself\n"
 
 
 def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path) -> None:
-    project = Project(tmp_path, Registry(PluginManager("flangeye")))
+    project = Project(tmp_path, Registry(PluginManager("flangeye")), MoveCodes(print))
     log = tmp_path / "runs" / "monday" / "run.mcap"
     log.parent.mkdir(parents=True)
     log.write_bytes(b"")
@@ -491,9 +487,9 @@ def test_a_run_that_goes_elsewhere_is_named_and_not_gone_on_with(tmp_path: Path)
 
 
 def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> None:
-    project = Project(tmp_path, load_registry())
+    project = Project(tmp_path, load_registry(), MoveCodes(print))
     project.text = SMALL.replace("0.25", "1.0")
-    project.begin(["cell.yaml"], move=False, owner="page")
+    project.begin(["cell.yaml"], "page")
     assert project.run is not None
     project.run._process.kill()
     project.run._process.wait(10)
@@ -501,9 +497,9 @@ def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> No
 
 
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
-    project = Project(tmp_path, load_registry())
+    project = Project(tmp_path, load_registry(), MoveCodes(print))
     project.text = SMALL.replace("0.25", "1.0")
-    project.begin([project.recipe_path.name], move=False, owner="page")
+    project.begin([project.recipe_path.name], "page")
     assert project.run is not None and project.run.code is None
     project.page_gone("page")
     assert not project.run.stopped  # nothing moves, so nothing is stopped
@@ -561,7 +557,7 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             page.get_by_role("button", name="Start", exact=True).click()
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
-            page.get_by_role("button", name="Move the arm").click()
+            move(page, served)
             page.get_by_text("fitted 0000").wait_for(timeout=120_000)
             cell.wait_until(cell.moving, patience=60)
             page.close()
@@ -575,7 +571,7 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             page.get_by_role("button", name="Resume", exact=True).click()
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
-            page.get_by_role("button", name="Move the arm").click()
+            move(page, served)
             cell.wait_until(cell.moving, patience=60)
             page.get_by_text("done (exit code 0)").wait_for(timeout=120_000)
         finally:

@@ -13,7 +13,10 @@ from flangeye.handeye.drift import DriftTest
 
 COLOURS = {"OK": "#2e9e5b", "DEGRADED": "#d68910", "MOVED": "#d64545"}
 PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{state}: {path}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none';
+ script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:">
+<title>{state}: {path}</title>
 <style>
 :root {{ color-scheme: light; }}
 body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: #1c2230; background: #fff;

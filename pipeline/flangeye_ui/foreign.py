@@ -1,0 +1,59 @@
+"""Files of runs and batches: they may come from anywhere, so a browser shows them locked in."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import quote
+
+from nicegui import app
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data: blob:; frame-ancestors 'none'; form-action 'none'; "
+    "base-uri 'none'"
+)
+"""An origin of its own for each file: its drawings run and reach neither the page nor a network."""
+SHOWN = {
+    ".html": "text/html; charset=utf-8", ".pdf": "application/pdf", ".png": "image/png",
+    ".json": "text/plain; charset=utf-8", ".csv": "text/plain; charset=utf-8",
+    ".yaml": "text/plain; charset=utf-8", ".txt": "text/plain; charset=utf-8",
+}  # fmt: skip
+"""What a browser opens; anything else is saved."""
+ROOMS = ("runs", "batches")
+
+
+def address_of(folder: Path, path: Path) -> str:
+    """Return where a file of the folder is served."""
+    return "/files/" + quote(path.relative_to(folder).as_posix())
+
+
+def add(folder: Path) -> None:
+    """Serve what lies in the runs and batches of a folder."""
+
+    @app.get("/files/{path:path}")
+    def file(path: str) -> Response:
+        return answer(folder, path)
+
+
+def answer(folder: Path, path: str) -> Response:
+    """Return a file under its policy; 404 for what is no file of a run or batch."""
+    found = _found(folder, path)
+    if found is None:
+        return PlainTextResponse("no such file of a run\n", 404)
+    kind = SHOWN.get(found.suffix.lower())
+    return FileResponse(
+        found, media_type=kind or "application/octet-stream", filename=found.name,
+        content_disposition_type="inline" if kind else "attachment",
+        headers={"content-security-policy": POLICY, "cache-control": "no-store"},
+    )  # fmt: skip
+
+
+def _found(folder: Path, path: str) -> Path | None:
+    """Return the file itself, whatever links lead to it, if it lies in one of the rooms."""
+    with suppress(OSError, ValueError, RuntimeError):  # of names that no system has
+        found = (folder / path).resolve()
+        inside = any(found.is_relative_to((folder / room).resolve()) for room in ROOMS)
+        return found if inside and found.is_file() else None
+    return None
