@@ -13,7 +13,7 @@ RECIPE = """\
 title: Poses of a camera in the hand
 configuration: {name: eye-in-hand, place: unknown}
 steps:
-  - acquire.samples: {path: poses.npz, reader: {matrices: {robot: "poses.npz:robot", length: m, target: {at: "poses.npz:target", length: m}}}}
+  - acquire.samples: {path: poses.npz, reader: {table: {file: poses.npz, columns: [robot], rotation: matrix, length: m, target: {columns: [target], rotation: matrix, length: m}}}}
   - solve.robust
 """
 

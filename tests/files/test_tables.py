@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye.errors import StageError
-from flangeye.files.tables import files_at, holds_positions, read_table
+from flangeye.files.tables import files_at, read_table
 
 numbers = st.floats(-1e6, 1e6)
 
@@ -72,7 +72,7 @@ def test_a_file_is_found_by_its_name_and_others_by_a_pattern(tmp_path: Path) -> 
 
 def test_a_value_that_is_missing_is_an_empty_cell(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text(json.dumps([{"x": 1}, {"x": None, "y": 2}]))
-    assert [cells for _, cells in read_table(tmp_path, "t.json").rows] == [("1", ""), ("", "2")]
+    assert [cells for _, cells in read_table(tmp_path, "t.json").rows] == [(1, ""), ("", 2)]
 
 
 FANUC = """P[1]{{
@@ -83,7 +83,7 @@ FANUC = """P[1]{{
 }};
 """
 PROGRAMS = {
-    "x_m y_m z_m vx_rad vy_rad vz_rad": "movel(p[{}, {}, {}, {}, {}, {}], a=1.2, v=0.25)\n",
+    "x_m y_m z_m rx_rad ry_rad rz_rad": "movel(p[{}, {}, {}, {}, {}, {}], a=1.2, v=0.25)\n",
     "x_mm y_mm z_mm a_deg b_deg c_deg": "XP={{X {},Y {},Z {},A {},B {},C {},S 2,T 35,E1 0.0}}\n",
     "x_mm y_mm z_mm w_deg p_deg r_deg": FANUC,
     "x_mm y_mm z_mm q1 q2 q3 q4": "CONST robtarget p:=[[{},{},{}],[{},{},{},{}],[0,0,0,0],"
@@ -98,7 +98,7 @@ def test_the_positions_of_a_program_are_rows(tmp_path: Path, columns: str) -> No
     (tmp_path / "program.txt").write_text(text + "end\n")
     table = read_table(tmp_path, "program.txt")
     assert table.heading == tuple(columns.split())
-    assert holds_positions(table)
+    assert table.convention is not None
     assert np.array_equal(table.numbers(range(rows.shape[1])), rows)
     first = 5 if columns.endswith("w_deg p_deg r_deg") else 2
     assert table.where(0) == f"{tmp_path / 'program.txt'}:{first}"

@@ -329,9 +329,9 @@ def _read_bag(path):
 
 
 def _read_arrays(path):
-    from flangeye.files.named_arrays import arrays_of
+    from flangeye.files.tables import tables_in
 
-    arrays_of(path)
+    tables_in(path.parent, path.name)
 
 
 def _read_json(path):

@@ -18,7 +18,7 @@ from flangeye.cli.commands import app
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid
 from flangeye.plugin.registry import load_registry
-from flangeye.recipe.draft.arrays import PoseArrays
+from flangeye.recipe.draft.frames import frames_in
 from flangeye.recipe.load import load_recipe
 from tests.plugins.reader.bags import joint_state, point_cloud, stops, tf, write_bag
 
@@ -358,7 +358,7 @@ def test_arrays_without_names_are_asked_for(folder: Path) -> None:
     ],
 )  # fmt: skip
 def test_two_frames_in_a_name(name: str, frames: tuple[str, str] | None) -> None:
-    assert PoseArrays(f"robot/poses.npz:{name}", (4, 4), 5).frames == frames
+    assert frames_in(name) == frames
 
 
 @pytest.mark.parametrize("names", [("arm.tum", "board.tum"), ("robot.csv", "camera.csv")])
@@ -429,7 +429,7 @@ def two_poses_of_nobody(folder):
          "rec/poses.mat: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew"),
         (odd_heading, [], "rec/log.csv: which columns are the arm's pose is not plain from "
          "u, v, w, alpha, beta, gamma; add --columns with their names, or numbers from 1, position "
-         "first: --columns x,y,z,a,b,c --rotation kuka"),
+         "first: --columns x,y,z,a,b,c --rotation kuka; or --joints with those of the joint"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
         (angles_of_nobody, [], "how the rotation in columns rx, ry, rz is written (ur, kuka, "
@@ -437,21 +437,21 @@ def two_poses_of_nobody(folder):
          "quaternion_wxyz, vector, xyz, ZYX, …): nothing tells; add --rotation vector"),
         (images, [], "which printed target is seen: nothing tells; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
-        (arrays_of_nobody, [], "which arrays are the arm's poses (poses.npz:A, poses.npz:B): "
+        (arrays_of_nobody, [], "which poses are the arm's (poses.npz:A, poses.npz:B): "
          "nothing tells; add --table poses.npz:A"),
         (arrays_of_nobody, ["--table", "A"],
-         "--table A: are no poses; known: poses.npz:A, poses.npz:B"),
-        (arrays_of_the_arm, [], "rec: robot.npy are 5 poses of the arm, but there are neither "
-         "scans nor as many measurements of the target beside them; put them there"),
+         "--table A: is no table of poses; known: poses.npz:A, poses.npz:B"),
+        (arrays_of_the_arm, [], "rec/robot.npy: has poses of the arm, but there are no scans beside "
+         "it, and no columns of what the camera saw; add --target-columns NAMES, or put the scans"),
         (lambda folder: table(folder, "x,y,z,qx,qy,qz,qw", quaternion), [],
          "rec/log.csv: has poses of the arm, but there are no scans beside it, and no "
          "columns of what the camera saw; add --target-columns NAMES, or put the scans there"),
         (lambda folder: (folder / "poses.xlsx").write_text("x"), [],
          "rec: poses.xlsx is a table that is not read; save it as .csv"),
-        (two_tables_of_nobody, [], "which table is the arm's (a.csv, b.csv): nothing tells; add "
+        (two_tables_of_nobody, [], "which poses are the arm's (a.csv, b.csv): nothing tells; add "
          "--table a.csv"),
-        (two_poses_of_nobody, [], "rec/log.csv: which columns are the arm's pose is not plain from "
-         "a_x, a_y, a_z, a_qx, a_qy, a_qz, a_qw, b_x, b_y, b_z, b_qx, b_qy, b_qz, b_qw; add --col"),
+        (two_poses_of_nobody, [], "which poses are the arm's (log.csv:a, log.csv:b): nothing tells; "
+         "add --table log.csv:a"),
         (lambda folder: (folder / "notes.md").write_text("x"), [],
          "rec: holds no scans and no table of poses; rec: no reader knows this layout"),
         (lambda folder: None, [],
@@ -464,7 +464,7 @@ def two_poses_of_nobody(folder):
          "parameters"),
         (sample, ["--target", "charuco: {columns: 8}"],
          "--target charuco.rows: is missing\n--target charuco.square: is missing\n"),
-        (sample, ["--reader", "table"], "--reader table.rotation: is missing\n--reader table.length: "),
+        (sample, ["--reader", "table"], "--reader table: rotation and length: is missing"),
         (odd_heading, ["--table", "a.csv"],
          "--table a.csv: is no table of poses; known: log.csv"),
         (sample, ["--out", "rec/poses.yaml", "--robot", "ur55"], "--robot model: no robot 'ur55'"),

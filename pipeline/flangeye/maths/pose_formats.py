@@ -66,6 +66,9 @@ class PoseConvention:
             :data:`EULER_ORDERS`, in which angles are written in the order of their axes.
         length: Unit of the position.
         angle: Unit of a rotation vector's length and of angles; a quaternion has none.
+        makers: Whose controllers show and take poses so, as the catalogue of robots spells them.
+        program: Regular expression of a position in a program, a group for each number.
+        program_length: Unit of the positions there.
     """
 
     name: str
@@ -73,6 +76,9 @@ class PoseConvention:
     rotation: str
     length: LengthUnit
     angle: AngleUnit = "rad"
+    makers: tuple[str, ...] = ()
+    program: str = ""
+    program_length: LengthUnit = "mm"
 
     def __post_init__(self) -> None:
         known = ("vector", "xyzw", "wxyz", *EULER_ORDERS)
@@ -251,29 +257,129 @@ def _to_euler(order: str, rotation: Floats) -> Floats:
 
 
 _XYZ = ("X", "Y", "Z")
+_N = r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
+"""A number in a program."""
+
+
+def _list_of(count: int) -> str:
+    return r"\s*" + r"\s*,\s*".join([_N] * count) + r"\s*"
+
+
+def _named(names: str, number: str) -> str:
+    """Return a pattern of numbers behind their names: ``X 1.5, Y 2``."""
+    return r"\s*,\s*".join(name + number for name in names)
+
 
 CONVENTIONS: Mapping[str, PoseConvention] = {
     # PolyScope's Move tab in its default units; URScript's p[...] is the same in metres.
-    "ur": PoseConvention("UR", (*_XYZ, "RX", "RY", "RZ"), "vector", "mm"),
+    "ur": PoseConvention(
+        "UR", (*_XYZ, "RX", "RY", "RZ"), "vector", "mm", "rad",
+        ("Universal Robots",), rf"\bp\[{_list_of(6)}\]", "m",
+    ),
     # KUKA System Software, operating manual: A about Z, B about the turned Y, C about the turned X.
-    "kuka": PoseConvention("KUKA ABC", (*_XYZ, "A", "B", "C"), "ZYX", "mm", "deg"),
+    "kuka": PoseConvention(
+        "KUKA ABC", (*_XYZ, "A", "B", "C"), "ZYX", "mm", "deg",
+        ("KUKA",), _named("XYZABC", rf"\s+{_N}"),
+    ),
     # FANUC operator's manual: W about X, P about Y, R about Z, the axes of the user frame.
-    "fanuc": PoseConvention("Fanuc WPR", (*_XYZ, "W", "P", "R"), "xyz", "mm", "deg"),
+    "fanuc": PoseConvention(
+        "Fanuc WPR", (*_XYZ, "W", "P", "R"), "xyz", "mm", "deg", ("FANUC", "Fanuc"),
+        _named("XYZ", rf"\s*=\s*{_N}\s*mm") + r"\s*,\s*" + _named("WPR", rf"\s*=\s*{_N}\s*deg"),
+    ),
     # ABB RAPID reference, data type orient: q1 is the real part.
-    "abb": PoseConvention("ABB", (*_XYZ, "Q1", "Q2", "Q3", "Q4"), "wxyz", "mm"),
+    "abb": PoseConvention(
+        "ABB", (*_XYZ, "Q1", "Q2", "Q3", "Q4"), "wxyz", "mm", "rad",
+        ("ABB",), rf"\[\s*\[{_list_of(3)}\]\s*,\s*\[{_list_of(4)}\]",
+    ),
     # Yaskawa operator's manual: as Fanuc.
-    "yaskawa": PoseConvention("Yaskawa", (*_XYZ, "RX", "RY", "RZ"), "xyz", "mm", "deg"),
+    "yaskawa": PoseConvention(
+        "Yaskawa", (*_XYZ, "RX", "RY", "RZ"), "xyz", "mm", "deg", ("Yaskawa",)
+    ),
     # Staubli VAL 3 reference, data type trsf: Rx, Ry, Rz about turned axes.
-    "staubli": PoseConvention("Staubli", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "mm", "deg"),
+    "staubli": PoseConvention(
+        "Staubli", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "mm", "deg", ("Stäubli", "Staubli")
+    ),
     # Kawasaki AS reference: orientation, altitude, tool; ZYZ about turned axes.
-    "kawasaki": PoseConvention("Kawasaki OAT", (*_XYZ, "O", "A", "T"), "ZYZ", "mm", "deg"),
+    "kawasaki": PoseConvention(
+        "Kawasaki OAT", (*_XYZ, "O", "A", "T"), "ZYZ", "mm", "deg", ("Kawasaki",)
+    ),
     # Doosan programming manual (DRL), posx: A, B, C are Euler angles ZYZ.
-    "doosan": PoseConvention("Doosan", (*_XYZ, "A", "B", "C"), "ZYZ", "mm", "deg"),
+    "doosan": PoseConvention(
+        "Doosan", (*_XYZ, "A", "B", "C"), "ZYZ", "mm", "deg", ("Doosan Robotics",)
+    ),
     # MVTec HALCON, create_pose with 'gba': Rx Ry Rz about turned axes, metres.
     "halcon": PoseConvention("HALCON", (*_XYZ, "RX", "RY", "RZ"), "XYZ", "m", "deg"),
     # ROS REP 103, and the URDF: fixed axes.
     "rpy": PoseConvention("roll pitch yaw", (*_XYZ, "ROLL", "PITCH", "YAW"), "xyz", "m"),
     "quaternion_xyzw": PoseConvention("quaternion", (*_XYZ, "QX", "QY", "QZ", "QW"), "xyzw", "m"),
     "quaternion_wxyz": PoseConvention("quaternion", (*_XYZ, "QW", "QX", "QY", "QZ"), "wxyz", "m"),
-}
-"""The conventions people meet, by name; others are made from :class:`PoseConvention`."""
+}  # fmt: skip
+"""The conventions people meet, by name; others are made from :class:`PoseConvention`. Readers,
+``flangeye init``, the doctor, drivers and exports use these rows."""
+
+
+def convention_of_maker(maker: str | None) -> str | None:
+    """Return the name of the convention that a maker's controllers use; None if not known."""
+    return next((name for name, c in CONVENTIONS.items() if maker in c.makers), None)
+
+
+MATRIX, APART = "matrix", "3x3"
+"""Rotations that are no numbers of a convention: 12 or 16 numbers row by row, and 9 behind a
+position."""
+PLAIN = ("xyzw", "wxyz", "vector", *EULER_ORDERS)
+"""Rotations that no maker's name stands for."""
+
+
+def written(rotation: str, length: LengthUnit, angle: AngleUnit) -> PoseConvention:
+    """Return the convention of a rotation, by its maker's name or plainly, in stated units."""
+    known = CONVENTIONS.get(rotation)
+    plain = known.rotation if known else rotation
+    labels = ("x", "y", "z", "a", "b", "c", "d")[: 7 if plain in PLAIN[:2] else 6]
+    return PoseConvention(rotation, labels, plain, length, angle)
+
+
+def pose_of_numbers(
+    numbers: Floats, rotation: str, length: LengthUnit, angle: AngleUnit = "rad"
+) -> Floats:
+    """Return the pose (4, 4) [m] of a row of numbers.
+
+    Args:
+        numbers: (k,), position first, or a matrix row by row.
+        rotation: A name in :data:`CONVENTIONS`, one of :data:`PLAIN`, ``matrix`` or ``3x3``.
+        length: Unit of the position.
+        angle: Unit of angles, or of a rotation vector's length.
+
+    Raises:
+        ValueError: They are no pose in this convention.
+    """
+    if rotation not in (MATRIX, APART):
+        return written(rotation, length, angle).matrix(numbers)
+    count, sizes = ("3 and 9", (12,)) if rotation == APART else ("12 or 16", (12, 16))
+    if numbers.size not in sizes:
+        raise ValueError(f"a matrix has {count} numbers, not {numbers.size}")
+    if rotation == APART:
+        rows = np.column_stack([numbers[3:].reshape(3, 3), numbers[:3]])
+    else:
+        rows = numbers.reshape(-1, 4)
+        if len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1):
+            raise ValueError("is not a rigid transform (its last row is not 0 0 0 1)")
+    return nearest_rigid(rows[:3] * np.array([1, 1, 1, _LENGTHS[length]]))
+
+
+def nearest_rigid(matrix: Floats) -> Floats:
+    """Return the pose (4, 4) of a matrix (3, 4) whose rotation is written with few digits.
+
+    Raises:
+        ValueError: A value is not finite, or the rotation is none.
+    """
+    if not np.isfinite(matrix).all():
+        raise ValueError("has values that are not finite")
+    rotation = matrix[:, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > NORM_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"is not a rigid transform (its rotation is {error:.2g} from orthonormal, "
+            f"at most {NORM_TOLERANCE} is allowed)"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    return rigid(u @ vt, matrix[:, 3])

@@ -11,7 +11,7 @@ import numpy as np
 from flangeye import part
 from flangeye.doctor.diagnosis import OR_ELSE, Change, Finding, Findings, RecordedSession
 from flangeye.maths.pose_corrections import inverted, reread, transposed
-from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS
+from flangeye.maths.pose_formats import CONVENTIONS, EULER_ORDERS, PLAIN
 from flangeye_plugins.check.as_recorded import fit_of, named
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import fit
@@ -116,9 +116,9 @@ def _stated(session: RecordedSession, of: str | None = None) -> str | None:
     ((_, params),) = session.reader.items()
     stated = params.get(of) if params and of else params
     rotation = stated.get("rotation") if isinstance(stated, Mapping) else None
-    if not isinstance(rotation, str):
+    if rotation not in (*CONVENTIONS, *PLAIN):
         return None
-    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
+    return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else str(rotation)
 
 
 def _name(rotation: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError
-from flangeye.files.tables import Column, Table, read_table
+from flangeye.files.tables import Cell, Column, Table, read_table
 from flangeye.types import Floats
 from flangeye_plugins.reader.written import WrittenParams
 
@@ -58,7 +58,7 @@ class Readings(NamedTuple):
     times: Floats | None
 
 
-def table_with_rows(folder: Path, name: str) -> Table:
+def table_with_rows(folder: Path, name: str | Sequence[str]) -> Table:
     """Return a table that holds something.
 
     Raises:
@@ -92,8 +92,8 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
     return Readings(own, values, times_of(own, given.time, given.time_unit))
 
 
-def _is_empty(cells: Sequence[str], column: int) -> bool:
-    return column >= len(cells) or cells[column].lower() in ("", "nan")
+def _is_empty(cells: Sequence[Cell], column: int) -> bool:
+    return column >= len(cells) or str(cells[column]).lower() in ("", "nan")
 
 
 def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:

@@ -8,12 +8,10 @@ import numpy as np
 
 from flangeye import StageError
 from flangeye.maths.geometry import rigid, rotation_exp, rotation_from_quaternion
+from flangeye.maths.pose_formats import MATRIX, NORM_TOLERANCE, pose_of_numbers
 from flangeye.types import Floats
 
 Numbers = Sequence[float] | Floats
-
-NORM_TOLERANCE = 1e-3
-"""Of quaternions and rotation matrices: four printed digits pass, a wrong order does not."""
 
 
 def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats:
@@ -51,16 +49,10 @@ def pose_from_matrix(where: str, matrix: Floats) -> Floats:
     Raises:
         StageError: A value is not finite, or the rotation is not one.
     """
-    m = _finite(where, matrix)
-    rotation = m[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > NORM_TOLERANCE or np.linalg.det(rotation) < 0 or tuple(m[3]) != (0, 0, 0, 1):
-        raise StageError(
-            f"{where}: is not a rigid transform (its rotation is {error:.2g} from orthonormal, "
-            f"at most {NORM_TOLERANCE} is allowed)"
-        )
-    u, _, vt = np.linalg.svd(rotation)
-    return rigid(u @ vt, m[:3, 3])
+    try:
+        return pose_of_numbers(_finite(where, matrix).ravel(), MATRIX, "m")
+    except ValueError as error:
+        raise StageError(f"{where}: {error}") from None
 
 
 def _finite(where: str, values: Numbers) -> Floats:

@@ -2,33 +2,36 @@
 
 CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
 commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
-the recipe names. JSON, JSON lines and YAML: ``{scan.ply: [numbers], …}``, or records such as
-``{scan: scan.ply, pose: {x: …}}``, each a row with dotted columns; or a file a pose, by a pattern
-of their names. Robot programs: a row each position. Without names the scans belong to the rows in
-the order of their names.
+the recipe names. JSON, YAML, OpenCV's storage, NumPy and MATLAB: records, or arrays of one length
+side by side, with dotted columns; or a file a pose, by a pattern of their names. Robot programs: a
+row each position. Scans belong to rows by the name or number in common, or in their order.
 
 What the camera measured may stand in the table in place of scans, as ``target``, and so may a
 second arm's pose, as ``second``; either in the same rows, or in a table of its own that is joined
-by time.
+by time, by name or number, or row by row. Joint angles alone are poses by the recipe's robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from flangeye import StageError, part
 from flangeye.files.clouds import LengthUnit
+from flangeye.files.pairs import partners
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.scans import Poses, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import interpolated, mean_pose, passed, turning
+from flangeye.models.robots import RobotModel
 from flangeye.types import FLANGE, FLANGE2, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.columns import (
@@ -44,14 +47,16 @@ from flangeye_plugins.reader.written import POINT
 
 SCAN = "scan"
 """How the column of the scans' file names is called, if the recipe does not say."""
+JOINTS = "joints"
+"""In place of a rotation: the poses follow from the joint angles."""
 
 
 class OtherParams(ColumnsParams):
     """Something else that was measured: in the same rows, or in a table of its own."""
 
-    file: str | None = Field(
-        None, description="A table of its own; joined by time, or row by row where neither has a "
-        "time.",
+    file: str | tuple[str, ...] | None = Field(
+        None, description="A table of its own, or tables side by side; joined by time, by the "
+        "numbers in the names of files, or row by row.",
     )  # fmt: skip
     columns: tuple[Column, ...] = Field(
         (), description="As for the arm; required when the target is in the same table."
@@ -88,14 +93,21 @@ class SecondParams(OtherParams):
 class TableParams(ColumnsParams, JointsParams):
     """The convention of the poses; nothing of it is guessed."""
 
-    file: str = Field(
+    file: str | tuple[str, ...] = Field(
         "poses.csv",
-        description="The table's name: .json, .jsonl, .yaml, or text of any ending; "
-        "or a pattern of files that hold a row each, poses/*.json.",
+        description="The table: FILE (text, JSON, YAML, OpenCV's storage, .npz, .npy, .mat, a "
+        "robot program); FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; "
+        "a pattern of files with a row each, poses/*.json; or several, side by side.",
     )
     pose: Literal["base_T_flange", "flange_T_base"] = Field(
-        description="Whose pose it is: the flange's in the base, as controllers show, or inverse."
+        "base_T_flange",
+        description="Whose pose it is: the flange's in the base, as controllers show, or inverse.",
     )
+    rotation: str = Field(
+        JOINTS, description="How the rotations are written, see below; joints: there are the "
+        "joint angles alone, and the recipe's robot gives the poses.",
+    )  # fmt: skip
+    length: Literal["m", "mm"] = Field("m", description="Unit of the positions.")
     scan: Column | None = Field(
         None,
         description="Column of the scans' file names; if not given, the one called scan, or "
@@ -110,54 +122,57 @@ class TableParams(ColumnsParams, JointsParams):
         None, description="Unit of the clouds; found by the scanner's range if not given."
     )
 
+    @classmethod
+    def more(cls) -> tuple[str, ...]:
+        """Joint angles may be all there is."""
+        return (JOINTS,)
 
-class Row(NamedTuple):
-    """One pose: where it stands in the file, its scan's name or None, and its numbers."""
-
-    where: str
-    scan: str | None
-    numbers: Floats
+    @model_validator(mode="after")
+    def _convention_given(self) -> TableParams:
+        missing = {"rotation", "length"} - self.model_fields_set
+        if self.rotation == JOINTS and self.joints:
+            return self
+        if missing or self.rotation == JOINTS:
+            named = " and ".join(sorted(missing, reverse=True)) or "joints"
+            raise ValueError(f"{named}: is missing (joint angles alone: joints, without rotation)")
+        return self
 
 
 @part("reader.table")
-def table(path: Path, params: TableParams) -> Archive:
+def table(path: Path, params: TableParams, kinematics: RobotModel | None = None) -> Archive:
     """Read a table of poses in the stated convention, with scans beside it or the target in it."""
     folder, name = (path.parent, path.name) if path.is_file() else (path, params.file)
-    if not files_at(folder, name):
-        raise NotThisLayout(f"{folder}: holds no {name}")
+    for each in [name] if isinstance(name, str) else name:
+        if not files_at(folder, each):
+            raise NotThisLayout(f"{folder}: holds no {each}")
     text = table_with_rows(folder, name)
+    poses = _arm_poses(text, params, kinematics)
     if params.target is None:
-        archive = _of_rows(folder, text, _from_text(text, params), params)
-        return _with_times(archive, text, params)
-    return _measured(folder, text, params)
+        return _with_scans(folder, text, poses, params)
+    return _measured(folder, text, poses, params)
 
 
-# --- scans beside the table
+def _arm_poses(text: Table, params: TableParams, robot: RobotModel | None) -> Floats:
+    """Return the flange's poses (N, 4, 4) [m]: as written, or at the joint angles."""
+    if params.rotation == JOINTS:
+        return _at_joints(text, params.angles(text), robot)
+    values = text.numbers(_columns(text, params, _scan_column(text, params)))
+    poses = np.array([params.value(text.where(i), row) for i, row in enumerate(values)])
+    return poses if params.pose == "base_T_flange" else inverted(poses)
 
 
-def _of_rows(folder: Path, text: Table, rows: Sequence[Row], params: TableParams) -> Archive:
-    found, notes = _scans(folder, text, rows)
-    poses = [_arm_pose(row.where, row.numbers, params) for row in rows]
-    apart = len({at[0].parent for at in found}) == len(found) > 1  # a folder for each pose
-    recordings = [
-        recording_of((at[0].parent if apart else at[0]).stem, pose, at)
-        for at, pose in zip(found, poses, strict=True)
-    ]
-    layout = f"table, {text.file.name}"
-    return Archive(layout, folder, recordings, text.files, params.cloud_unit, notes)
-
-
-def _arm_pose(where: str, values: Floats, params: TableParams) -> Floats:
-    pose = params.value(where, values)
-    return pose if params.pose == "base_T_flange" else inverted(pose)
-
-
-def _from_text(text: Table, params: TableParams) -> list[Row]:
-    scan = _scan_column(text, params)
-    columns = _columns(text, params, scan)
-    names = [None] * len(text.rows) if scan is None else text.texts(scan)
-    values = text.numbers(columns)
-    return [Row(text.where(i), names[i], values[i]) for i in range(len(values))]
+def _at_joints(text: Table, angles: Floats | None, robot: RobotModel | None) -> Floats:
+    if robot is None or angles is None:
+        raise StageError(
+            f"{text.file}: joint angles become poses by the arm's kinematics; write robot: NAME, "
+            "or robot: {urdf: FILE}, into the recipe"
+        )
+    if angles.shape[1] != len(robot.joints):
+        raise StageError(
+            f"{text.file}: names {angles.shape[1]} columns of joint angles, {robot.model} has "
+            f"{len(robot.joints)} joints; name as many, from the base: joints: […]"
+        )
+    return np.asarray(Arm(robot).flange(angles))
 
 
 def _scan_column(text: Table, params: TableParams) -> int | None:
@@ -181,64 +196,97 @@ def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
     return [i for i in range(len(text.rows[0][1])) if i not in taken]
 
 
-def _with_times(archive: Archive, text: Table, params: TableParams) -> Archive:
-    """Return the archive with its times, and the second arm of the same rows."""
+# --- scans beside the table
+
+
+def _with_scans(folder: Path, text: Table, poses: Floats, params: TableParams) -> Archive:
+    """Return poses with their scans, their times, and the second arm of the same rows."""
+    found, notes = _scans(folder, text, params)
     times, joints = times_of(text, params.time, params.time_unit), params.angles(text)
-    second = _second(archive.root, text, params)
+    second = _second(folder, text, params)
     if second is not None and second.table is not text:
         raise StageError(f"{second.table.file}: a second arm beside scans stands in the same table")
+    apart = len({at[0].parent for at in found}) == len(found) > 1  # a folder for each pose
     recordings = [
         replace(
-            recording,
+            recording_of((at[0].parent if apart else at[0]).stem, poses[i], at),
             time_ns=0 if times is None else round(times[i] * 1e9),
             joints=None if joints is None else joints[i],
-            poses=_poses(recording.base_T_flange, None if second is None else second.values[i]),
+            poses=_poses(poses[i], None if second is None else second.values[i]),
         )
-        for i, recording in enumerate(archive.recordings)
+        for i, at in enumerate(found)
     ]
-    return replace(archive, recordings=recordings)
+    layout = f"table, {text.name}"
+    return Archive(layout, folder, recordings, text.files, params.cloud_unit, notes)
+
+
+def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Path]], list[str]]:
+    """Return the scans of each row: the named one, or those that belong to it; and notes."""
+    column = _scan_column(text, params)
+    if column is not None:
+        names = text.texts(column)
+        return [[_named(folder, text.where(i), name)] for i, name in enumerate(names)], []
+    files = text.files if len(text.files) == len(text.rows) > 1 else ()
+    return scans_of(folder, Poses(str(text.file), len(text.rows), files, text.names), text.files)
+
+
+def _named(folder: Path, where: str, name: str) -> Path:
+    """Return the scan of a name, in the folder or, where one has it only, in a folder in it."""
+    inner = sorted(folder.glob(f"*/{escape(name)}")) if name and Path(name).name == name else []
+    found = folder / name if (folder / name).is_file() else inner[0] if len(inner) == 1 else None
+    if not name or found is None:
+        raise StageError(f"{where}: its scan '{name}' does not exist")
+    return found
 
 
 # --- the target in the table
 
 
-def _measured(folder: Path, text: Table, params: TableParams) -> Archive:
+def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> Archive:
     """Return poses with what was measured there, row by row or joined by time."""
-    rows = _from_text(text, params)
-    poses = np.array([_arm_pose(row.where, row.numbers, params) for row in rows])
     target = _target(folder, text, params)
     second = _second(folder, text, params)
     tables = [text, target.table, *([second.table] if second else [])]
     files = list(dict.fromkeys(file for table in tables for file in table.files))
     times = times_of(text, params.time, params.time_unit)
+    joints = params.angles(text)
     if times is not None and target.times is not None and target.table is not text:
         recordings, notes = _joined((times, poses), target, second, params)
-        recordings = _with_joints(recordings, times, params.angles(text))
+        recordings = _with_joints(recordings, times, joints)
     else:
-        for other in (target, *([second] if second else [])):
-            _same_rows(text, other)
-        recordings, notes = _row_by_row(times, poses, target, second), []
-        if (joints := params.angles(text)) is not None:
+        others, notes = [target, *([second] if second else [])], []
+        for at, other in enumerate(others):
+            order, notes = _partners(text, other.table)
+            others[at] = other._replace(values=[other.values[i] for i in order])
+        recordings = _row_by_row(text, times, poses, others)
+        if joints is not None:
             recordings = [replace(r, joints=at) for r, at in zip(recordings, joints, strict=True)]
-    layout = f"table, {', '.join(dict.fromkeys(t.file.name for t in tables))}"
+    layout = f"table, {', '.join(dict.fromkeys(t.name for t in tables))}"
     return Archive(layout, folder, recordings, files, params.cloud_unit, notes)
 
 
-def _same_rows(text: Table, other: Readings) -> None:
-    if len(other.values) != len(text.rows):
+def _partners(text: Table, other: Table) -> tuple[list[int], list[str]]:
+    """Return which row of another table belongs to each, and how that was found."""
+    if other is not text and text.names and other.names:
+        order, note = partners(str(text.file), text.names, other.names)
+        return order, [note]
+    if len(other.rows) != len(text.rows):
         raise StageError(
-            f"{other.table.file}: has {len(other.values)} rows, {text.file.name} has "
-            f"{len(text.rows)}; give each a time: to join them by it"
+            f"{other.file}: has {len(other.rows)} rows, {text.name} has {len(text.rows)}; give "
+            "each a time: to join them by it, or take the surplus away"
         )
+    told = [] if other is text else [f"paired row by row: {text.name} with {other.name}"]
+    return list(range(len(text.rows))), told
 
 
 def _row_by_row(
-    times: Floats | None, poses: Floats, target: Readings, second: Readings | None
+    text: Table, times: Floats | None, poses: Floats, others: Sequence[Readings]
 ) -> list[Recording]:
+    target, second = others[0], others[1] if len(others) > 1 else None
     return [
         _recording(
-            f"{i:04}", pose, target.values[i], second.values[i] if second else None,
-            0.0 if times is None else times[i],
+            text.names[i] if text.names else f"{i:04}", pose, target.values[i],
+            second.values[i] if second else None, 0.0 if times is None else times[i],
         )
         for i, pose in enumerate(poses)
     ]  # fmt: skip
@@ -341,22 +389,3 @@ def _other(folder: Path, text: Table, given: OtherParams, turned: bool) -> Readi
     if not turned:
         return found
     return found._replace(values=[None if v is None else inverted(v) for v in found.values])
-
-
-# --- the scans of rows
-
-
-def _scans(folder: Path, text: Table, rows: Sequence[Row]) -> tuple[list[list[Path]], list[str]]:
-    """Return the scans of each row: the named one, or those that belong to it; and notes."""
-    if any(row.scan for row in rows):
-        return [_named(folder, row) for row in rows], []
-    files = text.files if len(text.files) == len(rows) > 1 else ()
-    poses = Poses(str(text.file), len(rows), files, [file.stem for file in files])
-    return scans_of(folder, poses, text.files)
-
-
-def _named(folder: Path, row: Row) -> list[Path]:
-    scan = folder / (row.scan or "")
-    if not row.scan or not scan.is_file():
-        raise StageError(f"{row.where}: its scan '{row.scan or ''}' does not exist")
-    return [scan]

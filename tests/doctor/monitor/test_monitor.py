@@ -242,7 +242,7 @@ def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Pa
     (later / "poses.csv").unlink()
     np.save(later / "arm.npy", poses)
     words = ["monitor", str(tmp_path / "run" / "calibration.yaml"), "--archive", str(later)]
-    reader = "acquire.archive.reader={matrices: {robot: arm.npy, length: m}}"
+    reader = "acquire.archive.reader={table: {file: arm.npy, rotation: matrix, length: m}}"
     found = CliRunner().invoke(app, [*words, "--set", reader])
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout)["state"] == "OK"

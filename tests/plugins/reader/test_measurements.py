@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from flangeye import StageError
 from flangeye.maths.geometry import rigid
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import clock_offset, standstills, turning
+from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
 from flangeye_plugins.reader.corrected import CorrectedParams, corrected
-from flangeye_plugins.reader.matrices import MatricesParams, matrices
 from flangeye_plugins.reader.pairing import _ms
+from flangeye_plugins.reader.samples import visp
 from flangeye_plugins.reader.table import TableParams, table
-from flangeye_plugins.reader.visp import visp
 
 RNG = np.random.default_rng(4)
 
@@ -223,7 +224,8 @@ def test_streams_without_a_common_time_are_refused(tmp_path: Path) -> None:
         ({"columns": [99]}, "a.csv: has no column 99; they are 1 to 9"),
         ({"time": "v"}, "a.csv:3: its time is not after the row before it"),
         ({"columns": [*"xyzabcd"], "target": {"rotation": "point", "length": "m", "file": "b.csv"}},
-         "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it"),
+         "b.csv: has 1 rows, a.csv has 6; give each a time: to join them by it, or take the surplus "
+         "away"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_a_table_is_one_line(
@@ -256,34 +258,32 @@ def opencv_file(path):
 
 
 def saved(folder, sort):
-    """Write ARM and SEEN in one of the ways; return the two places."""
+    """Write ARM and SEEN in one of the ways; return how the recipe names each."""
     if sort == "npy":
         np.save(folder / "arm.npy", ARM)
         np.save(folder / "seen.npy", SEEN)
-        return "arm.npy", "seen.npy"
+        return {"file": "arm.npy"}, {"file": "seen.npy"}
     if sort == "npz":
         np.savez(folder / "both.npz", arm=ARM, seen=SEEN, name="x")
-        return "both.npz:arm", "both.npz:seen"
+        return {"file": "both.npz", "columns": ["arm"]}, {"columns": ["seen"]}
     if sort == "mat":
         savemat(folder / "b.mat", {"arm": np.moveaxis(ARM, 0, 2), "seen": np.moveaxis(SEEN, 0, 2)})
-        return "b.mat:arm", "b.mat:seen"
+        return {"file": "b.mat", "columns": ["arm"]}, {"columns": ["seen"]}
     if sort in ("yml", "xml"):
         opencv_file(folder / f"data.{sort}")
-        return f"data.{sort}:T1_*", f"data.{sort}:T2_*"
+        return {"file": f"data.{sort}", "columns": ["T1"]}, {"columns": ["T2"]}
     for name, poses in (("arm", ARM), ("seen", SEEN)):
         (folder / name).mkdir()
         for i, pose in enumerate(poses, 8):  # pose_10 comes after pose_9
             np.savetxt(folder / name / f"pose_{i}.txt", pose, delimiter="," if i % 2 else " ")
-    return "arm/*.txt", "seen/*.txt"
+    return {"file": "arm/*.txt"}, {"file": "seen/*.txt"}
 
 
 @pytest.mark.parametrize("sort", ["npy", "npz", "mat", "yml", "xml", "text"])
 def test_arrays_of_every_program(tmp_path: Path, sort: str) -> None:
     arm, seen = saved(tmp_path, sort)
-    target = {"at": seen, "length": "m"}
-    found = matrices(
-        tmp_path, MatricesParams.model_validate({"robot": arm, "length": "m", "target": target})
-    ).recordings
+    target = seen | {"rotation": "matrix", "length": "m"}
+    found = table(tmp_path, params(**arm, rotation="matrix", target=target)).recordings
     assert np.allclose([r.base_T_flange for r in found], ARM, atol=1e-9)
     assert np.allclose([r.camera_T_target for r in found], SEEN, atol=1e-9)
 
@@ -291,10 +291,11 @@ def test_arrays_of_every_program(tmp_path: Path, sort: str) -> None:
 def test_rows_of_numbers_in_an_array_and_the_other_way_round(tmp_path: Path) -> None:
     np.savez(tmp_path / "r.npz", arm=quaternions(np.linalg.inv(ARM)), seen=1e3 * SEEN[:, :3, 3],
              second=quaternions(SECOND))  # fmt: skip
-    found = matrices(tmp_path, MatricesParams.model_validate({
-        "robot": "r.npz:arm", "rotation": "xyzw", "length": "m", "pose": "flange_T_base",
-        "target": {"at": "r.npz:seen", "rotation": "point", "length": "mm"},
-        "second": "r.npz:second",
+    found = table(tmp_path, TableParams.model_validate({
+        "file": "r.npz", "columns": ["arm"], "rotation": "xyzw", "length": "m",
+        "pose": "flange_T_base",
+        "target": {"columns": ["seen"], "rotation": "point", "length": "mm"},
+        "second": {"columns": ["second"], "rotation": "xyzw", "length": "m"},
     })).recordings  # fmt: skip
     assert np.allclose([r.base_T_flange for r in found], ARM, atol=1e-9)
     assert np.allclose([r.centre_in_camera for r in found], SEEN[:, :3, 3], atol=1e-9)
@@ -317,29 +318,100 @@ def test_visps_pose_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "message"),
+    ("given", "message"),
     [
-        ("none.npy", "holds no none.npy"),
-        ("both.npz", "both.npz: has several arrays; name one behind a colon, both.npz:NAME; it has "
-         "arm, seen"),
-        ("both.npz:arms", "both.npz: has no array 'arms'; name one behind a colon, both.npz:NAME; "
-         "it has arm, seen"),
-        ("odd.npy", "odd.npy: is 6x5x4, expected N x 4 x 4 or rows"),
-        ("rows.txt", "0000: a matrix has 12 or 16 numbers, not 7"),
-        ("broken.npz", "broken.npz: is not a NumPy .npz file: "),
-        ("words.txt", "words.txt: is no table of numbers"),
+        ({"file": "none.npy"}, "holds no none.npy"),
+        ({"file": "both.npz", "columns": ["arms"]}, "both.npz: has no column 'arms'; known: arm."),
+        ({"file": "two.npz"}, "two.npz: holds 2 tables; name one of two.npz:arm, two.npz:time"),
+        ({"file": "two.npz:b"}, "two.npz: has no part 'b'; name one of two.npz:arm, two.npz:time"),
+        ({"file": "odd.npy"}, "odd.npy: row 1: a matrix has 12 or 16 numbers, not 20"),
+        ({"file": "rows.txt"}, "rows.txt:1: a matrix has 12 or 16 numbers, not 7"),
+        ({"file": "rows.txt:1/4"}, "rows.txt: has 6 rows, which are not 4 parts of equal length"),
+        ({"file": ["rows.txt", "two.npz:time"]},
+         "rows.txt: tables side by side have different numbers of rows: rows.txt 6, two.npz:time 9"),
+        ({"file": "broken.npz"}, "broken.npz: is not a NumPy .npz file: "),
+        ({"file": "words.txt"}, "words.txt: holds no poses"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_arrays_is_one_line(tmp_path: Path, place: str, message: str) -> None:
+def test_a_mistake_in_arrays_is_one_line(
+    tmp_path: Path, given: dict[str, Any], message: str
+) -> None:
     saved(tmp_path, "npz")
+    np.savez(tmp_path / "two.npz", arm=ARM, time=np.ones((9, 2)))
     np.save(tmp_path / "odd.npy", np.ones((6, 5, 4)))
     np.savetxt(tmp_path / "rows.txt", quaternions(ARM))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     (tmp_path / "words.txt").write_text("no numbers here\n")
     with pytest.raises(StageError) as error:
-        matrices(tmp_path, MatricesParams.model_validate({"robot": place, "length": "m"}))
+        table(tmp_path, params(**given, rotation="matrix"))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_rotations_and_positions_stand_side_by_side(tmp_path: Path) -> None:
+    """In two files, in two arrays of one, and matrices line by line in a text."""
+    np.save(tmp_path / "t.npy", ARM[:, :3, 3:])
+    np.savetxt(tmp_path / "R.txt", ARM[:, :3, :3].reshape(-1, 3))
+    np.savez(tmp_path / "seen.npz", R=SEEN[:, :3, :3], t=SEEN[:, :3, 3])
+    target = {"file": "seen.npz", "columns": ["t", "R"], "rotation": "3x3", "length": "m"}
+    found = table(
+        tmp_path, params(file=["t.npy", "R.txt"], rotation="3x3", target=target)
+    ).recordings
+    assert np.allclose([r.base_T_flange for r in found], ARM, atol=1e-9)
+    assert np.allclose([r.camera_T_target for r in found], SEEN, atol=1e-9)
+
+
+def blocks(folder, between, heading=""):
+    text = [heading + "\n".join(" ".join(map(repr, row)) for row in quaternions(p).tolist())
+            for p in (ARM, SEEN)]  # fmt: skip
+    (folder / "both.txt").write_text(between.join(text) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("between", "heading", "parts"),
+    [("\n\n", "", ("1", "2")), ("\n# then the marker\n", "", ("1", "2")), ("\n", "", ("1/2", "2/2")),
+     ("\n\nmarker\n", "", ("1", "2")), ("\n\n", "x y z qx qy qz qw\n", ("1", "2"))],
+)  # fmt: skip
+def test_two_blocks_in_one_text(
+    tmp_path: Path, between: str, heading: str, parts: tuple[str, str]
+) -> None:
+    blocks(tmp_path, between, heading)
+    arm, seen = (f"both.txt:{part}" for part in parts)
+    target = {"file": seen, "rotation": "xyzw", "length": "m"}
+    found = table(tmp_path, params(file=arm, target=target)).recordings
+    assert np.allclose([r.base_T_flange for r in found], ARM, atol=1e-9)
+    assert np.allclose([r.camera_T_target for r in found], SEEN, atol=1e-9)
+
+
+def test_a_file_for_each_pose_is_paired_by_its_number(tmp_path: Path) -> None:
+    numbers = [1, 2, 10, 11, 3, 20]
+    for k, (arm, seen) in enumerate(zip(ARM, SEEN, strict=True)):
+        np.savetxt(tmp_path / f"arm_{numbers[k]}.txt", arm)
+        np.savetxt(tmp_path / f"cam_{numbers[k]:03}.txt", seen)
+    target = {"file": "cam_*.txt", "rotation": "matrix", "length": "m"}
+    archive = table(tmp_path, params(file="arm_*.txt", rotation="matrix", target=target))
+    order = np.argsort(numbers)
+    assert np.allclose([r.base_T_flange for r in archive.recordings], ARM[order], atol=1e-9)
+    assert np.allclose([r.camera_T_target for r in archive.recordings], SEEN[order], atol=1e-9)
+    assert archive.notes == ["paired by number: arm_1 with cam_001, …, arm_20 with cam_020"]
+    (tmp_path / "cam_003.txt").rename(tmp_path / "cam_004.txt")
+    with pytest.raises(StageError, match=r"no partner for arm_3, and no partner for cam_004"):
+        table(tmp_path, params(file="arm_*.txt", rotation="matrix", target=target))
+
+
+def test_joint_angles_alone_are_poses_by_the_robots_kinematics(tmp_path: Path) -> None:
+    robot = load_model("robots", "ur5e")
+    joints = np.random.default_rng(1).uniform(-2, 2, (6, 6))
+    np.savetxt(tmp_path / "j.csv", np.hstack([np.degrees(joints), SEEN[:, :3, 3]]), delimiter=",")
+    given = TableParams.model_validate({
+        "file": "j.csv", "joints": [1, 2, 3, 4, 5, 6], "joint_unit": "deg",
+        "target": {"columns": [7, 8, 9], "rotation": "point", "length": "m"},
+    })  # fmt: skip
+    found = table(tmp_path, given, robot).recordings
+    assert np.allclose([r.base_T_flange for r in found], Arm(robot).flange(joints), atol=1e-9)
+    assert np.allclose([r.joints for r in found], joints)
+    with pytest.raises(StageError, match=r"joint angles become poses by the arm's kinematics; wri"):
+        table(tmp_path, given)
 
 
 def test_a_clock_offset_of_nothing_has_no_sign() -> None:

@@ -18,10 +18,14 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
 from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath, PointCloud
-from flangeye_plugins.reader.easy_handeye import EasyHandeyeParams, easy_handeye
-from flangeye_plugins.reader.moveit import moveit
+from flangeye_plugins.reader.samples import (
+    EasyHandeyeParams,
+    ZividParams,
+    easy_handeye,
+    moveit,
+    zivid,
+)
 from flangeye_plugins.reader.table import TableParams, table
-from flangeye_plugins.reader.zivid import ZividParams, zivid
 
 RNG = np.random.default_rng(4)
 
@@ -217,7 +221,7 @@ def test_a_mistake_in_a_table_is_named_with_its_line(
     [
         ({"rotation": "vector", "length": "m"}, "rotation: vector needs angle: deg or angle: rad"),
         ({"rotation": "xzz", "length": "m"}, "no rotation 'xzz'; known: ur, kuka"),
-        ({"rotation": "xyzw"}, "Field required"),
+        ({"rotation": "xyzw"}, "length: is missing"),
     ],
 )
 def test_nothing_of_a_convention_is_guessed(values: dict[str, Any], message: str) -> None:
@@ -234,11 +238,11 @@ def test_nothing_of_a_convention_is_guessed(values: dict[str, Any], message: str
          "x.yaml: was sampled for eye_in_hand, but the recipe says eye_on_base"),
         (easy_handeye, EasyHandeyeParams(calibration="eye_on_base"),
          "samples:\n- robot: {translation: {x: 1, y: 2}}\n  tracking: {}\n",
-         "x.yaml: sample 0: robot: has no 'translation.z'"),
+         "x.yaml: has no column 'robot.translation.z'; known: robot.translation.y, robot.translation.x"),
         (moveit, None, "- effector_wrt_world: [1, 2]\n  object_wrt_sensor: [1]\n",
-         "x.yaml: sample 0: effector_wrt_world: has 2 numbers, a matrix has 16"),
+         "x.yaml:1: a matrix has 12 or 16 numbers, not 2"),
         (moveit, None, "- effector_wrt_world: nothing\n",
-         "x.yaml: sample 0: effector_wrt_world: expected a list of numbers"),
+         "x.yaml:1: 'nothing' is not a number"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_samples_is_named(

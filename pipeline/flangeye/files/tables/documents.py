@@ -1,59 +1,70 @@
-"""JSON, JSON lines and YAML as tables: a record each row, what is nested under dotted names.
-
-``{"robot": {"position": {"x": 1, …}}, "marker": [[1, 0, …], …]}`` has the columns
-``robot.position.x``, …, ``marker.0.0``, …
-"""
+"""Files that hold named values: JSON, YAML, OpenCV's storage, NumPy and MATLAB, as plain data."""
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+import re
+import subprocess
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
 
 from flangeye.errors import RecipeError, StageError
+from flangeye.files import matlab_parser
+from flangeye.files.arrays import read_arrays
+from flangeye.files.children import python_command
 from flangeye.files.printable import reason_of
-from flangeye.files.tables.table import Row
+from flangeye.files.regular import read_regular, read_text
 from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
+from flangeye.types import Floats
 
-WIDEST = 1000
-"""Values of a record: one with more holds a scan."""
-SCAN = "name"
-"""Column of the names under which records stand."""
-Record = tuple[str, Any]
-"""Where it stands, and what it is."""
+MAX_MATLAB = 1_000_000
+"""Longest .mat file [bytes]."""
+HDF5 = b"\x89HDF\r\n"
+MATRICES = ((4, 4), (3, 3), (3, 4))
+"""Shapes of a pose, of its rotation, and of a pose without its last row."""
+WIDEST = 16
+"""Numbers of the longest row that is a pose; a wider array of few rows holds a pose a column."""
+_OPENCV = re.compile(r"\A%YAML[^\n]*\n(?:---[^\n]*\n)?|!!opencv(?:-nd)?-matrix")
 
 
-def json_rows(file: Path, text: str, single: bool) -> tuple[tuple[str, ...], list[Row]]:
-    """Return the columns and rows of a JSON file.
+class Document(NamedTuple):
+    """What a file holds, and where its records stand, as messages begin with it."""
 
-    Args:
-        file: Its name, for messages.
-        text: Its content.
-        single: Whether the whole file is one record.
+    data: Any
+    where: Callable[[int], str]
+
+
+def document_of(file: Path) -> Document | None:
+    """Return what a file holds as mappings, lists, numbers and arrays; None if it is plain text.
 
     Raises:
-        StageError: It is no JSON, or holds no records.
+        StageError: It cannot be read, or is damaged.
     """
-    return _rows(file, _loaded(str(file), text), single, lambda at: f"{file}: record {at + 1}")
-
-
-def json_lines_rows(file: Path, text: str, single: bool) -> tuple[tuple[str, ...], list[Row]]:
-    """Return the columns and rows of a file with a JSON record each line; as :func:`json_rows`."""
-    del single  # each line is one
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-    return _table([(f"{file}:{n}", _loaded(f"{file}:{n}", line)) for n, line in lines])
-
-
-def yaml_rows(file: Path, text: str, single: bool) -> tuple[tuple[str, ...], list[Row]]:
-    """Return the columns and rows of a YAML file; as :func:`json_rows`."""
-    if len(text) > MAX_BYTES:
-        raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
+    read = KINDS.get(file.suffix.lower())
+    if read is None:
+        return None
     try:
-        document = parse_yaml(text, str(file))
-    except RecipeError as error:
-        raise StageError(str(error)) from None
-    return _rows(file, document.data, single, lambda at: f"{file}:{document.line((at,))}")
+        document = read(file)
+        return document._replace(data=_plain(document.data))
+    except StageError:
+        raise
+    except Exception as error:  # damaged bytes can break these parsers in any way
+        raise StageError(f"{file}: cannot be read: {reason_of(error)}") from None
+
+
+def _json(file: Path) -> Document:
+    return Document(_loaded(str(file), read_text(file)), lambda at: f"{file}: record {at + 1}")
+
+
+def _json_lines(file: Path) -> Document:
+    lines = [(n, line) for n, line in enumerate(read_text(file).splitlines(), 1) if line.strip()]
+    records = [_loaded(f"{file}:{n}", line) for n, line in lines]
+    return Document(records, lambda at: f"{file}:{lines[at][0]}")
 
 
 def _loaded(where: str, text: str) -> Any:
@@ -63,51 +74,100 @@ def _loaded(where: str, text: str) -> Any:
         raise StageError(f"{where}: is no JSON: {reason_of(error)}") from None
 
 
-def _rows(
-    file: Path, data: Any, single: bool, where: Callable[[int], str]
-) -> tuple[tuple[str, ...], list[Row]]:
-    if single:
-        return _table([(str(file), data)])
-    if isinstance(data, Mapping):
-        lists = [value for value in data.values() if _is_records(value)]
-        if len(lists) == 1:
-            data = lists[0]
-        elif all(isinstance(value, list | Mapping) for value in data.values()):
-            named = [(f"{file}: {key}", {SCAN: key, "": value}) for key, value in data.items()]
-            return _table(named)
-    if not isinstance(data, list):
-        raise StageError(f"{file}: expected a list of records, or one under each scan's name")
-    return _table([(where(at), record) for at, record in enumerate(data)])
+def _yaml(file: Path) -> Document:
+    text = read_text(file)
+    if len(text) > MAX_BYTES:
+        raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
+    try:
+        document = parse_yaml(_OPENCV.sub("", text), str(file))
+    except RecipeError as error:
+        raise StageError(str(error)) from None
+    return Document(document.data, lambda at: f"{file}:{document.line((at,))}")
 
 
-def _is_records(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
+def _xml(file: Path) -> Document:
+    """Return what cv2.FileStorage wrote; entities, which can expand to any length, are refused."""
+    text = read_text(file)
+    if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        raise StageError(f"{file}: declares a document type or entities, which are not read")
+    return Document(_element(ElementTree.fromstring(text)), lambda at: f"{file}: record {at + 1}")
 
 
-def _table(records: list[Record]) -> tuple[tuple[str, ...], list[Row]]:
-    """Return the columns of all records, in the order of their first one, and a row each."""
-    cells = [(where, _cells(where, record)) for where, record in records]
-    columns = list(dict.fromkeys(name for _, found in cells for name in found))
-    rows = [(where, tuple(found.get(name, "") for name in columns)) for where, found in cells]
-    named = any(not name.isdigit() for name in columns if name != SCAN)
-    return tuple(columns) if named else (), rows
+def _element(element: ElementTree.Element) -> Any:
+    children = list(element)
+    if children and all(child.tag == "_" for child in children):
+        return [_element(child) for child in children]
+    if children:
+        return {child.tag: _element(child) for child in children}
+    words = (element.text or "").replace('"', " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words)
+    return numbers[0] if len(numbers) == 1 and element.tag != "data" else numbers
 
 
-def _cells(where: str, record: Any) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for name, value in _leaves(record):
-        if len(found) == WIDEST:
-            raise StageError(f"{where}: has more than {WIDEST} values, too many for a pose")
-        found[name] = "" if value is None else str(value)
-    return found
+def _numpy(file: Path) -> Document:
+    arrays = read_arrays(file)
+    data: Any = arrays[""] if list(arrays) == [""] else arrays
+    return Document(data, lambda at: f"{file}: row {at + 1}")
 
 
-def _leaves(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield every scalar with its dotted name."""
-    if not isinstance(value, list | Mapping):
-        yield "", value
-        return
-    children = value.items() if isinstance(value, Mapping) else enumerate(value)
-    for key, child in children:
-        for name, leaf in _leaves(child):
-            yield ".".join(part for part in (str(key), name) if part), leaf
+def _matlab(file: Path) -> Document:
+    """Return the arrays of a .mat file: its parser, which damage can crash, has its own process."""
+    command = python_command(matlab_parser.__file__)
+    content = read_regular(file, MAX_MATLAB)
+    if content.startswith(b"MATLAB 7.3") or content.startswith(HDF5):
+        raise StageError(
+            f"{file}: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew: "
+            f"load('{file.name}'); save('{file.name}', '-v7')"
+        )
+    try:
+        done = subprocess.run(
+            command, input=content, capture_output=True, timeout=matlab_parser.SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise StageError(
+            f"{file}: cannot be read: its parser took more than {matlab_parser.SECONDS} s"
+        ) from None
+    if done.returncode < 0:
+        raise StageError(f"{file}: cannot be read: it is damaged, its parser crashed")
+    if done.returncode:
+        raise ValueError(done.stderr.decode("utf-8", "replace"))
+    found = np.load(io.BytesIO(done.stdout), allow_pickle=False)
+    arrays = {n.removeprefix(matlab_parser.PREFIX): array for n, array in found.items()}
+    return Document(arrays, lambda at: f"{file}: row {at + 1}")
+
+
+KINDS: Mapping[str, Callable[[Path], Document]] = {
+    ".json": _json, ".jsonl": _json_lines, ".ndjson": _json_lines,
+    ".yaml": _yaml, ".yml": _yaml, ".samples": _yaml, ".xml": _xml,
+    ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
+}  # fmt: skip
+"""Documents by their ending; everything else is text."""
+
+
+def _plain(value: Any) -> Any:
+    """Return data with matrices as arrays: those that state their rows and columns (OpenCV, ROS,
+    ViSP), and stacks with a pose for each last index (MATLAB), turned so that poses come first.
+    """  # noqa: D205
+    if isinstance(value, np.ndarray):
+        return _poses_first(value)
+    if isinstance(value, list):
+        return [_plain(each) if isinstance(each, Mapping | list) else each for each in value]
+    if not isinstance(value, Mapping):
+        return value
+    if {"rows", "cols", "data"} <= set(value) and isinstance(value["data"], list):
+        channels = re.match(r"\d*", str(value.get("dt", "")))
+        shape = [int(value["rows"]), int(value["cols"])]
+        shape += [int(channels[0])] if channels and channels[0] else []
+        return np.array(value["data"], float).reshape(shape)
+    return {str(key): _plain(each) for key, each in value.items()}
+
+
+def _poses_first(array: Floats) -> Floats:
+    shape = array.shape
+    if len(shape) == 3 and shape[:2] in MATRICES and shape[1:] not in MATRICES:
+        return np.moveaxis(array, 2, 0)
+    wide = len(shape) == 2 and shape[0] in (3, 6, 7, 12, 16) and shape[1] > WIDEST
+    return array.T if wide else array

@@ -1,60 +1,167 @@
-"""Choose how a table is read: by its file's ending, or by the positions in its text."""
+"""Rows of poses, whatever file they are from.
+
+``poses.csv`` names a file; ``robot/*.txt`` files with a row each; ``log.txt:2`` the second block
+of rows of a text, ``log.txt:2/2`` the second half of its rows; ``poses.npz:arm`` the arrays of a
+document that have as many entries as ``arm``. Several names are tables side by side.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from flangeye.errors import StageError
 from flangeye.files.pairs import natural
 from flangeye.files.regular import read_text
-from flangeye.files.tables.documents import json_lines_rows, json_rows, yaml_rows
-from flangeye.files.tables.positions import position_rows
-from flangeye.files.tables.table import Row, Table
-from flangeye.files.tables.text import text_rows
+from flangeye.files.tables.documents import document_of
+from flangeye.files.tables.programs import program_rows
+from flangeye.files.tables.records import record_of, rows_of
+from flangeye.files.tables.table import Row, Rows, Table
+from flangeye.files.tables.text import row_of, text_rows
 
-Rows = tuple[tuple[str, ...], list[Row]]
-KINDS: Mapping[str, Callable[[Path, str, bool], Rows]] = {
-    ".json": json_rows,
-    ".jsonl": json_lines_rows,
-    ".ndjson": json_lines_rows,
-    ".yaml": yaml_rows,
-    ".yml": yaml_rows,
-}
-"""Documents by their ending; everything else is text."""
+_SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
+"""A part of a file's rows: the first of so many equal ones."""
 
 
 def files_at(folder: Path, name: str) -> list[Path]:
     """Return the file of a name, or those of a pattern, ``*.json`` or ``*/pose.json``, in order."""
     if (folder / name).is_file():
         return [folder / name]
+    name = name.partition(":")[0]
+    if (folder / name).is_file():
+        return [folder / name]
     found = folder.glob(name) if "*" in name and not Path(name).is_absolute() else ()
     return sorted((p for p in found if p.is_file()), key=lambda path: natural(str(path)))
 
 
-def read_table(folder: Path, name: str) -> Table:
-    """Read a table, or the one that the files of a pattern are together: a row or more of each.
+def read_table(folder: Path, name: str | Sequence[str]) -> Table:
+    """Read a table by its name, or tables side by side by several.
 
     Raises:
-        StageError: A file cannot be read, or the columns of two differ.
+        StageError: A file cannot be read, the part is not there, it has several and none is named,
+            the columns of two files differ, or tables side by side are not of one length.
     """
+    if not isinstance(name, str):
+        return _beside([read_table(folder, each) for each in name])
     files = files_at(folder, name)
-    if len(files) < 2:
-        file = files[0] if files else folder / name
-        heading, rows = _rows(file, single="*" in name)
-        return Table(name, file, heading, tuple(rows), (file,))
-    tables = [_rows(file, single=True) for file in files]
-    for file, (heading, _) in zip(files, tables, strict=True):
-        if heading != tables[0][0]:
-            raise StageError(f"{file}: its columns are not those of {files[0].name}")
-    rows = [row for _, found in tables for row in found]
-    return Table(name, folder / name, tables[0][0], tuple(rows), tuple(files))
+    if len(files) > 1 or "*" in name.partition(":")[0]:
+        return _of_files(folder, name, files)
+    file = files[0] if files else folder / name
+    part = name.partition(":")[2] if not (folder / name).is_file() else ""
+    return _table(name, file, _part(file, sources(file), part))
 
 
-def _rows(file: Path, single: bool) -> Rows:
-    text = read_text(file)
-    document = KINDS.get(file.suffix.lower())
+def tables_in(folder: Path, name: str) -> list[Table]:
+    """Return every table of a file, under the name that :func:`read_table` takes for it.
+
+    Raises:
+        StageError: It cannot be read.
+    """
+    file = folder / name
+    found = sources(file)
+    if len(found) == 1:
+        return [_table(name, file, found[0])]
+    parts = [f"{name}:{rows.part.split(',')[0]}" for rows in found]
+    return [_table(n, file, rows) for n, rows in zip(parts, found, strict=True)]
+
+
+def sources(file: Path) -> list[Rows]:
+    """Return the tables of a file: of a document, of a robot program, or of a text's blocks.
+
+    Raises:
+        StageError: It cannot be read.
+    """
+    document = document_of(file)
     if document is not None:
-        return document(file, text, single)
-    heading, rows = position_rows(file, text)
-    return (heading, rows) if rows else text_rows(file, text)
+        return rows_of(file, document)
+    text = read_text(file)
+    program = program_rows(file, text)
+    return [program] if program else text_rows(file, text)
+
+
+def _of_files(folder: Path, name: str, files: Sequence[Path]) -> Table:
+    """Return files with a row each as one table."""
+    tables = [_single(file) for file in files]
+    for file, rows in zip(files, tables, strict=True):
+        if rows.heading != tables[0].heading:
+            raise StageError(f"{file}: its columns are not those of {files[0].name}")
+    joined = [row for rows in tables for row in rows.rows]
+    apart = len({file.parent for file in files}) == len(files)
+    names = [file.parent.name if apart else file.stem for file in files]
+    named = names if len(joined) == len(files) else []
+    rows = Rows(tables[0].heading if tables else (), joined, "", named)
+    return _table(name, folder / name, rows, files)
+
+
+def _single(file: Path) -> Rows:
+    document = document_of(file)
+    if document is not None:
+        return record_of(file, document)
+    text = read_text(file)
+    return program_rows(file, text) or row_of(file, text) or Rows((), [])
+
+
+def _table(name: str, file: Path, rows: Rows, files: Sequence[Path] = ()) -> Table:
+    return Table(
+        name, file, rows.heading, tuple(rows.rows), tuple(files or (file,)), tuple(rows.names),
+        rows.convention,
+    )  # fmt: skip
+
+
+def _part(file: Path, found: Sequence[Rows], part: str) -> Rows:
+    if not found:
+        return Rows((), [])
+    share = _SHARE.fullmatch(part)
+    if share is not None and len(found) == 1:
+        return _share(file, found[0], int(share[1]), int(share[2]))
+    if not part and len(found) == 1:
+        return found[0]
+    for rows in found:
+        if part and part in (rows.part, *rows.part.split(",")):
+            return rows
+    if part and len(found) == 1 and found[0].part == "":
+        raise StageError(f"{file}: has one table only, not '{part}'; write {file.name}")
+    known = ", ".join(f"{file.name}:{rows.part.split(',')[0]}" for rows in found)
+    what = f"has no part '{part}'" if part else f"holds {len(found)} tables"
+    raise StageError(f"{file}: {what}; name one of {known}")
+
+
+def _share(file: Path, rows: Rows, which: int, of: int) -> Rows:
+    count = len(rows.rows)
+    if count % of or which > of:
+        raise StageError(f"{file}: has {count} rows, which are not {of} parts of equal length")
+    size = count // of
+    kept = slice((which - 1) * size, which * size)
+    return rows._replace(rows=rows.rows[kept], names=rows.names[kept])
+
+
+def _beside(tables: Sequence[Table]) -> Table:
+    """Return tables of one length as one; columns without names are called as their file."""
+    counts = {len(table.rows) for table in tables}
+    if len(counts) > 1:
+        told = ", ".join(f"{table.name} {len(table.rows)}" for table in tables)
+        raise StageError(
+            f"{tables[0].file}: tables side by side have different numbers of rows: {told}"
+        )
+    headings = [table.heading or _counted(table) for table in tables]
+    known = Counter(name for heading in headings for name in heading)
+    names = [
+        name if known[name] == 1 else f"{table.files[0].stem}.{name}"
+        for table, heading in zip(tables, headings, strict=True)
+        for name in heading
+    ]
+    rows: list[Row] = [
+        (each[0][0], tuple(cell for _, cells in each for cell in cells))
+        for each in zip(*(table.rows for table in tables), strict=True)
+    ]
+    files = dict.fromkeys(file for table in tables for file in table.files)
+    name = ", ".join(table.name for table in tables)
+    return Table(name, tables[0].file, tuple(names), tuple(rows), tuple(files), tables[0].names)
+
+
+def _counted(table: Table) -> tuple[str, ...]:
+    stem = re.sub(r"\W*\*\W*", "", table.files[0].stem if len(table.files) == 1 else
+                  str(Path(table.name).with_suffix("")).replace("/", "_"))  # fmt: skip
+    return tuple(f"{stem}.{i}" for i in range(len(table.rows[0][1]) if table.rows else 0))

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,22 +16,43 @@ from flangeye.types import Floats
 
 Column = str | int
 """A column by its name in the heading, or by its number from 1."""
-Row = tuple[str, tuple[str, ...]]
+Cell = str | float
+Row = tuple[str, tuple[Cell, ...]]
 """Where a row stands, as messages begin with it, and its cells."""
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of text.
+class Rows(NamedTuple):
+    """What one source gives: a block of a text, a program, the lists of one length in a document.
 
     Attributes:
-        name: Of the file in its folder, or the pattern of files.
-        file: The same with the folder, for messages.
+        heading: Names of the columns; empty without a heading.
+        rows: Of each row, where it stands and its cells.
+        part: What names it within its file: an array's name, a block's title; empty for all of it.
+        names: What each row is called, where rows have names; else empty.
+        convention: Of the poses, where the way of writing shows it: a robot program's.
+    """
+
+    heading: tuple[str, ...]
+    rows: Sequence[Row]
+    part: str = ""
+    names: Sequence[str] = ()
+    convention: str | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of one file, of a part of it, or of several files.
+
+    Attributes:
+        name: As a recipe names it: FILE, FILE:PART, a pattern of files, or files side by side.
+        file: The first of it with the folder, for messages.
         heading: Names of the columns; empty without a heading.
         rows: Of each row, where it stands and its cells.
         files: The files that were read.
+        names: What each row is called, where rows have names; else empty.
+        convention: Of the poses, where the way of writing shows it.
     """
 
     name: str
@@ -38,6 +60,8 @@ class Table:
     heading: tuple[str, ...]
     rows: tuple[Row, ...]
     files: tuple[Path, ...]
+    names: tuple[str, ...] = ()
+    convention: str | None = None
 
     def where(self, row: int) -> str:
         """Return what messages about a row begin with."""
@@ -78,7 +102,7 @@ class Table:
 
     def texts(self, column: int) -> list[str]:
         """Return the cells of a column."""
-        return [cells[column] for _, cells in self.rows]
+        return [str(cells[column]) for _, cells in self.rows]
 
     def _listed(self, column: Column) -> list[int]:
         """Return the columns of a list's entries, in their order."""
@@ -98,8 +122,10 @@ class Table:
         return [number for number in found if number is not None]
 
 
-def number_of(cell: str) -> float | None:
+def number_of(cell: Cell) -> float | None:
     """Return the number in a cell, with a decimal point or comma; None if it is none."""
+    if not isinstance(cell, str):
+        return cell
     text = cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
     try:
         return float(text)

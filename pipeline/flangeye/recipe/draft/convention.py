@@ -1,263 +1,426 @@
-"""From a table to the parameters of ``reader.table``: what its numbers show, and what not."""
+"""From the poses of a folder to the parameters of ``reader.table``."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flangeye.errors import RecipeError
-from flangeye.files.tables import Column, Table, holds_positions, number_of
-from flangeye.maths.pose_formats import CONVENTIONS
-from flangeye.recipe.draft.frames import frames_in, is_inverse, role_in
-from flangeye.recipe.draft.headings import (
-    ROTATIONS,
-    Group,
-    Headings,
-    headings_of,
-    holds_matrix,
-)
+from flangeye.files.tables import Column, Table, read_table
+from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.pose_formats import APART, CONVENTIONS, MATRIX, AngleUnit, LengthUnit
+from flangeye.maths.pose_formats import convention_of_maker as usual_of
+from flangeye.recipe.draft.evidence import Writing, mounting_of, writing_of
+from flangeye.recipe.draft.frames import is_inverse
+from flangeye.recipe.draft.headings import Headings, PoseColumns, poses_by_name
+from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
 from flangeye.recipe.draft.questions import Questions
 from flangeye.types import Floats
 
-FARTHEST = 20.0
-"""No arm reaches so far [m]: larger numbers are millimetres."""
-SHAPES = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
-"""How many numbers a pose has, and what they are if no name says more."""
-_ROWS = (6, 7)
-"""Of these, the numbers that are no matrix."""
-BY_MAKER: Mapping[str, str] = {
-    "Universal Robots": "ur", "Yaskawa": "yaskawa", "Stäubli": "staubli", "Staubli": "staubli",
-    "Doosan Robotics": "doosan", "KUKA": "kuka", "FANUC": "fanuc", "Fanuc": "fanuc", "ABB": "abb",
-}  # fmt: skip
-QUATERNIONS = ("xyzw", "wxyz", "abb", "quaternion_xyzw", "quaternion_wxyz")
+COMMON = ("vector", "ZYX", "xyz", "XYZ", "ZYZ")
+"""What three numbers of a rotation mean on the arms that are sold."""
+WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
 
-@dataclass(frozen=True)
-class Stated:
-    """How one thing in a table is written.
-
-    Attributes:
-        columns: Where, position first.
-        length: Unit that the heading states.
-        angle: The same for angles.
-        rotation: What the names of the columns say; None where they say nothing.
-        many: Numbers each has.
-        frames: Frames A and B of A_T_B, as a name says; None where none does.
-    """
-
-    columns: Sequence[Column]
-    length: str | None
-    angle: str | None
-    rotation: str | None
-    many: int
-    frames: tuple[str, str] | None = None
+def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
+    """Return the poses and points in a table, and what else it holds."""
+    return poses_by_name(table) if table.heading else poses_by_number(table)
 
 
 def table_params(
     tables: Sequence[Table], questions: Questions, maker: str | None, scans: bool
 ) -> dict[str, Any]:
-    """Return the parameters with which ``reader.table`` reads a table, and one joined to it.
+    """Return the parameters with which ``reader.table`` reads the poses of a folder.
 
     Args:
         tables: Those of the folder.
-        questions: For what they do not show.
+        questions: For what they do not show; what the data show is noted there as likely.
         maker: Who makes the arm, if that is known.
         scans: Whether there are scans beside them.
 
     Raises:
         RecipeError: There are no columns of a pose; names the option that says where.
     """
-    arm, other = _sorted(tables, questions)
-    heads = headings_of(arm)
-    stated = _arm(arm, heads, questions)
-    params: dict[str, Any] = {"file": arm.name} | _written(arm, stated, questions, "", maker)
-    params["pose"] = _direction(stated, questions, "", ("base_T_flange", "flange_T_base"))
-    params |= _of_row(heads)
-    target = None if scans else _target(arm, heads, other, questions, maker)
+    found = [pose for table in tables for pose in poses_of(table)[0]]
+    arm = _arm(tables, found, questions)
+    if not arm.is_pose:
+        return _of_joints(arm, tables, found, questions, scans)
+    target = None if scans else _target(tables, found, arm, questions)
     if target is None and not scans:
-        raise RecipeError(
-            f"{arm.file}: has poses of the arm, but there are no scans beside it, and no columns "
-            "of what the camera saw; add --target-columns NAMES, or put the scans there"
-        )
-    return params | ({"target": target} if target else {})
+        arm, target = _halves(arm)
+    _look(arm, target, questions, maker)
+    params = _file(arm.table) | _written(arm, questions, "", maker)
+    return params | _rest(arm.table) | _target_params(arm, target, questions)
 
 
-def _sorted(tables: Sequence[Table], questions: Questions) -> tuple[Table, Table | None]:
-    """Return the arm's table, and another that may hold what the camera saw."""
-    by_name = {table.name: table for table in tables}
-    likely = sorted(tables, key=_unlike_arm)
-    sure = len(tables) == 1 or _unlike_arm(likely[0]) != _unlike_arm(likely[1])
-    known = ", ".join(by_name)
-    answer = questions.given.get("table") or (
-        likely[0].name
-        if sure
-        else questions.ask("table", f"which table is the arm's ({known})", None, likely[0].name)
+def _of_joints(
+    arm: PoseColumns,
+    tables: Sequence[Table],
+    found: Sequence[PoseColumns],
+    questions: Questions,
+    scans: bool,
+) -> dict[str, Any]:
+    """Return the parameters of joint angles, which the arm's kinematics turn into poses."""
+    params = _file(arm.table) | {"rotation": "joints"} | _rest(arm.table)
+    if "joints" not in params:
+        params |= {"joints": list(arm.columns), "joint_unit": _angle(_numbers(arm), arm)}
+    target = None if scans else _target(tables, found, arm, questions)
+    if target is None and not scans:
+        raise RecipeError(_alone(arm))
+    return params | _target_params(arm, target, questions)
+
+
+def _file(table: Table) -> dict[str, Any]:
+    parts = table.name.split(", ")
+    return {"file": parts if len(parts) > 1 else table.name}
+
+
+def _alone(arm: PoseColumns) -> str:
+    return (
+        f"{arm.table.file}: has poses of the arm, but there are no scans beside it, and no columns "
+        "of what the camera saw; add --target-columns NAMES, or put the scans there"
     )
-    if answer not in by_name:
-        raise RecipeError(f"--table {answer}: is no table of poses; known: {known}")
-    others = [table for table in likely if table.name != answer]
-    return by_name[answer], others[0] if others else None
 
 
-def _unlike_arm(table: Table) -> tuple[bool, int]:
-    """Return a key that sorts tables: first what is a robot's by its form, or by its name."""
-    roles = {"arm": 0, None: 1, "target": 2}
-    role = "arm" if holds_positions(table) else role_in(table.name.lower())
-    return not _is_pose(table), roles[role]
+# --- whose poses they are
 
 
-def _is_pose(table: Table) -> bool:
-    return headings_of(table).arm is not None or _unnamed(table) is not None
-
-
-def _of_row(heads: Headings) -> dict[str, Any]:
-    params: dict[str, Any] = {} if heads.scan is None else {"scan": heads.scan}
-    if heads.time is not None:
-        params |= {"time": heads.time} | ({"time_unit": heads.time_unit} if heads.time_unit else {})
-    return params
-
-
-def _arm(table: Table, heads: Headings, questions: Questions) -> Stated:
-    given = questions.given.get("columns")
+def _arm(
+    tables: Sequence[Table], found: Sequence[PoseColumns], questions: Questions
+) -> PoseColumns:
+    """Return which columns are the arm's."""
+    asked = questions.given.get("table")
+    given = questions.given.get("columns") or questions.given.get("joints")
     if given is not None:
-        return _named(table, given, heads.arm)
-    if heads.arm is not None:
-        return _of_group(heads.arm)
-    unnamed = _unnamed(table)
-    if unnamed is not None:
-        return unnamed
-    called = [table.heading[i] for i in _numeric(table)] if table.heading else []
-    shown = ", ".join(called) or f"{len(_numeric(table))} numbers a row"
-    raise RecipeError(
+        table = _table_of(tables, found, questions)
+        own = [pose for pose in found if pose.table is table]
+        joints = questions.given.get("columns") is None
+        return _named(table, given, own, ("joints",) if joints else ())
+    poses = [pose for pose in found if pose.is_pose] or _joints(tables)
+    if asked is not None:
+        for pose in poses:
+            if asked in (pose.name, pose.table.name):
+                return pose
+        known = ", ".join([pose.name for pose in poses] or [table.name for table in tables])
+        raise RecipeError(f"--table {asked}: is no table of poses; known: {known}")
+    if not poses:
+        raise RecipeError(_unplain(tables[0]))
+    return _likeliest(poses, questions)
+
+
+def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumns:
+    """Return the poses that are the arm's by their name; of several, of which one says so."""
+    named = [p for p in poses if p.role == "arm"]
+    nobody = [p for p in poses if p.role is None]
+    likely = named or nobody
+    if not likely:
+        likely = list(poses)
+    upright = [p for p in likely if not (p.frames and is_inverse(p.frames))] or likely
+    first = upright[0]
+    if len(likely) > 1 and named:
+        rest = ", ".join(p.name for p in likely if p is not first)
+        questions.assumed.append(
+            f"the arm's poses: {first.name}, not {rest} (--table says otherwise)"
+        )
+    elif len(likely) > 1 and _in_order(likely):
+        questions.assumed.append(
+            f"the arm's poses: {_place(first)}, which stand before {_place(likely[1])} "
+            "(--table or --columns says otherwise)"
+        )
+    elif len(likely) > 1:
+        known = ", ".join(p.name for p in likely)
+        question = f"which poses are the arm's ({known})"
+        answer = questions.ask("table", question, None, likely[0].name)
+        matching = [p for p in likely if answer in (p.name, p.table.name)]
+        if not matching:
+            raise RecipeError(f"--table {answer}: is no table of poses; known: {known}")
+        first = matching[0]
+    if first.guess:
+        questions.assumed.append(f"{first.table.name}: {first.guess} (--columns says otherwise)")
+    return first
+
+
+def _in_order(likely: Sequence[PoseColumns]) -> bool:
+    """Return whether poses stand in one text beside or above each other, without any name."""
+    unnamed = all(not p.called for p in likely)
+    return unnamed and len({p.table.files for p in likely}) == 1 and not likely[0].table.heading
+
+
+def _place(pose: PoseColumns) -> str:
+    if ":" in pose.table.name or not isinstance(pose.columns[0], int):
+        return pose.table.name
+    numbers = [column for column in pose.columns if isinstance(column, int)]
+    return f"columns {min(numbers)} to {max(numbers)} of {pose.table.name}"
+
+
+def _joints(tables: Sequence[Table]) -> list[PoseColumns]:
+    """Return the joint angles that columns are named after."""
+    rest = [(table, poses_of(table)[1]) for table in tables]
+    return [PoseColumns(t, r.joints, ("joints",), angle=r.joint_unit) for t, r in rest if r.joints]
+
+
+def _table_of(tables: Sequence[Table], found: Sequence[PoseColumns], questions: Questions) -> Table:
+    asked = questions.given.get("table")
+    for table in tables:
+        if asked == table.name:
+            return table
+    if asked is not None:
+        known = ", ".join(table.name for table in tables)
+        raise RecipeError(f"--table {asked}: is no table of poses; known: {known}")
+    arms = [p.table for p in found if p.role == "arm"] or [p.table for p in found if p.role is None]
+    return (arms or list(tables))[0]
+
+
+def _unplain(table: Table) -> str:
+    shown = ", ".join(dict.fromkeys(table.heading)) or f"{len(table.rows[0][1])} numbers a row"
+    return (
         f"{table.file}: which columns are the arm's pose is not plain from {shown}; add --columns "
-        "with their names, or numbers from 1, position first: --columns x,y,z,a,b,c --rotation kuka"
+        "with their names, or numbers from 1, position first: --columns x,y,z,a,b,c --rotation "
+        "kuka; or --joints with those of the joint angles"
     )
 
 
-def _numeric(table: Table) -> list[int]:
-    return [i for i, cell in enumerate(table.rows[0][1]) if number_of(cell) is not None]
-
-
-def _unnamed(table: Table) -> Stated | None:
-    """Return the pose that all of a table's numbers are, where no names say otherwise."""
-    columns = _numeric(table)
-    called = [table.heading[i] for i in columns] if table.heading else []
-    many = len(columns)
-    if many not in SHAPES or (called and not (holds_matrix(called) and many > max(_ROWS))):
-        return None
-    return Stated([i + 1 for i in columns], None, None, SHAPES[many], many)
-
-
-def _named(table: Table, given: str, group: Group | None) -> Stated:
-    columns = columns_of(table, given)
-    many = len(table.indices(columns))
-    length, angle = (group.length, group.angle) if group else (None, None)
-    return Stated(columns, length, angle, SHAPES.get(many), many)
-
-
-def columns_of(table: Table, given: str) -> list[Column]:
-    """Return the columns that an option names.
-
-    Raises:
-        StageError: There is none of a name; names the nearest.
-    """
+def _named(
+    table: Table, given: str, known: Sequence[PoseColumns], rotations: tuple[str, ...] = ()
+) -> PoseColumns:
+    """Return the columns that an option names, with the units that the heading states."""
     columns: list[Column] = [
         int(word) if word.isdigit() else word for word in map(str.strip, given.split(","))
     ]
-    table.indices(columns)
-    return columns
-
-
-def _of_group(group: Group) -> Stated:
-    if group.whole is not None:
-        frames = frames_in(group.whole)
-        return Stated([group.whole], None, None, SHAPES[group.many], group.many, frames)
-    rotation = None if group.rotation is None else ROTATIONS[group.rotation]
-    if group.rotation is None:
-        rotation = "point"
-    columns = group.in_order()
-    return Stated(columns, group.length, group.angle, rotation, len(columns))
+    many = len(table.indices(columns))
+    usual = {3: ("point",), 12: (MATRIX,), 16: (MATRIX,), 7: ("xyzw", "wxyz")}.get(many, ())
+    same = next((p for p in known if set(p.columns) == set(columns)), None)
+    length, angle = (same.length, same.angle) if same else (None, None)
+    kept = same.rotations if same and not rotations else ()
+    return PoseColumns(table, tuple(columns), rotations or kept or usual, "", length, angle)
 
 
 def _target(
-    table: Table,
-    heads: Headings,
-    other: Table | None,
+    tables: Sequence[Table],
+    found: Sequence[PoseColumns],
+    arm: PoseColumns,
     questions: Questions,
-    maker: str | None,
-) -> dict[str, Any] | None:
-    """Return the parameters of what the camera saw, in the same table or one of its own."""
-    own = heads.target is None and other is not None
-    table = other if own and other is not None else table
-    heads = headings_of(table) if own else heads
-    group = heads.target or (heads.arm if own else None)
+) -> PoseColumns | None:
+    """Return what the camera saw, by its name, or whatever else there is as much of."""
     given = questions.given.get("target-columns")
-    stated = (
-        _named(table, given, group) if given
-        else _of_group(group) if group
-        else _unnamed(table) if own
-        else None
+    if given is not None:
+        named = [p.table for p in found if p.table is not arm.table and p.role == "target"]
+        table = _holding(given, [arm.table, *named, *tables])
+        return _named(table, given, [p for p in found if p.table is table])
+    timed = poses_of(arm.table)[1].time is not None
+    others = [
+        p for p in found
+        if p != arm and p.role != "arm"
+        and (len(p.table.rows) == len(arm.table.rows)
+             or (timed and poses_of(p.table)[1].time is not None))
+    ]  # fmt: skip
+    if not others and arm.role is None:
+        others = [p for p in found if p != arm and p.columns != arm.columns]
+    seen = [p for p in others if p.role == "target"] or others
+    whole = [p for p in seen if p.is_pose] or seen
+    if len(whole) > 1:
+        rest = ", ".join(p.name for p in whole[1:])
+        questions.assumed.append(f"what the camera saw: {whole[0].name}, not {rest}")
+    return whole[0] if whole else None
+
+
+def _holding(given: str, tables: Sequence[Table]) -> Table:
+    """Return the first table with the columns that an option names."""
+    first = given.split(",")[0].strip()
+    fitting = [t for t in tables if first.isdigit() or first in t.heading
+               or any(name.startswith(f"{first}.") for name in t.heading)]  # fmt: skip
+    return (fitting or list(tables))[0]
+
+
+def _halves(arm: PoseColumns) -> tuple[PoseColumns, PoseColumns]:
+    """Return the first and the second half of a table's rows, where both can be poses.
+
+    Raises:
+        RecipeError: They cannot.
+    """
+    table = arm.table
+    if len(table.files) > 1 or ":" in table.name or len(table.rows) % 2 or table.heading:
+        raise RecipeError(_alone(arm))
+    folder = table.files[0].parent
+    for _ in range(len(table.name.split("/")) - 1):
+        folder = folder.parent
+    first, second = (read_table(folder, f"{table.name}:{k}/2") for k in (1, 2))
+    count = len(first.rows)
+    told = f"rows 1 to {count} are the arm's, {count + 1} to {2 * count} the target's"
+    return replace(arm, table=first, guess=told), replace(arm, table=second, guess=told)
+
+
+# --- how they are written
+
+
+def _numbers(pose: PoseColumns) -> Floats:
+    return pose.table.numbers(pose.table.indices(pose.columns))
+
+
+def _look(
+    arm: PoseColumns, target: PoseColumns | None, questions: Questions, maker: str | None
+) -> None:
+    """Note what the poses of arm and target show together as likely answers.
+
+    Raises:
+        RecipeError: Halves of a table are not arm and target.
+    """
+    if target is None or not target.is_pose or len(arm.table.rows) != len(target.table.rows):
+        return
+    numbers, seen = _numbers(arm), _numbers(target)
+    kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
+    numbers, seen = numbers[kept], seen[kept]
+    choice = writing_of(
+        numbers, _writings(arm, numbers, questions, "", maker),
+        seen, _writings(target, seen, questions, "target-", None),
     )  # fmt: skip
-    if stated is None:
-        return None
-    if stated.many == 3:
-        stated = replace(stated, rotation="point")
-    params = _written(table, stated, questions, "target-", None)
-    if stated.frames is not None or questions.given.get("target-pose") is not None:
-        ways = ("camera_T_target", "target_T_camera")
-        params["pose"] = _direction(stated, questions, "target-", ways)
-    if own:
-        params = {"file": table.name} | params | _of_row(replace(heads, scan=None))
-    return params
+    if choice is None:
+        if ":1/2" in arm.table.name:
+            raise RecipeError(_alone(arm))
+        return
+    for prefix, writing in (("", choice.arm), ("target-", choice.target)):
+        questions.likely[f"{prefix}rotation"] = (writing.rotation, choice.told)
+        questions.likely[f"{prefix}angle"] = (writing.angle, choice.told)
+    poses, marks = choice.arm.poses(numbers), choice.target.poses(seen)
+    if poses is None or marks is None:
+        return
+    asked = questions.given
+    way = asked.get("pose") or WAYS[""][bool(arm.frames and is_inverse(arm.frames))]
+    camera, upright = asked.get("camera"), asked.get("target-pose")
+    mounting = mounting_of(
+        poses if way == "base_T_flange" else inverted(poses), marks,
+        [camera] if camera else ["base", "flange"], [upright] if upright else WAYS["target-"],
+    )  # fmt: skip
+    if mounting is not None:
+        questions.likely["camera"] = (mounting.camera, mounting.told)
+        questions.likely["target-pose"] = (mounting.target, mounting.told)
 
 
-def _direction(stated: Stated, questions: Questions, prefix: str, ways: tuple[str, str]) -> str:
-    """Return which way round poses are: as asked, or as a name says."""
-    if stated.frames is not None and questions.given.get(f"{prefix}pose") is None:
-        return ways[is_inverse(stated.frames)]
-    return questions.ask(f"{prefix}pose", "whose pose the table gives", ways[0])
+def _writings(
+    pose: PoseColumns, numbers: Floats, questions: Questions, prefix: str, maker: str | None
+) -> list[Writing]:
+    """Return what a pose's numbers may mean, the likelier first."""
+    given = questions.given.get(f"{prefix}rotation")
+    usual = usual_of(maker)
+    named = [given] if given else list(pose.rotations or COMMON)
+    if not given and usual and (not pose.rotations or usual in pose.rotations):
+        named = [usual, *named]
+    length = questions.given.get(f"{prefix}length") or _length(numbers, pose)
+    asked = questions.given.get(f"{prefix}angle")
+    found: dict[tuple[str, str], Writing] = {}
+    for name in named:
+        angles = [asked or _angle(numbers, pose)]
+        if not asked and not pose.angle and angles == ["rad"] and _has_angles(name):
+            angles.append("deg")
+        plain = CONVENTIONS[name].rotation if name in CONVENTIONS else name
+        for angle in angles if _has_angles(name) else ["rad"]:
+            found.setdefault((plain, angle), Writing(name, _unit(length), _turn_unit(angle)))
+    return list(found.values())
+
+
+def _unit(word: str) -> LengthUnit:
+    return "mm" if word == "mm" else "m"
+
+
+def _turn_unit(word: str) -> AngleUnit:
+    return "deg" if word == "deg" else "rad"
+
+
+def _has_angles(rotation: str) -> bool:
+    plain = CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
+    return plain not in (MATRIX, APART, "point", "joints", "xyzw", "wxyz")
 
 
 def _written(
-    table: Table, stated: Stated, questions: Questions, prefix: str, maker: str | None
+    pose: PoseColumns, questions: Questions, prefix: str, maker: str | None
 ) -> dict[str, Any]:
-    """Return how a pose or a point is written: rotation, units, columns."""
-    numbers = table.numbers(table.indices(stated.columns))
-    rotation = stated.rotation or _asked_rotation(stated, questions, prefix, maker)
-    rotation = questions.given.get(f"{prefix}rotation") or rotation
-    params: dict[str, Any] = {"rotation": rotation, "length": _length(numbers, stated, rotation)}
-    params["length"] = questions.given.get(f"{prefix}length") or params["length"]
-    if rotation not in (*QUATERNIONS, "matrix", "point"):
-        params["angle"] = questions.given.get(f"{prefix}angle") or _angle(numbers, stated)
-    return params | {"columns": list(stated.columns)}
+    """Return how a pose or a point is written: rotation, units, columns, and which way round."""
+    numbers = _numbers(pose)
+    rotation = questions.given.get(f"{prefix}rotation") or _rotation(pose, questions, prefix, maker)
+    length = questions.given.get(f"{prefix}length") or _length(numbers, pose)
+    params: dict[str, Any] = {"rotation": rotation, "length": length}
+    if _has_angles(rotation):
+        likely, _ = questions.likely.get(f"{prefix}angle", (_angle(numbers, pose), ""))
+        params["angle"] = questions.given.get(f"{prefix}angle") or likely
+    params["columns"] = list(pose.columns)
+    if rotation != "point":
+        params["pose"] = _direction(pose, questions, prefix)
+    return params
 
 
-def _asked_rotation(stated: Stated, questions: Questions, prefix: str, maker: str | None) -> str:
-    usual = BY_MAKER.get(maker or "")
-    if usual is not None and 3 + (4 if usual == "abb" else 3) != stated.many:
+def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str | None) -> str:
+    key = f"{prefix}rotation"
+    usual = usual_of(maker)
+    plain = {CONVENTIONS[n].rotation if n in CONVENTIONS else n for n in pose.rotations}
+    if len(plain) == 1:
+        return pose.rotations[0]
+    if usual and CONVENTIONS[usual].count - 3 != len(pose.table.indices(pose.columns)) - 3:
         usual = None
-    shown = ", ".join(map(str, stated.columns[3:] or stated.columns))
-    return questions.ask(
-        f"{prefix}rotation",
-        f"how the rotation in columns {shown} is written "
-        f"({', '.join(CONVENTIONS)}, vector, xyz, ZYX, …)",
-        usual,
-        "vector",
-    )
+    if pose.rotations and usual not in pose.rotations:
+        usual = pose.rotations[0] if pose.rotations[0] in _FIRST else None
+    shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
+    known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …"
+    question = f"how the rotation in columns {shown} is written ({known})"
+    return questions.ask(key, question, usual, "vector")
 
 
-def _length(numbers: Floats, stated: Stated, rotation: str) -> str:
-    if stated.length is not None:
-        return stated.length
-    places = numbers[:, [3, 7, 11]] if rotation == "matrix" else numbers[:, :3]
+_FIRST = ("kuka", "quaternion_xyzw", "xyzw")
+"""Of conventions with equal names, what most files hold: A, B, C; quaternions without names."""
+
+
+def _length(numbers: Floats, pose: PoseColumns) -> str:
+    if pose.length is not None:
+        return pose.length
+    matrix = MATRIX in pose.rotations
+    places = numbers[:, [3, 7, 11]] if matrix else numbers[:, :3]
     return "mm" if np.nanmax(np.abs(places)) > FARTHEST else "m"
 
 
-def _angle(numbers: Floats, stated: Stated) -> str:
-    if stated.angle is not None:
-        return stated.angle
-    return "deg" if np.nanmax(np.abs(numbers[:, 3:6])) > 2 * math.pi + 0.01 else "rad"
+def _angle(numbers: Floats, pose: PoseColumns) -> str:
+    if pose.angle is not None:
+        return pose.angle
+    turns = numbers if pose.rotations == ("joints",) else numbers[:, 3:6]
+    return "deg" if np.nanmax(np.abs(turns), initial=0) > TURN else "rad"
+
+
+def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
+    """Return which way round poses are: as asked, as the data show, or as a name says."""
+    ways = WAYS[prefix]
+    named = ways[is_inverse(pose.frames)] if pose.frames else None
+    likely = questions.likely.get(f"{prefix}pose")
+    if questions.given.get(f"{prefix}pose") is None and named is not None:
+        if likely is None or likely[0] == named:
+            return named
+        name = pose.called or pose.table.name
+        questions.likely[f"{prefix}pose"] = (likely[0], f"{likely[1]}; {name} says {named}")
+    whose = "the arm's" if not prefix else "the target's"
+    return questions.ask(f"{prefix}pose", f"which way round {whose} poses are", named or ways[0])
+
+
+def _target_params(
+    arm: PoseColumns, target: PoseColumns | None, questions: Questions
+) -> dict[str, Any]:
+    if target is None:
+        return {}
+    params = _written(target, questions, "target-", None)
+    if target.table is not arm.table:
+        rest = {k: v for k, v in _rest(target.table).items() if k in ("time", "time_unit")}
+        params = _file(target.table) | params | rest
+    return {"target": params}
+
+
+def _rest(table: Table) -> dict[str, Any]:
+    """Return the columns of a table that are no poses."""
+    rest = poses_of(table)[1]
+    params: dict[str, Any] = {} if rest.scan is None else {"scan": rest.scan}
+    if rest.time is not None:
+        params |= {"time": rest.time} | ({"time_unit": rest.time_unit} if rest.time_unit else {})
+    if rest.joints:
+        angles = table.numbers(table.indices(rest.joints))
+        degrees = np.nanmax(np.abs(angles)) > TURN
+        unit = rest.joint_unit or ("deg" if degrees else "rad")
+        params |= {"joints": list(rest.joints), "joint_unit": unit}
+    return params

@@ -9,14 +9,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-SEEN = re.compile(r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track")
+SEEN = re.compile(
+    r"target|marker|cam|board|tag|cent(er|re)|seen|sphere|object|optical|track|detect"
+)
 """In the name of what a camera measured."""
 _ARM = re.compile(r"robot|arm|gripper|flange|hand|tool|tcp|effector|(?<![a-z])ee(?![a-z])")
 _FRAMES: Mapping[str, str] = {
     name: frame
     for frame, names in {
         "base": "b base robotbase",
-        "flange": "f g e h flange gripper hand ee eef effector endeffector tool tcp",
+        "flange": "f g e h flange gripper hand ee eef effector endeffector end tool tcp robot",
         "camera": "c cam camera sensor scanner",
         "target": "o t m target object obj board marker tag pattern checkerboard chessboard",
         "world": "w world",

@@ -1,137 +1,203 @@
-"""What the columns of a table are called, and what they therefore hold."""
+"""What the columns of a table are called, and the poses, points and joint angles they hold."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass, field, replace
 
 from flangeye.files.tables import Column, Table, number_of
-from flangeye.recipe.draft.frames import SEEN, role_in
+from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.recipe.draft.frames import frames_in, role_in
 
 POSITION = ("x", "y", "z")
-ROTATIONS: Mapping[tuple[str, ...], str | None] = {
-    ("qx", "qy", "qz", "qw"): "xyzw",
-    ("q1", "q2", "q3", "q4"): "abb",
-    ("roll", "pitch", "yaw"): "xyz",
-    ("w", "p", "r"): "fanuc",
-    ("a", "b", "c"): "kuka",
-    ("o", "a", "t"): "kawasaki",
-    ("rx", "ry", "rz", "rw"): "xyzw",
-    ("vx", "vy", "vz"): "vector",
-    ("rx", "ry", "rz"): None,
-}
-"""Names of a rotation's columns in the order of its convention; None where several have them."""
-
+LISTED = ("qx", "qy", "qz", "qw")
 _LENGTHS, _ANGLES, _TIMES = ("m", "mm"), ("rad", "deg"), ("s", "ms", "us", "ns")
-_PLACES = ("position", "pos", "translation", "trans", "tvec", "t", "p")
+_PLACES = (
+    "position",
+    "pos",
+    "translation",
+    "translations",
+    "trans",
+    "tvec",
+    "tvecs",
+    "t",
+    "p",
+    "xyz",
+)
 _TURNS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
-    "rotation": "r", "rot": "r", "r": "r", "rvec": "v", "rotvec": "v",
+    "rotation": "r", "rotations": "r", "rot": "r", "r": "r", "euler": "r", "angles": "r",
+    "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
-_OPENCV = ("rvec", "tvec")
+_VECTORS = {
+    ("rotation", "vec"): "rotvec", ("rotation", "vector"): "rotvec", ("rot", "vec"): "rotvec",
+    ("translation", "vec"): "tvec", ("translation", "vector"): "tvec", ("trans", "vec"): "tvec",
+    ("rpy", "angles"): "rpy",
+}  # fmt: skip
+_OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
 """What OpenCV calls the pose of what a camera sees."""
 _SCANS = ("cloud", "scan", "file", "filename", "image", "img", "name", "path")
 _CLOCKS = ("time", "timestamp", "stamp", "secs", "sec", "t")
-_TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-_ROUNDED = 1e-3
-"""By how much the length of a written quaternion may differ from 1."""
-_POSES = (6, 7, 12, 16)
-"""Numbers of a list that is a whole pose."""
-_ENTRY = re.compile(r"(.+?)(?:\.\d+)+")
-_MATRIX = re.compile(r"[a-z_]*\d[_ ]?\d|[a-z]*\d{1,2}")
+_POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
+"""Numbers of a list that is a whole pose, and what they are if no name says more."""
+_JOINT = re.compile(
+    r"(?:j|joint|q|a|axis|theta)_?([1-9])(?:_?(?:rad|deg|pos|position))?|(joints?)\.(\d)"
+)
+_ENTRY = re.compile(r"(.+?)((?:\.\d+)+)")
+
+
+def _rotations() -> dict[tuple[str, ...], tuple[str, ...]]:
+    """Return the conventions of each set of names that makers give the columns of a rotation."""
+    found: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for name, convention in CONVENTIONS.items():
+        labels = tuple(label.lower() for label in convention.labels[3:])
+        same = next((known for known in found if set(known) == set(labels)), labels)
+        if same == labels:
+            found[labels] = (*found.get(labels, ()), name)
+    return found | {
+        ("rx", "ry", "rz", "rw"): ("quaternion_xyzw",), ("vx", "vy", "vz"): ("vector",),
+        ("ex", "ey", "ez"): ("xyz",), ("alpha", "beta", "gamma"): ("ZYX", "xyz", "XYZ", "ZYZ"),
+    }  # fmt: skip
+
+
+ROTATIONS = _rotations()
+"""Names of a rotation's columns in the order of its conventions, and those conventions."""
+
+
+@dataclass(frozen=True)
+class PoseColumns:
+    """Columns that hold a pose, a point or joint angles, as far as names and numbers show.
+
+    Attributes:
+        table: Where.
+        columns: Names or numbers from 1; position first, then the rotation.
+        rotations: What the rotation may be written as; one where it is known, ``point`` for none,
+            ``joints`` for joint angles.
+        called: What names it: the columns' common name; empty where they have none.
+        length: Unit of the position that a name states.
+        angle: The same for angles.
+        guess: What was concluded from the numbers alone, for people; empty if names say it.
+    """
+
+    table: Table
+    columns: tuple[Column, ...]
+    rotations: tuple[str, ...]
+    called: str = ""
+    length: str | None = None
+    angle: str | None = None
+    guess: str = ""
+
+    @property
+    def name(self) -> str:
+        """How people call it: the file, and behind a colon the columns' name."""
+        return ":".join(filter(None, (self.table.name, self.called)))
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a whole pose."""
+        return self.rotations not in (("point",), ("joints",))
+
+    @property
+    def role(self) -> str | None:
+        """``arm`` or ``target``: by the columns, the program or the file; None where none says."""
+        if self.table.convention is not None:
+            return "arm"
+        opencv = "target" if self.called.lower() in _OPENCV else None
+        of_columns = role_in(self.called)
+        names = [self.table.name.rpartition(":")[2], *re.split(r"[/:]", self.table.name)[::-1]]
+        of_file = next((role for name in names if (role := role_in(name))), None)
+        return of_columns or of_file or opencv
+
+    @property
+    def frames(self) -> tuple[str, str] | None:
+        """Frames A and B of A_T_B, as a name says."""
+        names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
+        return next((found for name in names if (found := frames_in(name))), None)
 
 
 @dataclass
 class Group:
-    """Columns that belong together.
-
-    Attributes:
-        columns: Name in the heading by what it is: x, y, z, qx, …
-        whole: Name of a list that is a whole pose.
-        many: Numbers in that list.
-        length: Unit that a name states, if any does.
-        angle: The same for angles.
-    """
+    """Columns with one name before their axes."""
 
     columns: dict[str, Column] = field(default_factory=dict)
-    whole: str | None = None
+    words: str = ""
+    rotation: Column | None = None
+    whole: Column | None = None
     many: int = 0
     length: str | None = None
     angle: str | None = None
-
-    @property
-    def rotation(self) -> tuple[str, ...] | None:
-        """Names of the rotation's columns, in order; None where there is none."""
-        return next((names for names in ROTATIONS if set(names) <= set(self.columns)), None)
-
-    @property
-    def has_position(self) -> bool:
-        """Whether it holds a point or a pose."""
-        return self.whole is not None or set(POSITION) <= set(self.columns)
-
-    @property
-    def is_pose(self) -> bool:
-        """Whether it holds a rotation too."""
-        return self.whole is not None or self.rotation is not None
-
-    def in_order(self) -> list[Column]:
-        """Return the columns of the pose, or of the point, position first."""
-        if self.whole is not None:
-            return [self.whole]
-        return [self.columns[name] for name in (*POSITION, *(self.rotation or ()))]
+    ordered: bool = True
 
 
-@dataclass
+@dataclass(frozen=True)
 class Headings:
-    """What a table's heading says.
+    """What a table holds beside poses.
 
     Attributes:
-        arm: The arm's pose; None where no columns are.
-        target: What the camera saw; None where no columns are.
         scan: Column of the scans' names.
         time: Column of the time.
         time_unit: Its unit.
+        joints: Columns of joint angles.
+        joint_unit: Their unit, as a name says.
     """
 
-    arm: Group | None = None
-    target: Group | None = None
     scan: Column | None = None
     time: Column | None = None
     time_unit: str | None = None
+    joints: tuple[Column, ...] = ()
+    joint_unit: str | None = None
 
 
-def headings_of(table: Table) -> Headings:
-    """Return what a table's columns hold, as far as their names tell."""
-    if not table.heading:
-        return _of_trajectory(table)
-    found = Headings()
+def poses_by_name(table: Table) -> tuple[list[PoseColumns], Headings]:
+    """Return the poses and points in a table with a heading, and what else its names say."""
+    groups, rest = _grouped(table)
+    found = [_pose(table, group) for group in groups.values()]
+    return [pose for pose in found if pose is not None], rest
+
+
+def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
+    rest = Headings()
     groups: dict[str, Group] = {}
     sizes = list_sizes(table.heading)
+    seen: Counter[str] = Counter()
     for index, name in enumerate(table.heading):
-        words = _words(name, sizes)
-        cell = table.rows[0][1][index]
-        if number_of(cell) is None:
-            if (words and words[-1] in _SCANS) or (table.file.parent / cell).is_file():
-                found.scan = name
-        elif list_name(name) in sizes and sizes[list_name(name)] in _POSES:
-            listed = list_name(name)
-            groups["_".join(words)] = Group(whole=listed, many=sizes[listed])
-        elif words and not _is_time(found, name, words):
-            _group(groups, name, words)
-    whole = {prefix: g for prefix, g in groups.items() if g.has_position}
-    seen = [prefix for prefix in whole if SEEN.search(prefix)]
-    arms = [prefix for prefix in whole if prefix not in seen and whole[prefix].is_pose]
-    named = [prefix for prefix in arms if not prefix or role_in(prefix) == "arm"]
-    arms = named or arms
-    others = seen or [prefix for prefix in whole if prefix not in arms[:1]]
-    found.arm = whole[arms[0]] if named or len(arms) == 1 else None
-    found.target = whole[others[0]] if others else None
-    return found
+        listed, size = list_name(name), sizes[list_name(name)] if list_name(name) else 0
+        nth = seen[listed]
+        seen[listed] += bool(listed)
+        joint = _JOINT.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
+        joint = joint or _JOINT.fullmatch(name.lower())
+        words = _words(f"{listed}.{'xyzw'[nth]}" if size in (3, 4) else listed if size else name)
+        if number_of(table.rows[0][1][index]) is None:
+            if (words and words[-1].lower() in _SCANS) or _is_file(table, index):
+                rest = replace(rest, scan=name)
+        elif joint and not _is_quaternion(table, name):
+            unit = next((u for u in _ANGLES if u == words[-1].lower()), None)
+            rest = replace(rest, joints=(*rest.joints, name), joint_unit=unit)
+        elif size in (*_POSES, 9):
+            if nth == 0:
+                _put_list(groups, words, listed, size)
+        elif words and not size > 4:
+            time, unit = _time(words)
+            if time and rest.time is None:
+                rest = replace(rest, time=name, time_unit=unit)
+            else:
+                _put(groups, name, words, listed=size == 4)
+    return groups, rest if len(rest.joints) > 3 else replace(rest, joints=())
+
+
+def _is_file(table: Table, index: int) -> bool:
+    cell = str(table.rows[0][1][index])
+    folder = table.files[0].parent
+    return bool(cell) and len(cell) < 200 and (folder / cell).is_file()
+
+
+def _is_quaternion(table: Table, name: str) -> bool:
+    """Return whether q1 is ABB's: four of them, beside a position."""
+    called = {each.lower() for each in table.heading}
+    return name.lower() in ("q1", "q2", "q3", "q4") and "q5" not in called and "q4" in called
 
 
 def list_sizes(names: Sequence[str]) -> Counter[str]:
@@ -145,59 +211,80 @@ def list_name(name: str) -> str:
     return match[1] if match else ""
 
 
-def _words(name: str, sizes: Mapping[str, int]) -> list[str]:
-    """Return the words of a column's name; entries of short lists are called x, y, z and w."""
-    listed = list_name(name)
-    size = sizes[listed] if listed else 0
-    if size in (3, 4):
-        name = f"{listed}.{'xyzw'[int(name.rpartition('.')[2]) % 4]}"
-    elif size in _POSES:
-        name = listed
-    return [w for w in re.split(r"[^0-9a-zA-Z°]+", name.lower().replace("°", "deg")) if w]
+def _words(name: str) -> list[str]:
+    """Return the words of a column's name; R of ``R_gripper2base`` is one."""
+    words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
+    for pair, one in _VECTORS.items():
+        for i in range(len(words) - 1):
+            if tuple(w.lower() for w in words[i : i + 2]) == pair:
+                words[i : i + 2] = [one]
+    return words
 
 
-def _of_trajectory(table: Table) -> Headings:
-    """Return what a file of TUM's format holds: time, position, quaternion, without a heading."""
-    if {len(cells) for _, cells in table.rows} != {len(_TUM)}:
-        return Headings()
-    numbers = table.numbers(range(len(_TUM)))
-    rising = bool((np.diff(numbers[:, 0]) > 0).all())
-    if not rising or np.abs(np.linalg.norm(numbers[:, 4:], axis=1) - 1).max() > _ROUNDED:
-        return Headings()
-    columns: dict[str, Column] = {name: i for i, name in enumerate(_TUM, 1)}
-    return Headings(arm=Group({k: v for k, v in columns.items() if k != "t"}), time=columns["t"])
-
-
-def holds_matrix(names: Sequence[str]) -> bool:
-    """Return whether columns are called as the entries of a matrix, or not at all."""
-    return all(_MATRIX.fullmatch(name.lower()) for name in names)
-
-
-def _is_time(found: Headings, name: str, words: Sequence[str]) -> bool:
+def _time(words: Sequence[str]) -> tuple[bool, str | None]:
+    words = [word.lower() for word in words]
     unit = words[-1] if words[-1] in _TIMES and len(words) > 1 else None
     called = [word for word in words if word != unit]
-    if called[-1] not in _CLOCKS or found.time is not None:
-        return False
-    found.time, found.time_unit = name, unit
-    return True
+    return called[-1] in _CLOCKS, unit
 
 
-def _group(groups: dict[str, Group], name: str, words: list[str]) -> None:
+def _put(groups: dict[str, Group], name: str, words: list[str], listed: bool) -> None:
     """Put a column where it belongs: ``robot_x_mm`` is the x of ``robot``, in millimetres."""
-    unit = words.pop() if words[-1] in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
-    axis, before = words[-1], words[:-1]
-    called = before[-1] if before else ""
+    last = words[-1].lower()
+    unit = words.pop().lower() if last in (*_LENGTHS, *_ANGLES) and len(words) > 1 else None
+    axis, before = words[-1].lower(), words[:-1]
     if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
         axis = axis[1]
-    if before and before[-1] in _PLACES:
-        before = before[:-1]
-    elif before and before[-1] in _TURNS and axis in ("x", "y", "z", "w"):
-        axis, before = _TURNS[before[-1]] + axis, before[:-1]
-    if not before and called in _OPENCV:
-        before = ["target"]
-    group = groups.setdefault("_".join(before), Group())
+    part, before = _without(before, (*_PLACES, *_TURNS) if axis in ("x", "y", "z", "w") else ())
+    axis = _TURNS.get(part, "") + axis
+    called = "_".join(before) or (part if part in _OPENCV else "")
+    group = groups.setdefault("" if called in _OPENCV else called, Group())
+    group.words = group.words or called
     group.columns.setdefault(axis, name)
+    group.ordered &= not listed
     if axis in POSITION and unit in _LENGTHS:
         group.length = unit
     elif unit in _ANGLES:
         group.angle = unit
+
+
+def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
+    """Return which part of a pose the last or the first word says, and the others."""
+    for at in (len(words) - 1, 0):
+        if words and words[at].lower() in parts:
+            return words[at].lower(), words[:at] + words[at + 1 :]
+    return "", words
+
+
+def _put_list(groups: dict[str, Group], words: list[str], listed: str, size: int) -> None:
+    if size == 9:
+        _, before = _without(words, tuple(_TURNS))
+        group = groups.setdefault("_".join(before), Group(words="_".join(before)))
+        group.rotation = listed
+    else:
+        group = groups.setdefault("_".join(words), Group(words="_".join(words)))
+        group.whole, group.many = listed, size
+
+
+def _pose(table: Table, group: Group) -> PoseColumns | None:
+    """Return what a group of columns holds; None where it has no position."""
+    stated = (group.words, group.length, group.angle)
+    if group.whole is not None:
+        usual = _POSES[group.many]
+        rotations = (usual,) if usual and group.many != 7 else ("xyzw", "wxyz") if usual else ()
+        if group.many == 6 and table.convention:
+            rotations = (table.convention,)
+        return PoseColumns(table, (group.whole,), rotations, *stated)
+    if not set(POSITION) <= set(group.columns):
+        return None
+    place = [group.columns[axis] for axis in POSITION]
+    if group.rotation is not None:
+        return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
+    fitting = [names for names in ROTATIONS if set(names) <= set(group.columns)]
+    names = max(fitting, key=len, default=None)
+    if names is None:
+        return PoseColumns(table, tuple(place), ("point",), *stated)
+    known = (table.convention,) if table.convention else ROTATIONS[names]
+    if not group.ordered and names == LISTED:
+        known = ("quaternion_xyzw", "quaternion_wxyz")
+    return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)

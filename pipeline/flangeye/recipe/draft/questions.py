@@ -19,11 +19,13 @@ class Questions:
         given: Answers by flag; None where it was not given.
         prompt: Asks a person, or None where there is nobody.
         assumed: What was taken by default, told at the end.
+        likely: By option, an answer that the data show, and how they do.
     """
 
     given: Mapping[str, str | None] = field(default_factory=dict)
     prompt: Prompt | None = None
     assumed: list[str] = field(default_factory=list)
+    likely: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def ask(self, flag: str, question: str, default: str | None, example: str = "") -> str:
         """Return the answer to a question.
@@ -40,9 +42,11 @@ class Questions:
         answer = self.given.get(flag)
         if answer is not None:
             return answer
+        default, shown = self.likely.get(flag, (default, ""))
         if self.prompt is not None:
             return self.prompt(f"{question} (--{flag})", default)
         if default is None:
             raise RecipeError(f"{question}: nothing tells; add --{flag} {example}".rstrip())
-        self.assumed.append(f"{question}: {default} (--{flag} says otherwise)")
+        reason = f"{shown}; " if shown else ""
+        self.assumed.append(f"{question}: {default} ({reason}--{flag} says otherwise)")
         return default

@@ -13,10 +13,9 @@ import yaml
 
 from flangeye.errors import RecipeError, StageError
 from flangeye.files.clouds import read_cloud
-from flangeye.files.named_arrays import arrays_of
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
-from flangeye.files.tables import Table
+from flangeye.files.tables import tables_in
 from flangeye.files.yaml_lines import parse_value
 from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
@@ -24,8 +23,6 @@ from flangeye.models.scanners import ScannerData
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
-from flangeye.recipe.draft.headings import headings_of
-from flangeye.recipe.draft.matrices import array_params
 from flangeye.recipe.draft.questions import Questions
 from flangeye.recipe.draft.survey import FolderSurvey
 from flangeye.recipe.load import parse_recipe
@@ -102,20 +99,13 @@ def _reader(
         reason = error
     else:
         return "auto"
-    if any(p.name.startswith("pos") and p.suffix in (".yaml", ".yml") for p in survey.files):
+    if any(p.name.startswith("pos0") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
-    scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
-    if survey.arrays and not any(_is_whole(table, scans) for table in survey.tables):
-        return {"matrices": array_params(survey.folder, survey.arrays, questions, scans)}
     if survey.tables:
-        return {"table": table_params(survey.tables, questions, _maker(robot), scans)}
+        scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
+        params = table_params(survey.tables, questions, _maker(robot), scans)
+        return {"table": params}
     raise StageError(_missing(survey, reason))
-
-
-def _is_whole(table: Table, scans: bool) -> bool:
-    """Return whether a table names the arm's poses, and a scan or the target for each."""
-    heads = headings_of(table)
-    return heads.arm is not None and (heads.target is not None or (scans and bool(heads.scan)))
 
 
 def _bound(reader: Any, registry: Registry, robot: Mapping[str, Any]) -> BoundPart:
@@ -144,7 +134,7 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
         return f"{reason}; flangeye init takes such lines as --reader '{{…}}' and --robot NAME"
     for path in survey.of(BINARY):
         try:
-            arrays_of(path)
+            tables_in(path.parent, path.name)
         except StageError as error:
             return str(error)
     scans = survey.of(CLOUDS) or survey.of(IMAGES)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.files.pairs import natural
 from flangeye.files.scans import CLOUDS, IMAGES, VENDOR
-from flangeye.files.tables import KINDS, Table, number_of, read_table
-from flangeye.recipe.draft.arrays import PoseArrays, places, pose_arrays
+from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.recipe.draft.headings import list_name, list_sizes
 
-TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".mod", ".src", ".ls", ".script", *KINDS)
-FEWEST_ROWS, FEWEST_COLUMNS = 3, 6
+TABLES = (".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS)
+FEWEST = 3
+"""Rows of a table of poses, and files that are named alike under one pattern."""
+LARGEST = 10_000_000
+"""A file that is larger [bytes] holds scans, and is not looked into."""
+_PART = re.compile(r"(?<![a-z])(r|rot|rotations?|rvecs?|t|trans|translations?|tvecs?|pos)(?![a-z])")
 
 
 @dataclass(frozen=True)
@@ -25,18 +30,16 @@ class FolderSurvey:
         folder: Where.
         files: All files of the folder, and of the folders in it.
         tables: Those that are tables of numbers.
-        arrays: What ``reader.matrices`` may read.
     """
 
     folder: Path
     files: Sequence[Path]
     tables: Sequence[Table]
-    arrays: Sequence[PoseArrays]
 
     def of(self, suffixes: Sequence[str]) -> list[Path]:
-        """Return the files that end so; arrays of poses are no clouds."""
-        named = {array.at.partition(":")[0] for array in self.arrays}
-        return [p for p in self.files if p.suffix.lower() in suffixes and p.name not in named]
+        """Return the files that end so; tables of poses are no clouds."""
+        read = {file for table in self.tables for file in table.files}
+        return [p for p in self.files if p.suffix.lower() in suffixes and p not in read]
 
     def lines(self) -> list[str]:
         """Return what was seen, a line each for people."""
@@ -49,8 +52,7 @@ class FolderSurvey:
             )
             if (kinds := Counter(p.suffix.lower() for p in self.of(suffixes)))
         ]
-        told += [f"table: {_of_table(table)}" for table in self.tables]
-        return [*told, *(f"array: {array}" for array in self.arrays)]
+        return [*told, *(f"table: {_of_table(table)}" for table in self.tables)]
 
 
 def look(folder: Path) -> FolderSurvey:
@@ -61,28 +63,78 @@ def look(folder: Path) -> FolderSurvey:
     """
     if not folder.is_dir():
         raise RecipeError(f"{folder}: is no folder; name the one that holds the recordings")
-    files = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
+    found = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
+    files = sorted(found, key=lambda path: natural(str(path)))
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
-    found = (_table(folder, place, len(of)) for place, of in places(folder, TABLES))
-    tables = [table for table in found if table is not None]
-    return FolderSurvey(folder, files, tables, pose_arrays(folder))
+    tables = [t for place, of in places(folder, files) for t in _tables(folder, place, len(of))]
+    return FolderSurvey(folder, files, _whole(folder, tables))
 
 
-def _table(folder: Path, place: str, files: int) -> Table | None:
-    """Return a table of poses, or the one that files with a pose each are together."""
+def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
+    """Yield files as a recipe names them, those that are named alike under one pattern."""
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for file in files:
+        if file.suffix.lower() in TABLES and file.stat().st_size <= LARGEST:
+            alike = re.sub(r"\d+(?=\D*$)", "*", file.stem) + file.suffix
+            groups[str(file.relative_to(folder).with_name(alike))].append(file)
+    single = [file for files in groups.values() if len(files) < FEWEST for file in files]
+    one_each = [n for n, count in Counter(f.name for f in single).items() if count >= FEWEST]
+    yield from ((place, files) for place, files in groups.items() if len(files) >= FEWEST)
+    for file in single:
+        if file.name not in one_each:
+            yield str(file.relative_to(folder)), [file]
+    for name in one_each:  # a folder for each capture
+        yield f"*/{name}", [file for file in single if file.name == name]
+
+
+def _tables(folder: Path, place: str, files: int) -> list[Table]:
+    """Return the tables of poses in a file, or the one that files with a pose each are together."""
     try:
-        table = read_table(folder, place)
+        found = [read_table(folder, place)] if files > 1 else tables_in(folder, place)
     except FlangeyeError:
-        return None
-    if files > 1 and len(table.rows) != files:
-        return None
-    wide = bool(table.rows) and len(table.rows[0][1]) >= FEWEST_COLUMNS
-    target = bool(table.heading) and len(table.heading) >= 3
-    if len(table.rows) < FEWEST_ROWS or not (wide or target):
-        return None
+        return []
+    return [t for t in found if _holds_numbers(t) and (files < 2 or len(t.rows) == files)]
+
+
+def _holds_numbers(table: Table) -> bool:
+    if len(table.rows) < FEWEST:
+        return False
     numbers = sum(number_of(cell) is not None for cell in table.rows[0][1])
-    return table if numbers >= 3 else None
+    return numbers >= FEWEST
+
+
+def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:
+    """Return tables with rotations joined to the positions that are named as they are; points
+    without as many poses beside them are left out.
+    """  # noqa: D205
+    keys = {table.name: _key(table.name) for table in tables if _width(table) in (3, 9)}
+    joined: list[Table] = []
+    used: set[str] = set()
+    for turns in tables:
+        key = keys.get(turns.name)
+        if key is None or key[0].startswith(("t", "p")):
+            continue
+        for places_of in tables:
+            other = keys.get(places_of.name)
+            same = other is not None and other[1] == key[1] and other[0].startswith(("t", "p"))
+            if same and _width(places_of) == 3 and len(places_of.rows) == len(turns.rows):
+                joined.append(read_table(folder, [places_of.name, turns.name]))
+                used |= {places_of.name, turns.name}
+    rest = [table for table in tables if table.name not in used]
+    counts = {len(t.rows) for t in (*joined, *rest) if t.heading or _width(t) > 3}
+    return [*joined, *(t for t in rest if _width(t) > 3 or len(t.rows) in counts)]
+
+
+def _width(table: Table) -> int:
+    """Return how many numbers a row has that has no names; 0 with names."""
+    return 0 if table.heading else len(table.rows[0][1])
+
+
+def _key(name: str) -> tuple[str, str] | None:
+    """Return whether a name is of rotations or of positions, and the rest of it."""
+    match = _PART.search(name.lower())
+    return match and (match[1], name[: match.start()].lower() + name[match.end() :].lower())
 
 
 def _of_table(table: Table) -> str:

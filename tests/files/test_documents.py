@@ -1,6 +1,7 @@
 """Arrays of poses in other programs' files: what damages their parsers does not damage us."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -8,9 +9,15 @@ import pytest
 from scipy.io import savemat
 
 from flangeye.errors import StageError
-from flangeye.files.named_arrays import arrays_of
+from flangeye.files.tables import document_of
 
 POSES = np.tile(np.eye(4), (5, 1, 1))
+
+
+def arrays_of(file: Path) -> Any:
+    document = document_of(file)
+    assert document is not None
+    return document.data
 
 
 def refusal(file: Path) -> str:
@@ -47,17 +54,6 @@ def test_names_and_numbers_of_a_mat_file(tmp_path: Path) -> None:
     found = arrays_of(file)
     assert set(found) == {"file", "count"}
     assert np.array_equal(found["file"], POSES)
-
-
-def test_json_of_objects_and_of_lists(tmp_path: Path) -> None:
-    file = tmp_path / "poses.json"
-    file.write_text('[{"robot": [1, 2], "name": "a"}, {"robot": [3, 4], "name": "b", "more": 1}]')
-    assert np.array_equal(arrays_of(file)["robot"], [[1, 2], [3, 4]])
-    assert list(arrays_of(file)) == ["robot"]
-    file.write_text('{"robot": [[1, 2], [3, 4]], "ragged": [[1], [2, 3]]}')
-    assert list(arrays_of(file)) == ["robot"]
-    file.write_text("[[1, 2], [3, 4]]")
-    assert np.array_equal(arrays_of(file)[""], [[1, 2], [3, 4]])
 
 
 YAML = "%YAML:1.0\n---\nT_0: !!opencv-matrix\n   rows: 2\n   cols: 2\n   dt: d\n   data: [ 1., 2., {} ]\n"

@@ -1,0 +1,141 @@
+"""What other tools save, each as ``reader.table`` reads it.
+
+easy_handeye and easy_handeye2 (IFL-CAMP, marcoesposito1988): ``samples:``, a list of ``robot`` and
+``tracking`` transforms, or ``hand_world_samples`` and ``camera_marker_samples``; metres, xyzw. The
+marker's pose is in the camera. The robot's is base_T_effector for eye-in-hand, and for eye-on-base
+its inverse: both tools solve eye-on-base as if it were eye-in-hand (``handeye_sampler.py``,
+``_get_transforms``). MoveIt Calibration's RViz panel: a list of ``effector_wrt_world`` and
+``object_wrt_sensor``, 4x4 matrices row by row in metres, for either mounting
+(``handeye_control_widget.cpp``, ``saveSamplesBtnClicked``). ViSP: ``pose_rPe_1.yaml`` is the flange
+in the base, ``pose_cPo_1.yaml`` the object in the camera, metres and rotation vector
+(``vpPoseVector``). Zivid's samples: ``pos01.yaml``, a matrix of the SDK (``FloatMatrix: Data:``) or
+of OpenCV (``PoseState``), with ``img01.ply`` beside it; millimetres in Zivid's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from flangeye import Params, StageError, part
+from flangeye.files.clouds import LengthUnit
+from flangeye.files.pairs import natural
+from flangeye.files.recording import Archive, NotThisLayout
+from flangeye.files.tables import Table, document_of, files_at, read_table
+from flangeye_plugins.reader.table import TableParams, table
+
+SUFFIXES = (".yaml", ".yml", ".samples", ".json")
+QUATERNION = ("translation.x", "translation.y", "translation.z",
+              "rotation.x", "rotation.y", "rotation.z", "rotation.w")  # fmt: skip
+METRES = {"rotation": "xyzw", "length": "m"}
+MATRIX = {"rotation": "matrix", "length": "m"}
+VECTOR = {"rotation": "vector", "length": "m", "angle": "rad"}
+EASY = (
+    ("robot", "tracking"), ("hand_world_samples", "camera_marker_samples"),
+    ("hand_world_samples.transforms", "camera_marker_samples.transforms"),
+)  # fmt: skip
+"""What the arm's and the marker's transforms stand under."""
+EFFECTOR, OBJECT = "effector_wrt_world", "object_wrt_sensor"
+
+
+class EasyHandeyeParams(Params):
+    """Which way round the robot's poses were written."""
+
+    calibration: Literal["eye_on_base", "eye_in_hand"] = Field(
+        description="The type it was sampled for: with eye_on_base the tool writes the robot's "
+        "poses the other way round (effector_T_base)."
+    )
+
+
+class ZividParams(Params):
+    """How the poses are written."""
+
+    length: Literal["m", "mm"] = Field(description="Unit of the positions; Zivid's own are mm.")
+    cloud_unit: LengthUnit | None = Field(
+        None, description="Unit of the exported clouds; found by the scanner's range if not given."
+    )
+
+
+@part("reader.easy_handeye")
+def easy_handeye(path: Path, params: EasyHandeyeParams) -> Archive:
+    """Read the samples that easy_handeye or easy_handeye2 saved."""
+    for file, found in _tables(path):
+        for robot, marker in EASY:
+            if _has(found, f"{robot}.translation"):
+                _refuse_other_type(file, params.calibration)
+                inverse = params.calibration == "eye_on_base"
+                return _read(file, "easy_handeye", METRES | {
+                    "columns": [f"{robot}.{name}" for name in QUATERNION],
+                    "pose": "flange_T_base" if inverse else "base_T_flange",
+                    "target": METRES | {"columns": [f"{marker}.{name}" for name in QUATERNION]},
+                })  # fmt: skip
+    raise NotThisLayout(f"{path}: holds no samples of easy_handeye (samples: of robot, tracking)")
+
+
+@part("reader.moveit")
+def moveit(path: Path) -> Archive:
+    """Read the samples that MoveIt Calibration saved."""
+    for file, found in _tables(path):
+        if _has(found, EFFECTOR):
+            return _read(file, "MoveIt Calibration", MATRIX | {
+                "columns": [EFFECTOR], "pose": "base_T_flange",
+                "target": MATRIX | {"columns": [OBJECT]},
+            })  # fmt: skip
+    raise NotThisLayout(f"{path}: holds no samples of MoveIt Calibration ({EFFECTOR}, {OBJECT})")
+
+
+@part("reader.visp")
+def visp(path: Path) -> Archive:
+    """Read ViSP's pose_rPe_N.yaml and pose_cPo_N.yaml."""
+    return _read(path / "*rPe*.yaml", "ViSP", VECTOR | {
+        "pose": "base_T_flange", "target": VECTOR | {"file": "*cPo*.yaml"},
+    })  # fmt: skip
+
+
+@part("reader.zivid")
+def zivid(path: Path, params: ZividParams) -> Archive:
+    """Read a folder of posNN.yaml with clouds or images imgNN beside them."""
+    pattern = next((p for p in ("pos*.yaml", "pos*.yml") if files_at(path, p)), None)
+    if pattern is None:
+        raise NotThisLayout(f"{path}: holds no pos01.yaml")
+    found = read_table(path, pattern)
+    columns = [name for name in ("FloatMatrix.Data", "PoseState") if _has(found, name)]
+    if not columns:
+        raise StageError(f"{found.file}: holds neither FloatMatrix.Data nor PoseState.data")
+    return _read(path / pattern, "Zivid", {
+        "rotation": "matrix", "length": params.length, "columns": columns,
+        "pose": "base_T_flange", "cloud_unit": params.cloud_unit,
+    })  # fmt: skip
+
+
+def _tables(path: Path) -> Iterator[tuple[Path, Table]]:
+    """Yield the tables of a file, or of the documents of a folder; what is none is no error."""
+    files = [path] if path.is_file() else sorted(path.glob("*"), key=lambda p: natural(p.name))
+    for file in files:
+        if file.suffix in SUFFIXES:
+            try:
+                yield file, read_table(file.parent, file.name)
+            except StageError:
+                if file == path:
+                    raise
+
+
+def _has(found: Table, name: str) -> bool:
+    return any(column == name or column.startswith(f"{name}.") for column in found.heading)
+
+
+def _read(file: Path, layout: str, given: Mapping[str, Any]) -> Archive:
+    archive: Archive = table(file.parent, TableParams.model_validate({"file": file.name, **given}))
+    return replace(archive, layout=layout)
+
+
+def _refuse_other_type(file: Path, stated: str) -> None:
+    document = document_of(file)
+    parameters = document.data.get("parameters") if document else None
+    written = parameters.get("calibration_type") if isinstance(parameters, Mapping) else None
+    if written and written != stated:
+        raise StageError(f"{file}: was sampled for {written}, but the recipe says {stated}")
