@@ -1,10 +1,12 @@
-"""Every fault of a controller on loopback: python -m tools.faults [TIMES] [--seed N] [--kind NAME …].
+"""Every fault under an arm that moves: python -m tools.faults [TIMES] [--seed N] [--kind NAME …].
 
 A calibration, or a program that leads the arm as a weld does, runs against a controller on loopback
-through the maker's client. The fault comes while the arm moves, at a random moment. By the
+through the maker's client. The fault is the controller's, or befalls the run's own processes
+(``tools.strokes``): killed, held for three seconds and let go of, interrupted. It comes while the arm moves, at a random moment. By the
 controller's clock the arm rests within 0.5 s; what was finished is in the log; the program ends
 within 3 s, not counting how long it or its guard, the longer of both, waited for a core of a busy
-machine. Under a fault that hinders nothing (a network late by 20 ms) it may go on to its end.
+machine. Under a fault that hinders nothing (a network late by 20 ms, a wall clock that is set) it may go on
+to its end.
 """
 
 from __future__ import annotations
@@ -23,11 +25,21 @@ from typing import NamedTuple
 
 from flangeye.files.children import python_command
 from tests.live.cell import Cell
+from tools.strokes import HELD, OF_A_CLIENT, SHIFTS, STROKES, environment
 
+AUBO_FAULTS = ("protective-stop", "emergency-stop", "drop", "die", "freeze", "latency=300 ms")
 FAULTS = (
-    "protective-stop", "emergency-stop", "singularity", "joint-limit", "drop", "die", "freeze",
-    "latency=20 ms", "latency=300 ms", "program-stop", "remote-control-off",
+    *AUBO_FAULTS, "singularity", "joint-limit", "latency=20 ms", "program-stop",
+    "remote-control-off",
 )  # fmt: skip
+ANYWHERE = (*STROKES, *SHIFTS)
+KINDS = {
+    "calibration": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
+    "leading": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
+    "aubo": (*AUBO_FAULTS, *ANYWHERE),
+}
+"""What may befall each kind of program; ``aubo`` is a calibration with that arm."""
+
 RESTS, ENDS, PATIENCE = 0.5, 3.0, 30.0
 """After a fault: longest time until the arm rests, by its clock, and until the program ends; a
 program that has not ended after the last goes on [s]."""
@@ -44,17 +56,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("times", nargs="?", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kind", nargs="+", choices=("calibration", "leading"),
-                        default=["calibration", "leading"])  # fmt: skip
-    parser.add_argument("--fault", nargs="+", default=list(FAULTS))
+    parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--fault", nargs="+", default=[])
     asked = parser.parse_args()
     print(
-        "kind         fault                times  went on  rest [s]  exit [s]  no core [s]  wrong",
+        "kind         fault                   times  went on  rest [s]  exit [s]  no core [s]  wrong",
         flush=True,
     )
     wrong = 0
     for kind in asked.kind:
-        for fault in asked.fault:
+        for fault in asked.fault or KINDS[kind]:
             trial = Trial(kind, fault, random.Random(f"{kind} {fault} {asked.seed}"))
             for _ in range(asked.times):
                 trial.once()
@@ -85,7 +96,8 @@ class Trial:
     def once(self) -> None:
         """Start a controller and a program, cause the fault, and look."""
         self._times += 1
-        with tempfile.TemporaryDirectory() as folder, Cell(Path(folder)) as cell:
+        model = "aubo-i5" if self._kind == "aubo" else "ur5e"
+        with tempfile.TemporaryDirectory() as folder, Cell(Path(folder), model=model) as cell:
             program = self._start(cell)
             try:
                 self.wrong += self._faults(cell, program)
@@ -100,43 +112,58 @@ class Trial:
         rests = max(end.rests for end in self._ends)
         exits, queued = max((end.exits or 0.0, end.queued) for end in self._ends)
         return (
-            f"{self._kind:12} {self._fault:20} {self._times:5} {self._went_on:8} {rests:9.2f} "
+            f"{self._kind:12} {self._fault:23} {self._times:5} {self._went_on:8} {rests:9.2f} "
             f"{exits:9.2f} {queued:12.2f} {len(self.wrong):6}"
         )
 
     def _start(self, cell: Cell) -> subprocess.Popen[str]:
-        if self._kind == "calibration":
-            return cell.start(cell.recipe(), "--move", "--out", "run")
+        env = environment(cell.folder)
+        if self._calibrates:
+            return cell.start(cell.recipe(), "--move", "--out", "run", env=env)
         return subprocess.Popen(
             python_command("-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "
                            "from tests.motion.leader import main; main(sys.argv[1])",
                            str(Path(__file__).parents[1]), cell.controller.host),
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env,
         )  # fmt: skip
+
+    @property
+    def _calibrates(self) -> bool:
+        return self._kind != "leading"
+
+    def _cause(self, cell: Cell, program: subprocess.Popen[str]) -> None:
+        """Let the fault happen."""
+        if strike := {**STROKES, **OF_A_CLIENT}.get(self._fault):
+            strike(program.pid)
+        elif shift := SHIFTS.get(self._fault):
+            (cell.folder / "shift").write_text(shift, "ascii")
+        else:
+            cell.control.fault(self._fault)
 
     def _faults(self, cell: Cell, program: subprocess.Popen[str]) -> Iterator[str]:
         """Cause the fault while the arm moves, and yield what is wrong afterwards."""
-        for _ in range(self._chance.randrange(4) if self._kind == "calibration" else 0):
+        for _ in range(self._chance.randrange(4) if self._calibrates else 0):
             cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
             cell.wait_until(lambda: _speed(cell) < STANDS or _over(program), STARTING)
         cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
         time.sleep(self._chance.uniform(0, 0.3))
         before, began = set(cell.finished()), cell.control.truth().time
-        cell.control.fault(self._fault)
+        self._cause(cell, program)
         end = _watched(cell, program, began)
         if end.exits is None or not program.returncode:
             self._went_on += 1
             yield from self._through(program, end.rests)
         else:
             self._ends.append(end)
-            if end.rests > RESTS or end.exits - end.queued > ENDS:
+            held = HELD if "held" in self._fault else 0.0
+            if end.rests > RESTS or end.exits - held - end.queued > ENDS:
                 yield (f"the arm rests after {end.rests:.2f} s, the program ends after "
                        f"{end.exits:.2f} s, {end.queued:.2f} s of them without a core")  # fmt: skip
         yield from (f"{lost} is lost" for lost in before - set(cell.finished()))
 
     def _through(self, program: subprocess.Popen[str], moved: float) -> Iterator[str]:
         """Yield what is wrong with a program that went on under a fault."""
-        if self._kind == "calibration":
+        if self._calibrates:
             _, told = program.communicate(timeout=WHOLE)
             if program.returncode not in (0, 1):
                 yield f"it went on and then ended: {told.splitlines()[-1]}"

@@ -8,6 +8,11 @@ No method of a driver moves anything by itself, waits for a motion to end, or bl
 than :data:`PATIENCE`: whoever commands a motion watches it (``flangeye.motion``), so that
 every arm stops for the same reasons. SI units; a twist is (linear, angular), about the flange's
 origin, along the base's axes.
+
+Silence alone stops an arm: a motion goes on while :meth:`Robot.state` is called at least every
+:data:`SILENT`, and the driver ends it otherwise, whichever process is stopped, starved or dead. So
+no driver leaves a controller with a command that outlasts its own silence. Times are those of
+``time.monotonic_ns``, which every process of a machine shares and which nobody sets.
 """
 
 from __future__ import annotations
@@ -24,6 +29,11 @@ PATIENCE = 3.0
 
 GRACE = 0.1
 """An arm that goes at a velocity brakes when the next command is this late [s]."""
+
+SILENT = 0.15
+"""Longest silence while an arm moves [s]: of who reads its state, of its guard, of the program. An
+arm at 0.5 rad/s takes another 0.12 s to brake, so it rests within 0.3 s; a machine that keeps a
+process from the processor for so long is too busy to move an arm."""
 
 Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
 
@@ -44,7 +54,7 @@ class RobotState:
         base_T_flange: Pose of the flange, any tool offset of the controller taken off.
         joints: (n,) angles [rad].
         joint_speeds: (n,) [rad/s].
-        time_ns: When the controller sampled it, on this computer's clock.
+        time_ns: When the controller sampled it, by ``time.monotonic_ns``.
         mode: What the controller is able to do; anything but ready and moving is a safety fault.
         force: (6,) force and torque on the flange in the base's axes [N, N m], if it is measured.
         message: What the controller says of a mode that is not ready, for people.
@@ -91,7 +101,11 @@ class Robot(Device, Protocol):
     flange_T_tool: Transform | None
 
     def state(self) -> RobotState:
-        """Return the newest sample; raise DeviceError when it is older than 100 ms."""
+        """Return the newest sample; raise DeviceError when it is older than 100 ms.
+
+        It is also the proof that somebody watches: a motion that nobody looked at for SILENT ends,
+        and is not taken up again.
+        """
         ...
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
@@ -146,7 +160,7 @@ class Scan:
 
     Attributes:
         cloud: In ``camera`` [m].
-        started_ns: When the exposure began, on this computer's clock.
+        started_ns: When the exposure began, by ``time.monotonic_ns``.
         ended_ns: When it ended.
         image: What a camera in the scanner saw, if it has one and was asked.
     """

@@ -9,13 +9,14 @@ from flangeye.errors import StageError
 from flangeye.log.read import read_run
 from tests.emulators.controllers.process import Process
 
-START = "180 -90 90 -90 -90 0 deg"
+START = {"ur5e": "180 -90 90 -90 -90 0 deg", "aubo-i5": "0 0 90 0 90 0 deg"}
+DRIVERS = {"ur5e": "ur_rtde", "aubo-i5": "aubo"}
 
 RECIPE = """
 title: A cell on loopback
 robot:
-  model: ur5e
-  driver: {{ur_rtde: {{host: {host}}}}}
+  model: {model}
+  driver: {{{driver}: {{host: {host}}}}}
   limits:
     box: {{centre: [450 mm, 0 mm, 500 mm], size: [1000 mm, 1400 mm, 900 mm]}}
     speed: {speed}
@@ -23,7 +24,7 @@ robot:
     joint_speed: 100 deg/s
 scanner:
   model: phoxi-m
-  driver: {{emulator: {{host: {host}, robot: ur5e, resolution: 0.2, {scanner}}}}}
+  driver: {{emulator: {{host: {host}, robot: {model}, resolution: 0.2, {scanner}}}}}
 steps:
   - acquire.live:
       view: {{guess: {{position: [620 mm, 0 mm, 980 mm]}}}}
@@ -39,23 +40,29 @@ steps:
 class Cell:
     """A controller on loopback and a recipe that drives it."""
 
-    def __init__(self, folder, *arguments):
-        self.folder = folder
-        self.controller = Process("--joints", START, "--seed", "1", *arguments)
+    def __init__(self, folder, *arguments, model="ur5e"):
+        self.folder, self._model = folder, model
+        words = ("--joints", START[model], "--seed", "1")
+        self.controller = Process(*words, *arguments, model=model)
         self.control = self.controller.control
 
     def recipe(self, count=5, scanner="seed: 1", speed="1 m/s"):
         path = self.folder / "cell.yaml"
         host = self.controller.host
-        path.write_text(RECIPE.format(host=host, count=count, scanner=scanner, speed=speed))
+        path.write_text(
+            RECIPE.format(
+                host=host, count=count, scanner=scanner, speed=speed, model=self._model,
+                driver=DRIVERS[self._model],
+            )
+        )  # fmt: skip
         return path
 
-    def start(self, *words, command="run"):
+    def start(self, *words, command="run", env=None):
         """Start a command, ``flangeye run`` unless told otherwise, in the background."""
         return subprocess.Popen(
             [sys.executable, "-m", "flangeye.cli", command, *map(str, words)],
             cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL, env=env,
         )  # fmt: skip
 
     def run(self, *words, command="run", patience=150):

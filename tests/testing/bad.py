@@ -277,7 +277,7 @@ class Plate:
         return t.PointCloud(t.CAMERA, np.full((4, 5, 3), 0.7, np.float32))
 
     def expose(self):
-        started = time.time_ns()
+        started = time.monotonic_ns()
         return lambda: Scan(self.cloud(), started, started)
 
     def close(self):

@@ -183,7 +183,7 @@ class Recorder:
         else:
             self._json(topic, type(value).__name__, {"value": _plain(value)})
         if isinstance(value, RobotState):
-            self._proto("/tf", foxglove.frame_transform(value.base_T_flange, value.time_ns))
+            self._proto("/tf", foxglove.frame_transform(value.base_T_flange, time.time_ns()))
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: t.Rejection) -> None:

@@ -19,15 +19,16 @@ from flangeye.files.load import busy
 from flangeye.models.robots import RobotModel
 from flangeye.motion.keyboard import keys
 from flangeye.motion.limits import MotionLimits
+from flangeye.motion.precedence import LEADING, take_precedence
 from flangeye.motion.route import Route
 from flangeye.motion.supervision import Sample
-from flangeye.motion.watchdog import Charge, Report, guard, watchdog_process
+from flangeye.motion.watchdog import BEAT, Charge, Report, guard, watchdog_process
 
 OPENING = 30.0
 """Longest time for a driver to connect, its client library's import included [s]."""
 
-SILENCE = 2.0 * PATIENCE
-"""A guard that says nothing for so long while the arm is under way is lost [s]."""
+EVERY = 0.03
+"""Between two signs of life [s]: a fifth of the silence that stops the arm."""
 
 GUARD = "guard"
 """Name of the process that watches an arm."""
@@ -79,7 +80,7 @@ class WatchedArm:
             DeviceError: The arm was stopped for a safety fault: the reason.
             RunStopped: The operator stopped it.
         """
-        while (report := self._hear(SILENCE, "has fallen silent")).what != "arrived":
+        while (report := self._hear(PATIENCE, "has fallen silent")).what != "arrived":
             self._state = report.content
             self._told(self._state)
         self._state = report.content
@@ -214,14 +215,57 @@ def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterato
 
 @contextmanager
 def _alarmed(alarm: Connection) -> Iterator[None]:
-    """Let every signal write to the alarm at once, even while a long computation runs."""
+    """Let every signal write to the alarm at once, even while a long computation runs.
+
+    Raises:
+        DeviceError: This is not the main thread, which alone hears of signals.
+    """
     with alarm:
         if threading.current_thread() is not threading.main_thread():
-            yield
-            return
+            raise DeviceError("an arm is opened from the program's main thread, or not at all")
         os.set_blocking(alarm.fileno(), False)
         before = signal.set_wakeup_fd(alarm.fileno(), warn_on_full_buffer=False)
+        suspending = signal.signal(signal.SIGTSTP, _end_instead)
         try:
-            yield
+            with _beating():
+                yield
         finally:
+            signal.signal(signal.SIGTSTP, suspending)
             signal.set_wakeup_fd(before)
+
+
+def _end_instead(*_: object) -> None:
+    """End the run at Ctrl-Z: an arm and its controller do not wait for who comes back."""
+    raise KeyboardInterrupt("stopped by Ctrl-Z")
+
+
+@contextmanager
+def _beating() -> Iterator[None]:
+    """Send this process the signal BEAT every EVERY, as long as it runs.
+
+    The interpreter's C handler writes it to the alarm without the interpreter's lock: a long
+    computation is no silence, but being suspended or kept from the processor is. A thread that does
+    nothing else takes the signal, so that it interrupts no call of a device's library.
+    """
+    over = threading.Event()
+    taker = threading.Thread(target=_take_beats, args=(over,), name="beats", daemon=True)
+    signal.signal(BEAT, _nothing)  # and stays: a last one may still be on its way at the end
+    taker.start()
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {BEAT})
+    signal.setitimer(signal.ITIMER_REAL, EVERY, EVERY)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+        over.set()
+        taker.join()
+
+
+def _take_beats(over: threading.Event) -> None:
+    take_precedence(LEADING)
+    over.wait()
+
+
+def _nothing(*_: object) -> None:
+    """Do nothing: the handler in C has written to the alarm already."""

@@ -89,6 +89,11 @@ class Supervisor:
         """Expect the arm to go where it is led from cycle to cycle, within its limits."""
         self.leg, self._led = None, True
 
+    @property
+    def under_way(self) -> bool:
+        """Whether the arm is expected to move."""
+        return self.leg is not None or self._led
+
     def judge(self, state: RobotState) -> bool:
         """Take in a sample; return whether the leg under way has ended and the arm has settled.
 

@@ -1,10 +1,13 @@
 """The watch at work: a loop beside the program that owns the arm and stops it on any safety fault.
 
 It runs in a process of its own, where no computation of the program can delay it. It hears of
-Ctrl-C through a pipe that the interpreter's signal handler writes to at once, whatever the program
-is busy with; the space bar it reads itself; when the program dies its end of the wire closes. Each
-of these stops the arm within one cycle. A program that leads the arm by velocities is told every
-cycle it asks for; when it says nothing any more, the arm is stopped too.
+Ctrl-C and Ctrl-Z through a pipe that the interpreter's signal handler writes to at once, whatever
+the program is busy with; the space bar it reads itself; when the program dies its end of the wire
+closes. Each of these stops the arm within one cycle. Through the same pipe the program proves that
+it lives (:data:`BEAT`); when it is silent for SILENT on the way, or this process was itself, the
+arm is stopped for good. While this process is silent, the arm's driver stops it. A program that
+leads the arm by velocities is told every cycle it asks for; when it says nothing, the arm is
+stopped too.
 """
 
 from __future__ import annotations
@@ -13,13 +16,14 @@ import os
 import select
 import signal
 import sys
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from flangeye.devices import GRACE, DeviceError, MovedByHand, Robot, RobotState
+from flangeye.devices import GRACE, SILENT, DeviceError, MovedByHand, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
@@ -30,8 +34,17 @@ from flangeye.motion.supervision import SafetyFault, Sample, Supervisor
 TOLD_NS = 200_000_000
 """Between two states told to the program while the arm is under way [ns]."""
 
-SILENT, HUNG = 2.0 * GRACE, 10.0 * GRACE
-"""A program that leads the arm and says nothing: the arm is stopped, and is led no more [s]."""
+BEAT = signal.SIGALRM
+"""What the program writes to the alarm as long as it lives; every other signal stops the arm."""
+
+STOPS = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z"}
+"""Signals as the operator knows them."""
+
+AT_REST = 1.0
+"""Longest silence of program or guard while the arm stands [s]."""
+
+SLOW, HUNG = 2.0 * GRACE, 10.0 * GRACE
+"""A program that leads the arm and is late: the arm is stopped, and is led no more [s]."""
 
 LISTENING = 0.5
 """Share of a cycle in which a guard that is asked for states waits for the next word."""
@@ -70,7 +83,8 @@ class Report(NamedTuple):
 
 def watchdog_process(wire: Connection, charge: Charge, alarm: Connection) -> None:
     """Guard an arm until the program lets go; the main function of the guard's process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the alarm tells, and sooner
+    for told in STOPS:
+        signal.signal(told, signal.SIG_IGN)  # the alarm tells, and sooner
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
     keyboard = _terminal(charge.keyboard)
@@ -104,6 +118,7 @@ class Watchdog:
         self._asked, self._listens = False, 0.0
         self._led_ns: int | None = None
         self._paused = False
+        self._turned = self._heard = time.monotonic()
 
     def run(self) -> None:
         """Watch the arm, cycle by cycle, until the program closes the wire."""
@@ -126,7 +141,9 @@ class Watchdog:
         """Watch the arm for one of its cycles."""
         try:
             self._robot.wait_cycle()
-            if by := self._operator():
+            by = self._operator()
+            self._require_life()
+            if by:
                 self._halt()
                 self._wire.send(Report("stopped", by))
             state = self._robot.state()
@@ -139,6 +156,22 @@ class Watchdog:
                 self._wire.send(Report("state", state))
         except (SafetyFault, DeviceError) as fault:
             self._bar(str(fault))
+
+    def _require_life(self) -> None:
+        """Doubt a program that is silent, and a guard that was held itself.
+
+        Raises:
+            SafetyFault: Who was silent, and for how long.
+        """
+        now = time.monotonic()
+        allowed = SILENT if self._supervisor.under_way else AT_REST
+        held, self._turned = now - self._turned, now
+        for who, silent in (("guard", held), ("program", now - self._heard)):
+            if self._charge.alarm is not None and silent > allowed:
+                raise SafetyFault(
+                    f"the {who} was held for {silent:.2f} s, at most {allowed} s are allowed (it "
+                    "was suspended, or the machine is too busy): the arm was stopped"
+                )
 
     def _tell_cycle(self, state: RobotState) -> None:
         """Answer who waits for the next cycle: never unasked, a full wire would hold the guard."""
@@ -153,7 +186,7 @@ class Watchdog:
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
         if silent > HUNG:
             self._bar(f"the program that leads the arm said nothing for {HUNG:.0f} s")
-        elif silent > SILENT and not self._paused:
+        elif silent > SLOW and not self._paused:
             self._paused = True  # the driver brakes by itself, and before: not on that alone
             try:
                 self._robot.stop()
@@ -191,12 +224,16 @@ class Watchdog:
             self._wire.send(Report("fault", reason))
 
     def _operator(self) -> str | None:
-        """Say who asked for a stop."""
+        """Say who asked for a stop; take in the program's signs of life."""
         watched = [fd for fd in (self._charge.alarm, self._charge.keyboard) if fd is not None]
         ready = select.select(watched, [], [], 0)[0] if watched else []
         said = {fd: os.read(fd, 64) for fd in ready}
-        if said.get(self._charge.alarm or -1):
-            return "Ctrl-C"
+        signals = {*said.get(self._charge.alarm or -1, b"")}
+        if BEAT in signals:
+            self._heard = time.monotonic()
+        if stops := signals - {BEAT}:
+            number = signal.Signals(min(stops))
+            return STOPS.get(number, number.name)
         return "the space bar" if b" " in said.get(self._charge.keyboard or -1, b"") else None
 
     def _obey(self) -> bool:
@@ -234,6 +271,7 @@ class Watchdog:
                 self._robot.move_linear(*content)
         except DeviceError as lost:
             self._bar(str(lost))
+        self._turned = time.monotonic()  # a command may wait until the arm rests
 
     def _tell_samples(self) -> None:
         """Answer for an interval once it is over, or when no more will come of it."""

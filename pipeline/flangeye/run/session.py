@@ -96,14 +96,18 @@ def _logged(recipe: Recipe, registry: Registry, folder: RunFolder) -> Iterator[R
         yield recorder
     except (FlangeyeError, KeyboardInterrupt) as error:
         if recorder:
-            recorder.ended(str(error) or "stopped by Ctrl-C")
+            recorder.ended(_why(error))
             recorder.close()
         if not (recorder and recorder.gathered):
             folder.discard()
         if isinstance(error, KeyboardInterrupt):
-            raise RunStopped("stopped by Ctrl-C") from None
+            raise RunStopped(_why(error)) from None
         raise
     finally:
         if recorder:
             recorder.close()
             registry.hooks.unregister(recorder)
+
+
+def _why(error: BaseException) -> str:
+    return str(error) or "stopped by Ctrl-C"

@@ -51,12 +51,15 @@ class Mover:
             self._motion = None
         self._queue.append(plan)
 
-    def go_on(self, twist: Floats, acceleration: float, seconds: float) -> None:
-        """Take a twist (6,) for some time, in place of everything else; then brake."""
-        if not isinstance(self._motion, Speed):
-            self._motion = Speed(self.arm.twist, twist, acceleration, in_space=True)
+    def go_on(
+        self, target: Floats, acceleration: float, seconds: float, in_space: bool = True
+    ) -> None:
+        """Take a twist (6,), or joint speeds (n,), for some time, then brake."""
+        if not isinstance(self._motion, Speed) or self._motion.in_space is not in_space:
+            velocity = self.arm.twist if in_space else self.arm.speeds
+            self._motion = Speed(velocity, target, acceleration, in_space)
         self._queue.clear()
-        self._motion.target, self._motion.acceleration = np.array(twist), acceleration
+        self._motion.target, self._motion.acceleration = np.array(target), acceleration
         self._cycles_left = round(seconds / self.arm.cycle)
 
     def halt(self, deceleration: float | None = None, in_space: bool = True) -> None:

@@ -136,9 +136,9 @@ class LoopbackScanner(OpenScanner):
         self._require_present()
         self._count += 1
         index, dropped = self._count, self._faults.random() < self._params.dropped
-        started = time.time_ns()
+        started = time.monotonic_ns()
         stances = self._stances()
-        ended = time.time_ns()
+        ended = time.monotonic_ns()
 
         def transfer() -> Scan:
             xyz = self._studio.scan(stances, (self._params.seed, index))
@@ -160,7 +160,7 @@ class LoopbackScanner(OpenScanner):
 
     def _stances(self) -> list[Stance]:
         """Return where the arm was, at even times over the exposure."""
-        began = time.time()
+        began = time.monotonic()
         stances = []
         for after in np.linspace(0.0, self._params.exposure, LOOKS):
             _wait_until(began + after)
@@ -176,4 +176,4 @@ class LoopbackScanner(OpenScanner):
 
 
 def _wait_until(moment: float) -> None:
-    time.sleep(max(0.0, moment - time.time()))
+    time.sleep(max(0.0, moment - time.monotonic()))

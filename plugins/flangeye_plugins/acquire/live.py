@@ -254,7 +254,7 @@ class LiveSession:
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
             self.stage_log("next", {"id": stop.id, "why": stop.pose.why})
-            self.idle.leaves(time.time_ns())
+            self.idle.leaves(time.monotonic_ns())
             self.arm.go(way)
             if taken:
                 yield taken()
@@ -264,14 +264,14 @@ class LiveSession:
 
     def _expose(self, stop: Stop, arrived_ns: int) -> Callable[[], Capture | Rejection]:
         """Expose at a stop; what is returned waits for the data."""
-        began = time.time_ns()
+        began = time.monotonic_ns()
         try:
             transfer = self.scanner.expose()
         except FrameDropped as dropped:
             return partial(_rejected, stop, str(dropped))
         finally:
-            self.idle.exposed(arrived_ns, began, time.time_ns())
-        return partial(self._capture, stop, transfer, self.arm.during(began, time.time_ns()))
+            self.idle.exposed(arrived_ns, began, time.monotonic_ns())
+        return partial(self._capture, stop, transfer, self.arm.during(began, time.monotonic_ns()))
 
     def _capture(
         self, stop: Stop, transfer: Callable[[], Scan], samples: Sequence[Sample]
@@ -299,7 +299,7 @@ class LiveSession:
             cloud=scan.cloud,
             poses=by_frame(Transform(BASE, FLANGE, middle.base_T_flange)),
             joints=middle.joints,
-            time_ns=scan.ended_ns,
+            time_ns=time.time_ns() - (time.monotonic_ns() - scan.ended_ns),
             role=stop.role,
             image=scan.image,
         )

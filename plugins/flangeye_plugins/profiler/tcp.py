@@ -131,7 +131,7 @@ class TcpProfiler(Device):
             self._lost = why
 
     def _take(self, line: bytes) -> None:
-        taken = time.time_ns() - round(self._params.latency * 1e9)
+        taken = time.monotonic_ns() - round(self._params.latency * 1e9)
         value = self._value(line)
         if value is not None:
             with self._lock:

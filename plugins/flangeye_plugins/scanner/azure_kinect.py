@@ -141,13 +141,13 @@ class AzureKinect(OpenScanner):
 
     def expose(self) -> Callable[[], Scan]:
         """Take the next capture; the arm waits until it is here."""
-        started = time.time_ns()
+        started = time.monotonic_ns()
         with contextlib.suppress(OSError):  # the answer says what became of the process
             self._pipe.write(b"next\n")
         answer = _answer(self._pipe, self._params.timeout + 0.5)
         depth = self._array(answer["depth"], np.uint16)
         colour = self._array(answer["colour"], np.uint8) if "colour" in answer else None
-        times = started, time.time_ns()
+        times = started, time.monotonic_ns()
 
         def decode() -> Scan:
             view = DepthView(**answer["calibration"])

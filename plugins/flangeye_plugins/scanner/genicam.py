@@ -139,9 +139,9 @@ class GenicamScanner(OpenScanner):
         """Scan once; the arm waits until the frame is here, for devices say no earlier."""
         if self._closed:
             raise DeviceError(f"{self.name}: is closed")
-        started = time.time_ns()
+        started = time.monotonic_ns()
         parts = self._fetch()
-        times = started, time.time_ns()
+        times = started, time.monotonic_ns()
         layout = self._layout
         return lambda: self._scan(layout.coordinates(parts), layout.per_metre, times)
 

@@ -96,9 +96,9 @@ class MechEye(OpenScanner):
     def expose(self) -> Callable[[], Scan]:
         """Capture; the arm waits until the frame is here."""
         frame, patience = self._api.Frame3D(), round(self._params.timeout * 1e3)
-        started = time.time_ns()
+        started = time.monotonic_ns()
         _require(self._camera.capture_3d(frame, patience), self.name)
-        times = started, time.time_ns()
+        times = started, time.monotonic_ns()
 
         def decode() -> Scan:
             xyz = frame.get_untextured_point_cloud().data()

@@ -110,11 +110,11 @@ class Realsense(OpenScanner):
 
     def expose(self) -> Callable[[], Scan]:
         """Take a new frame; the arm waits until it is here."""
-        started = time.time_ns()
+        started = time.monotonic_ns()
         for _ in range(0 if self._params.recording else STALE):
             self._frames()
         frames = self._frames()
-        times = started, time.time_ns()
+        times = started, time.monotonic_ns()
         return lambda: self._scan(self._coordinates(frames.get_depth_frame()), 1.0, times)
 
     def close(self) -> None:

@@ -80,7 +80,7 @@ class WatchedFolder(OpenScanner):
         """Note what is there already."""
         super().__init__(f"folder {params.path}", {"unit": params.unit})
         self._model, self._params = model, params
-        self._looked_ns = time.time_ns()
+        self._looked_ns = time.monotonic_ns()
         self._known = self._look()
         self._arrivals: dict[Path, Arrival] = {}
         self._closed = threading.Event()
@@ -136,7 +136,7 @@ class WatchedFolder(OpenScanner):
 
     def _notice(self) -> None:
         """Note which files are new, and since when each looks as it does."""
-        looked_ns, now = time.time_ns(), time.monotonic()
+        looked_ns, now = time.monotonic_ns(), time.monotonic()
         there = self._look()
         self._arrivals = {path: a for path, a in self._arrivals.items() if path in there}
         new = [path for path, stamp in there.items() if self._known.get(path) != stamp]
@@ -160,7 +160,7 @@ class WatchedFolder(OpenScanner):
     def _take(self, path: Path, cloud: PointCloud) -> Callable[[], Scan]:
         arrival = self._arrivals.pop(path)
         self._known[path] = arrival.stamp
-        ended = time.time_ns()
+        ended = time.monotonic_ns()
 
         def check() -> Scan:
             if self._model is not None:

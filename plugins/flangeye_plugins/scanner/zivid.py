@@ -84,14 +84,14 @@ class ZividScanner(OpenScanner):
         """Capture; the SDK returns when the images are taken, and computes points when asked."""
         if self._camera is None:
             raise DeviceError(f"{self.name}: is closed")
-        started = time.time_ns()
+        started = time.monotonic_ns()
         try:
             # SDK 2.14 gave 3D its own name; before, capture() told by the settings.
             capture = getattr(self._camera, "capture_3d", None) or self._camera.capture
             frame = capture(self._settings)
         except RuntimeError as error:
             raise DeviceError(f"{self.name}: {_line(error)}") from None
-        times = started, time.time_ns()
+        times = started, time.monotonic_ns()
 
         def transfer() -> Scan:
             try:

@@ -105,7 +105,7 @@ class OpenCVCamera(Device):
             if not good:
                 self._lost = True
                 return
-            taken = time.time_ns() - round(self._latency * 1e9)
+            taken = time.monotonic_ns() - round(self._latency * 1e9)
             frame = SensorFrame(self._image(pixels), taken)
             with self._lock:
                 self._newest = frame

@@ -180,7 +180,8 @@ class CameraProcess:
 
 def camera_process(wire: Connection, job: CameraJob) -> None:
     """Open the camera and answer until the program lets go; the main function of the process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program is told, and ends this
+    for told in (signal.SIGINT, signal.SIGTSTP):
+        signal.signal(told, signal.SIG_IGN)  # the program is told, and ends this
     latest = LatestState(job.state)
     with (
         suppress(EOFError, BrokenPipeError, ConnectionResetError),  # the program is gone

@@ -130,7 +130,7 @@ def test_an_arm_that_stops_says_why_and_takes_no_command(
     with open_aubo(controller.host) as robot:
         state = robot.state()
         robot.move_linear(moved(state.base_T_flange, z=-0.3), 0.1, 0.5)
-        until(lambda: controller.control.truth().speed > 0.001)
+        until(lambda: robot.state() and controller.control.truth().speed > 0.001)
         controller.control.fault(fault)
         state = until(lambda: (s := robot.state()).mode == mode and s)
         assert state.message == message

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.devices import GRACE, DeviceError
+from flangeye.devices import GRACE, SILENT, DeviceError
 from flangeye.models.loading import load_model
 from flangeye_plugins.robot.ur import worker
 from flangeye_plugins.robot.ur.driver import UrRtdeParams, robot_ur_rtde
@@ -173,25 +173,29 @@ def test_a_second_driver_is_refused(robot: Any, controller: Any) -> None:
     assert robot.state().mode == "ready"
 
 
-def test_the_grace_is_the_same_on_both_sides() -> None:
-    assert worker.GRACE == GRACE
+def test_grace_and_silence_are_the_same_on_both_sides() -> None:
+    assert (worker.GRACE, worker.SILENT) == (GRACE, SILENT)
 
 
 def test_closing_stops_the_arm_and_the_program(controller: Any) -> None:
     with open_ur(controller.host) as robot:
         robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
-        until(lambda: controller.control.truth().speed > 0.01)
+        until(lambda: robot.state() and controller.control.truth().speed > 0.01)
     until(lambda: controller.control.truth().speed == 0.0)
     until(lambda: controller.control.state()["runtime"] == "STOPPED")
 
 
 PROGRAM = """
-import sys, time
-from tests.plugins.robot.behaviour import DrivesAnArm
+import select, sys
+from contextlib import suppress
+from flangeye.devices import DeviceError
 from tests.plugins.robot.cell import moved, open_ur
 robot = open_ur(sys.argv[1])
 robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
 print("moving", flush=True)
+while not select.select([sys.stdin], [], [], 0.002)[0]:
+    with suppress(DeviceError):
+        robot.state()
 input()
 {last}
 """
@@ -234,7 +238,7 @@ def test_an_arm_whose_client_process_is_killed_is_stopped_by_the_watchdog(
     robot: Any, controller: Any
 ) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
-    until(lambda: controller.control.truth().speed > 0.01)
+    until(lambda: robot.state() and controller.control.truth().speed > 0.01)
     os.kill(robot._link._process.pid, signal.SIGKILL)
     with in_time(), pytest.raises(DeviceError) as error:
         while True:
@@ -251,7 +255,7 @@ def test_an_arm_whose_client_process_hangs_is_stopped_all_the_same(
     robot: Any, controller: Any
 ) -> None:
     robot.move_linear(moved(robot.state().base_T_flange, z=-0.3), 0.1, 0.5)
-    until(lambda: controller.control.truth().speed > 0.01)
+    until(lambda: robot.state() and controller.control.truth().speed > 0.01)
     os.kill(robot._link._process.pid, signal.SIGSTOP)
     with in_time(), pytest.raises(DeviceError) as error:
         robot.stop()

@@ -38,9 +38,9 @@ class AcmeScanner:
         self.facts = {"unit": unit, "layout": f"organised, {columns} x {rows}"}
 
     def expose(self):
-        started = time.time_ns()
+        started = time.monotonic_ns()
         self._ask("EXPOSE")
-        ended = time.time_ns()
+        ended = time.monotonic_ns()
         return lambda: Scan(self._cloud(), started, ended)
 
     def close(self):

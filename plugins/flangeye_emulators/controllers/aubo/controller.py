@@ -99,6 +99,13 @@ class AuboController:
         self._mover.go_on(xd, a, t)
         return OK
 
+    def speed_joint(self, qd: Floats, a: float, t: float) -> int:
+        """Turn the joints at speeds (n,) for ``t`` [s], then brake."""
+        if not self._can(qd, len(self.arm.speeds), a, 1.0):
+            return self._refusal()
+        self._mover.go_on(qd, a, t, in_space=False)
+        return OK
+
     def halt(self, deceleration: float, in_space: bool) -> int:
         """Brake and forget what follows."""
         self.note("stop")

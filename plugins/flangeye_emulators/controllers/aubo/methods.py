@@ -50,6 +50,10 @@ def _speed_line(box: AuboController, params: Mapping[str, Any]) -> int:
     return box.speed_line(_numbers(params["xd"]), params["a"], params["t"])
 
 
+def _speed_joint(box: AuboController, params: Mapping[str, Any]) -> int:
+    return box.speed_joint(_numbers(params["qd"]), params["a"], params["t"])
+
+
 METHODS: dict[str, Method] = {
     "getRobotNames": _tell(lambda box: [ROBOT]),
     "getAxisNames": _tell(lambda box: []),
@@ -73,6 +77,7 @@ METHODS: dict[str, Method] = {
     "MotionControl.moveJoint": _move_joint,
     "MotionControl.moveLine": _move_line,
     "MotionControl.speedLine": _speed_line,
+    "MotionControl.speedJoint": _speed_joint,
     "MotionControl.stopLine": lambda box, p: box.halt(p["acc"], in_space=True),
     "MotionControl.stopJoint": lambda box, p: box.halt(p["acc"], in_space=False),
     "MotionControl.getExecId": _tell(lambda box: box.exec_id),

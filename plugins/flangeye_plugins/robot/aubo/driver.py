@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState
+from flangeye.maths.geometry import rotation_log
 from flangeye.maths.pose_formats import CONVENTIONS
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.sdk import load_sdk
 from flangeye.plugin.stage import Params, part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye_plugins.robot.aubo.client import AuboClient
+from flangeye_plugins.robot.pieces import STANDING, Ride
 from flangeye_plugins.robot.tool_check import (
     ToolOffset,
     require_model,
@@ -37,9 +40,6 @@ BEGUN = 0.3
 
 STOP = 4.0
 """Deceleration of a stop [m/s^2, rad/s^2]."""
-
-STANDING = 2e-3
-"""A joint that is slower than this stands [rad/s]."""
 
 SAFETY: dict[str, tuple[Mode, str]] = {
     "Recovery": ("not ready", "the arm is outside its safety limits: move it back"),
@@ -76,8 +76,8 @@ def robot_aubo(model: RobotModel, params: AuboParams, reads_only: bool = False) 
     """An arm of AUBO with an ARCS controller, through its JSON-RPC interface.
 
     On the pendant: power on, brakes released, the payload of what is mounted, no program running.
-    The controller has no watchdog for this interface: a velocity ends by itself after a tenth of a
-    second, but a move that was begun is finished even if this computer dies.
+    The controller has no watchdog for this interface, so every motion is commanded in pieces that
+    end by themselves after a tenth of a second, and each look at the arm brings the next.
 
     Args:
         model: The arm; its kinematics are compared with what the controller says.
@@ -125,11 +125,16 @@ class AuboRobot(Device):
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
         self._tool_T_flange = np.linalg.inv(self.offset)
         self._begins = self._velocity_until = -np.inf
+        self._ride: Ride | None = None
+        self._rest = _in_joints(np.zeros(0))
         self._in_joints = False
         self._closed = False
 
     def state(self) -> RobotState:
-        """Read the arm; once more where this computer was too busy to read it at one time."""
+        """Read the arm, and send a move that is under way on.
+
+        It is read once more where this computer was too busy to read it at one time.
+        """
         state, took = self._read()
         if took > STALE:
             state, took = self._read()
@@ -138,11 +143,13 @@ class AuboRobot(Device):
                 f"{self.name}: reading it took {took:.2f} s, at most {STALE} s are allowed: the "
                 "network is slow"
             )
+        if self._ride is not None:
+            self._go_on(self._ride, state)
         return state
 
     def _read(self) -> tuple[RobotState, float]:
         """Return the arm's state, and how long it took to read [s]."""
-        began = time.time_ns()
+        began = time.monotonic_ns()
         tell = self._client.state
         joints, speeds, pose, force = (
             np.array(self._ask(what, question))
@@ -154,7 +161,7 @@ class AuboRobot(Device):
             )
         )
         mode, message = self._condition(speeds)
-        ended = time.time_ns()
+        ended = time.monotonic_ns()
         base_T_tool = POSE.matrix(pose)
         base_T_flange = base_T_tool @ self._tool_T_flange
         state = RobotState(
@@ -171,16 +178,33 @@ class AuboRobot(Device):
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
         """Start a move to joint angles (n,) [rad]; an arm that moves comes to rest first."""
         target = [float(angle) for angle in joints]
+        motion = self._client.motion
         self._begin(in_joints=True)
-        move = self._client.motion.moveJoint
-        self._client.command("move", lambda: move(target, acceleration, speed, 0.0, 0.0))
+        self._rest = _in_joints(np.asarray(joints))
+        self._ride = Ride(
+            speed, acceleration,
+            lambda speeds: self._command(
+                "speed", lambda: motion.speedJoint(speeds.tolist(), acceleration, GRACE)
+            ),
+            self._brake,
+            lambda: self._arrive(lambda: motion.moveJoint(target, acceleration, speed, 0.0, 0.0)),
+        )  # fmt: skip
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Start a straight move of the flange; an arm that moves comes to rest first."""
-        target = POSE.numbers(base_T_flange.matrix @ self.offset).tolist()
+        base_T_goal = base_T_flange.matrix @ self.offset
+        target = POSE.numbers(base_T_goal).tolist()
+        motion = self._client.motion
         self._begin(in_joints=False)
-        move = self._client.motion.moveLine
-        self._client.command("move", lambda: move(target, acceleration, speed, 0.0, 0.0))
+        self._rest = self._in_space(base_T_goal)
+        self._ride = Ride(
+            speed, acceleration,
+            lambda twist: self._command(
+                "speed", lambda: motion.speedLine(twist.tolist(), acceleration, GRACE)
+            ),
+            self._brake,
+            lambda: self._arrive(lambda: motion.moveLine(target, acceleration, speed, 0.0, 0.0)),
+        )  # fmt: skip
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Go on at a twist (6,) of the flange; the controller itself ends it after GRACE."""
@@ -188,7 +212,7 @@ class AuboRobot(Device):
         self._require_able()
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
         go = self._client.motion.speedLine
-        self._in_joints = False
+        self._in_joints, self._ride = False, None
         self._client.command("velocity", lambda: go(at_tool, acceleration, GRACE))
         self._velocity_until = time.monotonic() + GRACE
 
@@ -199,6 +223,10 @@ class AuboRobot(Device):
     def stop(self) -> None:
         """Brake, as the motion under way is made."""
         self._begins = self._velocity_until = -np.inf
+        self._ride = None
+        self._brake()
+
+    def _brake(self) -> None:
         motion = self._client.motion
         if self._in_joints:
             self._client.command("stop", lambda: motion.stopJoint(STOP))
@@ -224,7 +252,39 @@ class AuboRobot(Device):
         """Bring an arm that moves to rest, and expect the next move to begin."""
         self._require_able()
         self.stop()
-        self._in_joints, self._begins = in_joints, time.monotonic() + BEGUN
+        self._in_joints = in_joints
+
+    def _go_on(self, ride: Ride, state: RobotState) -> None:
+        """Command the next piece of a move, or let it be."""
+        if state.message or ride.over:
+            self._ride = None
+            return
+        rest, left = self._rest(state)
+        ride.renew(rest, left, float(np.abs(state.joint_speeds).max()))
+
+    def _arrive(self, move: Callable[[], int]) -> None:
+        """Let the controller make the last bit, and expect it to begin."""
+        self._begins = time.monotonic() + BEGUN
+        self._command("move", move)
+
+    def _command(self, what: str, order: Callable[[], int]) -> None:
+        """Give a command in the middle of a move; say why a controller that has stopped refuses."""
+        try:
+            self._client.command(what, order)
+        except DeviceError:
+            self._require_able()
+            raise
+
+    def _in_space(self, base_T_goal: Floats) -> Callable[[RobotState], tuple[Floats, float]]:
+        def rest(state: RobotState) -> tuple[Floats, float]:
+            base_T_tool = state.base_T_flange.matrix @ self.offset
+            turn = rotation_log(base_T_goal[:3, :3] @ base_T_tool[:3, :3].T)
+            way = base_T_goal[:3, 3] - base_T_tool[:3, 3]
+            return np.concatenate([way, turn]), float(
+                max(np.linalg.norm(way), np.linalg.norm(turn))
+            )
+
+        return rest
 
     def _require_able(self) -> None:
         """Do nothing for an arm that can move; raise DeviceError for another."""
@@ -247,9 +307,21 @@ class AuboRobot(Device):
     def _under_way(self) -> bool:
         """Return whether a command is carried out, or has yet to begin."""
         motion = self._client.motion
+        if self._ride is not None and not self._ride.over:
+            return True
         if self._ask("move", motion.getExecId) != -1:
             self._begins = -np.inf
             return True
         now = time.monotonic()
         waits = self._ask("queue", motion.getQueueSize) > 0
         return bool(waits or now < self._begins or now < self._velocity_until)
+
+
+def _in_joints(goal: Floats) -> Callable[[RobotState], tuple[Floats, float]]:
+    """Return what tells the way (n,) that is left to joint angles, and its length [rad]."""
+
+    def rest(state: RobotState) -> tuple[Floats, float]:
+        way = goal - state.joints
+        return way, float(np.abs(way).max())
+
+    return rest

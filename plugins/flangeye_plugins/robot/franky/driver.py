@@ -138,7 +138,7 @@ class FrankyRobot(Device):
             base_T_flange=Transform(BASE, FLANGE, base_T_flange),
             joints=np.array(sample.q),
             joint_speeds=np.array(sample.dq),
-            time_ns=time.time_ns(),
+            time_ns=time.monotonic_ns(),
             mode=mode,
             force=wrench_at_flange(felt, base_T_flange, base_T_tool),
             message=message,

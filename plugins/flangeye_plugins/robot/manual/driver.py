@@ -108,7 +108,7 @@ class ManualRobot(Device):
             base_T_flange=Transform(BASE, FLANGE, self._pose),
             joints=self._joints,
             joint_speeds=np.zeros(self._arm.n),
-            time_ns=time.time_ns(),
+            time_ns=time.monotonic_ns(),
             mode=self._mode(),
             message=STOPPED if self._stopped else "",
         )

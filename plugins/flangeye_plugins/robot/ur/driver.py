@@ -104,6 +104,7 @@ class UrRobot(Device):
 
     def state(self) -> RobotState:
         """Return the newest sample, tool taken off."""
+        self._link.look()
         sample = self._fresh()
         condition = condition_of(sample, sample.number <= self._commanded)
         base_T_tool = self._base_T_tool(sample)
@@ -175,7 +176,7 @@ class UrRobot(Device):
         until = time.monotonic() + STALE
         while True:
             # The time comes first: who is not let run for a while after reading has read it fresh.
-            late, now = time.monotonic() > until, time.time_ns()
+            late, now = time.monotonic() > until, time.monotonic_ns()
             sample = self._link.sample()
             age = np.inf if sample is None else 1e-9 * (now - sample.time_ns)
             if sample is not None and age < STALE:

@@ -10,6 +10,7 @@ import socket
 import struct
 import subprocess
 import tempfile
+import time
 import weakref
 import zlib
 from typing import Any, NamedTuple, NoReturn
@@ -36,7 +37,7 @@ class Sample(NamedTuple):
 
     Attributes:
         number: Samples since the connection was made.
-        time_ns: When the controller took it, on this computer's clock.
+        time_ns: When the controller took it, by the monotonic clock.
         robot_mode: RTDE ``robot_mode``.
         safety_mode: RTDE ``safety_mode``.
         runtime: RTDE ``runtime_state``.
@@ -84,8 +85,8 @@ class Link:
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # A file without a name: nothing of it is left, however both processes end.
         with theirs, tempfile.TemporaryFile(buffering=0) as memory:
-            memory.write(bytes(worker.SIZE))
-            self._memory = mmap.mmap(memory.fileno(), worker.SIZE)
+            memory.write(bytes(worker.MEMORY))
+            self._memory = mmap.mmap(memory.fileno(), worker.MEMORY)
             shared = [memory.fileno(), theirs.fileno()]
             words = [host, str(period), *map(str, shared), *(["read"] if reads_only else [])]
             self._process = subprocess.Popen(
@@ -120,6 +121,10 @@ class Link:
             if struct.unpack("<I", raw[worker.SAMPLE.size :])[0] == zlib.crc32(body):
                 return _sample_of(body)
         return None
+
+    def look(self) -> None:
+        """Prove to the process that somebody watches the arm: without, a motion ends."""
+        worker.LOOK.pack_into(self._memory, worker.SIZE, time.monotonic())
 
     def request(self, what: str, **arguments: Any) -> Any:
         """Let the library do something, and return what it gives.

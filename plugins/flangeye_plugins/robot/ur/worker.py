@@ -26,11 +26,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 SAMPLE = struct.Struct("<2q5i24d")
-"""count, time [ns], robot mode, safety mode, runtime state, control (1 remote, 0 local, -1 not
-known), busy; joints, joint speeds, tool pose, tool force. Behind it, a CRC-32: a reader that comes
-while a sample is written sees that it is torn, on any processor."""
+"""count, time [ns] by the monotonic clock, robot mode, safety mode, runtime state, control (1
+remote, 0 local, -1 not known), busy; joints, joint speeds, tool pose, tool force. Behind it, a
+CRC-32: a reader that comes while a sample is written sees that it is torn, on any processor."""
 
 SIZE = SAMPLE.size + 4
+LOOK = struct.Struct("<d")
+"""When the owner last looked at the arm [s], by the monotonic clock, which all processes share;
+behind the sample."""
+
+MEMORY = SIZE + LOOK.size
 DASHBOARD = 29999
 PLAYING = 2
 LOST = 17
@@ -44,6 +49,9 @@ KICK = 0.02
 
 GRACE = 0.1
 """A velocity ends when the next command is this late [s]; :data:`flangeye.devices.GRACE`."""
+
+SILENT = 0.15
+"""A motion ends when nobody looked for so long [s]; :data:`flangeye.devices.SILENT`."""
 
 BEGUN = 0.5
 """A move that has not begun after this has ended already [s]."""
@@ -133,7 +141,7 @@ class Publisher(threading.Thread):
 
     def _write(self, stamp: float, modes: list[int], numbers: list[float]) -> None:
         self._count += 1
-        sampled = self._clock.sampled(stamp, time.time())
+        sampled = self._clock.sampled(stamp, time.monotonic())
         commander = self._commander
         sample = SAMPLE.pack(
             self._count, int(sampled * 1e9), *modes, commander.remote, commander.busy(), *numbers
@@ -148,8 +156,9 @@ class Commander:
         remote: Whether programs may come through the network: 1, 0, or -1 where it cannot be asked.
     """
 
-    def __init__(self, control: Any, receive: Any, period: float) -> None:
+    def __init__(self, control: Any, receive: Any, period: float, memory: mmap.mmap) -> None:
         self.remote = -1
+        self._memory, self._answered = memory, time.monotonic()
         self._control, self._receive, self._period = control, receive, period
         self._operation, self._commanded = -1, -math.inf
         self._velocity_until = -math.inf
@@ -197,9 +206,19 @@ class Commander:
         """Do what is due when no command comes."""
         if self._receive.getRuntimeState() != PLAYING:
             return
-        if -math.inf < self._velocity_until < time.monotonic():
+        unwatched = self._looked() + SILENT < time.monotonic() and self.busy()
+        if unwatched or -math.inf < self._velocity_until < time.monotonic():
             self.stop()
         self._control.kickWatchdog()
+
+    def answered(self) -> None:
+        """Note that the owner was here: while it waits for an answer it looks at nothing."""
+        self._answered = time.monotonic()
+
+    def _looked(self) -> float:
+        """Return when the owner was last known to watch the arm [s]."""
+        looked: float = LOOK.unpack_from(self._memory, SIZE)[0]
+        return max(self._answered, looked)
 
     def end(self) -> None:
         """Stop the arm and the program on the controller."""
@@ -236,6 +255,9 @@ class Onlooker:
 
     def idle(self) -> None:
         """Do nothing when no command comes."""
+
+    def answered(self) -> None:
+        """Do nothing when one was answered."""
 
     def give_up(self) -> None:
         """End the process; the arm never heard of it."""
@@ -298,6 +320,7 @@ def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
         if not request:
             commander.give_up()
         line.send(json.dumps(answer(commander, json.loads(request))).encode())
+        commander.answered()
 
 
 def answer(commander: Commander | Onlooker, request: dict[str, Any]) -> dict[str, Any]:
@@ -348,15 +371,16 @@ def main(host: str, period: float, memory: int, channel: int, reads_only: bool) 
     # First of all, so that the library's threads are as punctual.
     take_precedence()
     line = socket.socket(fileno=channel)
+    shared = mmap.mmap(memory, MEMORY)
     try:
         import rtde_receive
 
         receive = rtde_receive.RTDEReceiveInterface(host)
-        commander = Onlooker() if reads_only else Commander(connect(host), receive, period)
+        commander = Onlooker() if reads_only else Commander(connect(host), receive, period, shared)
     except Exception as error:
         line.send(json.dumps({"ok": False, "error": one_line(error)}).encode())
         os._exit(1)
-    Publisher(receive, commander, mmap.mmap(memory, SIZE), period).start()
+    Publisher(receive, commander, shared, period).start()
     if isinstance(commander, Commander):
         RemoteControl(host, commander).start()
     line.send(json.dumps({"ok": True, "given": None}).encode())
