@@ -9,6 +9,7 @@ import numpy as np
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.types import CAMERA, Capture, FlangeCloud, PointCloud
+from flangeye_plugins.acquire.opening import SIMULATED
 from flangeye_plugins.reader.folder import write_folder
 
 FOLDER = Path(__file__).parents[1] / "data" / "samples" / "ur5_phoxi-m"
@@ -48,3 +49,4 @@ if __name__ == "__main__":
     for old in FOLDER.glob("*"):
         old.unlink()
     write_folder(FOLDER, captures())
+    (FOLDER / SIMULATED).write_text("Made by a simulator: python -m tools.sample\n")

@@ -86,6 +86,7 @@ def acquire_points(seed: Seed, params: PointsParams) -> Observations:
         notes=("simulated point by point as in the paper's section 3.1: no scan, no circle fit",),
         workspace=Box(CENTRE, SIZE),
         truth=Truth(Transform(BASE, CAMERA, BASE_T_CAMERA)),
+        simulated=True,
         **drawn,
         seed=seed,
     )

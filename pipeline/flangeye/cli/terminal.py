@@ -88,6 +88,7 @@ def print_result(console: Console, result: Result) -> None:
     """Print the matrix, how far it can be trusted, and how that is known."""
     used = sum(o.used for o in result.observations)
     lines = [result.title, f"{result.status}: {used} of {len(result.observations)} captures used"]
+    lines += [f"warning: {each.text}; {each.fix}" for each in result.warnings]
     lines += [f"note: {note}" for note in result.notes]
     for name, estimate in result.transforms.items():
         lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]

@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.elsewhere import digest_elsewhere
-from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Role
+from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Note, Role
 
 MIN_CAPTURES = 3
 MIN_SPREAD = 1e-3
@@ -101,7 +101,7 @@ class Archive:
         recordings: One per pose, in the archive's order.
         files: Files the poses and centres were read from.
         cloud_unit: Unit of the clouds where the layout fixes it, else None.
-        notes: What the person should be told.
+        notes: What is to be done, and what is for the record.
     """
 
     layout: str
@@ -109,7 +109,7 @@ class Archive:
     recordings: Sequence[Recording]
     files: Sequence[Path]
     cloud_unit: LengthUnit | None = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
 
 
 def check_ids(archive: Archive) -> None:

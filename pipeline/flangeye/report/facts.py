@@ -92,6 +92,7 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
     pairs = calibration.pairs if calibration else _unsolved(log.observations())
     header = parse_yaml(recipe, "recipe").data if recipe else {}
     box = work_of(calibration, source, _box(header)) if calibration else None
+    notes = [*source.notes, *(calibration.notes if calibration else ())]
     verifications = {e.step: e.value for e in log.of_kind("verify")}
     return r.Result(
         title=str(header.get("title", log.path.name)),
@@ -103,9 +104,11 @@ def _so_far(log: RunLog, recipe: str) -> r.Result:
         holdout=r.holdout_result(verifications),
         verifications=r.verifications_result(verifications),
         truth=_truth(source, calibration, box),
-        notes=list(calibration.notes) if calibration else [],
+        simulated=source.simulated,
+        warnings=r.warnings_result(notes),
+        notes=t.records_of(calibration.notes if calibration else ()),
         timing=_timing(log),
-        provenance=_provenance(source, calibration, header, recipe),
+        provenance=_provenance(source, t.records_of(notes), header, recipe),
     )
 
 
@@ -144,9 +147,8 @@ def _timing(log: RunLog) -> dict[str, r.StageTiming]:
 
 
 def _provenance(
-    source: t.Source, calibration: t.HandEye | None, header: dict[str, Any], recipe: str
+    source: t.Source, notes: list[str], header: dict[str, Any], recipe: str
 ) -> r.Provenance:
-    notes = [*source.notes, *(calibration.notes if calibration else ())]
     return r.Provenance(
         versions={},  # the machine that reports need not be the one that ran
         plugins={},

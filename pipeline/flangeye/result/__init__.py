@@ -7,11 +7,13 @@ of the same recipe, input and seed give the same document bit for bit, ``timing`
 from flangeye.result.calibration import (
     answers_result,
     correction_result,
+    expected_error,
     holdout_result,
     observations_result,
     transforms_result,
     truth_result,
     verifications_result,
+    warnings_result,
     workspace_result,
 )
 from flangeye.result.contract import (
@@ -29,11 +31,12 @@ from flangeye.result.contract import (
     TruthResult,
     Vector,
     VerificationResult,
+    WarningResult,
     WeldResult,
     WeldTruthResult,
     WorkspaceResult,
 )
-from flangeye.result.exported import calibrated_pose, require_one, result_of_camera
+from flangeye.result.exported import calibrated_pose, require_one, result_of_camera, status_of
 from flangeye.result.logged import logged_result
 from flangeye.result.provenance import library_versions, sha256
 from flangeye.result.welding import seam_result, weld_result
@@ -53,12 +56,14 @@ __all__ = [
     "TruthResult",
     "Vector",
     "VerificationResult",
+    "WarningResult",
     "WeldResult",
     "WeldTruthResult",
     "WorkspaceResult",
     "answers_result",
     "calibrated_pose",
     "correction_result",
+    "expected_error",
     "holdout_result",
     "library_versions",
     "logged_result",
@@ -67,9 +72,11 @@ __all__ = [
     "result_of_camera",
     "seam_result",
     "sha256",
+    "status_of",
     "transforms_result",
     "truth_result",
     "verifications_result",
+    "warnings_result",
     "weld_result",
     "workspace_result",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,12 @@ from flangeye.result.contract import (
     FieldResult,
     HoldoutResult,
     ObservationResult,
+    Result,
     TransformErrorResult,
     TransformResult,
     TruthResult,
     VerificationResult,
+    WarningResult,
     WorkspaceResult,
 )
 
@@ -72,6 +74,17 @@ def _correction(correction: t.ArmCorrection) -> CorrectionResult:
 
 def _listed(values: t.Array | None) -> Any:
     return None if values is None else np.asarray(values).tolist()
+
+
+def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
+    """Return the section ``warnings``: the notes that ask for something."""
+    return [WarningResult(text=str(note), fix=note.fix) for note in t.warnings_of(notes)]
+
+
+def expected_error(result: Result) -> tuple[float, float | None] | None:
+    """Return the error to expect at the work, rms and 95 % bound [m]; None where not estimated."""
+    answer = result.answers and result.answers.as_reported
+    return None if not answer or answer.expected_rms is None else (answer.expected_rms, None)
 
 
 def answers_result(

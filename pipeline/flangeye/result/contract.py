@@ -247,6 +247,13 @@ class StageTiming(_Part):
     )
 
 
+class WarningResult(_Part):
+    """What is to be done."""
+
+    text: str = Field(description="What is wrong, one line.")
+    fix: str = Field(description="A command, a line of the recipe, or what to do at the cell.")
+
+
 class Provenance(_Part):
     """What made this result."""
 
@@ -256,7 +263,7 @@ class Provenance(_Part):
     recipe_hash: str = Field(description="SHA-256 of recipe.resolved.yaml.")
     input_hash: str = Field(description="Hash of everything the captures are made from.")
     seed: int
-    notes: list[str] = Field(description="What the source and the solver want people to know.")
+    notes: list[str] = Field(description="What the source and the steps put on record.")
 
 
 class Result(_Part):
@@ -285,10 +292,13 @@ class Result(_Part):
     truth: TruthResult | None = None
     seam: SeamResult | None = None
     weld: WeldResult | None = None
-    notes: list[str] = Field(
-        default_factory=list,
-        description="What the solver and later steps want people to know with the verdict.",
+    simulated: bool = Field(
+        False, description="The captures are a simulator's: nothing real has been calibrated."
     )
+    warnings: list[WarningResult] = Field(
+        default_factory=list, description="What is to be done, and the line that does it."
+    )
+    notes: list[str] = Field(default_factory=list, description="What the steps put on record.")
     exports: dict[str, str] = Field(
         default_factory=dict, description="What export steps wrote: file name -> content."
     )

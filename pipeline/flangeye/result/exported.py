@@ -109,6 +109,11 @@ def require_one(format_name: str, pose: t.CalibratedPose, result: Result) -> Non
         )
 
 
+def status_of(result: Result) -> str:
+    """Return the verdict, with the word that it is of a simulation where it is."""
+    return f"{result.status} (simulated)" if result.simulated else result.status
+
+
 def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
     run = result.provenance
     partly = any(result.transforms[name].unobservable for name in names)
@@ -116,9 +121,11 @@ def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:
         f"{name}, maps {name.partition('_T_')[2]} to {name.partition('_T_')[0]}" for name in names
     )
     said = [
-        f"flangeye: {'; '.join(told)}; {result.status}",
+        f"flangeye: {'; '.join(told)}; {status_of(result)}",
         f"recipe {run.recipe}, sha256 {run.recipe_hash[:16]}; input sha256 {run.input_hash[:16]}",
     ]
+    if result.simulated:
+        said.append("SIMULATED: made by a simulator; no real cell was calibrated")
     if result.refused:
         said.append(f"REFUSED, DO NOT USE: {result.refused}")
     elif result.status != "verified":

@@ -100,7 +100,9 @@ def result_of(
         verifications=r.verifications_result(outcome.verifications),
         seam=r.seam_result(outcome.seam, scan),
         weld=r.weld_result(outcome.weld, scan),
-        notes=_notes(outcome),
+        simulated=outcome.source.simulated,
+        warnings=r.warnings_result([*outcome.source.notes, *_notes(outcome)]),
+        notes=t.records_of(_notes(outcome)),
         exports={file.name: file.text for file in outcome.exports},
         timing=_timing(watch),
         provenance=_provenance(outcome, recipe, registry),
@@ -129,7 +131,7 @@ def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:
 
 
 def _notes(outcome: Outcome) -> list[str]:
-    """Return what the steps after the source want people to know."""
+    """Return the notes of the solver and of the scan of the workpiece."""
     told = (outcome.calibration, outcome.scan)
     return [note for value in told if value is not None for note in value.notes]
 
@@ -142,5 +144,5 @@ def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Prove
         recipe_hash=r.sha256(recipe.resolved()),
         input_hash=outcome.source.fingerprint,
         seed=recipe.header.seed,
-        notes=[*outcome.source.notes, *_notes(outcome)],
+        notes=t.records_of([*outcome.source.notes, *_notes(outcome)]),
     )

@@ -54,6 +54,7 @@ from flangeye.types.frames import (
     TransformEstimate,
     by_frame,
 )
+from flangeye.types.notes import Note, Warn, records_of, warnings_of
 from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed, StageLog
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
 from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
@@ -89,6 +90,7 @@ __all__ = [
     "Look",
     "Mask",
     "Motion",
+    "Note",
     "Observation",
     "Observations",
     "Pair",
@@ -119,7 +121,10 @@ __all__ = [
     "VerificationView",
     "VerifiedHandEye",
     "Views",
+    "Warn",
     "WeldReport",
     "WorkpieceScan",
     "by_frame",
+    "records_of",
+    "warnings_of",
 ]

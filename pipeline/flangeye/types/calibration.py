@@ -10,6 +10,7 @@ import numpy as np
 from flangeye.types.arrays import Array, Floats, freeze
 from flangeye.types.features import Observation
 from flangeye.types.frames import BASE, FrameMismatchError, TransformEstimate
+from flangeye.types.notes import Note
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +155,7 @@ class HandEye:
             the arm as its controller reports it.
         pairs: Every observation the solver pulled.
         method: Stage that solved it.
-        notes: What the solver wants the person to know.
+        notes: What is to be done, and what is for the record.
         correction: What it found wrong with the arm and this pose holds with and without.
         others: The configuration's other unknowns, such as ``base_T_target``.
         corrected: Where another pose is the best for the corrected arm: that pose, with its
@@ -168,7 +169,7 @@ class HandEye:
     camera: TransformEstimate
     pairs: tuple[Pair, ...]
     method: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     correction: ArmCorrection | None = None
     others: tuple[TransformEstimate, ...] = ()
     corrected: CorrectedArm | None = None

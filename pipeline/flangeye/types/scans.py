@@ -11,6 +11,7 @@ import numpy as np
 from flangeye.types.arrays import Array, Pixels, freeze
 from flangeye.types.clouds import PointCloud
 from flangeye.types.frames import CAMERA, TARGET, Motion, Placed, Poses
+from flangeye.types.notes import Note
 
 Role = Literal["calibration", "verification"]
 
@@ -123,7 +124,7 @@ class WorkpieceScan:
         cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``
             as it stood there.
         source: Where it comes from, for people.
-        notes: What the person should be told.
+        notes: What is to be done, and what is for the record.
         truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it
             from the stages that plan and weld.
         places: Where the arm stood for each cloud; empty where the scanner stands beside the arm.
@@ -131,6 +132,6 @@ class WorkpieceScan:
 
     cloud: PointCloud
     source: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     truth: Mapping[str, Array] = field(default_factory=dict)
     places: tuple[ScanPlace, ...] = ()

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 from flangeye.types.clouds import PointCloud
 from flangeye.types.features import Observation, Rejection, VerificationView
 from flangeye.types.frames import Box, Transform
+from flangeye.types.notes import Note
 from flangeye.types.scans import Capture
 
 Look = Callable[[Sequence[Any]], PointCloud]
@@ -115,12 +116,15 @@ class Source:
 
     Attributes:
         fingerprint: Hash of everything the captures are made from.
-        notes: What the person should be told: what was skipped, detected, converted.
+        notes: What was skipped, detected or converted.
         workspace: Where the work is; the box of the flange's centres when not given.
         truth: Simulation only.
+        simulated: Whether captures come from a simulator; then nothing that is made of them may be
+            called verified without that word.
     """
 
     fingerprint: str
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
     workspace: Box | None = None
     truth: Truth | None = None
+    simulated: bool = False

@@ -9,6 +9,7 @@ import numpy as np
 
 from flangeye.types.arrays import Array, Floats, freeze
 from flangeye.types.clouds import PointCloud
+from flangeye.types.notes import Note
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Seam:
         half_width: From the root's plane to a shoulder [m], or None where it is not known.
         source: What it was planned from, for people.
         figures: How well that went, in SI units, by name.
-        notes: What the person should be told.
+        notes: What is to be done, and what is for the record.
         cloud: The part of the scan around it, in ``base``, for people.
     """
 
@@ -35,7 +36,7 @@ class Seam:
     half_width: float | None = None
     source: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     cloud: PointCloud | None = None
 
     def __post_init__(self) -> None:
@@ -82,7 +83,7 @@ class WeldReport:
         phases: K names of what the controller was doing.
         figures: By name, in SI units.
         loop: How the loop kept time, by name, in SI units; differs from run to run.
-        notes: What the person should be told.
+        notes: What is to be done, and what is for the record.
         sigma: (K,) standard deviation of the torch's place across the seam [m], or empty.
         bound: (K,) what its distance from the seam does not exceed [m], or empty.
         band: (K,) the same for 95 % of the seam [m], or empty.
@@ -107,7 +108,7 @@ class WeldReport:
     phases: tuple[str, ...]
     figures: Mapping[str, float] = field(default_factory=dict)
     loop: Mapping[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     sigma: Array = field(default_factory=lambda: np.zeros(0))
     bound: Array = field(default_factory=lambda: np.zeros(0))
     band: Array = field(default_factory=lambda: np.zeros(0))

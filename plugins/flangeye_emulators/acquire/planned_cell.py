@@ -398,4 +398,4 @@ def _source(cell: Cell, seed: int, params: CellSessionParams) -> Source:
     made_of = [cell.describe(), params.model_dump(mode="json")]
     text = json.dumps([VERSION, seed, made_of], sort_keys=True)
     note = f"simulated: a cell, {params.sightings} sightings"
-    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,))
+    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,), simulated=True)

@@ -239,4 +239,5 @@ def source_of(
     made_of = [robot.model, configuration.describe(), *(m.model_dump(mode="json") for m in models)]
     text = json.dumps([VERSION, seed, made_of], sort_keys=True)
     note = f"simulated: {configuration.name}, {len(session.reported.camera)} poses"
-    return Source(hashlib.sha256(text.encode()).hexdigest(), (note,), truth=session.truth)
+    fingerprint = hashlib.sha256(text.encode()).hexdigest()
+    return Source(fingerprint, (note,), truth=session.truth, simulated=True)

@@ -220,7 +220,7 @@ class _Session:
         if left := plan.wanted - found:
             note += f"; {left} more were planned and are not possible"
         truth = Truth(Transform(BASE, CAMERA, self.base_T_camera), unseen=self._unseen())
-        return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth)
+        return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth, simulated=True)
 
     def _unseen(self) -> tuple[Observation, ...]:
         """Return what a scanner without noise sees at the poses that take no part."""

@@ -149,6 +149,7 @@ def _source(session: LiveSession, arm: RobotDriver, eye: ScannerDriver) -> Sourc
         notes=(f"live: {session.arm.name} and {scanner.name}",),
         workspace=Box(itinerary.centre, itinerary.size),
         truth=scanner.truth if isinstance(scanner, KnowsTruth) else None,
+        simulated=arm.simulated or isinstance(scanner, KnowsTruth),
     )
 
 

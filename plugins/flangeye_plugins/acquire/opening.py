@@ -34,6 +34,7 @@ from flangeye.types import (
     Poses,
     Source,
     Transform,
+    Warn,
 )
 from flangeye.units import param
 from flangeye_plugins.acquire.cells import cell_poses, check_cell
@@ -60,6 +61,10 @@ class OpeningParams(Params):
     )
 
 
+SIMULATED = "SIMULATED.txt"
+"""A file of this name in an archive says that its recordings are a simulator's."""
+
+
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
     """Return where the archive is.
 
@@ -83,7 +88,10 @@ def open_archive(path: Path, params: OpeningParams) -> Archive:
     archive: Archive = params.reader(path)
     check_ids(archive)
     recordings = [with_companion(recording) for recording in archive.recordings]
-    notes = tuple(with_urls(note) for note in archive.notes)
+    notes = tuple(
+        Warn(with_urls(note), note.fix) if isinstance(note, Warn) else with_urls(note)
+        for note in archive.notes
+    )
     archive = replace(archive, recordings=recordings, notes=notes)
     if not params.leave_out:
         return archive
@@ -108,7 +116,8 @@ def source_of(
     """
     notes = (with_urls(f"archive: {archive.layout}, {archive.root}"), *archive.notes, *told)
     used = digests_of(archive.files) if digests is None else digests
-    return Source(fingerprint_of(archive.root, used), notes)
+    simulated = (archive.root / SIMULATED).is_file()
+    return Source(fingerprint_of(archive.root, used), notes, simulated=simulated)
 
 
 def skipped_note(archive: Archive, has: Callable[[Recording], bool], what: str) -> list[str]:

@@ -23,7 +23,7 @@ from flangeye.report.certificate.budget import Conditions, budget_of, shares_of,
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
-from flangeye.result import result_of_camera
+from flangeye.result import result_of_camera, status_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
@@ -97,6 +97,7 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
     scanner = _scanner(header, facts.log.models)
     return {
         "result": result,
+        "status": status_of(result),
         "budget": budget_of(result),
         "shares": shares_of(result),
         "use": use_budget_of(result, scanner, conditions),
