@@ -247,7 +247,7 @@ def npy(array: np.ndarray, tmp_path: Path) -> bytes:
 DEFECTS = {
     "empty": ("a.pcd", b"", "is empty (0 bytes)"),
     "another format": ("a.stl", b"solid", "'.stl' is not a point cloud; known: .csv, .npy, .pcd, "
-                       ".ply, .txt, .xyz"),
+                       ".ply, .pts, .txt, .xyz"),
     "not pcd": ("a.pcd", b"hello\nworld\n", "is not a PCD file: its header has no DATA line"),
     "not ply": ("a.ply", b"hello\nworld\n", "is not a PLY file: its header has no end_header line"),
     "ply by name only": ("a.ply", b"plx\nend_header\n",
@@ -439,3 +439,37 @@ def test_a_scan_of_three_million_points_is_read_at_a_few_times_the_cost_of_its_b
     began = time.process_time()
     assert read_cloud(path).xyz.shape == (1544, 2064, 3)
     assert time.process_time() - began < 5 * of_bytes
+
+
+def lines_of(points, form="{:f} {:f} {:f}"):
+    return "".join(form.format(*point) + "\n" for point in points.tolist())
+
+
+TABLES_OF_POINTS = {
+    "normals.npy": lambda f, p: np.save(f, np.hstack([p, p])),
+    "records.npy": lambda f, p: np.save(f, np.array(
+        [tuple(q) for q in p], [("z", "f4"), ("y", "f4"), ("x", "f4")])),
+    "units.csv": lambda f, p: f.write_text("x_mm,y_mm,z_mm\n" + lines_of(1e3 * p, "{},{},{}")),
+    "brackets.csv": lambda f, p: f.write_text("X [mm];Y [mm];Z [mm]\n"
+                                              + lines_of(1e3 * p, "{};{};{}").replace(".", ",")),
+    "counted.pts": lambda f, p: f.write_text(f"{len(p)}\n" + lines_of(p)),
+    "comma.csv": lambda f, p: f.write_text(lines_of(p, "{:f};{:f};{:f}").replace(".", ",")),
+    "tabs.txt": lambda f, p: f.write_text(lines_of(p, "{:f}\t{:f}\t{:f}").replace(".", ",")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES_OF_POINTS)
+def test_points_are_read_from_tables_as_other_programs_write_them(
+    tmp_path: Path, name: str
+) -> None:
+    points = np.random.default_rng(5).random((40, 3)).astype(np.float32)
+    TABLES_OF_POINTS[name](tmp_path / name, points)
+    found = read_cloud(tmp_path / name).points()
+    wanted = points[:, ::-1] if name == "records.npy" else points
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_a_pointer_of_git_lfs_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    with pytest.raises(StageError, match="a Git LFS pointer, not the file itself; fetch it: git l"):
+        read_cloud(tmp_path / "a.pcd")

@@ -448,6 +448,11 @@ def two_poses_of_nobody(folder):
          "columns of what the camera saw; add --target-columns NAMES, or put the scans there"),
         (lambda folder: (folder / "poses.xlsx").write_text("x"), [],
          "rec: poses.xlsx is a table that is not read; save it as .csv"),
+        (lambda folder: (folder / "demo.bag").write_text("x"), [],
+         "rec/demo.bag: is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src "
+         "rec/demo.bag --dst rec/demo; then flangeye init rec again"),
+        (lambda folder: (folder / "scan.e57").write_text("x"), [],
+         "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
         (two_tables_of_nobody, [], "which poses are the arm's (a.csv, b.csv): nothing tells; add "
          "--table a.csv"),
         (two_poses_of_nobody, [], "which poses are the arm's (log.csv:a, log.csv:b): nothing tells; "

@@ -73,6 +73,8 @@ def read_regular(
             raw = file.read(limit + 1)
         except OSError as failure:
             raise error(f"{path}: cannot be read: {_reason(failure)}") from None
+    if raw.startswith(b"version https://git-lfs.github.com/spec/"):
+        raise error(f"{path}: is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
     if len(raw) > limit:
         raise error(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     return raw

@@ -13,7 +13,7 @@ from flangeye.files.pairs import in_order, natural, partners
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats
 
-CLOUDS = (".pcd", ".ply", ".npy", ".xyz")
+CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts")
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VENDOR = {".zdf": "Zivid's SDK", ".praw": "Photoneo's PhoXi Control", ".mraw": "Mech-Mind's SDK"}
 """Files that only their maker can read, and with what to turn them into others."""

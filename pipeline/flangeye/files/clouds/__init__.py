@@ -44,6 +44,7 @@ _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
     ".npy": open_npy,
     ".pcd": open_pcd,
     ".ply": open_ply,
+    ".pts": open_text,
     ".txt": open_text,
     ".xyz": open_text,
 }
@@ -56,7 +57,7 @@ def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
 
     Args:
         path: A file with one of :data:`CLOUD_SUFFIXES`.
-        unit: Unit of the file's coordinates; files do not say.
+        unit: Unit of the file's coordinates, where its heading does not state one.
 
     Returns:
         The points in ``camera`` [m], organised (H, W, 3) if the file is; a missing point is NaN.
@@ -67,8 +68,9 @@ def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
     with at_hand(path):
         table = _open(path)
         xyz = table.decode()
-    if unit != "m":
-        xyz /= np.float32(PER_METRE[unit])  # exact to the last bit, which times 0.001 is not
+    stated = next((known for known in PER_METRE if known == getattr(table, "unit", "")), unit)
+    if stated != "m":
+        xyz /= np.float32(PER_METRE[stated])  # exact to the last bit, which times 0.001 is not
     return PointCloud(CAMERA, xyz.reshape(*table.shape, 3))
 
 

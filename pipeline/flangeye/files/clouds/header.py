@@ -12,6 +12,8 @@ from flangeye.files.regular import open_regular
 
 HEADER_BYTES = 65536
 """Headers seen in the wild have 200 to 1,000 bytes; nothing longer is read as a header."""
+LFS = b"version https://git-lfs.github.com/spec/"
+"""How the stand-in of a file begins that Git Large File Storage keeps elsewhere."""
 MAX_DIGITS = 18
 """Counts stay below 2^63."""
 
@@ -35,6 +37,8 @@ def read_head(path: Path) -> bytes:
         head = file.read(HEADER_BYTES)
     if not head:
         refuse(path, "is empty (0 bytes)")
+    if head.startswith(LFS):
+        refuse(path, "is a Git LFS pointer, not the file itself; fetch it: git lfs pull")
     return head
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -19,18 +20,24 @@ from flangeye.files.clouds.table import Points, PointTable, Shape, TextTable
 HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 """What NumPy raises at a header that is none: it parses a Python literal."""
 
+WIDEST = 16
+"""Columns of an array of points: x, y, z, then normals, colours, intensity."""
 NUMBERS = "fiu"
 """Kinds of NumPy's types that are numbers."""
 
 
 def open_npy(path: Path) -> PointTable:
-    """Return the points of an array (N, 3) or (H, W, 3).
+    """Return the points of an array (N, 3) or (H, W, 3), of more columns the first three, or of
+    records with x, y and z.
 
     Raises:
         StageError: It is not such an array.
-    """
-    shape = _npy_header(path)
-    if len(shape) not in (2, 3) or shape[-1] != 3:
+    """  # noqa: D205
+    shape, fields = _npy_header(path, records=True)
+    if fields:
+        axes_of(path, fields)
+        return NpyTable(path, shape, tuple(fields))
+    if len(shape) not in (2, 3) or not 3 <= shape[-1] <= WIDEST:
         refuse(path, f"has shape {shape}; a point cloud is (N, 3) or (H, W, 3)")
     return NpyTable(path, shape[:-1])
 
@@ -66,28 +73,34 @@ def holds_numbers(file: IO[bytes]) -> bool:
         return True
 
 
-def _npy_header(path: Path) -> Shape:
+def _npy_header(path: Path, records: bool = False) -> tuple[Shape, tuple[str, ...]]:
     read_head(path)
     with path.open("rb") as file:
-        return _shape_in(path, file, path.stat().st_size)
+        return _shape_in(path, file, path.stat().st_size, records)
 
 
-def _shape_in(path: Path | str, file: IO[bytes], size: int) -> Shape:
-    """Return the shape that a header states, held against the size of the whole [bytes]."""
+def _shape_in(
+    path: Path | str, file: IO[bytes], size: int, records: bool = False
+) -> tuple[Shape, tuple[str, ...]]:
+    """Return the shape that a header states, held against the size of the whole [bytes], and the
+    names of the fields, where records of numbers are taken too.
+    """  # noqa: D205
     try:
         shape, kind = _header(file)
         found = size - file.tell()
     except HEADER_ERRORS as error:
         reason = str(error).partition("\n")[0]
         refuse(path, f"is not a NumPy array: {reason}")
-    if kind.kind not in NUMBERS:
+    fields = tuple(kind.names or ())
+    of_numbers = all(kind[name].kind in NUMBERS for name in fields)
+    if not (records and fields and of_numbers) and kind.kind not in NUMBERS:
         refuse(path, f"holds '{kind}', not numbers")
     if any(type(length) is not int or length < 0 for length in shape):
         refuse(path, f"is not a NumPy array: its shape is {shape}")
     promised = math.prod(shape) * kind.itemsize
     if found < promised:
         refuse(path, f"truncated: shape {shape} needs {promised} bytes, it has {found}")
-    return tuple(shape)
+    return tuple(shape), fields
 
 
 def _header(file: IO[bytes]) -> tuple[Shape, np.dtype[Any]]:
@@ -106,10 +119,12 @@ class NpyTable:
     Attributes:
         path: The file.
         shape: (N,) or (H, W).
+        fields: Names of a record's fields; empty for plain numbers.
     """
 
     path: Path
     shape: Shape
+    fields: tuple[str, ...] = ()
 
     def check(self) -> None:
         """Its size was held against the header when it was opened."""
@@ -117,29 +132,69 @@ class NpyTable:
     def decode(self) -> Points:
         """Load the array."""
         with np.errstate(over="ignore"):
-            return load_npy(self.path).reshape(-1, 3).astype(np.float32)
+            array = np.load(self.path, allow_pickle=False)
+            if self.fields:
+                named = [self.fields[i] for i in axes_of(self.path, self.fields)]
+                return np.stack([array[name].ravel() for name in named], -1).astype(np.float32)
+            xyz: Points = array.reshape(-1, array.shape[-1])[:, :3].astype(np.float32)
+            return xyz
 
 
 def open_text(path: Path) -> PointTable:
     """Return the points of a table as text: x, y, z first, or wherever a heading names them.
 
-    Values are separated by blanks, commas or semicolons.
+    Values are separated by blanks, tabs, commas or semicolons; where those are not commas,
+    decimals may stand behind one. A first row with one whole number is the count of points
+    (``.pts``). A unit that the heading states, ``x_mm`` or ``X [mm]``, is that of the file.
 
     Raises:
         StageError: Its first row is neither three numbers or more nor a heading.
     """
     head = read_head(path)
-    first = head.partition(b"\n")[0]
+    lines = head.split(b"\n", 2)
+    counted = len(lines) > 2 and lines[0].strip().isdigit()  # how many points follow, as .pts has
+    first = lines[1] if counted else lines[0]
     row = first.decode("latin-1").lstrip("#/ ").strip()
-    delimiter = next((mark for mark in ",;" if mark in row), None)
+    delimiter = next((mark for mark in ";\t," if mark in row), None)
+    comma = (delimiter != "," and "," in row) or (delimiter == "," and _has_decimal_commas(row))
+    delimiter = None if comma and delimiter in (",", "\t") else delimiter
     cells = [cell.strip() for cell in row.split(delimiter)]
-    rows = _rows(path)
+    cells = [cell.replace(",", ".") for cell in cells] if comma else cells
+    rows, skipped = _rows(path) - counted, len(lines[0]) + 1 if counted else 0
+    if counted and rows != int(lines[0]):
+        refuse(path, f"its first row promises {int(lines[0])} points, but it has {rows}")
     if all(_is_number(cell) for cell in cells):
         if len(cells) < 3:
             refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
-        return TextTable(path, (rows,), 0, len(cells), (0, 1, 2), 0, rows, delimiter)
-    axes = axes_of(path, cells)
-    return TextTable(path, (rows - 1,), len(first) + 1, len(cells), axes, 0, rows - 1, delimiter)
+        return TextTable(
+            path, (rows,), skipped, len(cells), (0, 1, 2), 0, rows, delimiter, comma=comma
+        )
+    named = [_axis(cell) for cell in cells]
+    axes, start = axes_of(path, [name for name, _ in named]), skipped + len(first) + 1
+    second = head[start:].partition(b"\n")[0].decode("latin-1")
+    decimal = delimiter == ";" and "," in second
+    units = {named[axis][1] for axis in axes} - {""}
+    if len(units) > 1:
+        refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
+    return TextTable(
+        path, (rows - 1,), start, len(cells), axes, 0, rows - 1, delimiter,
+        unit=next(iter(units), ""), comma=decimal,
+    )  # fmt: skip
+
+
+_HEADING = re.compile(r"([A-Za-z]\w*?)[\s_]*[\[(]?(mm|m|in)?[\])]?")
+
+
+def _axis(cell: str) -> tuple[str, str]:
+    """Return the name and the unit of a heading's cell: ``x_mm``, ``X [mm]``."""
+    match = _HEADING.fullmatch(cell.strip('"'))
+    return (match[1], match[2] or "") if match else (cell, "")
+
+
+def _has_decimal_commas(row: str) -> bool:
+    """Return whether blanks separate numbers with decimal commas: ``1,5 2,0 3,25``."""
+    words = row.split()
+    return len(words) > 2 and all(_is_number(word.replace(",", ".")) for word in words)
 
 
 def _rows(path: Path) -> int:

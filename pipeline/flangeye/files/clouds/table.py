@@ -50,6 +50,8 @@ class TextTable:
         skipped: Rows before the points.
         rows: Rows in all, points and others.
         delimiter: What separates values, white space if None.
+        unit: Of the coordinates, where a heading states it; else empty.
+        comma: Whether decimals are behind a comma.
     """
 
     path: Path
@@ -60,6 +62,8 @@ class TextTable:
     skipped: int
     rows: int
     delimiter: str | None = None
+    unit: str = ""
+    comma: bool = False
 
     def check(self) -> None:
         """Count the rows, and the values of the last one."""
@@ -83,10 +87,11 @@ class TextTable:
         with self.path.open("rb") as file:
             file.seek(self.offset)
             text = io.TextIOWrapper(file, encoding="latin-1")
-            if self.rows == n and self.delimiter is None:
+            if self.rows == n and self.delimiter is None and not self.comma:
                 values = self._parse(text)  # NumPy drops blank rows too, and takes half the time
             else:
-                rows = filterfalse(str.isspace, text)
+                rows: Iterable[str] = filterfalse(str.isspace, text)
+                rows = (row.replace(",", ".") for row in rows) if self.comma else rows
                 values = self._parse(islice(rows, self.skipped, self.skipped + n))
         if values.shape != (n, self.width):
             refuse(self.path, f"its rows have {values.shape[1]} values, not {self.width}")

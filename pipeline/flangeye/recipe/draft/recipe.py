@@ -38,6 +38,23 @@ CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
 """Tables that other programs keep; some of them can hold code."""
 
 
+CONVERTED = {
+    ".bag": "is a ROS 1 bag; convert it: pip install rosbags && "
+    "rosbags-convert --src {file} --dst {stem}",
+    ".e57": "is an E57 scan, which is not read; save it as .ply: pip install pye57 open3d, or "
+    "open it in CloudCompare (CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+    ".las": "is a LAS scan, which is not read; save it as .ply "
+    "(CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+    ".laz": "is a LAS scan, which is not read; save it as .ply "
+    "(CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+    ".stl": "is a mesh, not a scan; sample it to points as .ply "
+    "(CloudCompare -O {file} -SAMPLE_MESH POINTS 1000000 -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+    ".obj": "is a mesh, not a scan; sample it to points as .ply "
+    "(CloudCompare -O {file} -SAMPLE_MESH POINTS 1000000 -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+}
+"""Recordings that other programs turn into what is read, and how."""
+
+
 @dataclass(frozen=True)
 class Draft:
     """A recipe, and what to tell of it.
@@ -145,6 +162,10 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
             f"was; put poses.csv beside them, its first line: {column},{POSES_LINE}; then a line "
             f"for each, {scans[0].name},412.1,-33.0,501.7,2.91,0.12,-0.03"
         )
+    for suffix, way in CONVERTED.items():
+        if others := survey.of((suffix,)):
+            named = way.format(file=others[0], stem=others[0].with_suffix(""))
+            return f"{others[0]}: {named}; then flangeye init {survey.folder} again"
     closed = survey.of(CLOSED)
     if closed:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
