@@ -1,0 +1,136 @@
+r"""Errors of an arm's geometry: joint zeros, encoders, sag, link lengths and twists, and the rest.
+
+An arm's controller reports f(q) by nominal parameters; the flange really is at the twist
+:math:`D(q)\,\delta` from there. Each kind's typical size is a ratio to that of the joint zeros
+(``Carrier.accuracy``), for makers machine, weigh and encode with one care: all kinds of one arm
+share its quality, and each is a little better or worse beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.graph import Carrier, Linear, Problem
+from flangeye.maths.geometry import rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.smooth_field import effects as field_effects
+from flangeye.maths.smooth_field import field_over
+from flangeye.types import Floats, SmoothField
+
+KINDS = {
+    "zeros": ("joint zeros", 1.0),
+    "encoders": ("encoder eccentricity", 0.2),
+    "sag": ("sag", 1.0),
+    "lengths": ("link lengths", 0.15),
+    "twists": ("link twists", 0.3),
+}
+"""Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
+for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
+industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
+FIELD = 0.1
+"""Likewise what no kind explains, smooth over the workspace [m]."""
+QUALITY = 4.0
+"""By how many times an arm may be better or worse than its file says, one sigma: joint accuracy is
+on no data sheet, and arms of one maker differ tenfold."""
+EACH = 1.8
+"""By how many times each kind may be larger or smaller beside the arm's quality, one sigma."""
+UP = np.array([0.0, 0.0, 1.0])
+"""Of an arm's base that is level."""
+DELTA = 1e-6
+"""Step of numeric derivatives by a length [m] or a twist [rad]."""
+
+
+def arm_effects(problem: Problem, arm: str) -> list[Effect]:
+    """Return what may be wrong with one arm, all of it of one quality."""
+    carriers = [c for c in problem.carriers if c.arm == arm]
+    accuracy = carriers[0].accuracy
+    effects = []
+    if all(c.joints is not None and c.kinematics is not None for c in carriers):
+        for kind, (name, ratio) in KINDS.items():
+            block = _of_carriers(arm, kind)
+            effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
+    flange = carriers[0].frame
+    field = field_over(np.asarray(problem.frames[flange].place)[:, :3, 3])
+    block = _by_place(arm, field)
+    return [*effects, Effect("smooth error", block, FIELD * accuracy, EACH, arm, True, "field")]
+
+
+def _of_carriers(arm: str, kind: str) -> Block:
+    """Return the block of twists (T, 6, K) that all carriers of one arm have at each time."""
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        moved = [c for c in problem.carriers if c.arm == arm]
+        parts = [linear.blocks[c.frame] @ displacements(c)[kind][problem.seen.times] for c in moved]
+        return np.asarray(sum(parts))
+
+    return block
+
+
+def _by_place(arm: str, field: SmoothField) -> Block:
+    """Return the block of a smooth displacement of what the arm moves, by where it is reported."""
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        moved = [c for c in problem.carriers if c.arm == arm]
+        return np.asarray(sum(_field_block(problem, linear, c.frame, field) for c in moved))
+
+    return block
+
+
+def _field_block(problem: Problem, linear: Linear, frame: str, field: SmoothField) -> Floats:
+    places = np.asarray(problem.frames[frame].place)[problem.seen.times, :3, 3]
+    return linear.blocks[frame][:, :, 3:] @ field_effects(field, places)
+
+
+@lru_cache(maxsize=16)
+def displacements(carrier: Carrier) -> dict[str, Floats]:
+    """Return (T, 6, K) twists of what is carried, in the arm's base at its origin, of each kind."""
+    arm, joints = _known(carrier)
+    link = carrier.link
+    columns = arm.jacobian(joints, link)
+    waves = np.stack([np.sin(joints), np.cos(joints)], axis=1)
+    lengths = [3 * i + k for i in range(arm.n) for k in (0, 1)]
+    twists = [3 * i + 2 for i in range(arm.n)]
+    return {
+        "zeros": columns,
+        "encoders": (columns[:, :, None, :] * waves[:, None]).reshape(len(joints), 6, -1),
+        "sag": columns * _levers(arm, joints)[:, None],
+        "lengths": _by_links(carrier, lengths),
+        "twists": _by_links(carrier, twists),
+    }
+
+
+def _by_links(carrier: Carrier, which: Sequence[int]) -> Floats:
+    """Return (T, 6, m) what some of the links' (3 n) a, d [m] and alpha [rad] do."""
+    arm, joints = _known(carrier)
+    before, columns = arm.pose(joints, carrier.link), []
+    for step in DELTA * np.eye(3 * arm.n)[which]:
+        after = arm.altered(step.reshape(-1, 3)).pose(joints, carrier.link)
+        turned = rotation_log(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
+        shifted = after[:, :3, 3] - before[:, :3, 3]
+        columns.append(np.concatenate([turned, shifted], axis=1) / DELTA)
+    return np.stack(columns, axis=2)
+
+
+def _levers(arm: Arm, joints: Floats) -> Floats:
+    """Return (T, n) the horizontal lever about each joint of what hangs on it [m].
+
+    Its weight is taken to be spread evenly over the links' origins beyond the joint.
+    """
+    origins, (axes, places) = arm.frames(joints)[..., :3, 3], arm.axes(joints)
+    beyond = [origins[:, i + 1 :].mean(axis=1) - places[:, i] for i in range(arm.n)]
+    return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ UP)
+
+
+def _known(carrier: Carrier) -> tuple[Arm, Floats]:
+    """Return kinematics and joints of a carrier that has both.
+
+    Raises:
+        ValueError: It lacks one of them.
+    """
+    if carrier.kinematics is None or carrier.joints is None:
+        raise ValueError(f"the joints or the kinematics of {carrier.arm} are not known")
+    return carrier.kinematics, carrier.joints

@@ -1,0 +1,35 @@
+"""What an effect is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from flangeye.estimation.graph import Linear, Problem
+from flangeye.types import Floats
+
+Block = Callable[[Problem, Linear], Floats]
+"""Gives (N, 6, K) of sightings, measured or planned: what one unit of each of K numbers does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """One thing that can be wrong with a cell.
+
+    Attributes:
+        name: For the person, as in "joint zeros".
+        block: Its design, of sightings at any poses: those measured, or those of the work.
+        size: Prior median of the standard deviation of each number, in its unit.
+        factor: By how many times that size is uncertain, one sigma (log-normal).
+        cause: Effects of one cause (an arm) have a common quality as well; empty for none.
+        of_arm: Whether it displaces an arm against what its controller reports.
+        kind: Which part of a correction its numbers are (``zeros``, ``lengths``, ``field``...).
+    """
+
+    name: str
+    block: Block
+    size: float
+    factor: float
+    cause: str = ""
+    of_arm: bool = False
+    kind: str = ""

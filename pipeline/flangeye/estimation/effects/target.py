@@ -1,0 +1,53 @@
+"""Errors that all sightings of one target share: of its size, of its circle, of its face."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.graph import Linear, Problem
+from flangeye.types import Floats
+
+TILT = 0.5e-3
+"""Typical tilt of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the rim
+and what the last joint's bearing adds."""
+OFFSET = 0.02e-3
+"""Typical distance of the seen circle's centre from the controller's flange origin [m]."""
+TIMES = 2.0
+"""By how many times both may be larger or smaller, one sigma."""
+
+
+def target_effects(problem: Problem) -> list[Effect]:
+    """Return what circles and faces may have wrong alike at all poses.
+
+    Where a target's place is unknown, a tilt and an offset are part of it.
+    """
+    circles = [k for k, (_, t) in enumerate(problem.ends) if problem.frames[t].place is not None]
+    s = problem.seen
+    ranks = s.ranks[np.isin(s.pairs, circles) & s.by_depth]
+    effects = []
+    if (ranks == 5).any():
+        effects.append(Effect("tilt of the face", _tilt(circles), TILT, TIMES))
+    if (ranks > 0).any():
+        effects.append(Effect("offset of the circle", _offset(circles), OFFSET, TIMES))
+    return effects
+
+
+def _tilt(circles: list[int]) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        out = np.zeros((len(problem.seen), 6, 2))
+        rows = np.isin(problem.seen.pairs, circles) & (problem.seen.ranks == 5)
+        out[rows, :3] = linear.turns[rows][:, :, :2]
+        return out
+
+    return block
+
+
+def _offset(circles: list[int]) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        out = np.zeros((len(problem.seen), 6, 3))
+        rows = np.isin(problem.seen.pairs, circles)
+        out[rows, 3:] = linear.turns[rows]
+        return out
+
+    return block

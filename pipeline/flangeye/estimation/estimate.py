@@ -1,0 +1,154 @@
+"""From a problem and a first guess to the joint posterior of places and effects.
+
+Outliers are sightings that all the others, with every effect that may be wrong, do not predict: a
+smooth error of an arm is none. The sizes are found for those that agree, in turn, until the same
+agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flangeye.estimation.effects.arm import QUALITY
+from flangeye.estimation.effects.effect import Effect
+from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.mixed import (
+    Fit,
+    Model,
+    Posterior,
+    Sizes,
+    fit,
+    left_out,
+    mode_of,
+    posterior,
+)
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.types import Floats, Mask
+
+SCALE = 2.0
+"""By how many times features may be better or worse than their fits state, one sigma."""
+FURTHER = 0.05e-3, 0.02e-3
+"""Median noise of a sighting beyond its feature's: rotation [rad] and translation [m]. The
+repeatability of industrial arms by ISO 9283 is 0.02 to 0.1 mm."""
+TIMES = 4.0
+"""By how many times that may be more or less, one sigma."""
+OUTLIER = 0.9999
+"""A good sighting is predicted by the others no worse than with this probability."""
+ROUNDS = 8
+"""Of linearising, sizes and outliers in turn, at most; two or three are usual."""
+SETTLED = 1e-5
+"""Places that move by less [rad, m] are linearised about for good: what is left is of second order,
+1e-10."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the sightings tell.
+
+    Attributes:
+        problem: What was given.
+        effects: What may be wrong.
+        places: (4, 4) of each unknown, linearised about: the posterior mean.
+        posterior: Of moves of the places and of the effects' numbers.
+        inliers: (N,) which sightings took part.
+        squares: (N,) squared distances of each from what the others predict, over its rank.
+    """
+
+    problem: Problem
+    effects: Sequence[Effect]
+    places: Places
+    posterior: Posterior
+    inliers: Mask
+    squares: Floats
+
+    def columns(self, chosen: str) -> slice:
+        """Return where an effect's numbers stand among the effects' columns, by its name."""
+        counts = self.counts
+        i = [e.name for e in self.effects].index(chosen)
+        return slice(sum(counts[:i]), sum(counts[: i + 1]))
+
+    @property
+    def counts(self) -> list[int]:
+        """How many numbers each effect has."""
+        sizes = self.posterior.model.sizes.effect
+        return [int((sizes == k).sum()) for k in range(len(self.effects))]
+
+
+def prior_of(effects: Sequence[Effect], counts: Sequence[int]) -> Sizes:
+    """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
+    causes = sorted({e.cause for e in effects if e.cause})
+    count = len(effects)
+    centre = np.log([*(e.size for e in effects), 1.0, 1.0, *FURTHER])
+    mix = np.zeros((count + 4, count + 4 + len(causes)))
+    spread = [*(np.log(e.factor) for e in effects), *[np.log(SCALE)] * 2, *[np.log(TIMES)] * 2]
+    mix[:, : count + 4] = np.diag(spread)
+    for k, effect in enumerate(effects):
+        if effect.cause:
+            mix[k, count + 4 + causes.index(effect.cause)] = np.log(QUALITY)
+    return Sizes(centre, mix, np.repeat(np.arange(count), counts))
+
+
+def model_at(problem: Problem, places: Places, effects: Sequence[Effect], shares: Floats) -> Model:
+    """Return the linear model near some places."""
+    linear, s = problem.linearised(places), problem.seen
+    blocks = [effect.block(problem, linear) for effect in effects]
+    still = np.zeros((len(s), 6, 0))
+    return Model(
+        (s.projectors @ linear.residuals[..., None])[..., 0],
+        np.concatenate([still, *(linear.blocks[name] for name in problem.unknown)], axis=2),
+        np.concatenate([still, *blocks], axis=2),
+        s.covariances,
+        s.projectors,
+        prior_of(effects, [block.shape[2] for block in blocks]),
+        shares,
+    )
+
+
+def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: Mask) -> Estimate:
+    """Return the posterior of all that is unknown.
+
+    Args:
+        problem: What is given.
+        start: (4, 4) of each unknown, near the answer.
+        effects: What may be wrong.
+        agree: (N,) which sightings agree with the start.
+    """
+    places, inliers = start, agree
+    z: Floats | None = None
+    seen: set[bytes] = set()
+    for _ in range(ROUNDS):
+        model = model_at(problem, places, effects, inliers.astype(float))
+        z = mode_of(model, z)
+        found = fit(model, model.sizes.at(z))
+        places, step = _moved(problem, places, found)
+        squares, good = judged(model, found)
+        key = good.tobytes()
+        if step < SETTLED and (key == inliers.tobytes() or key in seen):
+            break
+        seen.add(key)
+        inliers = good if good.sum() >= 3 else inliers
+    model = model_at(problem, places, effects, inliers.astype(float))
+    known = posterior(model, mode_of(model, z))
+    squares, _ = judged(model, known.mode)
+    return Estimate(problem, effects, places, known, inliers, squares)
+
+
+def _moved(problem: Problem, places: Places, found: Fit) -> tuple[Places, float]:
+    step = found.mean[: 6 * len(problem.unknown)]
+    return problem.moved(places, step), float(np.abs(step).max(initial=0.0))
+
+
+def judged(model: Model, found: Fit) -> tuple[Floats, Mask]:
+    """Return (N,) squared distances from what the others predict, and which agree with them."""
+    everyone = replace(model, shares=np.ones(len(model.shares)))
+    noise = model.noise(found.sizes)
+    q = model.projectors
+    left, spread = left_out(everyone, found)
+    covariance = q @ (noise + spread) @ q + np.eye(6) - q
+    squares = np.einsum("na,nab,nb->n", left, np.linalg.inv(covariance), left)
+    ranks = np.trace(q, axis1=1, axis2=2).round()
+    limits = np.array([chi2_quantile(OUTLIER, int(k)) if k else np.inf for k in range(7)])
+    return squares / np.maximum(ranks, 1), squares < limits[ranks.astype(int)]

@@ -1,0 +1,214 @@
+r"""A cell as a graph of frames, and what its cameras are predicted to see. Arrays only.
+
+Every frame stands on another, down to one root. A frame's place on its parent is known, unknown, or
+reported by a controller at each time (a *carrier*: an arm's flange or link, a rail's carriage). A
+sighting of a target by a camera closes a loop:
+
+.. math:: {}^{root}T_{camera}(t)^{-1} \; {}^{root}T_{target}(t) = {}^{camera}T_{target}
+
+One camera and one arm are such a graph as well: there is no other model of a cell. A frame moves by
+(rotation, translation): R' = Exp(phi) R about its own origin in its parent's axes, t' = t + tau. A
+residual is what takes the predicted target in the camera to the measured one, in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.frame_graph import Frame, chain, composed
+from flangeye.maths.geometry import hat, invert, rotation_between, rotation_exp, rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.types import Floats, Indices, Mask
+
+Places = Mapping[str, Floats]
+"""(4, 4) parent_T_frame of each unknown frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What cameras saw of targets, N times: poses, each with what was measured of it.
+
+    Attributes:
+        times: (N,) index of the reported poses.
+        pairs: (N,) which camera saw which target, an index of ``Problem.ends``.
+        rotations: (N, 3, 3) camera_R_target; of a circle the turn about z means nothing, of a
+            centre all of it.
+        centres: (N, 3) in ``camera`` [m].
+        covariances: (N, 6, 6) own noise, order (rotation, translation), in ``camera``.
+        projectors: (N, 6, 6) onto what was measured: of rank 6 for a pose, 5 with a normal, 3 for
+            a centre.
+        offsets: (N, 3) what was seen, in the target's frame [m].
+        by_depth: (N,) whether a scanner measured it by depth, and not a camera in an image.
+        shared: (N, 6, k) what one deviation of each error that all features of a camera share, such
+            as of its intrinsics, does to the feature.
+    """
+
+    times: Indices
+    pairs: Indices
+    rotations: Floats
+    centres: Floats
+    covariances: Floats
+    projectors: Floats
+    offsets: Floats
+    by_depth: Mask
+    shared: Floats
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def ranks(self) -> Indices:
+        """(N,) how many numbers each measured: 6 for a pose, 5 with a normal, 3 for a centre."""
+        traces = np.trace(self.projectors, axis1=1, axis2=2)
+        return np.asarray(traces.round(), dtype=np.intp)
+
+    @property
+    def poses(self) -> Floats:
+        """(N, 4, 4) camera_T_target."""
+        out = np.zeros((len(self), 4, 4))
+        out[:, :3, :3], out[:, :3, 3], out[:, 3, 3] = self.rotations, self.centres, 1.0
+        return out
+
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Sightings:
+        """Return some of them."""
+        return Sightings(**{each.name: getattr(self, each.name)[chosen] for each in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """What an arm moves: its flange, or one of its links; or what a rail or a positioner moves.
+
+    Attributes:
+        frame: What it moves.
+        arm: Which arm moves it: carriers of one arm share its errors.
+        kinematics: The arm's; None where they are not known, or for a rail.
+        joints: (T, n) at each time [rad]; None where nothing is known of them.
+        accuracy: Median of the deviation of a joint's zero, by the robot's file [rad].
+        link: Which link it is; None for the flange.
+    """
+
+    frame: str
+    arm: str
+    kinematics: Arm | None = None
+    joints: Floats | None = None
+    accuracy: float = 0.0
+    link: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is given: the graph, who moves in it, and what was seen.
+
+    Attributes:
+        frames: By name; the root has no entry.
+        ends: Each camera and target, by the sightings' ``pairs``.
+        seen: N sightings.
+        carriers: What moves.
+    """
+
+    frames: Mapping[str, Frame]
+    ends: Sequence[tuple[str, str]]
+    seen: Sightings
+    carriers: Sequence[Carrier] = ()
+
+    @property
+    def unknown(self) -> list[str]:
+        """Frames whose places are to be found."""
+        return [name for name, frame in self.frames.items() if frame.place is None]
+
+    @property
+    def moving(self) -> list[str]:
+        """Frames whose places were reported at each time."""
+        return [n for n, f in self.frames.items() if f.place is not None and f.place.ndim == 3]
+
+    def where(self, chosen: Mask | NDArray[np.intp]) -> Problem:
+        """Return the problem of some of the sightings."""
+        return replace(self, seen=self.seen.where(chosen))
+
+    def moved(self, places: Places, step: Floats) -> Places:
+        """Return the places moved by (6 K,), in the order of ``unknown``."""
+        out = {}
+        for name, (turn, shift) in zip(self.unknown, step.reshape(-1, 2, 3), strict=True):
+            place = np.array(places[name])
+            place[:3, :3] = rotation_exp(turn) @ place[:3, :3]
+            place[:3, 3] += shift
+            out[name] = place
+        return out
+
+    def linearised(self, places: Places) -> Linear:
+        """Return what is predicted at some places, and how each frame moves it."""
+        s, moved = self.seen, [*self.unknown, *self.moving]
+        residuals, turns = np.zeros((len(s), 6)), np.zeros((len(s), 3, 3))
+        blocks = {name: np.zeros((len(s), 6, 6)) for name in moved}
+        for k, ends in enumerate(self.ends):
+            rows = s.pairs == k
+            if rows.any():
+                frames = self._at(places, s.times[rows])
+                residuals[rows], turns[rows] = _residuals(frames, ends, s.where(rows))
+                for name, block in _blocks(frames, ends, s.offsets[rows], moved).items():
+                    blocks[name][rows] = block
+        return Linear(residuals, turns, blocks)
+
+    def _at(self, places: Places, times: Indices) -> dict[str, Frame]:
+        """Return the frames at some times, all places known."""
+        out = {}
+        for name, frame in self.frames.items():
+            place = np.asarray(places[name] if frame.place is None else frame.place)
+            out[name] = replace(frame, place=place if place.ndim == 2 else place[times])
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """What is predicted at some places, and how it moves.
+
+    Attributes:
+        residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].
+        turns: (N, 3, 3) camera_R_target, predicted.
+        blocks: (N, 6, 6) how each unknown or reported frame moves the prediction.
+    """
+
+    residuals: Floats
+    turns: Floats
+    blocks: Mapping[str, Floats] = field(default_factory=dict)
+
+
+def _residuals(
+    frames: Mapping[str, Frame], ends: tuple[str, str], s: Sightings
+) -> tuple[Floats, Floats]:
+    camera, target = (composed(frames, end) for end in ends)
+    predicted = np.broadcast_to(invert(camera) @ target, (len(s), 4, 4))
+    rotations = predicted[:, :3, :3]
+    centres = (rotations @ s.offsets[..., None])[..., 0] + predicted[:, :3, 3]
+    turns = rotation_between(rotations[:, :, 2], s.rotations[:, :, 2])
+    whole = s.ranks == 6
+    turns[whole] = rotation_log(s.rotations[whole] @ np.swapaxes(rotations[whole], 1, 2))
+    return np.concatenate([turns, s.centres - centres], axis=1), np.asarray(rotations)
+
+
+def _blocks(
+    frames: Mapping[str, Frame], ends: tuple[str, str], offsets: Floats, moved: Sequence[str]
+) -> dict[str, Floats]:
+    """Return (N, 6, 6) of the frames on the way: how each turns and moves what is seen."""
+    camera, target = (composed(frames, end) for end in ends)
+    back = np.swapaxes(camera[..., :3, :3], -1, -2)
+    tip = (target[..., :3, :3] @ offsets[..., None])[..., 0] + target[..., :3, 3]
+    blocks: dict[str, Floats] = {}
+    for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+        before = np.eye(4)
+        for name in chain(frames, end):
+            after = before @ np.asarray(frames[name].place)
+            if name in moved:
+                # A turn about the frame's own origin, in its parent's axes, and a shift of it.
+                turns = np.broadcast_to(sign * back @ before[..., :3, :3], (len(offsets), 3, 3))
+                lever = (back @ (tip - after[..., :3, 3])[..., None])[..., 0]
+                block = np.zeros((len(offsets), 6, 6))
+                block[:, :3, :3] = block[:, 3:, 3:] = turns
+                block[:, 3:, :3] = -hat(lever) @ turns
+                blocks[name] = blocks.get(name, 0.0) + block
+            before = after
+    return blocks

@@ -1,0 +1,320 @@
+r"""A linear mixed model: unknown places, random effects, and the sizes of both effects and noise.
+
+The N sightings leave residuals of six numbers each (rotation before translation),
+
+.. math:: r = G\,p + \sum_k E_k \delta_k + e,
+    \qquad \delta_k \sim N(0, s_k^2 I), \quad e \sim N(0, R)
+
+where p moves the unknown places and each effect E_k is something that can be wrong with the cell.
+The noise is R = D C D + T: the features' own covariances C, scaled by D for rotations and for
+translations, and further variance T of each sighting. Sizes s_k, D and T maximise the restricted
+likelihood (REML, Patterson & Thompson 1971) times their priors, and are then integrated over by
+importance sampling about that mode, for a dozen sightings do not determine them. Henderson's
+mixed-model equations give p and delta at every set of sizes by one Cholesky factorisation of as
+many unknowns as places and effects have: the cost is linear in N. Arrays only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+from scipy.optimize import minimize
+from scipy.stats import qmc
+
+from flangeye.types import Floats, Mask
+
+FREE = 1e-10
+"""Information per unknown place before anything is seen, in units of the scaled design: none, but
+what keeps the factorisation positive where the sightings show nothing."""
+SAMPLES = 32
+"""Draws of the sizes about their mode (half of them mirrored). Twice as many change the stated
+error of 16 poses by less than 1 %."""
+WIDER = 1.3
+"""Factor on the Laplace approximation's deviations that the draws come from: importance sampling
+needs a proposal wider than the posterior."""
+TAIL = 5
+"""Degrees of freedom of that proposal, a multivariate t, for the same reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Prior of the logarithms of all sizes: log s = centre + mix @ z, with z standard normal.
+
+    Attributes:
+        centre: (S,) medians' logarithms: of the effects [their units], then of the noise's four,
+            which are D of rotations and translations, and T's deviations [rad, m].
+        mix: (S, Z) what each standard normal number does to them: effects that share a cause, such
+            as all errors of one arm, share a column.
+        effect: (K,) which size each column of the effects' design has.
+    """
+
+    centre: Floats
+    mix: Floats
+    effect: np.ndarray
+
+    def at(self, z: Floats) -> Floats:
+        """Return (S,) sizes."""
+        return np.asarray(np.exp(self.centre + self.mix @ z))
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What was seen, near one set of places.
+
+    Attributes:
+        residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].
+        places: (N, 6, P) how the unknown places move what is predicted.
+        effects: (N, 6, K) how the effects do, an effect of size one.
+        covariances: (N, 6, 6) of the features alone.
+        projectors: (N, 6, 6) onto what was measured.
+        sizes: Their prior.
+        shares: (N,) weight of each sighting, from 0 (an outlier) to 1.
+    """
+
+    residuals: Floats
+    places: Floats
+    effects: Floats
+    covariances: Floats
+    projectors: Floats
+    sizes: Sizes
+    shares: Floats
+
+    @cached_property
+    def design(self) -> Floats:
+        """(N, 6, P + K) of places and effects, across what was measured alone."""
+        return np.asarray(self.projectors @ np.concatenate([self.places, self.effects], axis=2))
+
+    @property
+    def p(self) -> int:
+        """Number of unknowns of the places."""
+        return int(self.places.shape[2])
+
+    def noise(self, sizes: Floats) -> Floats:
+        """Return (N, 6, 6) covariances of the noise; the identity across what was not measured."""
+        scale, further = np.repeat(sizes[-4:-2], 3), np.repeat(sizes[-2:] ** 2, 3)
+        q = self.projectors
+        inside = self.covariances * np.outer(scale, scale) + np.diag(further)
+        return np.asarray(q @ inside @ q + np.eye(6) - q)
+
+    def weighted(self, shares: Floats) -> Model:
+        """Return the model with other weights of its sightings."""
+        return replace(self, shares=shares)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Places and effects at one set of sizes.
+
+    Attributes:
+        sizes: (S,) the sizes.
+        mean: (P + K,) of places and effects.
+        covariance: (P + K, P + K).
+        weights: (N, 6, 6) inverse covariances of the noise, each by its share.
+        cost: -2 log of the restricted likelihood, but for a constant.
+        gradient: (S,) of it by the logarithm of each size.
+        information: (P + K, P + K) of the sightings and the prior.
+        right: (P + K,) right side of the normal equations.
+    """
+
+    sizes: Floats
+    mean: Floats
+    covariance: Floats
+    weights: Floats
+    cost: float
+    gradient: Floats
+    information: Floats
+    right: Floats
+
+
+def fit(model: Model, sizes: Floats) -> Fit:
+    """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
+
+    Raises:
+        numpy.linalg.LinAlgError: The equations are not positive definite.
+    """
+    h, r = model.design, np.asarray((model.projectors @ model.residuals[..., None])[..., 0])
+    noise = model.noise(sizes)
+    q, share = model.projectors, model.shares
+    bare = np.asarray(np.linalg.inv(noise), dtype=np.float64)
+    weights = q @ bare @ q * share[:, None, None]
+    count = h.shape[2]
+    weighted = weights @ h
+    flat, flat_weighted = h.reshape(-1, count), weighted.reshape(-1, count)
+    right = flat_weighted.T @ r.ravel()
+    prior = np.concatenate([np.full(model.p, 0.0), sizes[model.sizes.effect] ** -2.0])
+    information = flat.T @ flat_weighted + np.diag(prior)
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(scale, scale)
+    scaled[np.diag_indices(model.p)] += FREE
+    root = cholesky(scaled, lower=True)
+    covariance = cho_solve((root, True), np.eye(count)) / np.outer(scale, scale)
+    mean = covariance @ right
+    left = np.asarray(r - h @ mean)
+    log_noise = np.linalg.slogdet(noise)[1]
+    cost = float(
+        share @ log_noise
+        - 2 * np.log(prior[model.p :]).sum() / 2
+        + 2 * (np.log(np.diag(root)) + np.log(scale)).sum()
+        + np.einsum("na,nab,nb->", left, weights, left)
+        + prior @ mean**2
+    )
+    gradient = _gradient(model, sizes, Fit(sizes, mean, covariance, weights, cost, sizes,
+                                           information, right), (h, left, bare, prior))  # fmt: skip
+    return Fit(sizes, mean, covariance, weights, cost, gradient, information, right)
+
+
+def _gradient(
+    model: Model, sizes: Floats, found: Fit, parts: tuple[Floats, Floats, Floats, Floats]
+) -> Floats:
+    """Return (S,) derivatives of the cost by the logarithms of the sizes.
+
+    Of an effect's: 2 (K_k - (tr V_k + |delta_k|^2) / s_k^2). Of the noise's, with dR by each:
+    tr(W dR) - tr(V H'W dR W H) - e'W dR W e.
+    """
+    h, left, bare, prior = parts
+    out = np.zeros(len(sizes))
+    second = np.diag(found.covariance)[model.p :] + found.mean[model.p :] ** 2
+    np.add.at(out, model.sizes.effect, 2 * (1 - second * prior[model.p :]))
+    w = found.weights
+    spread = h @ found.covariance @ np.swapaxes(h, 1, 2) + left[:, :, None] * left[:, None, :]
+    # dcost/dR, (N, 6, 6)
+    slope = model.shares[:, None, None] * (model.projectors @ bare @ model.projectors) - (
+        w @ spread @ w
+    )
+    scale, further = sizes[-4:-2], sizes[-2:] ** 2
+    scaled = model.covariances * np.outer(np.repeat(scale, 3), np.repeat(scale, 3))
+    product = slope * scaled
+    out[-4] = product[:, :3].sum() + product[:, :, :3].sum()
+    out[-3] = product[:, 3:].sum() + product[:, :, 3:].sum()
+    out[-2] = 2 * further[0] * np.trace(slope[:, :3, :3], axis1=1, axis2=2).sum()
+    out[-1] = 2 * further[1] * np.trace(slope[:, 3:, 3:], axis1=1, axis2=2).sum()
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
+
+    Attributes:
+        model: What was seen.
+        fits: One for each draw of the sizes; the first is at the mode.
+        chances: (F,) weights of the draws; they sum to one.
+    """
+
+    model: Model
+    fits: tuple[Fit, ...]
+    chances: Floats
+
+    @property
+    def mode(self) -> Fit:
+        """The fit at the most likely sizes."""
+        return self.fits[0]
+
+    @cached_property
+    def mean(self) -> Floats:
+        """(P + K,) of places and effects."""
+        return np.asarray(sum(c * f.mean for c, f in zip(self.chances, self.fits, strict=True)))
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(P + K, P + K) of the mixture about its mean."""
+        within = sum(c * f.covariance for c, f in zip(self.chances, self.fits, strict=True))
+        apart = np.array([f.mean - self.mean for f in self.fits])
+        return np.asarray(within + (apart.T * self.chances) @ apart)
+
+    def sizes(self) -> Floats:
+        """Return (S,) the sizes' posterior medians, as geometric means."""
+        logs = np.array([np.log(f.sizes) for f in self.fits])
+        return np.asarray(np.exp(self.chances @ logs))
+
+
+def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
+    """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
+    prior = model.sizes
+    z = np.zeros(prior.mix.shape[1]) if start is None else start
+
+    def cost(z: Floats) -> tuple[float, Floats]:
+        found = fit(model, prior.at(z))
+        return found.cost + float(z @ z), prior.mix.T @ found.gradient + 2 * z
+
+    options = {"maxiter": steps, "ftol": 1e-7, "gtol": 1e-3}
+    return np.asarray(
+        minimize(cost, z, jac=True, method="L-BFGS-B", bounds=[(-6, 6)] * len(z),
+                 options=options).x
+    )  # fmt: skip
+
+
+def posterior(model: Model, mode: Floats | None = None) -> Posterior:
+    """Return the joint posterior, the sizes integrated over."""
+    z = mode_of(model) if mode is None else mode
+    spread = _laplace(model, z)
+    draws = _draws(len(z))
+    norms = (draws**2).sum(axis=1)
+    fits, logs = [fit(model, model.sizes.at(z))], [-0.5 * (float(z @ z))]
+    logs[0] -= 0.5 * fits[0].cost
+    for draw in draws:
+        at = z + WIDER * spread @ draw
+        found = fit(model, model.sizes.at(at))
+        fits.append(found)
+        logs.append(-0.5 * (found.cost + float(at @ at)))
+    # Density of the proposal, a multivariate t; the mode is its first draw.
+    of_proposal = -0.5 * (TAIL + len(z)) * np.log1p(np.concatenate([[0.0], norms]) / TAIL)
+    weights = np.array(logs) - of_proposal
+    chances = np.exp(weights - weights.max())
+    return Posterior(model, tuple(fits), chances / chances.sum())
+
+
+def _laplace(model: Model, z: Floats) -> Floats:
+    """Return (Z, Z) a root of the covariance of the sizes about their mode."""
+    step, prior = 0.05, model.sizes
+
+    def slope(at: Floats) -> Floats:
+        return np.asarray(prior.mix.T @ fit(model, prior.at(at)).gradient / 2 + at)
+
+    rows = [(slope(z + step * e) - slope(z - step * e)) / (2 * step) for e in np.eye(len(z))]
+    curvature = 0.5 * (np.array(rows) + np.array(rows).T)
+    values, vectors = np.linalg.eigh(curvature)
+    # A size that nothing shows has the prior's curvature, one.
+    return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
+
+
+def _draws(count: int) -> Floats:
+    """Return (SAMPLES, count) multivariate t numbers, low in discrepancy, in mirrored pairs."""
+    from scipy.special import gammaincinv, ndtri
+
+    points = qmc.Sobol(count + 1, scramble=True, seed=0).random(SAMPLES // 2)
+    normal = ndtri(np.clip(points[:, :-1], 1e-6, 1 - 1e-6))
+    chi2 = 2 * gammaincinv(TAIL / 2, np.clip(points[:, -1], 1e-6, 1 - 1e-6))
+    half = normal / np.sqrt(chi2 / TAIL)[:, None]
+    return np.concatenate([half, -half])
+
+
+def left_out(model: Model, found: Fit) -> tuple[Floats, Floats]:
+    """Return (N, 6) residuals and (N, 6, 6) covariances of each sighting by all the others.
+
+    In closed form (the leave-one-out residual of Cook & Weisberg 1982): a sighting that took part
+    has drawn the fit towards itself by H V H'W, which is taken back.
+    """
+    h = model.design
+    left = (model.projectors @ model.residuals[..., None])[..., 0] - h @ found.mean
+    leverage = h @ found.covariance @ np.swapaxes(h, 1, 2)
+    full = np.linalg.inv(np.eye(6) - leverage @ found.weights)
+    predicted = full @ leverage
+    return (full @ left[..., None])[..., 0], predicted
+
+
+def without(found: Fit, model: Model, fold: Mask) -> Floats:
+    """Return (P + K,) the mean without some sightings, by the same normal equations less theirs."""
+    h, w = model.design[fold], found.weights[fold]
+    r = (model.projectors[fold] @ model.residuals[fold][..., None])[..., 0]
+    count = h.shape[2]
+    weighted = (w @ h).reshape(-1, count)
+    information = found.information - h.reshape(-1, count).T @ weighted
+    right = found.right - weighted.T @ r.ravel()
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(scale, scale)
+    scaled[np.diag_indices(model.p)] += FREE
+    return np.asarray(np.linalg.solve(scaled, right / scale) / scale)

@@ -1,0 +1,126 @@
+"""Sessions of the foreign generator as problems of the estimator, and how wrong its answers are."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
+from flangeye.estimation.effects.arm import arm_effects
+from flangeye.estimation.effects.target import target_effects
+from flangeye.estimation.estimate import Estimate, estimate
+from flangeye.estimation.graph import Carrier, Problem, Sightings
+from flangeye.maths.frame_graph import Frame
+from flangeye.maths.geometry import hat, kabsch, rigid
+from flangeye.maths.kinematics import Arm
+from flangeye.models.model import read_model
+from flangeye.models.robots import RobotModel
+from tests.estimation import foreign
+
+ROBOTS = Path(__file__).parents[2] / "data/robots"
+
+
+class Score(NamedTuple):
+    """NEES over 6, and the mean squares of what is stated and what is true over the box [m^2]."""
+
+    nees: float
+    stated: float
+    true: float
+
+
+class Scores(NamedTuple):
+    """Of one session."""
+
+    true: Score
+    reported: Score
+    svd: float
+    expected: float
+    outliers: int
+
+
+@cache
+def robot(name: str) -> tuple[RobotModel, Arm]:
+    model = read_model(ROBOTS / f"{name}.yaml", RobotModel)
+    return model, Arm(model)
+
+
+def problem_of(s: foreign.Session, kind: str, poses, joints, seen) -> Problem:
+    """Return the sightings of a session, or of its work, with what is stated of their noise."""
+    model, arm = robot(s.arm["name"])
+    hand, n = kind == "hand", len(seen)
+    place = None if kind in ("marker", "hand") else np.eye(4)
+    frames = {
+        "flange": Frame("base", poses),
+        "camera": Frame("flange" if hand else "base"),
+        "target": Frame("base" if hand else "flange", place),
+    }
+    rotation, position = foreign.NOISE[kind]
+    covariances = np.tile(np.diag([rotation**2] * 3 + [position**2] * 3), (n, 1, 1))
+    projectors = np.tile(np.eye(6), (n, 1, 1))
+    if kind == "flange":
+        projectors[:, :3, :3] -= seen[:, :3, 2, None] * seen[:, None, :3, 2]
+    if kind == "centres":
+        projectors[:, :3, :3] = 0
+    circles = kind in ("flange", "centres")
+    sightings = Sightings(
+        np.arange(n), np.zeros(n, dtype=np.intp), seen[:, :3, :3], seen[:, :3, 3],
+        projectors @ covariances @ projectors, projectors, np.zeros((n, 3)), np.full(n, circles),
+        np.zeros((n, 6, 0)),
+    )  # fmt: skip
+    carrier = Carrier("flange", "flange", arm, joints, model.joint_accuracy)
+    return Problem(frames, [("camera", "target")], sightings, [carrier])
+
+
+def estimated(s: foreign.Session, kind: str) -> Estimate:
+    """Return the estimate of a session, begun 10 mm and 0.6 degrees from the truth."""
+    problem = problem_of(s, kind, s.reported, s.joints, s.seen)
+    truth = {"camera": s.camera, "target": s.target}
+    start = problem.moved(truth, np.full(6 * len(problem.unknown), 0.01))
+    effects = [*arm_effects(problem, "flange"), *target_effects(problem)]
+    return estimate(problem, start, effects, np.ones(len(s.seen), dtype=bool))
+
+
+def score(kind: str, arm: dict, s: float, poses: int, seed: int) -> Scores:
+    """Return how wrong both answers of one session are, and how wrong they say."""
+    session = foreign.session(kind, arm, s, poses, seed)
+    found = estimated(session, kind)
+    reported, _, joints = foreign.work(session, 64)
+    camera, target = found.places["camera"], found.places.get("target", np.eye(4))
+    seen = np.linalg.inv(camera) @ reported @ target
+    if session.in_hand:
+        seen = np.linalg.inv(reported @ camera) @ target
+    work = problem_of(session, kind, reported, joints, seen)
+    a = as_reported(found, work)
+    truth = foreign.reported_camera(session)
+    points = seen[:, :3, 3]
+    return Scores(
+        _scored(found, functional(found, np.zeros_like(a)), session.camera, points),
+        _scored(found, functional(found, a), truth, points),
+        _of_svd(session, truth, points) if kind in ("flange", "centres") else np.nan,
+        expected_error(found, work, a).rms,
+        int((~found.inliers).sum()),
+    )
+
+
+def _scored(found: Estimate, answer: Answer, truth, seen) -> Score:
+    """Return an answer's score by its truth over points (N, 3) in the camera."""
+    x = found.problem.moved(found.places, answer.mean)["camera"]
+    turned = Rotation.from_matrix(truth[:3, :3] @ x[:3, :3].T).as_rotvec()
+    error = np.concatenate([turned, truth[:3, 3] - x[:3, 3]])
+    own = answer.covariance[:6, :6]
+    lever = seen @ x[:3, :3].T
+    moves = np.concatenate([-hat(lever), np.tile(np.eye(3), (len(lever), 1, 1))], axis=2)
+    stated = np.trace(moves @ own @ np.swapaxes(moves, 1, 2), axis1=1, axis2=2).mean()
+    true = ((moves @ error) ** 2).sum(axis=1).mean()
+    return Score(float(error @ np.linalg.solve(own, error)) / 6, float(stated), float(true))
+
+
+def _of_svd(s: foreign.Session, truth, seen) -> float:
+    """Return the mean square over the points of the plain least-squares pose of the centres."""
+    x = rigid(*kabsch(s.seen[:, :3, 3], s.reported[:, :3, 3]))
+    off = seen @ (x - truth)[:3, :3].T + (x - truth)[:3, 3]
+    return float((off**2).sum(axis=1).mean())

@@ -1,0 +1,60 @@
+"""The mixed model: its gradient, its folds, and how true it is on arms that it did not make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flangeye.estimation.mixed import fit, left_out, without
+from tests.estimation import foreign
+from tests.estimation.sessions import estimated, robot, score
+
+
+@pytest.fixture(scope="module")
+def found():
+    return estimated(foreign.session("marker", foreign.UR5E, 1e-3, 16, 1), "marker")
+
+
+@pytest.mark.parametrize("arm", [foreign.UR5E, foreign.PANDA])
+def test_the_foreign_arms_are_those_of_the_catalogue(arm) -> None:
+    joints = arm["home"] + np.linspace(-0.4, 0.4, 5)[:, None]
+    assert robot(arm["name"])[1].flange(joints) == pytest.approx(foreign.pose(arm, joints))
+
+
+def test_the_gradient_is_that_of_the_cost(found) -> None:
+    model = found.posterior.model
+    z = 0.5 * np.random.default_rng(0).standard_normal(model.sizes.mix.shape[1])
+    exact = model.sizes.mix.T @ fit(model, model.sizes.at(z)).gradient
+    steps = 1e-5 * np.eye(len(z))
+    both = [[fit(model, model.sizes.at(z + x)).cost for x in (step, -step)] for step in steps]
+    assert exact == pytest.approx(np.array([(a - b) / 2e-5 for a, b in both]), rel=1e-2, abs=5e-3)
+
+
+def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
+    model, mode = found.posterior.model, found.posterior.mode
+    shares = np.ones(16)
+    everyone = fit(model.weighted(shares), mode.sizes)
+    shares[3] = 0.0
+    others = fit(model.weighted(shares), mode.sizes)
+    expected = (model.residuals - model.design @ others.mean)[3]
+    assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
+    fold = shares == 0
+    assert without(everyone, model, fold) == pytest.approx(others.mean, rel=1e-4, abs=1e-9)
+
+
+def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:
+    session = foreign.session("marker", foreign.UR5E, 0.3e-3, 20, 2)
+    session.seen[5, :3, 3] += [0.0, 0.02, 0.0]
+    inliers = estimated(session, "marker").inliers
+    assert not inliers[5] and inliers.sum() == 19
+
+
+@pytest.mark.parametrize("kind", ["marker", "flange"])
+def test_what_is_stated_as_reported_is_as_large_as_the_error(kind) -> None:
+    arms = foreign.UR5E, foreign.PANDA
+    scores = [score(kind, arms[seed % 2], 0.3e-3, 16, seed) for seed in range(8)]
+    nees, stated, true = np.array([s.reported for s in scores]).T
+    assert 0.4 < nees.mean() < 1.7  # 8 sessions of 6 numbers: 99 % of means
+    assert 0.6 < np.sqrt(stated.mean() / true.mean()) < 1.7
+    if kind == "flange":
+        assert true.mean() < 1.1**2 * np.mean([s.svd for s in scores])
