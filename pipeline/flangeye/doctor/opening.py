@@ -218,7 +218,7 @@ def _as_recipe(
         marks_open=any(getattr(s.params, "unobservable", None) == "mark" for s in recipe.steps),
         reader=reader,
         acquire=first.stage.name,
-        changes={} if first.params is None else _given(first.params, {"reader", "path"}),
+        changes={} if first.params is None else _given(first.params, {"reader"}),
     )
 
 

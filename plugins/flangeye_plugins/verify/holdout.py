@@ -34,7 +34,7 @@ from flangeye.types import (
     Source,
     Verification,
 )
-from flangeye.units import Length, param
+from flangeye.units import Angle, Length, param
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -45,6 +45,12 @@ class HoldoutParams(Params):
 
     folds: int = Field(5, ge=2, description="Number of folds; each is held out once.")
     max_rms: Length = param("1 mm", gt=0, description="Largest held-out error that passes, rms.")
+    max_tilt: Angle = param(
+        "2 deg",
+        gt=0,
+        description="Largest held-out angle between measured and expected faces that passes, rms. "
+        "Positions alone can fit while every angle was read wrongly.",
+    )
     max_outliers: float = Field(
         0.3, ge=0, lt=1, description="Largest share of poses the solver may set aside as wrong."
     )
@@ -283,4 +289,12 @@ def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str]
     if outliers:
         told += f" over all {poses} poses, {inliers * 1e3:.3f} mm without {outliers} set aside"
     sign = "within" if passed else "above"
+    tilt = figures.get("tilt_rms", 0.0)
+    if passed and tilt > params.max_tilt:
+        return False, (
+            f"the measured orientations are off by {np.degrees(tilt):.1f} deg rms on poses held "
+            f"out, limit {np.degrees(params.max_tilt):g} deg, while positions fit to "
+            f"{inliers * 1e3:.3f} mm: the angles were read wrongly; 'flangeye doctor' tries other "
+            "conventions"
+        )
     return passed, f"{told}, {sign} the limit of {params.max_rms * 1e3:g} mm"
