@@ -164,3 +164,15 @@ def test_a_hostile_log_is_one_line(exporting: Any, tmp_path: Path, edit: Any, me
     assert (code, out) == (2, "")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_formats_are_listed_and_found_by_what_they_write(exporting: Any) -> None:
+    code, out, _ = exporting("export", "--list")
+    assert code == 0
+    assert {stage.name.partition(".")[2] for stage in EXPORTS} <= {
+        line.split()[0] for line in out.splitlines()
+    }
+    exporting.ran(TOY_RECIPE)
+    code, out, _ = exporting("export", "here", "--to", "URScript", "--out", "-")
+    assert code == 0
+    assert "camera = p[" in out

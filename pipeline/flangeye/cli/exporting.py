@@ -11,7 +11,17 @@ from flangeye.cli.app import LogFile, app, load_plugins
 from flangeye.cli.saying import say
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flangeye.plugin.stage import Stage
     from flangeye.types import ExportedFile
+
+
+def _list_formats(wanted: bool) -> None:
+    if wanted:
+        for each in load_plugins().exports():
+            say(f"{each.name.partition('.')[2]:<16}{each.summary}")
+        raise typer.Exit
 
 
 @app.command()
@@ -34,15 +44,20 @@ def export(
             "--anyway", help="Export even if the calibration was refused; the file says so."
         ),
     ] = False,
+    _list: Annotated[
+        bool,
+        typer.Option(
+            "--list", callback=_list_formats, is_eager=True, help="List the formats and exit."
+        ),
+    ] = False,
 ) -> None:
-    """Export the calibration for another program; 'flangeye stages export' lists the formats.
+    """Export the calibration for another program; --list shows the formats.
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
     from flangeye.files.written import write_whole
 
-    name = f"export.{to.removeprefix('export.')}"
-    file = _exported(run, name, values or [], anyway, camera)
+    file = _exported(run, to.removeprefix("export."), values or [], anyway, camera)
     if out == Path("-"):
         typer.echo(file.text, nl=False)
         return
@@ -66,8 +81,15 @@ def tables(
     say(f"{recipe}: calibrates from {', '.join(file.name for file in files)}")
 
 
+def _format_named(to: str, formats: Sequence[Stage]) -> str:
+    """Return the format of that name, or the only one that speaks of it: ``urscript`` is ``ur``."""
+    names = [each.name for each in formats]
+    spoken = [each.name for each in formats if to.lower() in f"{each.name} {each.summary}".lower()]
+    return spoken[0] if f"export.{to}" not in names and len(spoken) == 1 else f"export.{to}"
+
+
 def _exported(
-    run: Path, name: str, values: list[str], anyway: bool, camera: str | None
+    run: Path, to: str, values: list[str], anyway: bool, camera: str | None
 ) -> ExportedFile:
     from flangeye.errors import StageError
     from flangeye.log.read import read_run
@@ -76,6 +98,7 @@ def _exported(
     from flangeye.result import calibrated_pose, logged_result, require_one
 
     registry = load_plugins()
+    name = _format_named(to, registry.exports())
     stage = registry.stage(name)
     if stage not in registry.exports():
         raise StageError(
