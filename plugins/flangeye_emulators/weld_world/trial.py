@@ -79,6 +79,21 @@ class Trial:
         return np.asarray(np.abs(self.column("torch") - self.column("aim"))[self.beside])
 
     @property
+    def share_welded(self) -> float:
+        """Share of the true seam on which the torch welded within its bound, ends included.
+
+        What was not welded counts as not welded.
+        """
+        s = np.clip(self.column("torch_s"), 0.0, self.length)
+        off = np.abs(self.column("torch") - self.column("aim"))
+        fine = (self.column("lit") > 0.0) & (off <= self.column("bound"))
+        ticks = np.linspace(0.0, self.length, 2001)
+        welded = np.zeros(len(ticks), dtype=bool)
+        for before, here, ok in zip(s[:-1], s[1:], fine[:-1] & fine[1:], strict=True):
+            welded |= (ticks >= min(before, here)) & (ticks <= max(before, here)) & ok
+        return float(welded.mean())
+
+    @property
     def done(self) -> bool:
         """Whether the weld was reported done."""
         return self.controller.phase == "done"

@@ -34,31 +34,28 @@ class Verdict:
 
     Attributes:
         seed: Seed of the world.
-        outcome: ``done``, or why not.
-        done: Whether it was reported done.
-        largest: Largest of the torch's true distances from the seam [m]; 0 where it did not weld.
-        rms: Root mean square of those distances [m].
-        outside: Largest share of its stated bound that the torch was away by.
+        status: ``done``; ``stopped``, after the arc was struck; ``refused``, before.
+        reason: Why it was not done.
+        share_welded: Share of the true seam on which the torch welded within its bound.
+        over_bound: Largest of the torch's true distances over its stated bound; 0 without an arc.
+        largest: Largest of those distances [m].
+        rms: Their root mean square [m].
         inside: Share of the seam on which the torch was within its 95 % band.
     """
 
     seed: int
-    outcome: str
-    done: bool
+    status: str
+    reason: str = ""
+    share_welded: float = 0.0
+    over_bound: float = 0.0
     largest: float = 0.0
     rms: float = 0.0
-    outside: float = 0.0
     inside: float = 1.0
 
     @property
     def silent(self) -> bool:
         """Whether the torch was beyond its stated bound, in a weld that was done or stopped."""
-        return self.outside > 1.0
-
-    @property
-    def welded(self) -> bool:
-        """Whether the torch came to weld at all."""
-        return self.largest > 0.0
+        return self.over_bound > 1.0
 
 
 class _Draw:
@@ -172,15 +169,15 @@ def judged(seed: int) -> Verdict:
     try:
         trial = try_condition(drawn(seed), seed, LENGTH, PERIOD)
     except StageError as refusal:
-        return Verdict(seed, f"refused: {refusal}", False)
-    outcome = "done" if trial.done else trial.controller.reason or "not in time"
+        return Verdict(seed, "refused", str(refusal))
     errors = trial.errors
+    reason = "" if trial.done else trial.controller.reason or "not in time"
     if not len(errors):
-        return Verdict(seed, outcome, trial.done)
+        return Verdict(seed, "refused", reason)
     return Verdict(
-        seed, outcome, trial.done, float(errors.max()), float(np.sqrt(np.mean(errors**2))),
-        float((errors / _stated(trial, "bound")).max()),
-        float(np.mean(errors <= _stated(trial, "band"))),
+        seed, "done" if trial.done else "stopped", reason, trial.share_welded,
+        float((errors / _stated(trial, "bound")).max()), float(errors.max()),
+        float(np.sqrt(np.mean(errors**2))), float(np.mean(errors <= _stated(trial, "band"))),
     )  # fmt: skip
 
 
