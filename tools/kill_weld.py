@@ -152,9 +152,9 @@ def powerless(trial: Trial) -> float:
 
 def camera(trial: Trial) -> float:
     """The camera falls silent, or is lost, as its parameters say."""
-    control, last = trial.controller.control, time.time()
+    control, last = trial.controller.control, time.monotonic()
     while trial.run.poll() is None:
-        last = time.time() if control.truth().speed > MOVES else last
+        last = time.monotonic() if control.truth().speed > MOVES else last
         time.sleep(LOOK)
     trial.reason = trial.told()
     return last - max(s["time_ns"] for s in trial.notes("sight") if s["tag"]) * 1e-9
