@@ -322,6 +322,8 @@ class RobotDriver:
             controller and commands nothing. None where the driver has no way to.
         in_this_process: Whether it must run in the process that owns the terminal, because it
             talks to a person.
+        passive: Whether it commands nothing: others move the arm, a scan is taken where it stands,
+            and no permission is needed.
         simulated: Whether its arm moves nothing, so that no permission is needed and experiments
             that must not run on an arm may.
     """
@@ -331,6 +333,7 @@ class RobotDriver:
     read: Callable[[], Robot] | None = field(default=None, compare=False, repr=False)
     in_this_process: bool = False
     simulated: bool = False
+    passive: bool = False
 
 
 @dataclass(frozen=True)

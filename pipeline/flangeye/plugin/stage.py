@@ -230,11 +230,13 @@ class Part(Plugin):
     Attributes:
         simulated: A robot part whose arm moves nothing, and whose time is not this computer's.
         interactive: A robot part that talks to a person at the terminal; nothing it does is urgent.
+        passive: A robot part that commands nothing: others move the arm, no permission is needed.
         simulation_only: A controller part that is known to diverge; a real arm is refused with it.
     """
 
     simulated: bool = False
     interactive: bool = False
+    passive: bool = False
     simulation_only: bool = False
 
     @property
@@ -411,6 +413,7 @@ def part(
     *,
     simulated: bool = False,
     interactive: bool = False,
+    passive: bool = False,
     simulation_only: bool = False,
 ) -> Callable[[Callable[..., Any]], Part]:
     """Declare a function as the part ``name``, for example ``cost.translation``.
@@ -420,6 +423,7 @@ def part(
         formerly: Names it had, which recipes may still use for one version.
         simulated: For a robot: its arm moves nothing, and its time is not this computer's.
         interactive: For a robot: it talks to a person at the terminal.
+        passive: For a robot: it commands nothing, others move the arm.
         simulation_only: For a controller: it is known to diverge and must not move a real arm.
 
     Raises:
@@ -432,6 +436,7 @@ def part(
             formerly=tuple(formerly),
             simulated=simulated,
             interactive=interactive,
+            passive=passive,
             simulation_only=simulation_only,
         )
         if declared.kind not in PARTS:

@@ -244,6 +244,6 @@ def _devices(header: Header, context: Context, complain: Complain) -> None:
 def _robot_driver(driver: BoundPart, model: RobotModel | None) -> RobotDriver:
     part, opened = driver.part, partial(driver, model)
     # A driver that talks to a person, or moves nothing, has nothing to command in the first place.
-    harmless = opened if part.interactive or part.simulated else None
+    harmless = opened if part.interactive or part.simulated or part.passive else None
     read = partial(opened, reads_only=True) if part.can_only_read else harmless
-    return RobotDriver(part.name, opened, read, part.interactive, part.simulated)
+    return RobotDriver(part.name, opened, read, part.interactive, part.simulated, part.passive)

@@ -33,7 +33,7 @@ from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits, limits_of
 from flangeye.motion.reach import Margins
 from flangeye.motion.reading import read_state
-from flangeye.motion.route import Barred
+from flangeye.motion.route import Barred, Leg, Route
 from flangeye.motion.supervision import Sample
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
 from flangeye.recipe.header import LimitsSection
@@ -126,7 +126,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         itinerary.plan(params.poses, params.verification, seed)
         return itinerary
 
-    if not motion.allowed:
+    if motion.plan_only or not (motion.allowed or arm.passive):
         start, how = _offline(params, robot, resumed) if motion.offline else _read(arm, allowed)
         text, plan = planned(start).shown(start)
         raise NothingMoved("\n".join([text, how, HOW_TO_MOVE]), plan)
@@ -137,7 +137,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
         itinerary = planned(guard.state.joints)
         release = opening.pop_all()
     done = resumed.done if resumed else frozenset()
-    session = LiveSession(itinerary, guard, opened, params.moved, done, stage_log)
+    session = LiveSession(itinerary, guard, opened, params.moved, done, stage_log, arm.passive)
     return LiveCaptures(session, _source(session, arm, eye), release)
 
 
@@ -233,6 +233,7 @@ class LiveSession:
         moved: A scan during which the flange moved by more is set aside [m].
         done: Captures that were taken before.
         stage_log: Hears where the arm goes next, and why there.
+        passive: Whether others move the arm, by ways that nobody here plans.
         idle: How long the arm had nothing to do.
     """
 
@@ -242,6 +243,7 @@ class LiveSession:
     moved: float
     done: frozenset[str]
     stage_log: StageLog
+    passive: bool = False
     idle: Idle = field(default_factory=Idle)
 
     def captures(self) -> Iterator[Capture | Rejection]:
@@ -250,7 +252,7 @@ class LiveSession:
         for stop in self.itinerary.stops():
             if stop.id in self.done:
                 continue
-            way = self.itinerary.way(self.arm.state.joints, stop)
+            way = self._way(stop)
             if isinstance(way, Barred):
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
@@ -262,6 +264,11 @@ class LiveSession:
             taken = self._expose(stop, self.arm.wait().time_ns)
         if taken:
             yield taken()
+
+    def _way(self, stop: Stop) -> Route | Barred:
+        if self.passive:
+            return Route((Leg(stop.pose.joints, 1.0, 1.0, 0.0),))
+        return self.itinerary.way(self.arm.state.joints, stop)
 
     def _expose(self, stop: Stop, arrived_ns: int) -> Callable[[], Capture | Rejection]:
         """Expose at a stop; what is returned waits for the data."""

@@ -31,14 +31,13 @@ from flangeye_plugins.reader.ros2_frames import Frames, Stream, in_order, pose_o
 from flangeye_plugins.reader.ros2_messages import (
     Raw,
     bag_files,
-    cloud_of,
     messages,
-    pixels_of,
     save_cloud,
     save_image,
     scratch,
     topics_of,
 )
+from flangeye_plugins.ros2.messages import cloud_of, intrinsics_of, pixels_of
 
 T = TypeVar("T")
 CLOUD, POSE = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped"
@@ -162,7 +161,7 @@ def _first_look(path: Path) -> Bag:
         elif kind == JOINTS:
             _append(bag.joints, raw, raw.read(_joint_angles))
         elif kind == INFO:
-            bag.cameras[raw.topic] = raw.read(_intrinsics)
+            bag.cameras[raw.topic] = raw.read(intrinsics_of)
             bag.seen_from[raw.topic] = raw.frame
         else:
             bag.seen_from.setdefault(raw.topic, raw.frame)
@@ -183,12 +182,6 @@ def _pose_stamped(topic: str, message: Any) -> Floats:
 def _joint_angles(message: Any) -> dict[str, float]:
     angles = zip(message.name, message.position, strict=False)
     return {str(name): float(angle) for name, angle in angles}
-
-
-def _intrinsics(message: Any) -> tuple[Floats, Floats]:
-    matrix = message.k if hasattr(message, "k") else message.K
-    distortion = message.d if hasattr(message, "d") else message.D
-    return np.array(matrix, dtype=float).reshape(3, 3), np.array(distortion, dtype=float)
 
 
 # --- the arm

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import struct
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
@@ -15,25 +14,16 @@ from typing import Any, TypeVar
 import numpy as np
 
 from flangeye import StageError
-from flangeye.files.images import decode_image
 from flangeye.files.pairs import natural
 from flangeye.files.printable import reason_of
 from flangeye.files.recording import NotThisLayout
 from flangeye.files.regular import open_regular
 from flangeye.log.records import Channel, LogFile
-from flangeye.types import Singles
+from flangeye_plugins.ros2.messages import cloud_of, frame_of, pixels_of, stamp_of, types
 
 T = TypeVar("T")
 
-SHORTEST = 12
-"""A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
 MISSING = "{}: reading ROS 2 bags needs the extra 'ros': pip install 'flangeye[ros]'"
-NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""``sensor_msgs/PointField``: datatype -> NumPy's."""
-GREY = {"mono8": (np.uint8, 1), "8UC1": (np.uint8, 1), "mono16": (np.uint16, 1),
-        "16UC1": (np.uint16, 1), "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3),
-        "8UC3": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4)}  # fmt: skip
-"""Encodings of ``sensor_msgs/Image`` that are read: type and channels."""
 
 
 @dataclass(frozen=True)
@@ -73,21 +63,12 @@ class Raw:
     @property
     def stamp(self) -> float:
         """``header.stamp`` [s] of a message that begins with a header; else when received."""
-        if len(self.data) < SHORTEST:
-            return self.received
-        order = "<" if self.data[1] & 1 else ">"
-        seconds, nanoseconds = struct.unpack_from(f"{order}iI", self.data, 4)
-        return seconds + nanoseconds * 1e-9 if seconds or nanoseconds else self.received
+        return stamp_of(self.data) * 1e-9 or self.received
 
     @property
     def frame(self) -> str:
         """``header.frame_id`` of a message that begins with a header."""
-        if len(self.data) < SHORTEST + 4:
-            return ""
-        order = "<" if self.data[1] & 1 else ">"
-        (length,) = struct.unpack_from(f"{order}I", self.data, SHORTEST)
-        text = self.data[SHORTEST + 4 : SHORTEST + 4 + length]
-        return text.rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+        return frame_of(self.data)
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -185,9 +166,7 @@ def _db3_topics(file: Path) -> dict[str, str]:
 
 
 def _db3_messages(file: Path, topics: Collection[str]) -> Iterator[Raw]:
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = types()
     marks = ",".join("?" * len(topics))
     with _opened(file) as database:
         rows = database.execute(
@@ -210,33 +189,6 @@ def scratch(bag: Path) -> Path:
     folder = Path(_scratch().name) / f"{abs(hash(bag.resolve())):x}"
     folder.mkdir(exist_ok=True)
     return folder
-
-
-def cloud_of(message: Any) -> Singles:
-    """Return the points of a ``sensor_msgs/PointCloud2``, (H, W, 3) if organised, else (N, 3) [m].
-
-    Raises:
-        StageError: It has no x, y and z.
-    """
-    fields = {f.name: f for f in message.fields}
-    if not {"x", "y", "z"} <= set(fields):
-        raise StageError(f"a PointCloud2 without x, y, z: it has {', '.join(fields) or 'nothing'}")
-    order = ">" if message.is_bigendian else "<"
-    kind = np.dtype(
-        {
-            "names": list("xyz"),
-            "formats": [order + NUMBERS[fields[axis].datatype] for axis in "xyz"],
-            "offsets": [fields[axis].offset for axis in "xyz"],
-            "itemsize": message.point_step,
-        }
-    )
-    row = message.width * message.point_step  # some drivers leave row_step at 0
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    rows = data.reshape(message.height, message.row_step or row)
-    used = np.ascontiguousarray(rows[:, :row])
-    points = used.reshape(-1).view(kind)
-    xyz = np.stack([points[axis].astype(np.float32) for axis in "xyz"], axis=-1)
-    return xyz.reshape(message.height, message.width, 3) if message.height > 1 else xyz
 
 
 def save_cloud(path: Path, message: Any) -> Path:
@@ -262,30 +214,3 @@ def save_image(path: Path, message: Any) -> Path:
         return path.with_suffix(suffix)
     cv2.imwrite(str(path.with_suffix(".png")), pixels_of(message))
     return path.with_suffix(".png")
-
-
-def pixels_of(message: Any) -> Any:
-    """Return the pixels of a ``sensor_msgs/Image`` as 8 bits, blue first where coloured.
-
-    Those of a ``CompressedImage`` are grey.
-
-    Raises:
-        StageError: Its encoding is not known.
-        ImageError: It is compressed, and damaged.
-    """
-    import cv2
-
-    if hasattr(message, "format"):
-        return decode_image(bytes(message.data), cv2.IMREAD_GRAYSCALE)
-    if message.encoding not in GREY:
-        known = ", ".join(GREY)
-        raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")
-    kind, channels = GREY[message.encoding]
-    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    width = message.width * channels * order.itemsize
-    pixels = np.ascontiguousarray(rows[:, :width]).view(order)
-    pixels = pixels.reshape(message.height, message.width, channels)[:, :, :3].squeeze()
-    if kind is np.uint16:
-        pixels = (pixels / max(int(pixels.max()), 1) * 255).astype(np.uint8)
-    return pixels[..., ::-1] if message.encoding.startswith("rgb") else pixels

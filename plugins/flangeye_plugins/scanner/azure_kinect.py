@@ -21,12 +21,12 @@ from flangeye.files.children import python_command
 from flangeye.files.machine import MachineName, find_named, require_named
 from flangeye.files.machine import settings_file as machine_settings
 from flangeye.files.paths import RecipePath
+from flangeye.files.pipe import Pipe, PipeEndedError
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
 from flangeye.units import Duration, param
 from flangeye_plugins.scanner.kinect_view import DepthView
 from flangeye_plugins.scanner.opened import OpenScanner
-from flangeye_plugins.scanner.pipe import Pipe, PipeEndedError
 
 NAME = "scanner.azure_kinect"
 DEFAULT_PYTHON = "kinect"

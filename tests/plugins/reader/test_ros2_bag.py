@@ -28,7 +28,8 @@ from flangeye.run.runner import Runner
 from flangeye.types import ArchivePath
 from flangeye_plugins.reader.folder import FolderParams, folder
 from flangeye_plugins.reader.ros2_bag import BagParams, ros2_bag
-from flangeye_plugins.reader.ros2_messages import bag_files, cloud_of, messages
+from flangeye_plugins.reader.ros2_messages import bag_files, messages
+from flangeye_plugins.ros2.messages import cloud_of
 from tests.plugins.reader.bags import (
     FIXED,
     START,

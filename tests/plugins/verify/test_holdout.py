@@ -133,6 +133,13 @@ def test_tilt_is_the_angle_between_mapped_and_reported_normals() -> None:
     assert result.figures["tilt_rms"] == pytest.approx(2e-3, rel=0.01)
 
 
+def test_angles_that_were_read_wrongly_do_not_pass_though_positions_fit() -> None:
+    result = verify_holdout(svd(simulate(30, tilt=np.radians(6))), svd, HoldoutParams())
+    assert not result.passed and "off by 6.0 deg" in result.reason
+    assert result.figures["rms"] < 1 * MM
+    assert verify_holdout(svd(simulate(30, tilt=np.radians(1))), svd, HoldoutParams()).passed
+
+
 def test_a_loop_measures_a_camera_beside_an_arm_as_that_is_measured() -> None:
     observations, every = simulate(12, tilt=0.02), np.arange(12)
     calibration = svd(simulate(12, seed=1))

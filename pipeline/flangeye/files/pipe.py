@@ -7,7 +7,7 @@ import os
 import queue
 import subprocess
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import IO, cast
 
 
@@ -18,14 +18,21 @@ class PipeEndedError(Exception):
 class Pipe:
     """A process, read in the background so that waiting for it can end."""
 
-    def __init__(self, command: Sequence[str]) -> None:
-        """Start it.
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
+        """Start it, with this process's environment unless another is given.
 
         Raises:
             OSError: There is no such program.
         """
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,  # Ctrl-C is for us, who then close it
         )
         self._in, self._out, self._err = cast(
             "tuple[IO[bytes], IO[bytes], IO[bytes]]",
@@ -48,11 +55,11 @@ class Pipe:
         self._in.write(data)
         self._in.flush()
 
-    def line(self, patience: float) -> bytes:
+    def line(self, patience: float | None) -> bytes:
         """Return the next line, without its end.
 
         Raises:
-            TimeoutError: It did not come within ``patience`` [s].
+            TimeoutError: It did not come within ``patience`` [s]; None waits for ever.
             PipeEndedError: It never will.
         """
         while b"\n" not in self._rest:
@@ -60,7 +67,7 @@ class Pipe:
         line, _, self._rest = self._rest.partition(b"\n")
         return line
 
-    def read(self, size: int, patience: float) -> bytes:
+    def read(self, size: int, patience: float | None) -> bytes:
         """Return the next ``size`` bytes; raises as :meth:`line`."""
         parts, missing = [self._rest[:size]], size - len(self._rest)
         self._rest = self._rest[size:]
@@ -80,7 +87,7 @@ class Pipe:
             with contextlib.suppress(OSError):  # what was not sent yet has nowhere to go
                 stream.close()
 
-    def _more(self, patience: float) -> None:
+    def _more(self, patience: float | None) -> None:
         try:
             chunk = self._chunks.get(timeout=patience)
         except queue.Empty:

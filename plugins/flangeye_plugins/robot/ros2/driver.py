@@ -1,0 +1,280 @@
+"""``robot.ros2`` moves an arm under ROS 2; ``robot.ros2_freedrive`` listens to one others move."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import SILENT, DeviceError, Mode, Robot
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import part
+from flangeye.types import Floats, Transform
+from flangeye.units import Duration, in_mm, param
+from flangeye_plugins.robot.ros2 import pieces
+from flangeye_plugins.robot.ros2.listener import Listener, ListenParams
+from flangeye_plugins.ros2.client import DISCOVERY, Bridge
+from flangeye_plugins.ros2.messages import encoded, message
+
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+
+RENEWAL = 0.025
+"""Between two pieces of a motion [s]."""
+
+BEGINNING = pieces.BEHIND + 2 * RENEWAL
+"""How long before now a piece begins [s]."""
+
+SET_OFF = 0.8
+"""An arm that has not begun to move after this is not being moved by its controller [s]."""
+
+BEGUN = 1e-3
+"""It has begun when a joint has turned so far [rad]."""
+
+SETTLING = 0.3
+"""How long a controller may take to its goal when the motion is over [s]."""
+
+MOVED_ON = 0.02
+"""An arm that was moved by hand has left its last place when a joint turned so far [rad]."""
+
+
+class Ros2Params(ListenParams):
+    """Parameters of ``robot.ros2``."""
+
+    trajectory: str = Field(
+        description="Topic on which the controller takes joint trajectories: "
+        "/joint_trajectory_controller/joint_trajectory."
+    )
+
+
+class FreedriveParams(ListenParams):
+    """Parameters of ``robot.ros2_freedrive``."""
+
+    still: Duration = param(
+        "500 ms", gt=0, description="How long the arm must have stood before a scan is taken."
+    )
+
+
+@part("robot.ros2")
+def robot_ros2(model: RobotModel, params: Ros2Params, reads_only: bool = False) -> Robot:
+    """Any arm with a ROS 2 driver: joint states tell where it is, a joint trajectory moves it.
+
+    Motions are published in pieces that lead a third of a second ahead and end by themselves, so an
+    arm that nobody leads any more stands within half a second. The controller must replace the
+    trajectory before, as ros2_control's joint_trajectory_controller does.
+
+    Args:
+        model: The arm, as its URDF has it.
+        params: See :class:`Ros2Params`.
+        reads_only: Publish nothing.
+
+    Raises:
+        DeviceError: No ROS 2, no joint states of this arm, or no controller that listens.
+    """
+    bridge = Bridge("robot.ros2", params.sim_time, punctual=True)
+    try:
+        listener = Listener if reads_only else Ros2Arm
+        return listener("robot.ros2", model, params, bridge)  # type: ignore[return-value]
+    except BaseException:
+        bridge.close()
+        raise
+
+
+@part("robot.ros2_freedrive", passive=True)
+def robot_ros2_freedrive(model: RobotModel, params: FreedriveParams) -> Robot:
+    """An arm under ROS 2 that others move: by hand, in freedrive, or by the cell's own program.
+
+    Nothing is ever published, so no permission to move is needed: a scan is taken whenever the arm
+    has moved on and stands still.
+
+    Raises:
+        DeviceError: No ROS 2, or no joint states of this arm.
+    """
+    bridge = Bridge("robot.ros2_freedrive", params.sim_time)
+    try:
+        return FreedriveArm(model, params, bridge)
+    except BaseException:
+        bridge.close()
+        raise
+
+
+class Ros2Arm(Listener):
+    """An arm that is moved in pieces; see :class:`flangeye.devices.Robot`."""
+
+    def __init__(self, asker: str, model: RobotModel, params: Ros2Params, bridge: Bridge) -> None:
+        """Hear where the arm is, and find the controller.
+
+        Raises:
+            DeviceError: Joint states do not come, or nobody listens to the trajectories.
+        """
+        self._topic, self._names = params.trajectory, list(params.joints)
+        self._motion: pieces.Motion | None = None
+        self._from, self._began, self._renewed = np.zeros(len(params.joints)), 0.0, 0.0
+        self._ended = 0.0
+        super().__init__(asker, model, params, bridge)
+        bridge.offer(self._topic, TRAJECTORY)
+        self._require_listener()
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Start a move to joint angles (n,) [rad]."""
+        self._begin(pieces.joint_path(self._fresh().joints, joints, speed, acceleration))
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Start a straight move of the flange."""
+        start, goal = self._fresh().joints, base_T_flange.matrix
+        self._begin(pieces.linear_path(self.arm, start, goal, speed, acceleration))
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,) of the flange."""
+        joints = self._fresh().joints
+        jacobian = self.arm.jacobian(joints)
+        speeds = np.linalg.lstsq(jacobian, np.concatenate([twist[3:], twist[:3]]), rcond=None)[0]
+        lever = float(np.linalg.norm(jacobian[3:], axis=0).max())
+        motion = self._motion
+        if not isinstance(motion, pieces.Velocity):
+            motion = pieces.Velocity(joints)
+            self._begin(motion)
+        motion.ask(speeds, acceleration / max(lever, 1.0))
+
+    def wait_cycle(self) -> None:
+        """Wait for the next joint state, and lead the arm on: it stops where nobody waits."""
+        super().wait_cycle()
+        silent = time.monotonic() - self._renewed
+        if self._motion is not None and silent > SILENT:
+            self.stop()  # nobody watched: what ended by itself is not taken up again
+        elif self._motion is not None and silent >= RENEWAL:
+            self._renew()
+
+    def stop(self) -> None:
+        """Publish a hold: the controller brakes from where the arm is on its motion."""
+        if self._motion is not None:
+            self._publish(self._motion.stop())
+            self._motion, self._ended = None, time.monotonic() + pieces.STOPPING
+
+    def close(self) -> None:
+        """Stop, and let go of ROS 2."""
+        try:
+            if not self._bridge.closed:
+                self.stop()
+        except DeviceError:
+            pass  # the bridge is gone: the piece under way ends by itself
+        finally:
+            super().close()
+
+    def _mode(self, moves: bool) -> Mode:
+        settles = time.monotonic() < self._ended + SETTLING
+        return "moving" if moves or settles or self._motion is not None else "ready"
+
+    def _begin(self, motion: pieces.Motion) -> None:
+        self._require_listener()
+        self._motion, self._from = motion, self._samples[-1].joints
+        self._began = self._renewed = time.monotonic()
+        self._renew()
+
+    def _renew(self) -> None:
+        """Publish the motion's next piece; the last one leads to its end."""
+        now, joints = time.monotonic(), self._fresh().joints
+        motion = self._motion
+        if motion is None:
+            return
+        self._publish(motion.piece(joints, now - self._renewed))
+        self._renewed = now
+        if motion.done:
+            self._motion, self._ended = None, now + pieces.LAST
+        elif isinstance(motion, pieces.Path) and now - self._began > SET_OFF:
+            self._require_motion(joints)
+
+    def _require_motion(self, joints: Floats) -> None:
+        if np.abs(joints - self._from).max() < BEGUN:
+            raise DeviceError(
+                f"{self.name}: {self._topic} was given a trajectory {SET_OFF} s ago and the arm "
+                "has not moved: its controller rejects them (its log says why) or is not active; "
+                f"are its joints {', '.join(self._names)}?"
+            )
+        self._began = np.inf  # it did set off
+
+    def _require_listener(self) -> None:
+        until = time.monotonic() + DISCOVERY
+        while not self._bridge.listeners(self._topic):
+            if time.monotonic() > until:
+                topics = self._bridge.topics().values()
+                others = [t.name for t in topics if t.type == TRAJECTORY and t.subscribers]
+                raise DeviceError(
+                    f"{self.name}: no controller listens to {self._topic}; topics of this type "
+                    f"that one listens to: {', '.join(others) or 'none'}: is the controller active?"
+                )
+            time.sleep(0.05)
+
+    def _publish(self, points: list[pieces.Point]) -> None:
+        time_type, header = "builtin_interfaces/msg/Time", "std_msgs/msg/Header"
+        began = self._bridge.stamp_ns(time.monotonic_ns()) - round(1e9 * BEGINNING)
+        stamp = message(time_type, sec=began // 10**9, nanosec=began % 10**9)
+        trajectory = message(
+            TRAJECTORY, header=message(header, stamp=stamp, frame_id=""), joint_names=self._names,
+            points=[_point(p) for p in points],
+        )  # fmt: skip
+        self._bridge.publish(self._topic, encoded(trajectory))
+
+
+def _point(point: pieces.Point) -> object:
+    seconds, nanoseconds = divmod(round(1e9 * (point.after + BEGINNING)), 10**9)
+    after = message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=nanoseconds)
+    nothing = np.zeros(0)
+    return message(
+        "trajectory_msgs/msg/JointTrajectoryPoint", positions=point.joints, velocities=point.speeds,
+        accelerations=nothing, effort=nothing, time_from_start=after,
+    )  # fmt: skip
+
+
+class FreedriveArm(Listener):
+    """An arm that others move; see :class:`flangeye.devices.Robot`."""
+
+    by_hand = True
+    """See :class:`flangeye.devices.MovedByHand`."""
+
+    def __init__(self, model: RobotModel, params: FreedriveParams, bridge: Bridge) -> None:
+        """Hear where the arm is."""
+        self._still = params.still
+        self._left: Floats | None = None
+        self._awaited = False
+        self._stood_since = time.monotonic()
+        super().__init__("robot.ros2_freedrive", model, params, bridge)
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Wait until the arm was moved on and stands still; say where a scan would tell most."""
+        del speed, acceleration
+        pose = self.arm.flange(joints)
+        lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))
+        sys.stderr.write(
+            f"Move the flange on, for example to {in_mm(pose[:3, 3])}, leaning {lean:.0f} deg; the "
+            f"scan is taken when it has stood for {self._still:g} s\n"
+        )
+        self._awaited = True
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Wait as for joints."""
+        found = self.arm.inverse(base_T_flange.matrix)
+        self.move_joints(found[0] if len(found) else self._fresh().joints, speed, acceleration)
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Refuse: others move it."""
+        raise DeviceError(f"{self.name}: others move it; it cannot be led")
+
+    def stop(self) -> None:
+        """Do nothing: the arm is somebody else's."""
+
+    def _facing(self) -> Floats:
+        return self.arm.flange(self._fresh().joints)[:3, 2]
+
+    def _mode(self, moves: bool) -> Mode:
+        now, joints = time.monotonic(), self._samples[-1].joints
+        if moves:
+            self._stood_since = now
+        went = self._left is None or bool(np.abs(joints - self._left).max() > MOVED_ON)
+        if not self._awaited:
+            return "ready"
+        if not went or now - self._stood_since < self._still:
+            return "moving"
+        self._awaited, self._left = False, joints
+        return "ready"

@@ -1,0 +1,230 @@
+"""Where an arm is, as ROS 2 tells: joint states, and a pose by its model or from tf."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from flangeye.devices import Device, DeviceError, Mode, RobotState
+from flangeye.files.load import busy
+from flangeye.maths.kinematics import Arm
+from flangeye.models.robots import RobotModel
+from flangeye.plugin.stage import Params
+from flangeye.types import BASE, FLANGE, Floats, Transform
+from flangeye_plugins.robot.tool_check import require_model
+from flangeye_plugins.ros2.client import DISCOVERY, Bridge, Message
+from flangeye_plugins.ros2.frames import Frames
+from flangeye_plugins.ros2.messages import decoded
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+STALE = 0.1
+"""A sample older than this is no news of the arm [s]."""
+
+SLOWEST = 0.05
+"""Longest time between joint states with which an arm can be watched [s]."""
+
+WINDOW_NS = 50_000_000
+"""Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty."""
+
+STANDING = 1e-3
+"""No joint turns faster on an arm that stands [rad/s]."""
+
+
+class TfParams(Params):
+    """The frames of a pose that is taken from tf."""
+
+    base: str = Field("base_link", description="Frame of the arm's base.")
+    flange: str = Field("tool0", description="Frame of the flange, origin in its face, z outwards.")
+
+
+class ListenParams(Params):
+    """What tells where the arm is."""
+
+    joints: tuple[str, ...] = Field(
+        min_length=1,
+        description="Names of the joints from base to flange, prefix included; the messages may "
+        "hold others and any order.",
+    )
+    joint_states: str = Field("/joint_states", description="Topic of the joint states.")
+    tf: TfParams | None = Field(
+        None,
+        description="Take the flange's pose from tf instead of the model's kinematics; needs "
+        "tf2_msgs, which every ROS 2 distribution has.",
+    )
+    sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
+
+
+class Sample(NamedTuple):
+    """Joint angles (n,) [rad], when they were so [ns], and when that came [ns]."""
+
+    joints: Floats
+    time_ns: int
+    received_ns: int
+
+
+class Listener(Device):
+    """An arm that is listened to; see :class:`flangeye.devices.Robot` for its state.
+
+    Attributes:
+        name: For people.
+        period: Between two joint states [s].
+        flange_T_tool: None: joint states know no tool.
+    """
+
+    flange_T_tool: Transform | None = None
+
+    def __init__(self, asker: str, model: RobotModel, params: ListenParams, bridge: Bridge) -> None:
+        """Hear where the arm is.
+
+        Raises:
+            DeviceError: Joint states do not come, or are not this arm's.
+        """
+        self.name = f"{model.model} on {params.joint_states}"
+        self.arm, self._params, self._bridge = Arm(model), params, bridge
+        self._asker, self._model = asker, model
+        self._seen = 0
+        self._samples: deque[Sample] = deque()
+        self._columns: tuple[tuple[str, ...], list[int]] = ((), [])
+        if len(params.joints) != self.arm.n:
+            raise DeviceError(
+                f"{asker}: joints names {len(params.joints)}, but a {model.model} has {self.arm.n}"
+            )
+        bridge.follow(params.joint_states, JOINT_STATE)
+        self._frames = Frames(bridge) if params.tf else None
+        if self._frames and params.tf:
+            self._frames.wait_for(params.tf.base, params.tf.flange)
+        self.period = self._measured_period()
+        require_model(self.name, self.state(), model)
+
+    def state(self) -> RobotState:
+        """Return the newest sample."""
+        self._take(0.0)
+        newest = self._fresh()
+        pose = self._flange(newest)
+        speeds = self.speeds()
+        return RobotState(
+            base_T_flange=Transform(BASE, FLANGE, pose),
+            joints=newest.joints,
+            joint_speeds=speeds,
+            time_ns=newest.time_ns,
+            mode=self._mode(bool(np.abs(speeds).max() > STANDING)),
+        )
+
+    def wait_cycle(self) -> None:
+        """Return when the next joint state has come."""
+        if not self._take(STALE):
+            self._fresh()
+            raise DeviceError(f"{self.name}: {self._silence()}")
+
+    def close(self) -> None:
+        """Let go of ROS 2."""
+        self._bridge.close()
+
+    def speeds(self) -> Floats:
+        """Return the joints' speeds (n,) over the last 50 ms [rad/s]."""
+        first, last = self._samples[0], self._samples[-1]
+        seconds = 1e-9 * (last.time_ns - first.time_ns)
+        return (last.joints - first.joints) / seconds if seconds > 0 else np.zeros(self.arm.n)
+
+    def _flange(self, sample: Sample) -> Floats:
+        if self._frames and (tf := self._params.tf):
+            return self._frames.pose(tf.base, tf.flange)
+        return self.arm.flange(sample.joints)
+
+    def _mode(self, moves: bool) -> Mode:
+        return "moving" if moves else "ready"
+
+    def _measured_period(self) -> float:
+        """Return the time between two joint states [s]."""
+        began, times = time.monotonic(), list[int]()
+        while len(times) < 10 and time.monotonic() - began < DISCOVERY:
+            if self._take(DISCOVERY / 2):
+                times.append(self._samples[-1].received_ns)
+        if len(times) < 2:
+            told = self._silence() if self._seen else "nothing came on it"
+            raise DeviceError(
+                f"{self._asker}: {self._params.joint_states}: {told}{self._missing()}"
+            )
+        period = float(np.median(np.diff(times))) * 1e-9
+        if period > SLOWEST:
+            raise DeviceError(
+                f"{self._asker}: {self._params.joint_states} comes {1 / period:.0f} times a "
+                f"second, at least {1 / SLOWEST:.0f} are needed: raise the rate of its publisher"
+            )
+        return max(period, 1e-3)
+
+    # --- samples
+
+    def _take(self, patience: float) -> bool:
+        """Take in the newest message of this arm; return whether there was a new one."""
+        until = time.monotonic() + patience
+        while message := self._bridge.wait(
+            self._params.joint_states, self._seen, max(until - time.monotonic(), 0.0)
+        ):
+            self._seen = message.number
+            if self._keep(message):
+                return True
+        return False
+
+    def _keep(self, message: Message) -> bool:
+        """Keep a message's angles, if it has those of this arm."""
+        told = decoded(message.data, JOINT_STATE)
+        names = tuple(told.name)
+        if names != self._columns[0]:
+            if not set(self._params.joints) <= set(names):
+                return False  # a gripper's or a rail's, on the same topic
+            self._columns = names, [names.index(joint) for joint in self._params.joints]
+        joints = np.asarray(told.position, dtype=float)[self._columns[1]]
+        sample = Sample(joints, self._bridge.local_ns(message), message.received_ns)
+        self._require_forwards(sample)
+        self._samples.append(sample)
+        while len(self._samples) > 2 and sample.time_ns - self._samples[1].time_ns > WINDOW_NS:
+            self._samples.popleft()
+        return True
+
+    def _require_forwards(self, sample: Sample) -> None:
+        back = 1e-9 * (self._samples[-1].time_ns - sample.time_ns) if self._samples else 0.0
+        if back > STALE:
+            self._samples.clear()
+            raise DeviceError(
+                f"{self.name}: its stamps jumped back by {back:.2f} s: a clock was set, or the "
+                "simulation was started again; start the run again"
+            )
+
+    def _fresh(self) -> Sample:
+        """Return the newest sample; raise DeviceError for one that is too old."""
+        if not self._samples:
+            raise DeviceError(f"{self.name}: no joint state has come{self._missing()}")
+        newest = self._samples[-1]
+        if 1e-9 * (time.monotonic_ns() - newest.received_ns) > STALE:
+            raise DeviceError(f"{self.name}: {self._silence()}")
+        off = 1e-9 * (newest.received_ns - newest.time_ns)
+        if abs(off) > STALE:
+            when = "before" if off > 0 else "after"
+            raise DeviceError(
+                f"{self.name}: stamped {abs(off):.2f} s {when} it came, at most {STALE} s are "
+                "allowed: set the clocks of both computers (NTP), or sim_time: true where stamps "
+                "are of /clock"
+            )
+        return newest
+
+    def _silence(self) -> str:
+        last = self._bridge.newest(self._params.joint_states)
+        age = 1e-9 * (time.monotonic_ns() - last.received_ns) if last else np.inf
+        return f"silent for {age:.2f} s, at most {STALE} s are allowed{busy()}"
+
+    def _missing(self) -> str:
+        """Say which joints were looked for, where messages came without them."""
+        last = self._bridge.newest(self._params.joint_states)
+        if last is None or self._samples:
+            return ""
+        names = decoded(last.data, JOINT_STATE).name
+        lost = [joint for joint in self._params.joints if joint not in names]
+        if not lost:
+            return ""
+        return f": it has no joint {', '.join(lost)}, but {', '.join(names)}"

@@ -1,0 +1,264 @@
+"""Motions in pieces that end by themselves: what is not renewed leaves the arm standing.
+
+A piece holds where the motion has just been, leads a little way along it, and then to rest. The
+controller replaces the piece before. When no more come, because anything on the way here has died,
+it drives the last one to its end. Pieces begin in the past: joint_trajectory_controller then goes
+on between points it was given, and not from a measured place, which is always a little behind.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from flangeye.devices import GRACE, DeviceError
+from flangeye.maths.geometry import rotation_exp, rotation_log
+from flangeye.maths.kinematics import Arm
+from flangeye.types import Floats
+
+AHEAD = 0.15
+"""How far a piece leads along the motion before it brakes [s]: five renewals may be late."""
+
+STOPPING = 0.2
+"""Longest time in which a piece comes to rest after that [s]. With :data:`AHEAD`, and a tenth of a
+second for the controller, an arm that nobody leads any more stands within half a second."""
+
+BEHIND = 0.2
+"""How far back the points of a piece begin [s]: longer than clocks may differ and messages take."""
+
+KNOT = 0.05
+"""Between the points of a piece [s]; the controller's cubics between them keep to the motion."""
+
+BRISK = 3.0
+"""Deceleration of a stop, where it takes less time [rad/s^2]."""
+
+REACTION = 0.03
+"""From a stop to its beginning at the controller: it brakes from where the arm is by then [s]."""
+
+LAST = 0.03
+"""What is left of a motion when its last piece is published: about a renewal [s]."""
+
+STEP = 0.01
+"""Between the samples of a motion [s]."""
+
+PACE = 0.15
+"""Over which it is seen how fast the arm goes along a motion [s]."""
+
+SLOWEST = 0.1
+"""A motion goes on at least at this share of its speed: an arm that was held up is to go on."""
+
+
+class Point(NamedTuple):
+    """A point of a piece: joints (n,) [rad] and their speeds [rad/s], so long after now [s]."""
+
+    joints: Floats
+    speeds: Floats
+    after: float
+
+
+class Motion:
+    """What is driven in pieces.
+
+    Attributes:
+        done: Whether there is nothing left to lead to.
+    """
+
+    def __init__(self) -> None:
+        self.done = False
+        self._elapsed = 0.0
+        self._past: deque[Point] = deque()
+
+    def piece(self, joints: Floats, seconds: float) -> list[Point]:
+        """Return the next piece, ``seconds`` after the one before, of an arm at ``joints`` (n,)."""
+        self._go_on(joints, seconds)
+        self._elapsed += seconds
+        now = self._point(0.0)
+        points = [*self._recent(), now, *self._ahead()]
+        self._past.append(now._replace(after=self._elapsed))
+        return [*points, *brake(points[-1], self._deceleration())]
+
+    def stop(self) -> list[Point]:
+        """Return the piece that brakes from where the arm is on the motion."""
+        points = [*self._recent(), self._point(REACTION)]
+        return [*points, *brake(points[-1], BRISK)] if points[-1].speeds.any() else points
+
+    def _recent(self) -> list[Point]:
+        while self._past and self._elapsed - self._past[0].after > BEHIND:
+            self._past.popleft()
+        return [p._replace(after=p.after - self._elapsed) for p in self._past]
+
+    def _go_on(self, joints: Floats, seconds: float) -> None:
+        """Let time pass."""
+        raise NotImplementedError
+
+    def _point(self, after: float) -> Point:
+        """Return where the motion is going to be."""
+        raise NotImplementedError
+
+    def _ahead(self) -> list[Point]:
+        """Return the points up to where the piece brakes."""
+        raise NotImplementedError
+
+    def _deceleration(self) -> float:
+        return BRISK
+
+
+class Path(Motion):
+    """A motion that is known from its beginning to its end."""
+
+    def __init__(self, joints: Floats, acceleration: float) -> None:
+        """Follow (N, n) joint angles, :data:`STEP` apart; brake at ``acceleration`` [rad/s^2].
+
+        Its acceleration is spread over :data:`AHEAD`: the controller's cubic across a corner of the
+        speed would be faster than either side of it.
+        """
+        super().__init__()
+        width = round(AHEAD / STEP)
+        padded = np.pad(joints, ((width, width), (0, 0)), mode="edge")
+        self._joints = sliding_window_view(padded, width + 1, axis=0).mean(axis=-1)
+        self._speeds = np.gradient(self._joints, STEP, axis=0)
+        self._speeds[[0, -1]] = 0.0
+        self._end, self._phase = STEP * (len(self._joints) - 1), 0.0
+        self._acceleration = acceleration
+        self._seen: deque[tuple[float, float]] = deque()
+
+    def _go_on(self, joints: Floats, seconds: float) -> None:
+        self._phase = min(self._phase + seconds * self._pace(joints), self._end)
+        self.done = self._end - self._phase <= LAST
+
+    def _pace(self, joints: Floats) -> float:
+        """Return how fast the arm goes along the motion, 1 for as planned.
+
+        One that is held up is waited for and never hurried after.
+        """
+        self._seen.append((self._elapsed, self._reached(joints)))
+        while self._elapsed - self._seen[0][0] > PACE:
+            self._seen.popleft()
+        (began, start), (now, here) = self._seen[0], self._seen[-1]
+        if now < 2 * PACE or now == began:
+            return 1.0
+        return float(np.clip((here - start) / (now - began), SLOWEST, 1.0))
+
+    def _reached(self, joints: Floats) -> float:
+        """Return the time at which the motion passes nearest to where the arm is [s]."""
+        until = int(self._phase / STEP) + 2
+        nearest = int(np.argmin(np.abs(self._joints[:until] - joints).max(axis=1)))
+        along = STEP * self._speeds[nearest]
+        beyond = float((joints - self._joints[nearest]) @ along) / max(float(along @ along), 1e-12)
+        return STEP * (nearest + float(np.clip(beyond, -0.5, 0.5)))
+
+    def _point(self, after: float) -> Point:
+        place = min((self._phase + after) / STEP, len(self._joints) - 1.0)
+        low = min(int(place), len(self._joints) - 2)
+        share = place - low
+        joints, speeds = (
+            (1.0 - share) * rows[low] + share * rows[low + 1]
+            for rows in (self._joints, self._speeds)
+        )
+        return Point(joints, speeds, after)
+
+    def _ahead(self) -> list[Point]:
+        left = max(self._end - self._phase, LAST)
+        knots = [KNOT * i for i in range(1, round(AHEAD / KNOT) + 1) if KNOT * i < left]
+        if left <= AHEAD:
+            knots = [*(knot for knot in knots if left - knot > STEP), left]
+        return [self._point(after) for after in knots]
+
+    def _deceleration(self) -> float:
+        return self._acceleration
+
+
+class Velocity(Motion):
+    """A motion at the speeds that were asked for last."""
+
+    def __init__(self, joints: Floats) -> None:
+        """Begin at rest at (n,) joint angles [rad]."""
+        super().__init__()
+        self._place, self._speeds = joints, np.zeros_like(joints)
+        self._wanted, self._acceleration, self._left = self._speeds, 1.0, 0.0
+
+    def ask(self, speeds: Floats, acceleration: float) -> None:
+        """Take (n,) speeds [rad/s], reached at an acceleration [rad/s^2], for :data:`GRACE`."""
+        self._wanted, self._acceleration, self._left = speeds, acceleration, GRACE
+
+    def _go_on(self, joints: Floats, seconds: float) -> None:
+        self._left -= seconds
+        wanted = self._wanted if self._left > 0 else np.zeros_like(self._wanted)
+        change = wanted - self._speeds
+        largest = max(float(np.abs(change).max()), 1e-12)
+        before = self._speeds
+        self._speeds = before + change * min(1.0, self._acceleration * seconds / largest)
+        self._place = self._place + 0.5 * (before + self._speeds) * seconds
+        self.done = self._left <= 0 and not self._speeds.any()
+
+    def _point(self, after: float) -> Point:
+        return Point(self._place + self._speeds * after, self._speeds, after)
+
+    def _ahead(self) -> list[Point]:
+        return [self._point(GRACE)]
+
+
+def brake(last: Point, deceleration: float) -> list[Point]:
+    """Return the point at which joints come to rest; none where they stand.
+
+    With positions and speeds at both ends a controller's cubic is the parabola of a constant
+    deceleration.
+    """
+    fastest = float(np.abs(last.speeds).max())
+    if not fastest:
+        return []
+    seconds = min(fastest / deceleration, STOPPING)
+    goal = last.joints + 0.5 * seconds * last.speeds
+    return [Point(goal, np.zeros_like(goal), last.after + seconds)]
+
+
+def joint_path(start: Floats, goal: Floats, speed: float, acceleration: float) -> Path:
+    """Return a straight motion in joint angles (n,); the leading joint keeps ``speed`` [rad/s]."""
+    way = goal - start
+    length = float(np.abs(way).max())
+    share = _ride(length, speed, acceleration) / max(length, 1e-12)
+    return Path(start + share[:, None] * way, acceleration)
+
+
+def linear_path(arm: Arm, start: Floats, goal: Floats, speed: float, acceleration: float) -> Path:
+    """Return a motion of the flange straight to a pose (4, 4) [m/s, m/s^2].
+
+    Raises:
+        DeviceError: The arm cannot follow the line without a jump of its joints.
+    """
+    base_T_flange = arm.flange(start)
+    way = goal[:3, 3] - base_T_flange[:3, 3]
+    turn = rotation_log(base_T_flange[:3, :3].T @ goal[:3, :3])
+    length = float(max(np.linalg.norm(way), np.linalg.norm(turn)))
+    shares = _ride(length, speed, acceleration) / max(length, 1e-12)
+    joints = [start]
+    for share in shares[1:]:
+        pose = np.eye(4)
+        pose[:3, 3] = base_T_flange[:3, 3] + share * way
+        pose[:3, :3] = base_T_flange[:3, :3] @ rotation_exp(share * turn)
+        joints.append(_nearest(arm.inverse(pose), joints[-1]))
+    return Path(np.array(joints), BRISK)
+
+
+def _nearest(found: Floats, before: Floats) -> Floats:
+    turns = found + 2 * np.pi * np.round((before - found) / (2 * np.pi)) if len(found) else found
+    apart = np.abs(turns - before).max(axis=1) if len(found) else np.array([np.inf])
+    if apart.min() > 20 * STEP:  # 20 rad/s: no arm turns so fast, it would fold over
+        raise DeviceError("the arm cannot follow the straight line: a joint would have to jump")
+    return np.asarray(turns[apart.argmin()])
+
+
+def _ride(length: float, speed: float, acceleration: float) -> Floats:
+    """Return places along a length, :data:`STEP` apart in time, standing at both ends."""
+    ramp = min(speed / acceleration, np.sqrt(length / acceleration))
+    top = acceleration * ramp
+    seconds = length / max(top, 1e-12) + ramp
+    times = np.minimum(STEP * np.arange(int(np.ceil(seconds / STEP)) + 1), seconds)
+    places = np.clip(
+        top * (times - 0.5 * ramp), 0.5 * acceleration * np.minimum(times, ramp) ** 2, None
+    )
+    left = np.minimum(seconds - times, ramp)
+    return np.asarray(np.minimum(places, length - 0.5 * acceleration * left**2))

@@ -1,0 +1,1 @@
+"""A folder of its own: the other Python looks for modules here first, and finds no others."""

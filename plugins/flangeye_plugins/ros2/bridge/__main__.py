@@ -1,0 +1,210 @@
+"""The process that holds rclpy: serialised messages in, serialised messages out.
+
+It runs under the Python of the sourced distribution, with the standard library and rclpy alone, and
+without flangeye. Requests come on standard input, answers and messages leave on standard output: a
+line of JSON each, followed by as many bytes as its ``size`` says. It knows no message's content and
+commands nothing of its own: who wants an arm to move has to say so again and again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+SERVICE = 1.0
+"""Longest wait for a service to be found [s]."""
+
+Request = dict[str, Any]
+
+
+class Refused(Exception):
+    """What was asked for cannot be done: why."""
+
+
+class Output:
+    """Standard output, one whole frame at a time; what libraries print goes to standard error."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._stream = os.fdopen(os.dup(1), "wb")
+        os.dup2(2, 1)
+
+    def say(self, header: Request, body: bytes = b"") -> None:
+        """Write a frame; whoever does not listen any more ends this process."""
+        line = json.dumps({**header, "size": len(body)}).encode() + b"\n"
+        try:
+            with self._lock:
+                self._stream.write(line + body)
+                self._stream.flush()
+        except OSError:
+            os._exit(0)
+
+
+class Bridge:
+    """A node, and what was asked of it."""
+
+    def __init__(self, node: Any, output: Output) -> None:
+        self._node, self._output = node, output
+        self._publishers: dict[str, Any] = {}
+        self._wanted: dict[str, bool] = {}
+
+    def graph(self) -> Any:
+        """Return topic -> type, nodes that publish, and the number of those that listen."""
+        return {
+            topic: {
+                "type": types[0],
+                "publishers": sorted(
+                    info.node_name for info in self._node.get_publishers_info_by_topic(topic)
+                ),
+                "subscribers": self._node.count_subscribers(topic),
+            }
+            for topic, types in self._node.get_topic_names_and_types()
+        }
+
+    def services(self) -> Any:
+        """Return service -> type."""
+        return {name: types[0] for name, types in self._node.get_service_names_and_types()}
+
+    def follow(self, topic: str, type: str, always: bool) -> Any:
+        """Subscribe as the publishers publish; return how many there are, none: not subscribed.
+
+        Args:
+            topic: Its name.
+            type: Its type.
+            always: Whether every message is passed on, or only the next one after each ``want``.
+        """
+        kind = type_of(type)
+        infos = self._node.get_publishers_info_by_topic(topic)
+        others = sorted({info.topic_type for info in infos} - {type})
+        if others:
+            raise Refused(f"{topic} carries {others[0]}, {type} is needed")
+        if infos and topic not in self._wanted:
+            self._wanted[topic] = always
+            self._node.create_subscription(
+                kind, topic, self._passes_on(topic, always), matching(infos), raw=True
+            )
+        return len(infos)
+
+    def want(self, topic: str) -> Any:
+        """Pass on the next message of a topic."""
+        self._wanted[topic] = True
+
+    def offer(self, topic: str, type: str, latched: bool) -> Any:
+        """Create a publisher."""
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        profile = QoSProfile(depth=1, durability=durability)
+        self._publishers[topic] = self._node.create_publisher(type_of(type), topic, profile)
+
+    def listeners(self, topic: str) -> Any:
+        """Return how many subscriptions match a publisher of ours."""
+        return self._publishers[topic].get_subscription_count()
+
+    def publish(self, topic: str, body: bytes) -> None:
+        """Publish a serialised message."""
+        self._publishers[topic].publish(body)
+
+    def trigger(self, service: str) -> Any:
+        """Call a service of type std_srvs/srv/Trigger; its answer comes as a frame of its own."""
+        kind = getattr(importlib.import_module("std_srvs.srv"), "Trigger")  # noqa: B009
+        client = self._node.create_client(kind, service)
+        if not client.wait_for_service(timeout_sec=SERVICE):
+            raise Refused(f"nobody offers the service {service}")
+
+        def answered(future: Any) -> None:
+            done = future.result()
+            self._output.say({"triggered": bool(done.success), "message": done.message})
+            self._node.destroy_client(client)
+
+        client.call_async(kind.Request()).add_done_callback(answered)
+
+    def _passes_on(self, topic: str, always: bool) -> Callable[[bytes], None]:
+        def passes_on(body: bytes) -> None:
+            if self._wanted[topic]:
+                self._wanted[topic] = always
+                now = time.monotonic_ns()
+                head = {"topic": topic, "received_ns": now, "ahead_ns": time.time_ns() - now}
+                self._output.say(head, body)
+
+        return passes_on
+
+
+def matching(infos: list[Any]) -> QoSProfile:
+    """Return a quality of service with which a subscription hears all of some publishers."""
+    profiles = [info.qos_profile for info in infos]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        depth=10,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def type_of(name: str) -> Any:
+    """Return the class of a message type such as ``sensor_msgs/msg/Image``."""
+    package, _, kind = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError):
+        raise Refused(f"this ROS 2 has no {name}: install the package {package}") from None
+
+
+def serve(bridge: Bridge, output: Output) -> None:
+    """Do what is asked until the input ends; then nothing here is wanted any more."""
+    stream = sys.stdin.buffer
+    while line := stream.readline():
+        request = json.loads(line)
+        body = stream.read(request.pop("size", 0))
+        if request["ask"] == "publish":
+            bridge.publish(request["topic"], body)
+        else:
+            output.say(answer(bridge, request))
+    os._exit(0)
+
+
+def answer(bridge: Bridge, request: Request) -> Request:
+    """Return the answer to a request, after doing it."""
+    try:
+        given = getattr(bridge, request.pop("ask"))(**request)
+    except Refused as refused:
+        return {"error": str(refused)}
+    except Exception as error:
+        return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+    return {"given": given}
+
+
+def be_punctual() -> None:
+    """Let nothing on a busy machine delay this process, where the user may ask for that."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+
+def main() -> None:
+    """Open a node, say so, and serve."""
+    output = Output()
+    if "punctual" in sys.argv:
+        be_punctual()
+    rclpy.init()
+    node = rclpy.create_node(
+        f"flangeye_{os.getpid()}", enable_rosout=False, start_parameter_services=False
+    )
+    output.say({"given": rclpy.get_rmw_implementation_identifier()})
+    threading.Thread(target=serve, args=(Bridge(node, output), output), daemon=True).start()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+if __name__ == "__main__":
+    main()

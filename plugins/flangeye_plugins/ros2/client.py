@@ -1,0 +1,338 @@
+"""Our end of the bridge, a process under the Python of the sourced distribution."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flangeye.devices import Device, DeviceError
+from flangeye.files.children import python_command
+from flangeye.files.load import busy
+from flangeye.files.machine import find_named, settings_file
+from flangeye.files.pipe import Pipe, PipeEndedError
+from flangeye_plugins.ros2.messages import stamp_of, types
+
+BRIDGE = Path(__file__).with_name("bridge")
+"""Run by the other Python, and not imported here: this one may have no rclpy."""
+
+PROGRAM = "ros2"
+"""The entry of this machine's settings that names the Python which has rclpy."""
+
+STARTING = 10.0
+"""Longest time until the process has a node: a cold disk reads rclpy's hundred libraries [s]."""
+
+ANSWERING = 1.5
+"""Longest time for an answer; finding a service takes the most, a second [s]."""
+
+DISCOVERY = 5.0
+"""Longest time until what runs on the network is known: DDS repeats what it says every 3 s [s]."""
+
+CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
+
+
+class Topic(NamedTuple):
+    """A topic that runs.
+
+    Attributes:
+        name: With its namespace.
+        type: ``sensor_msgs/msg/PointCloud2``.
+        publishers: Names of the nodes that publish it.
+        subscribers: How many listen.
+    """
+
+    name: str
+    type: str
+    publishers: tuple[str, ...]
+    subscribers: int
+
+
+class Message(NamedTuple):
+    """A message as it came.
+
+    Attributes:
+        number: How many of its topic had come, with it.
+        received_ns: When, by ``time.monotonic_ns``.
+        ahead_ns: By how much the wall clock, which stamps are of, was ahead of that one.
+        data: Serialised (CDR).
+    """
+
+    number: int
+    received_ns: int
+    ahead_ns: int
+    data: bytes
+
+
+Take = Callable[[Message], None]
+
+
+class Bridge(Device):
+    """A node in a process of its own.
+
+    Attributes:
+        asker: Who is told of in errors: the driver.
+        middleware: The RMW implementation that the node uses.
+    """
+
+    def __init__(self, asker: str, sim_time: bool = False, punctual: bool = False) -> None:
+        """Start it.
+
+        Args:
+            asker: Who is told of in errors.
+            sim_time: Whether stamps are those of the topic ``/clock``.
+            punctual: Whether it may take precedence over other processes, as what watches an arm.
+
+        Raises:
+            DeviceError: There is no ROS 2 here, or its node does not start.
+        """
+        types()  # without them nothing that comes can be read
+        self.asker = asker
+        self._news = threading.Condition()
+        self._newest: dict[str, Message] = {}
+        self._takers: dict[str, Take] = {}
+        self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._triggered: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._asking = threading.Lock()
+        words = [*ros_python(asker), str(BRIDGE), *(["punctual"] if punctual else [])]
+        try:
+            self._pipe = Pipe(words, _environment())
+        except OSError as error:
+            raise DeviceError(f"{asker}: {words[0]} cannot be run ({error.strerror})") from None
+        threading.Thread(target=self._listen, daemon=True).start()
+        self._sim_time = sim_time
+        try:
+            self.middleware = str(self._answer(STARTING))
+            if sim_time:
+                self.follow(CLOCK, CLOCK_TYPE)
+        except DeviceError:
+            self.close()
+            raise
+
+    # --- what is there
+
+    def topics(self) -> dict[str, Topic]:
+        """Return what is known of the running graph, by topic."""
+        return {
+            name: Topic(name, about["type"], tuple(about["publishers"]), about["subscribers"])
+            for name, about in self._ask("graph").items()
+        }
+
+    def services(self) -> dict[str, str]:
+        """Return service -> type."""
+        return dict(self._ask("services"))
+
+    # --- what comes
+
+    def follow(self, topic: str, kind: str, always: bool = True, take: Take | None = None) -> None:
+        """Subscribe, as soon as somebody publishes.
+
+        Args:
+            topic: Its name.
+            kind: Its type.
+            always: Whether every message is wanted, or those that :meth:`want` asks for.
+            take: Is given each message as it comes, in another thread.
+
+        Raises:
+            DeviceError: Nobody publishes it, or with another type.
+        """
+        if take:
+            self._takers[topic] = take
+        until = time.monotonic() + DISCOVERY
+        while not self._ask("follow", topic=topic, type=kind, always=always):
+            if time.monotonic() > until:
+                raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
+            time.sleep(0.05)
+
+    def newest(self, topic: str) -> Message | None:
+        """Return the newest message of a topic that is followed.
+
+        Raises:
+            DeviceError: The bridge is gone.
+        """
+        if self._gone:
+            raise DeviceError(f"{self.asker}: {self._gone}")
+        return self._newest.get(topic)
+
+    def wait(self, topic: str, after: int, patience: float) -> Message | None:
+        """Return a message of a higher number than ``after``; None where none comes in time [s]."""
+        with self._news:
+            self._news.wait_for(lambda: self._gone or self._count(topic) > after, timeout=patience)
+        found = self.newest(topic)
+        return found if found and found.number > after else None
+
+    def want(self, topic: str) -> int:
+        """Ask for the next message of a topic; return the number after which it comes."""
+        count = self._count(topic)
+        self._ask("want", topic=topic)
+        return count
+
+    def local_ns(self, message: Message) -> int:
+        """Return the moment of a message's stamp, by ``time.monotonic_ns``.
+
+        A stamp of simulated time is held against ``/clock``; a message without a stamp has the
+        moment at which it came.
+        """
+        stamp = stamp_of(message.data)
+        if not stamp:
+            return message.received_ns
+        if not self._sim_time:
+            return stamp - message.ahead_ns
+        tick = self.newest(CLOCK)
+        return (
+            message.received_ns if tick is None else tick.received_ns + stamp - stamp_of(tick.data)
+        )
+
+    def stamp_ns(self, local_ns: int) -> int:
+        """Return what a message of a moment, by ``time.monotonic_ns``, is stamped with."""
+        tick = self.newest(CLOCK) if self._sim_time else None
+        if tick is None:
+            return local_ns + time.time_ns() - time.monotonic_ns()
+        return stamp_of(tick.data) + local_ns - tick.received_ns
+
+    # --- what leaves
+
+    def offer(self, topic: str, kind: str, latched: bool = False) -> None:
+        """Create a publisher."""
+        self._ask("offer", topic=topic, type=kind, latched=latched)
+
+    def listeners(self, topic: str) -> int:
+        """Return how many listen to a topic that is offered."""
+        return int(self._ask("listeners", topic=topic))
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Publish a serialised message; never waits for an answer."""
+        self._send({"ask": "publish", "topic": topic, "size": len(data)}, data)
+
+    def trigger(self, service: str, patience: float) -> None:
+        """Call a ``std_srvs/srv/Trigger`` and wait for its answer.
+
+        Raises:
+            DeviceError: Nobody offers it, it does not answer in time, or says that it failed.
+        """
+        self._ask("trigger", service=service)
+        try:
+            answer = self._triggered.get(timeout=patience)
+        except queue.Empty:
+            raise DeviceError(
+                f"{self.asker}: {service} did not answer within {patience:.1f} s"
+            ) from None
+        if not answer["triggered"]:
+            raise DeviceError(
+                f"{self.asker}: {service} refused: {answer['message'] or 'no reason'}"
+            )
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing can be asked of it any more."""
+        return bool(self._gone)
+
+    def close(self) -> None:
+        """End the process; safe to call twice."""
+        self._gone = self._gone or "is closed"
+        self._pipe.close()
+
+    # --- the wire
+
+    _gone = ""
+
+    def _count(self, topic: str) -> int:
+        found = self._newest.get(topic)
+        return found.number if found else 0
+
+    def _others(self, kind: str) -> str:
+        others = [t.name for t in self.topics().values() if t.type == kind and t.publishers]
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        return (
+            f"of type {kind} there are: {', '.join(sorted(others)) or 'none'} "
+            f"(ROS_DOMAIN_ID {domain}, {self.middleware})"
+        )
+
+    def _ask(self, what: str, **arguments: Any) -> Any:
+        with self._asking:
+            self._send({"ask": what, **arguments})
+            return self._answer(ANSWERING)
+
+    def _answer(self, patience: float) -> Any:
+        try:
+            answer = self._answers.get(timeout=patience)
+        except queue.Empty:
+            answer = {"error": f"the bridge to ROS 2 did not answer within {patience:g} s{busy()}"}
+        if "error" in answer:
+            raise DeviceError(f"{self.asker}: {answer['error']}")
+        return answer["given"]
+
+    def _send(self, request: dict[str, Any], body: bytes = b"") -> None:
+        if self._gone:
+            raise DeviceError(f"{self.asker}: {self._gone}")
+        with contextlib.suppress(OSError):  # why it ended is heard where it is read
+            self._pipe.write(json.dumps(request).encode() + b"\n" + body)
+
+    def _listen(self) -> None:
+        """Take in what the bridge says, until it ends."""
+        try:
+            while True:
+                said = json.loads(self._pipe.line(None))
+                self._take(said, self._pipe.read(said["size"], None))
+        except PipeEndedError as ended:
+            self._gone = self._gone or f"the bridge to ROS 2 has ended ({ended})"
+        self._answers.put({"error": self._gone})
+        with self._news:
+            self._news.notify_all()
+
+    def _take(self, said: dict[str, Any], body: bytes) -> None:
+        if "topic" in said:
+            topic = said["topic"]
+            with self._news:
+                message = Message(
+                    self._count(topic) + 1, said["received_ns"], said["ahead_ns"], body
+                )
+                self._newest[topic] = message
+                self._news.notify_all()
+            if topic in self._takers:
+                self._takers[topic](message)
+        elif "triggered" in said:
+            self._triggered.put(said)
+        else:
+            self._answers.put(said)
+
+
+def ros_python(asker: str) -> list[str]:
+    """Return the command of the Python that has rclpy: this machine's, the sourced one, or this.
+
+    A sourced distribution puts its packages into ``PYTHONPATH``, in a folder that says for which
+    Python they were built.
+
+    Raises:
+        DeviceError: There is none: says what to do.
+    """
+    if (named := find_named("programs", PROGRAM)) is not None:
+        return [str(named)]
+    for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep):
+        version = re.search(r"python(3\.\d+)", folder)
+        if version and (Path(folder) / "rclpy").is_dir():
+            found = shutil.which(f"python{version[1]}")
+            if found is None:
+                raise DeviceError(f"{asker}: {folder} is for python{version[1]}, which is not here")
+            return [found]
+    if find_spec("rclpy") is not None:
+        return python_command()
+    raise DeviceError(
+        f"{asker}: no ROS 2 in this terminal: source it (source /opt/ros/jazzy/setup.bash) and "
+        f'start again, or name the Python that has rclpy, {PROGRAM} = "/its/whole/path" under '
+        f"[programs] in {settings_file()}"
+    )
+
+
+def _environment() -> dict[str, str]:
+    """Return this environment without what would keep the other Python from its own packages."""
+    mine = ("PYTHONHOME", "PYTHONSAFEPATH", "PYTHONDONTWRITEBYTECODE")
+    return {name: value for name, value in os.environ.items() if name not in mine}

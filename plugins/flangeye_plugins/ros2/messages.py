@@ -1,0 +1,170 @@
+"""ROS 2 messages without ROS: CDR to objects and back; clouds and images of them as arrays."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye import StageError
+from flangeye.files.images import decode_image
+from flangeye.types import Floats, Singles
+
+SHORTEST = 12
+"""A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""``sensor_msgs/PointField``: datatype -> NumPy's."""
+PIXELS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
+          "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),
+          "rgba8": ("u1", 4), "bgra8": ("u1", 4)}  # fmt: skip
+"""Encodings of ``sensor_msgs/Image`` that are read: type and channels."""
+PER_METRE = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
+"""Encodings of depth images: units in a metre (REP 118)."""
+MISSING = "ROS 2 messages need the extra 'ros': pip install 'flangeye[ros]'"
+
+
+def stamp_of(data: bytes) -> int:
+    """Return ``header.stamp`` [ns] of a message that begins with a header or time; 0 for none."""
+    if len(data) < SHORTEST:
+        return 0
+    seconds, nanoseconds = struct.unpack_from(f"{_order(data)}iI", data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def frame_of(data: bytes) -> str:
+    """Return ``header.frame_id`` of a message that begins with a header."""
+    if len(data) < SHORTEST + 4:
+        return ""
+    (length,) = struct.unpack_from(f"{_order(data)}I", data, SHORTEST)
+    text = data[SHORTEST + 4 : SHORTEST + 4 + length]
+    return text.rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+
+def _order(data: bytes) -> str:
+    return "<" if data[1] & 1 else ">"
+
+
+@cache
+def types() -> Any:
+    """Return the message types; the four living distributions agree on those that are read here.
+
+    Raises:
+        StageError: The extra ``ros`` is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise StageError(MISSING) from None
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def decoded(data: bytes, kind: str) -> Any:
+    """Return the message of a type in serialised ``data``.
+
+    Raises:
+        StageError: It is damaged, or not of this type.
+    """
+    try:
+        return types().deserialize_cdr(data, kind)
+    except StageError:
+        raise
+    except Exception as error:  # damaged bytes can break the library in any way
+        raise StageError(f"a message is no {kind}: {error}") from None
+
+
+def encoded(message: Any) -> bytes:
+    """Return a message serialised."""
+    return bytes(types().serialize_cdr(message, message.__msgtype__))
+
+
+def message(kind: str, **fields: Any) -> Any:
+    """Return a new message of a type."""
+    return types().types[kind](**fields)
+
+
+def cloud_of(message: Any) -> Singles:
+    """Return the points of a ``sensor_msgs/PointCloud2``, (H, W, 3) if organised, else (N, 3) [m].
+
+    Raises:
+        StageError: It has no x, y and z.
+    """
+    fields = {f.name: f for f in message.fields}
+    if not {"x", "y", "z"} <= set(fields):
+        raise StageError(f"a PointCloud2 without x, y, z: it has {', '.join(fields) or 'nothing'}")
+    order = ">" if message.is_bigendian else "<"
+    kind = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [order + NUMBERS[fields[axis].datatype] for axis in "xyz"],
+            "offsets": [fields[axis].offset for axis in "xyz"],
+            "itemsize": message.point_step,
+        }
+    )
+    row = message.width * message.point_step  # some drivers leave row_step at 0
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    rows = data.reshape(message.height, message.row_step or row)
+    used = np.ascontiguousarray(rows[:, :row])
+    points = used.reshape(-1).view(kind)
+    xyz = np.stack([points[axis].astype(np.float32) for axis in "xyz"], axis=-1)
+    return xyz.reshape(message.height, message.width, 3) if message.height > 1 else xyz
+
+
+def intrinsics_of(message: Any, rectified: bool = False) -> tuple[Floats, Floats]:
+    """Return camera matrix (3, 3) and distortion (k,) of a ``sensor_msgs/CameraInfo``.
+
+    Args:
+        message: The CameraInfo.
+        rectified: Whether the images are rectified: their camera is P's, without distortion.
+    """
+    k, d, p = (
+        np.array(getattr(message, name if hasattr(message, name) else name.upper()), dtype=float)
+        for name in "kdp"
+    )
+    if rectified and p.any():
+        return p.reshape(3, 4)[:, :3], np.zeros(0)
+    return k.reshape(3, 3), d
+
+
+def values_of(message: Any) -> NDArray[Any]:
+    """Return what a ``sensor_msgs/Image`` holds: (H, W) or (H, W, channels), as it was sent.
+
+    Raises:
+        StageError: Its encoding is not known.
+    """
+    if message.encoding not in PIXELS:
+        known = ", ".join(PIXELS)
+        raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")
+    name, channels = PIXELS[message.encoding]
+    kind = np.dtype((">" if message.is_bigendian else "<") + name)
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    width = message.width * channels * kind.itemsize
+    pixels = np.ascontiguousarray(rows[:, :width]).view(kind)
+    return pixels.reshape(message.height, message.width, channels).squeeze(
+        axis=2 if channels == 1 else ()
+    )
+
+
+def pixels_of(message: Any) -> Any:
+    """Return the pixels of a ``sensor_msgs/Image`` as 8 bits, blue first where coloured.
+
+    Those of a ``CompressedImage`` are grey.
+
+    Raises:
+        StageError: Its encoding is not known.
+        ImageError: It is compressed, and damaged.
+    """
+    if hasattr(message, "format"):
+        import cv2
+
+        return decode_image(bytes(message.data), cv2.IMREAD_GRAYSCALE)
+    pixels = values_of(message)
+    if pixels.ndim == 3:
+        pixels = pixels[:, :, :3]
+    if pixels.dtype.kind == "f":
+        raise StageError(f"an image of encoding '{message.encoding}' is of depths, not of light")
+    if pixels.dtype.itemsize == 2:
+        pixels = (pixels / max(int(pixels.max()), 1) * 255).astype(np.uint8)
+    return pixels[..., ::-1] if message.encoding.startswith("rgb") else pixels

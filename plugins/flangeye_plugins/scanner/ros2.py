@@ -1,0 +1,270 @@
+"""``scanner.ros2``: any camera that publishes clouds, depth images or images under ROS 2."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flangeye.devices import PATIENCE, DeviceError, FrameDropped, Scan, Scanner
+from flangeye.errors import StageError
+from flangeye.models.scanners import ScannerModel
+from flangeye.plugin.stage import Params, part
+from flangeye.types import Floats, Image
+from flangeye.units import Duration, param
+from flangeye_plugins.ros2.client import Bridge, Message
+from flangeye_plugins.ros2.messages import (
+    PER_METRE,
+    cloud_of,
+    decoded,
+    frame_of,
+    intrinsics_of,
+    pixels_of,
+    values_of,
+)
+from flangeye_plugins.scanner.kinect_view import DepthView
+from flangeye_plugins.scanner.opened import OpenScanner
+
+NAME = "scanner.ros2"
+CLOUD, DEPTH = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO, EMPTY = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/Empty"
+
+TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
+"""An std_msgs/msg/Empty, serialised: ROS gives a message without fields one byte."""
+
+EARLY = 0.1
+"""A stamp so long after the message came is of another clock [s]."""
+
+PINHOLES = ("", "plumb_bob", "rational_polynomial")
+"""Distortion models of CameraInfo that OpenCV's coefficients mean."""
+
+
+class Ros2Params(Params):
+    """Parameters of ``scanner.ros2``: a cloud, or a depth image, or an image of a marker alone."""
+
+    cloud: str | None = Field(None, description="Topic of the clouds (PointCloud2).")
+    depth: str | None = Field(None, description="Topic of depth images (Image), not of clouds.")
+    image: str | None = Field(
+        None, description="Topic of images (Image, CompressedImage), for markers; of the same "
+        "camera as the depths, or alone.",
+    )  # fmt: skip
+    camera_info: str | None = Field(
+        None, description="CameraInfo of depth or image; camera_info beside them if not given."
+    )
+    trigger: str | None = Field(
+        None, description="Service (std_srvs/Trigger) or topic (std_msgs/Empty) that takes a scan; "
+        "without one the camera runs by itself.",
+    )  # fmt: skip
+    timeout: Duration = param("2.5 s", gt=0, le=PATIENCE, description="Longest wait for a scan.")
+    sim_time: bool = Field(False, description="Stamps are simulated time, of the topic /clock.")
+
+    @model_validator(mode="after")
+    def _looks_at_something(self) -> Ros2Params:
+        if self.cloud and self.depth:
+            raise ValueError("give either cloud or depth, not both")
+        if not (self.cloud or self.depth or self.image):
+            raise ValueError(
+                "name a topic: cloud: /camera/points ('flangeye init --ros2' lists what runs)"
+            )
+        return self
+
+    @property
+    def info(self) -> str:
+        """Topic of the CameraInfo."""
+        return self.camera_info or f"{str(self.depth or self.image).rpartition('/')[0]}/camera_info"
+
+
+@part("scanner.ros2")
+def scanner_ros2(model: ScannerModel | None, params: Ros2Params) -> Scanner:
+    """Any camera with a ROS 2 driver; a scan is the first message stamped after it was asked for.
+
+    Clouds may be organised or not, of any layout. A scan far out of the model's range is refused.
+
+    Raises:
+        DeviceError: No ROS 2, nobody publishes the topic, or with another type.
+    """
+    bridge = Bridge(NAME, params.sim_time)
+    try:
+        return Ros2Scanner(bridge, model, params)
+    except BaseException:
+        bridge.close()
+        raise
+
+
+class Camera(NamedTuple):
+    """A pinhole camera: its matrix (3, 3), OpenCV's distortion (k,), and its frame."""
+
+    matrix: Floats
+    distortion: Floats
+    frame: str
+
+
+class Ros2Scanner(OpenScanner):
+    """Topics of one camera."""
+
+    def __init__(self, bridge: Bridge, model: ScannerModel | None, params: Ros2Params) -> None:
+        """Subscribe.
+
+        Raises:
+            DeviceError: Nobody publishes, or what is needed does not come.
+        """
+        self._bridge, self._params = bridge, params
+        topics = bridge.topics()
+        self._kinds: dict[str, str] = {}
+        for topic, kinds in (
+            (params.cloud, [CLOUD]), (params.depth, [DEPTH]), (params.image, list(IMAGES)),
+        ):  # fmt: skip
+            if topic:
+                runs = topics[topic].type if topic in topics else kinds[0]
+                self._kinds[topic] = runs if runs in kinds else kinds[0]
+                bridge.follow(topic, self._kinds[topic], always=False)
+        self._camera = None if params.cloud and not params.image else self._read_camera()
+        self._calls = bool(params.trigger) and self._find_trigger(str(params.trigger))
+        super().__init__(f"{params.cloud or params.depth or params.image}", self._facts(), model)
+
+    def expose(self) -> Callable[[], Scan]:
+        """Take the first message stamped from now on; the arm waits until it is here."""
+        started = time.monotonic_ns()
+        until = time.monotonic() + self._params.timeout
+        wanted = {topic: self._bridge.want(topic) for topic in self._kinds}
+        self._trigger()
+        taken = {t: self._after(t, count, started, until) for t, count in wanted.items()}
+        ended = max(message.received_ns for message in taken.values())
+
+        def decode() -> Scan:
+            try:
+                return self._scan(self._points(taken), 1.0, (started, ended), self._image(taken))
+            except StageError as error:
+                raise (
+                    error
+                    if isinstance(error, DeviceError)
+                    else FrameDropped(f"{self.name}: {error}")
+                ) from None
+
+        return decode
+
+    def close(self) -> None:
+        """Let go of ROS 2."""
+        self._bridge.close()
+
+    # --- what is there
+
+    def _read_camera(self) -> Camera:
+        topic = self._params.info
+        self._bridge.follow(topic, INFO)
+        message = self._bridge.wait(topic, 0, self._params.timeout)
+        if message is None:
+            raise DeviceError(f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s")
+        info = decoded(message.data, INFO)
+        if info.distortion_model not in PINHOLES:
+            raise DeviceError(
+                f"{NAME}: {topic} has the distortion model {info.distortion_model}; known: "
+                f"{', '.join(PINHOLES[1:])}: rectify the images (image_proc) and name those"
+            )
+        rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
+        return Camera(*intrinsics_of(info, rectified), frame_of(message.data))
+
+    def _find_trigger(self, trigger: str) -> bool:
+        """Return whether the trigger is a service; a topic is offered.
+
+        Raises:
+            DeviceError: It is neither.
+        """
+        services = self._bridge.services()
+        if trigger in services:
+            return True
+        runs = self._bridge.topics().get(trigger)
+        if runs is None or runs.type != EMPTY:
+            known = sorted(s for s, kind in services.items() if kind == "std_srvs/srv/Trigger")
+            raise DeviceError(
+                f"{NAME}: {trigger} is neither a service nor a topic of {EMPTY} that runs; "
+                f"services of type std_srvs/srv/Trigger: {', '.join(known) or 'none'}"
+            )
+        self._bridge.offer(trigger, EMPTY)
+        until = time.monotonic() + self._params.timeout
+        while not self._bridge.listeners(trigger) and time.monotonic() < until:
+            time.sleep(0.05)
+        return False
+
+    def _facts(self) -> dict[str, str]:
+        trigger = self._params.trigger
+        how = f"triggered by {trigger}" if trigger else "runs by itself"
+        unit = "m" if not self._params.depth else "as the image's encoding has it"
+        frame = {"frame": self._camera.frame} if self._camera else {}
+        return {"unit": unit, "middleware": self._bridge.middleware, "scans": how, **frame}
+
+    # --- one scan
+
+    def _trigger(self) -> None:
+        if self._params.trigger and self._calls:
+            self._bridge.trigger(self._params.trigger, self._params.timeout)
+        elif self._params.trigger:
+            self._bridge.publish(self._params.trigger, TRIGGER_MESSAGE)
+
+    def _after(self, topic: str, count: int, started: int, until: float) -> Message:
+        """Return the first message stamped after a moment; those before it are passed over."""
+        late: list[float] = []
+        while message := self._bridge.wait(topic, count, max(until - time.monotonic(), 0.0)):
+            stamp = self._bridge.local_ns(message)
+            early = 1e-9 * (stamp - message.received_ns)
+            if early > EARLY:
+                raise DeviceError(
+                    f"{NAME}: {topic} is stamped {early:.2f} s after "
+                    "it came: set the clocks of both computers (NTP), or sim_time"
+                )
+            if stamp >= started:
+                return message
+            late.append(1e-9 * (started - stamp))
+            count = self._bridge.want(topic)
+        waited = f"within {self._params.timeout:g} s"
+        if not late:
+            raise DeviceError(
+                f"{NAME}: nothing came on {topic} {waited}; {self._why_silent(topic)}"
+            )
+        raise DeviceError(
+            f"{NAME}: {len(late)} messages came on {topic} {waited}, all stamped before they were "
+            f"asked for, the last by {late[-1]:.2f} s: set the camera's clock (NTP), or let its "
+            "driver stamp with the system's time"
+        )
+
+    def _why_silent(self, topic: str) -> str:
+        runs = self._bridge.topics().get(topic)
+        if runs is None or not runs.publishers:
+            return "its publisher has ended: start the camera's driver again"
+        by = ", ".join(runs.publishers)
+        return f"{by} still runs: does the camera have to be triggered, or was its cable pulled?"
+
+    def _points(self, taken: dict[str, Message]) -> Floats:
+        """Return the scan's points (H, W, 3) or (N, 3) [m]; none where there is an image alone."""
+        if cloud := self._params.cloud:
+            return cloud_of(decoded(taken[cloud].data, CLOUD))  # type: ignore[return-value]
+        if not (depth := self._params.depth) or not self._camera:
+            return np.zeros((0, 3))
+        message = decoded(taken[depth].data, DEPTH)
+        if message.encoding not in PER_METRE:
+            known = ", ".join(PER_METRE)
+            raise DeviceError(
+                f"{NAME}: {depth} has the encoding {message.encoding}, depths have one of {known}"
+            )
+        depths = np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0)
+        view = DepthView(self._camera.matrix.tolist(), self._camera.distortion.tolist())
+        return view.points(depths)  # type: ignore[return-value]
+
+    def _image(self, taken: dict[str, Message]) -> Image | None:
+        topic, camera = self._params.image, self._camera
+        if topic is None or camera is None:
+            return None
+        frames = sorted({frame_of(message.data) for message in taken.values()})
+        if len(frames) > 1:
+            raise DeviceError(
+                f"{NAME}: the topics are of several cameras, {' and '.join(frames)}: name the "
+                "depths that the driver aligns to the image, or the image alone"
+            )
+        pixels = pixels_of(decoded(taken[topic].data, self._kinds[topic]))
+        return Image(
+            np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), *camera[:2]
+        )

@@ -1,0 +1,115 @@
+"""A cell under ROS 2: an arm behind a controller and a camera, each a node in its own process."""
+
+import itertools
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager, suppress
+
+import numpy as np
+
+from tests.plugins.ros2.installed import environment
+
+FACING = [180.0, -90.0, 90.0, -90.0, -90.0, 0.0]
+"""Joint angles at which the UR5e holds its flange below the camera [deg]."""
+
+_domains = itertools.count()
+
+
+def free_domain():
+    """A ROS domain that no other test, worker or test run uses now; DDS has ports for some 200."""
+    return 1 + (os.getpid() * 7 + next(_domains)) % 100  # each test has its own
+
+
+class Peer:
+    """A node in a process of its own, that takes words and says some."""
+
+    def __init__(self, script, options, env):
+        command = [sys.executable, "-m", f"tests.plugins.ros2.peers.{script}", json.dumps(options)]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env
+        )
+        self._said: queue.Queue = queue.Queue()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+        assert self.heard()["ready"]
+
+    def tell(self, **words):
+        self.process.stdin.write(json.dumps(words) + "\n")
+        self.process.stdin.flush()
+
+    def ask(self, **words):
+        self.tell(**words)
+        return self.heard()
+
+    def heard(self, patience=30):
+        said = self._said.get(timeout=patience)
+        assert said is not None, "the peer has ended"
+        return said
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+        self._listener.join()
+        with suppress(OSError):
+            self.process.stdin.close()
+        self.process.stdout.close()
+
+    def _listen(self):
+        for line in self.process.stdout:
+            self._said.put(json.loads(line))
+        self._said.put(None)
+
+
+class Controller(Peer):
+    """The arm and its controller."""
+
+    topic = "/arm_controller/joint_trajectory"
+
+    def __init__(self, env, **options):
+        given = {
+            "robot": "ur5e", "joints": FACING, "prefix": "", "namespace": "", "seed": None,
+            "controller": "arm_controller", "latency": 0.01, "lag": 0.02, "sim_time": False,
+        }  # fmt: skip
+        super().__init__("controller", given | options, env)
+        self.joints = [f"{options.get('prefix', '')}joint_{i}" for i in range(1, 7)]
+
+    def history(self):
+        """Rows of time.monotonic() and the fastest joint's speed [rad/s], on the arm's side."""
+        return self.ask(history=True)["history"]
+
+    def rest_after(self, moment):
+        """How long after a moment of time.monotonic() the arm came to rest for good [s]."""
+        moving = [time for time, speed, _ in self.history() if speed > 1e-3]
+        return max(moving[-1] - moment, 0.0) if moving else 0.0
+
+
+class Camera(Peer):
+    """The camera's driver."""
+
+    def __init__(self, env, layout="zivid", **options):
+        given = {
+            "robot": "ur5e", "scanner": "phoxi-m", "layout": layout, "namespace": "/camera",
+            "seed": 1, "resolution": 0.2, "prefix": "", "sim_time": False, "moved": [0.0, 0.0, 0.0],
+            "refuses": "", "lens": "plumb_bob", "joints": FACING,
+        }  # fmt: skip
+        super().__init__("camera", given | options, env)
+
+    def pose(self):
+        """Where it really stands, base_T_camera (4, 4)."""
+        return np.array(self.ask(pose=True)["pose"])
+
+
+@contextmanager
+def peers(*started):
+    try:
+        yield started
+    finally:
+        for peer in started:
+            peer.kill()
+
+
+__all__ = ["FACING", "Camera", "Controller", "Peer", "environment", "free_domain", "peers"]

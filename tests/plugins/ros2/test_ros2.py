@@ -1,0 +1,145 @@
+"""``robot.ros2`` and ``scanner.ros2`` with the real rclpy in other processes; in realtime."""
+
+import time
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError
+from flangeye.models.loading import load_model
+from flangeye_plugins.robot.ros2.driver import (
+    FreedriveParams,
+    Ros2Params,
+    robot_ros2,
+    robot_ros2_freedrive,
+)
+from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
+from flangeye_plugins.scanner.ros2 import scanner_ros2
+from tests.plugins.ros2 import installed
+from tests.plugins.ros2.cell import Camera, Controller, environment, free_domain, peers
+
+pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
+
+ARM, EYE = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
+
+
+@pytest.fixture
+def env(monkeypatch):
+    installed.require()
+    given = environment(free_domain())
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    return given
+
+
+def opened(controller, **params):
+    given = {"joints": tuple(controller.joints), "trajectory": controller.topic}
+    return robot_ros2.function(ARM, Ros2Params(**given | params))
+
+
+def drive(robot, goal, speed=0.5, seconds=10.0):
+    """Go there; return the fastest joint's speed on the way."""
+    robot.move_joints(goal, speed, 1.0)
+    fastest, until = 0.0, time.monotonic() + seconds
+    while robot.state().mode != "ready":
+        assert time.monotonic() < until
+        robot.wait_cycle()
+        fastest = max(fastest, float(np.abs(robot.state().joint_speeds).max()))
+    return fastest
+
+
+def under_way(robot, turn=1.0, seconds=1.0):
+    robot.move_joints(robot.state().joints + turn * np.eye(6)[0], 0.5, 1.0)
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        robot.wait_cycle()
+        robot.state()
+
+
+@pytest.mark.parametrize("latency", [0.01, 0.1])
+def test_a_move_keeps_its_speed_and_whatever_dies_the_arm_rests(env, latency):
+    with peers(Controller(env, latency=latency, prefix="left_")) as (arm,), opened(arm) as robot:
+        start = robot.state().joints
+        goal = start + 0.4 * np.eye(6)[0]
+        assert drive(robot, goal) < 1.15 * 0.5
+        assert np.abs(robot.state().joints - goal).max() < 1e-3
+        under_way(robot)
+        moment = time.monotonic()
+        robot.stop()
+        time.sleep(1.0)
+        assert 0.0 < arm.rest_after(moment) < 0.5
+        robot.wait_cycle()
+        under_way(robot)
+        moment = time.monotonic()
+        robot._bridge._pipe._process.kill()
+        time.sleep(1.0)
+        assert 0.0 < arm.rest_after(moment) < 0.5
+        with pytest.raises(DeviceError, match="the bridge to ROS 2 has ended"):
+            robot.wait_cycle()
+
+
+def test_what_goes_wrong_with_an_arm_is_one_line(env):
+    with peers(Controller(env)) as (arm,):
+        with pytest.raises(DeviceError, match="no controller listens to /other"):
+            opened(arm, trajectory="/other")
+        with pytest.raises(DeviceError, match="it has no joint elbow, but gripper_finger"):
+            opened(arm, joints=(*arm.joints[:5], "elbow"))
+        with opened(arm) as robot:
+            arm.tell(rejects=True)
+            with pytest.raises(DeviceError, match="controller rejects them"):
+                under_way(robot, seconds=2.0)
+            robot.stop()
+            arm.tell(rejects=False, silent=0.5)
+            time.sleep(0.3)
+            with pytest.raises(DeviceError, match="silent for"):
+                robot.state()
+            time.sleep(0.5)
+            robot.wait_cycle()
+            arm.tell(jump=-5.0)
+            time.sleep(0.1)
+            with pytest.raises(DeviceError, match="stamps jumped back by"):
+                for _ in range(50):
+                    robot.wait_cycle()
+
+
+def test_an_arm_that_others_move_is_ready_when_it_stands_elsewhere(env):
+    with peers(Controller(env, controller=None)) as (arm,):
+        params = FreedriveParams(joints=tuple(arm.joints), still="200 ms")
+        with robot_ros2_freedrive.function(ARM, params) as robot:
+            start = robot.state().joints
+            for turn in (0.0, 0.3):
+                robot.move_joints(start, 1.0, 1.0)
+                if turn:
+                    robot.wait_cycle()
+                    assert robot.state().mode == "moving"
+                    arm.tell(hand=(start + turn).tolist(), seconds=0.5)
+                until = time.monotonic() + 5
+                while robot.state().mode != "ready":
+                    assert time.monotonic() < until
+                    robot.wait_cycle()
+                assert np.allclose(robot.state().joints, start + turn, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("layout", "topics", "shape"),
+    [
+        ("zivid", {"cloud": "/camera/points", "trigger": "/camera/capture"}, 3),
+        ("phoxi", {"cloud": "/camera/points", "trigger": "/camera/capture"}, 3),
+        ("realsense", {"cloud": "/camera/points"}, 2),
+        ("empty", {"cloud": "/camera/points", "trigger": "/camera/trigger"}, 3),
+        ("depth", {"depth": "/camera/image_rect_raw"}, 3),
+    ],
+)
+def test_a_scan_is_the_first_stamped_after_it_was_asked_for(env, layout, topics, shape):
+    with peers(Controller(env), Camera(env, layout)) as (_, camera):  # noqa: SIM117
+        with scanner_ros2.function(EYE, Topics(**topics)) as eye:
+            scan = eye.expose()()
+            assert scan.cloud.xyz.ndim == shape
+            assert 0.8 < np.median(scan.cloud.points()[:, 2]) < 1.1
+            assert scan.cloud.points().any(axis=1).all()
+            camera.tell(offset=-9.0)
+            with pytest.raises(DeviceError, match="stamped before they were|did not answer"):
+                eye.expose()
+            camera.kill()
+            with pytest.raises(DeviceError, match="nothing came on|nobody offers|did not answer"):
+                eye.expose()
