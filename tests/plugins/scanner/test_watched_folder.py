@@ -177,7 +177,7 @@ def test_nothing_new_in_time_is_said(folder: Path) -> None:
         scanner.expose()
     assert str(error.value) == (
         f"folder {folder}: no whole new cloud within 0.2 s; looked for * (.csv, .npy, .pcd, .ply, "
-        ".txt, .xyz)"
+        ".pts, .txt, .xyz)"
     )
 
 
