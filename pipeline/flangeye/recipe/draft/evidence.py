@@ -84,15 +84,47 @@ def writing_of(
     for a, b in product(arms, targets):
         one, other = angles[id(a)], seen[id(b)]
         if one is not None and other is not None:
-            tried.append((float(np.median(np.abs(one - other))), a, b))
+            tried.append((_apart(one, other), a, b))
     tried.sort(key=lambda each: each[0])
     if not tried or tried[0][0] > ALIKE:
         return None
     best, a, b = tried[0]
-    if len(tried) > 1 and tried[1][0] < CLEARER * max(best, LOOSE_ANGLE):
-        return None
+    alike = [each for each in tried if each[0] < CLEARER * max(best, LOOSE_ANGLE)]
+    if len(alike) > 1:
+        return _by_places(arm, target, [(a, b) for _, a, b in alike])
     beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""
     return Choice(a, b, f"arm and target turn alike to {np.degrees(best):.2g} deg{beyond}")
+
+
+def _by_places(
+    arm: Floats, target: Floats, alike: Sequence[tuple[Writing, Writing]]
+) -> Choice | None:
+    """Return which of several writings leaves the target in one place; None where none does best.
+
+    Quaternions whose numbers are all permuted turn by the same angles, so these do not tell.
+    """
+    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST)).astype(int)
+    tried = []
+    for a, b in alike:
+        poses, seen = a.poses(arm[some]), b.poses(target[some])
+        if poses is not None and seen is not None:
+            twins = _residuals_by_twins(poses, seen, ["base", "flange"], ["camera_T_target"])
+            tried += [(residual, a, b) for residual, *_ in twins.values()]
+    tried.sort(key=lambda each: each[0])
+    others = [each for each in tried if each[1:] != tried[0][1:]]
+    if not others or others[0][0] < CLEARER * max(tried[0][0], LOOSE_PLACE):
+        return None
+    (best, a, b), beyond = tried[0], others[0][0]
+    return Choice(a, b, f"fits to {1e3 * best:.1f} mm, the next to {1e3 * beyond:.0f} mm")
+
+
+def _apart(one: Floats, other: Floats) -> float:
+    """Return the median difference of angles [rad], as for turns of a radian.
+
+    Radians that are read as degrees turn by next to nothing, and would differ by less than that.
+    """
+    size = float(np.median(one))
+    return float(np.median(np.abs(one - other))) / min(max(size, 1e-6), 1.0)
 
 
 def turn_alike(arm: Floats, target: Floats) -> bool:
@@ -126,6 +158,10 @@ def mounting_of(
 ) -> Mounting | None:
     """Return the mounting that fits; None where none does, or several do.
 
+    A camera on the flange with ``camera_T_target`` and one beside the robot with
+    ``target_T_camera`` are one equation with its unknowns exchanged, so no data tell them apart:
+    of such twins it is the one whose target is written as detectors write it.
+
     Args:
         arm: (N, 4, 4) base_T_flange [m].
         seen: (N, 4, 4) poses of the target as they stand in the file [m].
@@ -135,19 +171,28 @@ def mounting_of(
     if len(arm) < FEWEST:
         return None
     some = np.linspace(0, len(arm) - 1, min(len(arm), MOST)).astype(int)
-    arm, seen = arm[some], seen[some]
-    tried = []
-    for camera, way in product(cameras, targets):
+    twins = _residuals_by_twins(arm[some], seen[some], cameras, targets)
+    if not twins:
+        return None
+    (best, camera, way), *others = sorted(twins.values())
+    if others and others[0][0] < CLEARER * max(best, LOOSE_PLACE):
+        return None
+    beyond = f", the next to {1e3 * others[0][0]:.0f} mm" if others else ""
+    return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}")
+
+
+def _residuals_by_twins(
+    arm: Floats, seen: Floats, cameras: Sequence[str], targets: Sequence[str]
+) -> dict[bool, tuple[float, str, str]]:
+    """Return the residual [m] of each equation, with the mounting that it is taken for."""
+    twins: dict[bool, tuple[float, str, str]] = {}
+    for way, camera in product(sorted(targets), cameras):  # camera_T_target goes first
         carried = arm if camera == "flange" else inverted(arm)
         found = _residual(carried, seen if way == "camera_T_target" else inverted(seen))
-        if found is not None:
-            tried.append((found, camera, way))
-    tried.sort()
-    if not tried or (len(tried) > 1 and tried[1][0] < CLEARER * max(tried[0][0], LOOSE_PLACE)):
-        return None
-    best, camera, way = tried[0]
-    beyond = f", the next to {1e3 * tried[1][0]:.0f} mm" if len(tried) > 1 else ""
-    return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}")
+        equation = (camera == "flange") == (way == "camera_T_target")
+        if found is not None and equation not in twins:
+            twins[equation] = found, camera, way
+    return twins
 
 
 def _residual(carried: Floats, seen: Floats) -> float | None:

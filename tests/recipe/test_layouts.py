@@ -1,0 +1,221 @@
+"""Layouts of folders that `init` reads: each made from own numbers, and not edited after."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from flangeye.cli.commands import app
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from flangeye.types import Floats
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "layouts.md"
+SEED = 7
+COUNT = 24
+
+
+def session(seed: int) -> tuple[Floats, Floats, Floats]:
+    """Return joints, base_T_flange and camera_T_target of a camera in a UR5e's hand, with noise."""
+    rng = np.random.default_rng(seed)
+    joints = np.array([0.3, -1.4, 1.6, -1.8, -1.5, 0.2]) + rng.uniform(-0.5, 0.5, (COUNT, 6))
+    arm = np.asarray(Arm(load_model("robots", "ur5e")).flange(joints))
+    flange_T_camera = rigid(rotation_exp(np.array([0.1, -0.2, 1.1])), np.array([0.05, 0.02, 0.09]))
+    base_T_target = rigid(rotation_exp(np.array([0.1, 0.2, 2.0])), np.array([-0.5, -0.1, 0.0]))
+    noise = [rigid(rotation_exp(r), t) for r, t in zip(
+        rng.normal(0, 3e-4, (COUNT, 3)), rng.normal(0, 1e-4, (COUNT, 3)), strict=True)]  # fmt: skip
+    seen = np.linalg.inv(arm @ flange_T_camera) @ base_T_target @ np.array(noise)
+    return joints, arm, seen
+
+
+def vector(poses, scale=1.0):
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    return np.hstack([scale * poses[:, :3, 3], turns])
+
+
+def euler(poses, order, scale=1e3):
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler(order, degrees=True)
+    return np.hstack([scale * poses[:, :3, 3], turns])
+
+
+def quaternion(poses):
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+
+
+def text(rows, mark=","):
+    return "\n".join(mark.join(f"{x:.9g}" for x in row) for row in rows) + "\n"
+
+
+def indexed(rows):
+    return np.column_stack([np.arange(1, len(rows) + 1), rows])
+
+
+def blocks(f, j, a, s):
+    (f / "both.txt").write_text(text(vector(a), " ") + "\n" + text(vector(s), " "))
+
+
+def halves(f, j, a, s):
+    (f / "poses.txt").write_text(text([*quaternion(a), *quaternion(s)], " "))
+
+
+def index_column(f, j, a, s):
+    for name, poses in (("gripper2base", a), ("target2cam", s)):
+        (f / f"{name}.csv").write_text(text(indexed(vector(poses, 1e3)[:, [3, 4, 5, 0, 1, 2]])))
+
+
+def cam2target(f, j, a, s):
+    (f / "gripper2base.csv").write_text(text(indexed(vector(a, 1e3))))
+    (f / "cam2target.csv").write_text(text(indexed(vector(np.linalg.inv(s), 1e3))))
+
+
+def side_by_side(f, j, a, s):
+    for name, poses in (("gripper2base", a), ("cam2target", np.linalg.inv(s)), ("target2cam", s)):
+        (f / f"{name}.csv").write_text(text(vector(poses)))
+
+
+def storage(f, name, written):
+    file = cv2.FileStorage(str(f / name), cv2.FILE_STORAGE_WRITE)
+    for key, value in written:
+        file.write(key, value)
+    file.release()
+
+
+def opencv_numbered(f, j, a, s):
+    storage(f, "pairs.yml", [(f"{n}_{k}", p) for n, ps in (("robot", a), ("cam", s))
+                             for k, p in enumerate(ps)])  # fmt: skip
+
+
+def opencv_lists(f, j, a, s):
+    for name, poses in (("robot", a), ("camera", s)):
+        lines = [f"pose{k}: [ {', '.join(f'{x:.9g}' for x in row)} ]"
+                 for k, row in enumerate(vector(poses), 1)]  # fmt: skip
+        (f / f"{name}.yml").write_text("%YAML:1.0\n---\n" + "\n".join(lines) + "\n")
+
+
+def opencv_vectors(f, j, a, s):
+    written = {
+        "Rotation_Vec": vector(s)[:, 3:].tolist(),
+        "Translation_Vec": vector(s)[:, :3].tolist(),
+    }
+    (f / "camera.yml").write_text(
+        "%YAML:1.0\n---\n" + "".join(f"{k}: {v}\n" for k, v in written.items())
+    )
+    np.save(f / "gripper2base.npy", a)
+
+
+def json_per_image(f, j, a, s):
+    for k, (arm, seen) in enumerate(zip(a, s, strict=True)):
+        (f / f"{k}.json").write_text(json.dumps({"robot": arm.tolist(), "marker": seen.tolist()}))
+
+
+def npz_opencv(f, j, a, s):
+    np.savez(f / "handeye.npz", R_gripper2base=a[:, :3, :3], t_gripper2base=a[:, :3, 3:],
+             R_target2cam=s[:, :3, :3], t_target2cam=s[:, :3, 3:])  # fmt: skip
+
+
+def separate_files(f, j, a, s):
+    for name, poses in (("gripper2base", a), ("target2cam", s)):
+        np.savetxt(f / f"R_{name}.txt", poses[:, :3, :3].reshape(-1, 3))
+        np.savetxt(f / f"t_{name}.txt", poses[:, :3, 3])
+
+
+def matlab(f, j, a, s):
+    savemat(f / "data.mat", {"bHg": np.moveaxis(a, 0, 2), "cHt": np.moveaxis(s, 0, 2)})
+
+
+def folders(f, j, a, s):
+    for name, poses in (("robot", a), ("camera", s)):
+        (f / name).mkdir()
+        for k, pose in enumerate(poses):
+            np.savetxt(f / name / f"{k}.txt", pose)
+
+
+def headings(f, j, a, s):
+    names = [*"XYZABC", *(f"target_{n}" for n in ["x", "y", "z", "qx", "qy", "qz", "qw"])]
+    (f / "log.csv").write_text(";".join(names) + "\n"
+                               + text(np.hstack([euler(a, "ZYX"), quaternion(s)]), ";"))  # fmt: skip
+
+
+def rx_ry_rz(f, j, a, s):
+    names = [
+        *("x", "y", "z", "rx", "ry", "rz"),
+        *(f"cam_{n}" for n in ["x", "y", "z", "qx", "qy", "qz", "qw"]),
+    ]
+    (f / "log.csv").write_text(",".join(names) + "\n"
+                               + text(np.hstack([euler(a, "xyz"), quaternion(s)])))  # fmt: skip
+
+
+def urscript(f, j, a, s):
+    lines = [f"p[{', '.join(f'{x:.9g}' for x in row)}]" for row in vector(a)]
+    (f / "program.script").write_text("\n".join(lines))
+    (f / "marker.csv").write_text(text(s.reshape(-1, 16)))
+
+
+def matrices_in_text(f, j, a, s):
+    for name, poses in (("robot", a), ("marker", s)):
+        stacked = "\n\n".join(text(pose, " ").strip() for pose in poses)
+        (f / f"{name}.txt").write_text(stacked + "\n")
+
+
+def wxyz(f, j, a, s):
+    for name, poses in (("arm", a), ("board", s)):
+        (f / f"{name}.csv").write_text(text(quaternion(poses)[:, [0, 1, 2, 6, 3, 4, 5]]))
+
+
+def json_arrays(f, j, a, s):
+    (f / "calib.json").write_text(
+        json.dumps({"T_base_flange": a.tolist(), "T_cam_board": s.tolist()})
+    )
+
+
+LAYOUTS: dict[str, Callable[..., None]] = {
+    "two blocks of rows in one text, arm above marker": blocks,
+    "the same without a line between them": halves,
+    "a running index, rotation vector before the position": index_column,
+    "`cam2target.csv`: the camera in the target": cam2target,
+    "`gripper2base`, `cam2target`, `target2cam` side by side": side_by_side,
+    "OpenCV's storage, `robot_0`, `cam_0`, … matrices": opencv_numbered,
+    "OpenCV's storage, `pose1: […]` in two files": opencv_lists,
+    "OpenCV's storage, lists `Rotation_Vec` and `Translation_Vec`": opencv_vectors,
+    "a JSON for each image, without leading zeros": json_per_image,
+    "`.npz` with `R_gripper2base`, `t_gripper2base`, …": npz_opencv,
+    "`R_gripper2base.txt` and `t_gripper2base.txt`, …": separate_files,
+    "MATLAB, 4×4×N": matlab,
+    "a folder `robot/` and one `camera/` of 4×4 texts": folders,
+    "headings X, Y, Z, A, B, C and target_x, …": headings,
+    "rx, ry, rz in degrees, of no maker": rx_ry_rz,
+    "URScript positions and a table of matrices": urscript,
+    "4×4 matrices line by line in two texts": matrices_in_text,
+    "quaternions w, x, y, z without a heading": wxyz,
+    "JSON of arrays, `T_base_flange`, `T_cam_board`": json_arrays,
+}
+"""What is in the folder, and how it is written."""
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_layout_is_verified_without_an_edit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec").mkdir()
+    LAYOUTS[name](tmp_path / "rec", *session(SEED))
+    told = CliRunner().invoke(app, ["init", "rec", "--yes"])
+    assert told.exit_code == 0, f"{told.output}{told.exception}"
+    done = CliRunner().invoke(app, ["run", "recipe.yaml", "--out", "out"])
+    assert done.exit_code == 0, f"{told.output}{done.output}{done.exception}"
+    assert "verified" in done.output
+
+
+def test_the_page_lists_these_layouts() -> None:
+    rows = [line.split("|") for line in PAGE.read_text("utf-8").splitlines() if line[:1] == "|"]
+    listed = [row[1].strip() for row in rows[2:]]
+    assert listed == list(LAYOUTS)
