@@ -64,12 +64,6 @@ class Estimate:
     inliers: Mask
     squares: Floats
 
-    def columns(self, chosen: str) -> slice:
-        """Return where an effect's numbers stand among the effects' columns, by its name."""
-        counts = self.counts
-        i = [e.name for e in self.effects].index(chosen)
-        return slice(sum(counts[:i]), sum(counts[: i + 1]))
-
     @property
     def counts(self) -> list[int]:
         """How many numbers each effect has."""

@@ -225,11 +225,6 @@ class Posterior:
         apart = np.array([f.mean - self.mean for f in self.fits])
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
-    def sizes(self) -> Floats:
-        """Return (S,) the sizes' posterior medians, as geometric means."""
-        logs = np.array([np.log(f.sizes) for f in self.fits])
-        return np.asarray(np.exp(self.chances @ logs))
-
 
 def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
     """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
