@@ -423,7 +423,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
 
 def test_a_log_that_cannot_be_read_is_one_line(browser: Any, served: Served) -> None:
     broken = served.folder / "runs" / "broken"
-    broken.mkdir()
+    broken.mkdir(parents=True)
     (broken / "run.mcap").write_bytes(b"no log at all")
     page = opened(browser, served)
     go(page, "Verdict")
