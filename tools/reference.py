@@ -16,19 +16,35 @@ from typer.main import get_command
 from flangeye.cli.commands import app
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Plugin
+from flangeye.report.look import DARK, LIGHT, LOGO, MONO, SANS
 from flangeye.result import Result
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages to the documentation; a hook of mkdocs."""
-    for name, text in pages().items():
-        files.append(File.generated(config, f"reference/{name}", content=text))
+    made = {f"reference/{name}": text for name, text in pages().items()}
+    made |= {"assets/look.css": _look(), "assets/logo.svg": LOGO.replace("currentColor", "#ffffff")}
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
     return files
 
 
 def pages() -> dict[str, str]:
     """Return each page by its file's name."""
     return {"cli.md": _commands(), "stages.md": _stages(), "result.md": _result()}
+
+
+def _look() -> str:
+    """Return the colours and type of the report for the site's theme."""
+    themes = {"default": LIGHT, "slate": DARK}
+    rules = [
+        f'[data-md-color-scheme="{name}"] {{ --md-primary-fg-color: {LIGHT["link"]}; '
+        f"--md-accent-fg-color: {of['link']}; --md-typeset-a-color: {of['link']}; "
+        f"--md-default-bg-color: {of['paper']}; --md-code-bg-color: {of['panel']}; }}"
+        for name, of in themes.items()
+    ]
+    type_ = f"body {{ --md-text-font-family: {SANS}; --md-code-font-family: {MONO}; }}"
+    return "\n".join([*rules, type_]) + "\n"
 
 
 def _commands() -> str:

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 from nicegui import ui
 
+from flangeye.report.look import LIGHT
+
 PAGES = {"/": "Cell", "/plan": "Plan", "/run": "Run", "/verdict": "Verdict", "/archive": "Archive"}
 
 
@@ -14,7 +16,10 @@ PAGES = {"/": "Cell", "/plan": "Plan", "/run": "Run", "/verdict": "Verdict", "/a
 def page(title: str) -> Iterator[None]:
     """Lay out one page around what is made inside."""
     ui.dark_mode(None)
-    ui.colors(primary="#1f5fa8", positive="#1a7f45", negative="#c02626", warning="#a86200")
+    ui.colors(
+        primary=LIGHT["link"], positive=LIGHT["verified"], negative=LIGHT["refused"],
+        warning=LIGHT["unverified"],
+    )  # fmt: skip
     ui.page_title(f"{title} · flangeye")
     with ui.header().classes("items-center q-py-xs"), ui.element("nav").classes("row gap-4"):
         for path, name in PAGES.items():

@@ -14,6 +14,7 @@ from flangeye.batch.figures import drawings_of
 from flangeye.batch.tally import Tally
 from flangeye.files.bundled import VERSION
 from flangeye.files.place import Place
+from flangeye.report.look import css
 from flangeye.report.plotly_js import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres
 
@@ -147,5 +148,6 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals["look"] = css
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
     return environment

@@ -19,6 +19,7 @@ from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.graph import graph_drawing
 from flangeye.report.images import image_view, missed_view
+from flangeye.report.look import css
 from flangeye.report.plotly_js import packed_plotly, plotly_js
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
@@ -113,6 +114,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    environment.globals["look"] = css
     environment.filters |= {"mm": millimetres, "deg": degrees, "percent": percent}
     environment.filters |= {"figure": figure, "words": lambda name: name.replace("_", " ")}
     return environment

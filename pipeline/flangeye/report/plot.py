@@ -1,7 +1,6 @@
 """Pieces of plotly figures as plain data: what plotly.js reads, without building Python objects.
 
-Colours are told apart by every kind of eye (Okabe and Ito 2008) and read on white and on black;
-the theme itself (text, grid, background) is set by the page's script.
+The page's script sets the theme: text, grid and background.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flangeye.report.look import SERIES
 from flangeye.types import Floats
 
 Trace = dict[str, Any]
 Figure = dict[str, Any]
 
-USED, UNUSED, HELD_OUT = "#3a7ebf", "#d98a00", "#8a8f98"
-TRUTH, CIRCLE, NEUTRAL = "#c0559a", "#d5451b", "#8a8f98"
-AXES = ("#d5451b", "#2a9d5c", "#3a7ebf")
-"""Red, green, blue for x, y, z, as every robot tool draws frames."""
+USED, UNUSED, HELD_OUT = SERIES["used"], SERIES["unused"], SERIES["held_out"]
+TRUTH, CIRCLE, NEUTRAL = SERIES["truth"], SERIES["circle"], SERIES["held_out"]
+AXES = (SERIES["x"], SERIES["y"], SERIES["z"])
 
 DIVERGING = [
     [0.0, "#2166ac"],

@@ -10,17 +10,18 @@ from typing import Any
 from flangeye.doctor.monitor.history import Finding, History
 from flangeye.files.written import write_whole
 from flangeye.handeye.drift import DriftTest
+from flangeye.report.look import LIGHT, SERIES, css
 
-COLOURS = {"OK": "#2e9e5b", "DEGRADED": "#d68910", "MOVED": "#d64545"}
+COLOURS = {"OK": LIGHT["verified"], "DEGRADED": LIGHT["unverified"], "MOVED": LIGHT["refused"]}
 PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none';
  script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:">
 <title>{state}: {path}</title>
 <style>
-:root {{ color-scheme: light; }}
-body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: #1c2230; background: #fff;
-  font: 1rem/1.5 system-ui, sans-serif; }}
+{look}:root {{ color-scheme: light; }}
+body {{ margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: {ink}; background: {paper};
+  font: 1rem/1.5 var(--sans); }}
 h1 {{ margin: 0; font-size: 1.5rem; color: {colour}; }}
 p {{ margin: .4rem 0; overflow-wrap: anywhere; }}
 </style></head><body><h1>{state}</h1><p>{sentence}</p>{figure}
@@ -36,6 +37,7 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
     """
     last = history.findings[-1]
     page = PAGE.format(
+        look=css(), ink=LIGHT["ink"], paper=LIGHT["paper"],
         state=last.state, colour=COLOURS[last.state], sentence=escape(sentence(last)),
         figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
         checks=len(history.findings), path=escape(str(history.path)), rate=test.false_alarms,
@@ -63,13 +65,13 @@ def figure(history: History, test: DriftTest) -> Any:
     colours = [COLOURS[f.state] for f in history.findings]
     shifts = [f.shift * 1e3 for f in history.findings]
     chart.add_scatter(
-        x=at, y=shifts, mode="lines+markers", line={"color": "#8a93a3", "width": 1},
+        x=at, y=shifts, mode="lines+markers", line={"color": LIGHT["axis"], "width": 1},
         marker={"color": colours, "size": 8}, text=[f.state for f in history.findings],
         hovertemplate="%{y:.3f} mm, %{text}<extra></extra>", row=1, col=1,
     )  # fmt: skip
     chart.add_scatter(
         x=at, y=[f.statistic for f in history.findings], mode="lines",
-        line={"color": "#3a7ebf"}, hovertemplate="%{y:.2f}<extra></extra>", row=2, col=1,
+        line={"color": SERIES["used"]}, hovertemplate="%{y:.2f}<extra></extra>", row=2, col=1,
     )  # fmt: skip
     limit = test.limit * 1e3
     chart.add_hline(y=limit, line_color=COLOURS["MOVED"], line_dash="dot", row=1, col=1)

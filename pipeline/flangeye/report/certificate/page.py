@@ -21,6 +21,7 @@ from flangeye.recipe.own_models import carried_files
 from flangeye.report.account import provenance_of
 from flangeye.report.certificate.budget import Conditions, budget_of, shares_of, use_budget_of
 from flangeye.report.facts import Facts, facts_of
+from flangeye.report.look import css
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
 from flangeye.result import result_of_camera, status_of
@@ -87,6 +88,7 @@ def render(facts: Facts, conditions: Conditions) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals["look"] = css
     environment.filters |= {"mm": millimetres, "deg": degrees}
     return environment.get_template("certificate.html.j2").render(_content(facts, conditions))
 
