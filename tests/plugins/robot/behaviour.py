@@ -45,13 +45,17 @@ class DrivesAnArm:
     ) -> None:
         start = robot.state().base_T_flange
         target = moved(start, x=0.02, z=-0.03, turn=(0.0, 0.1, -0.2))
-        with in_time(1.0):
-            robot.move_linear(target, speed=0.1, acceleration=0.5)
         states = []
-        while (state := robot.state()).mode == "moving":
+
+        def go():
+            with in_time(1.0):
+                robot.move_linear(target, speed=0.1, acceleration=0.5)
+
+        def ended(state):
             states.append(state)
-            robot.wait_cycle()
-        assert state.mode == "ready"
+            return state.mode != "moving"
+
+        assert arrived(robot, go, ended).mode == "ready"
         np.testing.assert_allclose(robot.state().base_T_flange.matrix, target.matrix, atol=1e-6)
         way = np.array([s.base_T_flange.translation for s in states]) - start.translation
         along = target.translation - start.translation
@@ -62,21 +66,24 @@ class DrivesAnArm:
 
     def test_a_joint_move_goes_where_it_should(self, robot: Any) -> None:
         target = robot.state().joints + [0.1, 0.0, -0.05, 0.0, 0.05, 0.2]
-        robot.move_joints(target, speed=0.5, acceleration=2.0)
-        assert robot.state().mode == "moving"
-        np.testing.assert_allclose(arrived(robot).joints, target, atol=1e-9)
+
+        def go():
+            robot.move_joints(target, speed=0.5, acceleration=2.0)
+            assert robot.state().mode == "moving"
+
+        np.testing.assert_allclose(arrived(robot, go).joints, target, atol=1e-9)
 
     def test_a_move_to_where_it_is_ends_at_once(self, robot: Any) -> None:
         with in_time(2.0):
-            robot.move_linear(robot.state().base_T_flange, 0.1, 0.5)
-            assert arrived(robot).mode == "ready"
+            start = robot.state().base_T_flange
+            assert arrived(robot, lambda: robot.move_linear(start, 0.1, 0.5)).mode == "ready"
 
     def test_a_second_move_replaces_the_first(self, robot: Any) -> None:
         start = robot.state().base_T_flange
         robot.move_linear(moved(start, z=-0.2), 0.1, 0.5)
         until(lambda: robot.state().base_T_flange.translation[2] < start.translation[2] - 1e-3)
-        robot.move_linear(start, 0.1, 0.5)
-        np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
+        back = arrived(robot, lambda: robot.move_linear(start, 0.1, 0.5))
+        np.testing.assert_allclose(back.base_T_flange.matrix, start.matrix, atol=1e-6)
 
     def test_velocities_are_followed_and_end_when_no_command_comes(
         self, robot: Any, controller: Any
@@ -104,8 +111,8 @@ class DrivesAnArm:
         for _ in range(50):
             robot.move_velocity(np.array([0, 0, 0.05, 0, 0, 0]), 1.0)
             robot.wait_cycle()
-        robot.move_linear(start, 0.1, 0.5)
-        np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, start.matrix, atol=1e-6)
+        back = arrived(robot, lambda: robot.move_linear(start, 0.1, 0.5))
+        np.testing.assert_allclose(back.base_T_flange.matrix, start.matrix, atol=1e-6)
 
     @pytest.mark.parametrize("move", ["linear", "joints", "velocity"])
     def test_stop_ends_every_motion_soon(self, robot: Any, controller: Any, move: str) -> None:
@@ -156,8 +163,8 @@ class DrivesAnArm:
     def test_what_is_touched_is_felt_at_the_flange(self, robot: Any, controller: Any) -> None:
         start = robot.state().base_T_flange
         controller.control.set_surfaces(Surface.floor(start.translation[2] - 0.0095))
-        robot.move_linear(moved(start, z=-0.01), 0.01, 0.1)
-        np.testing.assert_allclose(arrived(robot).force, [0, 0, 10, 0, 0, 0], atol=0.1)
+        down = arrived(robot, lambda: robot.move_linear(moved(start, z=-0.01), 0.01, 0.1))
+        np.testing.assert_allclose(down.force, [0, 0, 10, 0, 0, 0], atol=0.1)
 
     def test_a_closed_robot_says_so(self, controller: Any) -> None:
         robot = self.opened(controller.host)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from flangeye.devices import PATIENCE
+from flangeye.devices import PATIENCE, SILENT
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.loading import load_model
 from flangeye.types import Transform
@@ -43,10 +43,22 @@ def until(condition, patience=PATIENCE):
     return found
 
 
-def arrived(robot, patience=20.0):
-    """Watch a move to its end; return the last state."""
-    end = time.monotonic() + patience
-    while (state := robot.state()).mode == "moving":
-        assert time.monotonic() < end, "the arm does not arrive"
+def arrived(robot, order=lambda: None, done=lambda state: state.mode != "moving", patience=20.0):
+    """Give an order and watch the arm until it is done; return the last state.
+
+    The order is given again where this computer was too busy to look in time: a motion that nobody
+    looks at ends.
+    """
+    looked = time.monotonic()
+    end = looked + patience
+    order()
+    while True:
+        began = time.monotonic()
         robot.wait_cycle()
-    return state
+        state = robot.state()
+        if time.monotonic() - looked > SILENT and not state.message:
+            order()
+        elif done(state):
+            return state
+        looked = began
+        assert time.monotonic() < end, "the arm does not arrive"

@@ -88,8 +88,8 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         truth = controller.control.truth()
         np.testing.assert_allclose(flange.matrix, truth.base_T_flange, atol=1e-9)
         target = moved(flange, z=-0.02, turn=(0.2, 0.0, 0.0))
-        robot.move_linear(target, 0.1, 0.5)
-        np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, target.matrix, atol=1e-6)
+        there = arrived(robot, lambda: robot.move_linear(target, 0.1, 0.5))
+        np.testing.assert_allclose(there.base_T_flange.matrix, target.matrix, atol=1e-6)
 
 
 @contextmanager
@@ -183,9 +183,8 @@ def test_a_controller_that_is_lost_is_an_error_in_time(
 
 
 def test_what_the_arm_cannot_do_is_a_protective_stop(robot: Any) -> None:
-    state = robot.state()
-    robot.move_linear(moved(state.base_T_flange, x=2.0), 0.2, 1.0)
-    state = until(lambda: (s := robot.state()).mode == "protective stop" and s, 10.0)
+    far = moved(robot.state().base_T_flange, x=2.0)
+    state = arrived(robot, lambda: robot.move_linear(far, 0.2, 1.0))
     assert state.message.startswith("protective stop")
 
 

@@ -94,8 +94,8 @@ def test_a_tool_the_recipe_does_not_know_is_refused_and_one_it_knows_is_taken_of
         truth = with_tool.control.truth()
         np.testing.assert_allclose(flange.matrix, truth.base_T_flange, atol=1e-9)
         target = moved(flange, z=-0.02, turn=(0.2, 0.0, 0.0))
-        robot.move_linear(target, 0.1, 0.5)
-        np.testing.assert_allclose(arrived(robot).base_T_flange.matrix, target.matrix, atol=1e-6)
+        there = arrived(robot, lambda: robot.move_linear(target, 0.1, 0.5))
+        np.testing.assert_allclose(there.base_T_flange.matrix, target.matrix, atol=1e-6)
         # Turning about the flange leaves its centre where it is, though the tool swings.
         for _ in range(50):
             robot.move_velocity(np.array([0, 0, 0, 0.2, 0, 0]), 2.0)
