@@ -429,7 +429,8 @@ def two_poses_of_nobody(folder):
          "rec/poses.mat: is a MATLAB 7.3 file (HDF5), which is not read; in MATLAB, write it anew"),
         (odd_heading, [], "rec/log.csv: which columns are the arm's pose is not plain from "
          "u, v, w, alpha, beta, gamma; add --columns with their names, or numbers from 1, position "
-         "first: --columns x,y,z,a,b,c --rotation kuka; or --joints with those of the joint"),
+         "first: --columns x,y,z,a,b,c --rotation kuka; or those of the joint angles: --columns "
+         "1,2,3,4,5,6 --rotation joints"),
         (odd_heading, ["--columns", "u,v,ww,4,5,6"],
          "rec/log.csv: has no column 'ww'; known: w"),
         (angles_of_nobody, [], "how the rotation in columns rx, ry, rz is written (ur, kuka, "

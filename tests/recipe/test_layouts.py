@@ -17,8 +17,11 @@ from flangeye.cli.commands import app
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.models.robots import UR_JOINTS
 from flangeye.types import Floats
+from tests.plugins.ros2.urdf import urdf_of
 
+NAMES = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "layouts.md"
 SEED = 7
 COUNT = 24
@@ -140,7 +143,7 @@ def folders(f, j, a, s):
 
 
 def headings(f, j, a, s):
-    names = [*"XYZABC", *(f"target_{n}" for n in ["x", "y", "z", "qx", "qy", "qz", "qw"])]
+    names = [*"XYZABC", *(f"target_{n}" for n in NAMES)]
     (f / "log.csv").write_text(";".join(names) + "\n"
                                + text(np.hstack([euler(a, "ZYX"), quaternion(s)]), ";"))  # fmt: skip
 
@@ -148,7 +151,7 @@ def headings(f, j, a, s):
 def rx_ry_rz(f, j, a, s):
     names = [
         *("x", "y", "z", "rx", "ry", "rz"),
-        *(f"cam_{n}" for n in ["x", "y", "z", "qx", "qy", "qz", "qw"]),
+        *(f"cam_{n}" for n in NAMES),
     ]
     (f / "log.csv").write_text(",".join(names) + "\n"
                                + text(np.hstack([euler(a, "xyz"), quaternion(s)])))  # fmt: skip
@@ -177,6 +180,20 @@ def json_arrays(f, j, a, s):
     )
 
 
+def joints_alone(f, j, a, s):
+    (f / "robot.txt").write_text(text(np.degrees(j), " "))
+    (f / "target2cam.csv").write_text(text(vector(s)))
+    (f / "arm.urdf").write_text(urdf_of(load_model("robots", "ur5e")))
+
+
+def joints_of_ros(f, j, a, s):
+    order = [2, 1, 0, 3, 4, 5]  # as drivers of ROS write them: by alphabet
+    names = [f"{UR_JOINTS[k]}_joint" for k in order] + [f"marker_{n}" for n in NAMES]
+    rows = np.hstack([j[:, order], quaternion(s)])
+    (f / "states.csv").write_text(",".join(names) + "\n" + text(rows))
+    (f / "arm.urdf").write_text(urdf_of(load_model("robots", "ur5e")))
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -197,6 +214,8 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "4×4 matrices line by line in two texts": matrices_in_text,
     "quaternions w, x, y, z without a heading": wxyz,
     "JSON of arrays, `T_base_flange`, `T_cam_board`": json_arrays,
+    "joint angles without names, and the arm's `.urdf`": joints_alone,
+    "joint angles of ROS by alphabet, and the arm's `.urdf`": joints_of_ros,
 }
 """What is in the folder, and how it is written."""
 
@@ -219,3 +238,17 @@ def test_the_page_lists_these_layouts() -> None:
     rows = [line.split("|") for line in PAGE.read_text("utf-8").splitlines() if line[:1] == "|"]
     listed = [row[1].strip() for row in rows[2:]]
     assert listed == list(LAYOUTS)
+
+
+def test_joint_angles_are_no_poses_and_ask_for_their_arm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec").mkdir()
+    joints_alone(tmp_path / "rec", *session(SEED))
+    told = CliRunner().invoke(app, ["init", "rec", "--yes", "--robot", "none"])
+    assert str(told.exception) == (
+        "rec/robot.txt: 6 numbers a row, which as poses in any usual convention do not turn as the "
+        "target does; joint angles? name the arm: --robot NAME ('flangeye robots' lists them), or "
+        "its .urdf; or say --rotation (kuka, vector, …)"
+    )

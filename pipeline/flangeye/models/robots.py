@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +17,8 @@ from flangeye.units import Angle, AngularSpeed, JointPosition, Length, param
 
 NOWHERE = ("0 mm", "0 mm", "0 mm")
 UNTURNED = ("0 deg", "0 deg", "0 deg")
+UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+"""Joints of Universal Robots from base to flange, as its ROS driver names them."""
 
 
 class Recess(Model):
@@ -146,3 +150,14 @@ class SecondRobot:
     """The arm of a recipe that carries the target before the camera on the first."""
 
     model: RobotModel
+
+
+def joints_in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Return joints from base to flange where their names say it; drivers sort by alphabet."""
+    named = list(names)
+    ur = [next((n for n in named if joint in n), "") for joint in UR_JOINTS]
+    if all(ur):
+        return tuple(ur)
+    numbers = {name: [int(n) for n in re.findall(r"\d+", name)] for name in named}
+    numbered = sorted((n for n in named if numbers[n]), key=lambda n: numbers[n][::-1])
+    return tuple(numbered) if len(numbered) in (6, 7) else ()

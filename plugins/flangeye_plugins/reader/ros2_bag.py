@@ -8,7 +8,7 @@ are found in the arm's motion, and clouds and poses are paired by time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -23,7 +23,7 @@ from flangeye.files.recording import Archive, Recording
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.streams import mean_pose, turning, with_joints
-from flangeye.models.robots import RobotModel
+from flangeye.models.robots import RobotModel, joints_in_order
 from flangeye.types import FLANGE, Floats, Motion
 from flangeye.units import param
 from flangeye_plugins.reader.pairing import Pair, PairingParams, Signal, pair
@@ -47,10 +47,6 @@ TF = "tf2_msgs/msg/TFMessage"
 BASES = ("base", "base_link", "world")
 FLANGES = ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_link_ee", "link_eef")
 """Names under which ROS's drivers publish the two frames, the better one first."""
-UR_JOINTS = tuple(
-    f"{name}_joint"
-    for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-)
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """How a recipe names its arm."""
 OFTEN = 3.0
@@ -262,20 +258,12 @@ def _joints(bag: Bag, params: BagParams) -> Stream | None:
     if len(topics) != 1:
         return None
     times, values = bag.joints[str(topics[0])]
-    names = params.joints or _usual_order(values[0])
+    names = params.joints or joints_in_order(values[0])
     usable = [(t, v) for t, v in zip(times, values, strict=True) if set(names) <= set(v)]
     if not names or not usable:
         return None
     angles = [np.array([value[name] for name in names]) for _, value in usable]
     return in_order([t for t, _ in usable], angles)
-
-
-def _usual_order(names: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the joints from base to flange where their names tell; drivers sort by alphabet."""
-    if set(UR_JOINTS) <= set(names):
-        return UR_JOINTS
-    numbered = sorted(name for name in names if name.rstrip("_joint")[-1:].isdigit())
-    return tuple(numbered) if len(numbered) in (6, 7) else ()
 
 
 # --- what the camera saw

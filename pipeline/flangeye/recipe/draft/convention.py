@@ -10,18 +10,21 @@ import numpy as np
 
 from flangeye.errors import RecipeError
 from flangeye.files.tables import Column, Table, read_table
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import APART, CONVENTIONS, MATRIX, AngleUnit, LengthUnit
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
+from flangeye.models.robots import RobotModel
 from flangeye.recipe.draft.evidence import Writing, mounting_of, writing_of
 from flangeye.recipe.draft.frames import is_inverse
-from flangeye.recipe.draft.headings import Headings, PoseColumns, poses_by_name
+from flangeye.recipe.draft.headings import JOINTS, Headings, PoseColumns, as_joints, poses_by_name
 from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
 from flangeye.recipe.draft.questions import Questions
 from flangeye.types import Floats
 
 COMMON = ("vector", "ZYX", "xyz", "XYZ", "ZYZ")
 """What three numbers of a rotation mean on the arms that are sold."""
+NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
 
@@ -31,14 +34,14 @@ def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
 
 
 def table_params(
-    tables: Sequence[Table], questions: Questions, maker: str | None, scans: bool
+    tables: Sequence[Table], questions: Questions, robot: RobotModel | None, scans: bool
 ) -> dict[str, Any]:
     """Return the parameters with which ``reader.table`` reads the poses of a folder.
 
     Args:
         tables: Those of the folder.
         questions: For what they do not show; what the data show is noted there as likely.
-        maker: Who makes the arm, if that is known.
+        robot: The arm, if it is known.
         scans: Whether there are scans beside them.
 
     Raises:
@@ -46,31 +49,31 @@ def table_params(
     """
     found = [pose for table in tables for pose in poses_of(table)[0]]
     arm = _arm(tables, found, questions)
-    if not arm.is_pose:
-        return _of_joints(arm, tables, found, questions, scans)
     target = None if scans else _target(tables, found, arm, questions)
     if target is None and not scans:
         arm, target = _halves(arm)
-    _look(arm, target, questions, maker)
-    params = _file(arm.table) | _written(arm, questions, "", maker)
-    return params | _rest(arm.table) | _target_params(arm, target, questions)
+    arm = _seen_together(arm, target, questions, robot)
+    if arm.rotations == JOINTS:
+        params = _of_joints(arm, questions, robot)
+    else:
+        params = _written(arm, questions, "", robot.maker if robot else None) | _rest(arm.table)
+    return _file(arm.table) | params | _target_params(arm, target, questions)
 
 
-def _of_joints(
-    arm: PoseColumns,
-    tables: Sequence[Table],
-    found: Sequence[PoseColumns],
-    questions: Questions,
-    scans: bool,
-) -> dict[str, Any]:
-    """Return the parameters of joint angles, which the arm's kinematics turn into poses."""
-    params = _file(arm.table) | {"rotation": "joints"} | _rest(arm.table)
-    if "joints" not in params:
-        params |= {"joints": list(arm.columns), "joint_unit": _angle(_numbers(arm), arm)}
-    target = None if scans else _target(tables, found, arm, questions)
-    if target is None and not scans:
-        raise RecipeError(_alone(arm))
-    return params | _target_params(arm, target, questions)
+def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None) -> dict[str, Any]:
+    """Return the parameters of joint angles, which the arm's kinematics turn into poses.
+
+    Raises:
+        RecipeError: The arm is not known.
+    """
+    if robot is None:
+        raise RecipeError(
+            f"{arm.table.file}: {len(arm.columns)} joint angles a row become poses by the arm's "
+            f"kinematics; {NAME_THE_ARM}"
+        )
+    unit = questions.given.get("angle") or _angle(_numbers(arm), arm)
+    joints = {"joints": list(arm.columns), "joint_unit": unit}
+    return {"rotation": JOINTS[0]} | _rest(arm.table) | joints
 
 
 def _file(table: Table) -> dict[str, Any]:
@@ -93,13 +96,17 @@ def _arm(
 ) -> PoseColumns:
     """Return which columns are the arm's."""
     asked = questions.given.get("table")
-    given = questions.given.get("columns") or questions.given.get("joints")
+    given, joints = questions.given.get("columns"), questions.given.get("rotation") == JOINTS[0]
     if given is not None:
         table = _table_of(tables, found, questions)
         own = [pose for pose in found if pose.table is table]
-        joints = questions.given.get("columns") is None
-        return _named(table, given, own, ("joints",) if joints else ())
-    poses = [pose for pose in found if pose.is_pose] or _joints(tables)
+        return _named(table, given, own, JOINTS if joints else ())
+    angles = [p for p in found if p.rotations == JOINTS] + _joints(tables)
+    poses = [p for p in found if p.is_pose]
+    if joints:
+        poses = angles or [as_joints(p) for p in poses]
+    else:
+        poses = [p for p in poses if p.role != "target"] or angles or poses
     if asked is not None:
         for pose in poses:
             if asked in (pose.name, pose.table.name):
@@ -159,7 +166,7 @@ def _place(pose: PoseColumns) -> str:
 def _joints(tables: Sequence[Table]) -> list[PoseColumns]:
     """Return the joint angles that columns are named after."""
     rest = [(table, poses_of(table)[1]) for table in tables]
-    return [PoseColumns(t, r.joints, ("joints",), angle=r.joint_unit) for t, r in rest if r.joints]
+    return [PoseColumns(t, r.joints, JOINTS, angle=r.joint_unit) for t, r in rest if r.joints]
 
 
 def _table_of(tables: Sequence[Table], found: Sequence[PoseColumns], questions: Questions) -> Table:
@@ -179,7 +186,7 @@ def _unplain(table: Table) -> str:
     return (
         f"{table.file}: which columns are the arm's pose is not plain from {shown}; add --columns "
         "with their names, or numbers from 1, position first: --columns x,y,z,a,b,c --rotation "
-        "kuka; or --joints with those of the joint angles"
+        "kuka; or those of the joint angles: --columns 1,2,3,4,5,6 --rotation joints"
     )
 
 
@@ -213,12 +220,14 @@ def _target(
     timed = poses_of(arm.table)[1].time is not None
     others = [
         p for p in found
-        if p != arm and p.role != "arm"
+        if p != arm and p.role != "arm" and p.rotations != JOINTS
         and (len(p.table.rows) == len(arm.table.rows)
              or (timed and poses_of(p.table)[1].time is not None))
     ]  # fmt: skip
     if not others and arm.role is None:
-        others = [p for p in found if p != arm and p.columns != arm.columns]
+        others = [
+            p for p in found if p.rotations != JOINTS and p != arm and p.columns != arm.columns
+        ]
     seen = [p for p in others if p.role == "target"] or others
     whole = [p for p in seen if p.is_pose] or seen
     if len(whole) > 1:
@@ -260,33 +269,41 @@ def _numbers(pose: PoseColumns) -> Floats:
     return pose.table.numbers(pose.table.indices(pose.columns))
 
 
-def _look(
-    arm: PoseColumns, target: PoseColumns | None, questions: Questions, maker: str | None
-) -> None:
-    """Note what the poses of arm and target show together as likely answers.
+def _seen_together(
+    arm: PoseColumns, target: PoseColumns | None, questions: Questions, robot: RobotModel | None
+) -> PoseColumns:
+    """Return the arm's columns, noting what its poses and the target's show as likely answers.
+
+    Numbers without names that turn with the target as joint angles only are joint angles.
 
     Raises:
-        RecipeError: Halves of a table are not arm and target.
+        RecipeError: Numbers without names are neither; halves of a table are not arm and target.
     """
     if target is None or not target.is_pose or len(arm.table.rows) != len(target.table.rows):
-        return
+        return _within_reach(arm, robot)
     numbers, seen = _numbers(arm), _numbers(target)
     kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
     numbers, seen = numbers[kept], seen[kept]
     choice = writing_of(
-        numbers, _writings(arm, numbers, questions, "", maker),
+        numbers, _writings(arm, numbers, questions, "", robot),
         seen, _writings(target, seen, questions, "target-", None),
     )  # fmt: skip
     if choice is None:
         if ":1/2" in arm.table.name:
             raise RecipeError(_alone(arm))
-        return
+        if arm.rotations != JOINTS and arm.may_be_joints and not questions.given.get("rotation"):
+            raise RecipeError(_neither(arm, robot))
+        return arm
     for prefix, writing in (("", choice.arm), ("target-", choice.target)):
         questions.likely[f"{prefix}rotation"] = (writing.rotation, choice.told)
         questions.likely[f"{prefix}angle"] = (writing.angle, choice.told)
+    if choice.arm.kinematics is not None and arm.rotations != JOINTS:
+        arm = as_joints(arm)
+        questions.assumed.append(f"{_place(arm)}: joint angles ({choice.told}; --rotation says "
+                                 "otherwise)")  # fmt: skip
     poses, marks = choice.arm.poses(numbers), choice.target.poses(seen)
     if poses is None or marks is None:
-        return
+        return arm
     asked = questions.given
     way = asked.get("pose") or WAYS[""][bool(arm.frames and is_inverse(arm.frames))]
     camera, upright = asked.get("camera"), asked.get("target-pose")
@@ -297,14 +314,36 @@ def _look(
     if mounting is not None:
         questions.likely["camera"] = (mounting.camera, mounting.told)
         questions.likely["target-pose"] = (mounting.target, mounting.told)
+    return arm
+
+
+def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:
+    """Return numbers as joint angles, where the arm cannot reach them as positions."""
+    if robot is None or not arm.may_be_joints or len(robot.joints) != len(arm.columns):
+        return arm
+    numbers = _numbers(arm)
+    scale = 1e-3 if _length(numbers, arm) == "mm" else 1.0
+    farthest = np.nanmax(np.linalg.norm(scale * numbers[:, :3], axis=1))
+    return as_joints(arm) if farthest > robot.length else arm
+
+
+def _neither(arm: PoseColumns, robot: RobotModel | None) -> str:
+    named = f" nor as joint angles of {robot.model}" if robot else f"; joint angles? {NAME_THE_ARM}"
+    return (
+        f"{arm.table.file}: {len(arm.columns)} numbers a row, which as poses in any usual "
+        f"convention do not turn as the target does{named}; or say --rotation (kuka, vector, …)"
+    )
 
 
 def _writings(
-    pose: PoseColumns, numbers: Floats, questions: Questions, prefix: str, maker: str | None
+    pose: PoseColumns, numbers: Floats, questions: Questions, prefix: str, robot: RobotModel | None
 ) -> list[Writing]:
     """Return what a pose's numbers may mean, the likelier first."""
     given = questions.given.get(f"{prefix}rotation")
-    usual = usual_of(maker)
+    joints = _as_angles(pose, numbers, robot) if given in (None, JOINTS[0]) else []
+    if pose.rotations == JOINTS:
+        return joints
+    usual = usual_of(robot.maker if robot else None)
     named = [given] if given else list(pose.rotations or COMMON)
     if not given and usual and (not pose.rotations or usual in pose.rotations):
         named = [usual, *named]
@@ -318,7 +357,15 @@ def _writings(
         plain = CONVENTIONS[name].rotation if name in CONVENTIONS else name
         for angle in angles if _has_angles(name) else ["rad"]:
             found.setdefault((plain, angle), Writing(name, _unit(length), _turn_unit(angle)))
-    return list(found.values())
+    return [*found.values(), *joints]
+
+
+def _as_angles(pose: PoseColumns, numbers: Floats, robot: RobotModel | None) -> list[Writing]:
+    """Return joint angles as what numbers may mean, where the arm has as many joints."""
+    if robot is None or len(robot.joints) != numbers.shape[1] or not pose.may_be_joints:
+        return []
+    angles = as_joints(pose)
+    return [Writing(JOINTS[0], "m", _turn_unit(_angle(_numbers(angles), angles)), Arm(robot))]
 
 
 def _unit(word: str) -> LengthUnit:
@@ -362,7 +409,8 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     if pose.rotations and usual not in pose.rotations:
         usual = pose.rotations[0] if pose.rotations[0] in _FIRST else None
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
-    known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …"
+    joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
+    known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
     question = f"how the rotation in columns {shown} is written ({known})"
     return questions.ask(key, question, usual, "vector")
 
@@ -382,7 +430,7 @@ def _length(numbers: Floats, pose: PoseColumns) -> str:
 def _angle(numbers: Floats, pose: PoseColumns) -> str:
     if pose.angle is not None:
         return pose.angle
-    turns = numbers if pose.rotations == ("joints",) else numbers[:, 3:6]
+    turns = numbers if pose.rotations == JOINTS else numbers[:, 3:6]
     return "deg" if np.nanmax(np.abs(turns), initial=0) > TURN else "rad"
 
 

@@ -18,6 +18,7 @@ from flangeye.errors import CalibrationRefused
 from flangeye.handeye.closed.motions import motions_of, place_of, translation_of
 from flangeye.handeye.closed.separable import park_martin
 from flangeye.maths.geometry import rigid
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
 from flangeye.maths.pose_formats import AngleUnit, LengthUnit, pose_of_numbers
 from flangeye.types import Floats
@@ -35,14 +36,17 @@ LOOSE_ANGLE, LOOSE_PLACE = np.radians(0.2), 2e-3
 
 
 class Writing(NamedTuple):
-    """One way in which a row of numbers may be a pose."""
+    """One way in which a row of numbers may be a pose: as written, or at an arm's joint angles."""
 
     rotation: str
     length: LengthUnit
     angle: AngleUnit
+    kinematics: Arm | None = None
 
     def poses(self, numbers: Floats) -> Floats | None:
         """Return (N, 4, 4) poses [m]; None where a row is none in this convention."""
+        if self.kinematics is not None:
+            return self.kinematics.flange(np.radians(numbers) if self.angle == "deg" else numbers)
         try:
             rows = [pose_of_numbers(row, self.rotation, self.length, self.angle) for row in numbers]
         except ValueError:

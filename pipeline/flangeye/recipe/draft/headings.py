@@ -9,9 +9,12 @@ from dataclasses import dataclass, field, replace
 
 from flangeye.files.tables import Column, Table, number_of
 from flangeye.maths.pose_formats import CONVENTIONS
+from flangeye.models.robots import joints_in_order
 from flangeye.recipe.draft.frames import frames_in, role_in
 
 POSITION = ("x", "y", "z")
+JOINTS = ("joints",)
+"""In place of a rotation: joint angles."""
 LISTED = ("qx", "qy", "qz", "qw")
 _LENGTHS, _ANGLES, _TIMES = ("m", "mm"), ("rad", "deg"), ("s", "ms", "us", "ns")
 _PLACES = (
@@ -44,7 +47,8 @@ _CLOCKS = ("time", "timestamp", "stamp", "secs", "sec", "t")
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Numbers of a list that is a whole pose, and what they are if no name says more."""
 _JOINT = re.compile(
-    r"(?:j|joint|q|a|axis|theta)_?([1-9])(?:_?(?:rad|deg|pos|position))?|(joints?)\.(\d)"
+    r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
+    r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
 )
 _ENTRY = re.compile(r"(.+?)((?:\.\d+)+)")
 
@@ -75,7 +79,7 @@ class PoseColumns:
         table: Where.
         columns: Names or numbers from 1; position first, then the rotation.
         rotations: What the rotation may be written as; one where it is known, ``point`` for none,
-            ``joints`` for joint angles.
+            :data:`JOINTS` for joint angles.
         called: What names it: the columns' common name; empty where they have none.
         length: Unit of the position that a name states.
         angle: The same for angles.
@@ -98,7 +102,14 @@ class PoseColumns:
     @property
     def is_pose(self) -> bool:
         """Whether it is a whole pose."""
-        return self.rotations not in (("point",), ("joints",))
+        return self.rotations not in (("point",), JOINTS)
+
+    @property
+    def may_be_joints(self) -> bool:
+        """Whether it is joint angles, or numbers without names that may be."""
+        numbers = [column for column in self.columns if isinstance(column, int)]
+        nameless = len(numbers) == len(self.columns) == 6 and numbers == sorted(numbers)
+        return self.rotations == JOINTS or (nameless and not self.rotations)
 
     @property
     def role(self) -> str | None:
@@ -116,6 +127,11 @@ class PoseColumns:
         """Frames A and B of A_T_B, as a name says."""
         names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
         return next((found for name in names if (found := frames_in(name))), None)
+
+
+def as_joints(pose: PoseColumns) -> PoseColumns:
+    """Return the same columns as joint angles."""
+    return replace(pose, rotations=JOINTS)
 
 
 @dataclass
@@ -185,7 +201,8 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
                 rest = replace(rest, time=name, time_unit=unit)
             else:
                 _put(groups, name, words, listed=size == 4)
-    return groups, rest if len(rest.joints) > 3 else replace(rest, joints=())
+    joints = rest.joints if len(rest.joints) > 3 else ()
+    return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
 
 
 def _is_file(table: Table, index: int) -> bool:

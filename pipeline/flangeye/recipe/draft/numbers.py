@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flangeye.files.tables import Column, Table, number_of
-from flangeye.recipe.draft.headings import Headings, PoseColumns
+from flangeye.recipe.draft.headings import JOINTS, Headings, PoseColumns
 from flangeye.types import Floats
 
 FARTHEST = 20.0
@@ -67,6 +67,8 @@ def _parts(numbers: Floats) -> list[tuple[int, int]]:
         (12, 12),
         (7, 7),
         (6, 6),
+        (6, 16),
+        (7, 16),
         (6, 7),
         (7, 6),
         (16, 3),
@@ -119,13 +121,16 @@ def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> Pose
         if np.nanmax(np.abs(norms - 1)) < ROUNDED:
             columns = part if first == 3 else [*part[4:], *part[:4]]
             return PoseColumns(table, tuple(columns), QUATERNIONS, guess=told)
-    return None
+    angles = np.nanmax(np.abs(numbers)) <= 360.0
+    return PoseColumns(table, tuple(part), JOINTS, guess=told) if angles else None
 
 
 def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns:
     """Return which three of six numbers are the position: the only ones beyond any angle, else the
     first.
     """  # noqa: D205
+    if "joint" in table.name.lower():
+        return PoseColumns(table, tuple(part), JOINTS, guess=told)
     first, second = (float(np.nanmax(np.abs(numbers[:, at]))) for at in ([0, 1, 2], [3, 4, 5]))
     turned_first = second > FARTHEST and first < TURN
     columns: list[Column] = [*part[3:], *part[:3]] if turned_first else [*part]

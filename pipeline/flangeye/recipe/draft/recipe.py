@@ -19,7 +19,9 @@ from flangeye.files.tables import tables_in
 from flangeye.files.yaml_lines import parse_value
 from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
+from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
+from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
@@ -82,7 +84,7 @@ def draft_recipe(
     Raises:
         FlangeyeError: Something is missing that no answer gives; says which line to add.
     """
-    robot = _robot(questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", NONE))
+    robot = _robot(survey, out, questions)
     reader = _reader(survey, questions, registry, robot)
     archive = _bound(reader, registry, robot)(survey.folder)
     stage, target = _what(archive, questions)
@@ -94,7 +96,11 @@ def draft_recipe(
     return Draft(_yaml(data), _summary(archive, reader))
 
 
-def _robot(answer: str) -> dict[str, Any]:
+def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, Any]:
+    """Return the arm as asked, or by the one URDF of the folder."""
+    urdfs = survey.of((".urdf",))
+    usual = os.path.relpath(urdfs[0], out.parent) if len(urdfs) == 1 else NONE
+    answer = questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", usual)
     if answer == NONE:
         return {}
     return {"urdf": answer} if answer.endswith(".urdf") else {"model": answer}
@@ -120,7 +126,7 @@ def _reader(
         return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
     if survey.tables:
         scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
-        params = table_params(survey.tables, questions, _maker(robot), scans)
+        params = table_params(survey.tables, questions, _model(robot), scans)
         return {"table": params}
     raise StageError(_missing(survey, reason))
 
@@ -141,8 +147,10 @@ def _bound(reader: Any, registry: Registry, robot: Mapping[str, Any]) -> BoundPa
     return bound
 
 
-def _maker(robot: Mapping[str, Any]) -> str | None:
-    return load_model("robots", robot["model"]).maker if "model" in robot else None
+def _model(robot: Mapping[str, Any]) -> RobotModel | None:
+    if "urdf" in robot:
+        return robot_from_urdf(Path(robot["urdf"]))
+    return load_model("robots", robot["model"]) if "model" in robot else None
 
 
 def _missing(survey: FolderSurvey, reason: StageError) -> str:
