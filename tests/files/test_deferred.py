@@ -64,7 +64,7 @@ def test_what_is_loaded_or_not_installed_stays_as_it_is() -> None:
 def test_a_check_does_without_numpy() -> None:
     """What takes longest to import is not needed to say that a recipe is sound."""
     code = (
-        "import sys; from flangeye.cli.unparsed import say_verdict; "
+        "import sys; from flangeye.cli.fast_path import say_verdict; "
         "say_verdict('ur5_phoxi-m_simulated'); sys.exit('numpy._core' in sys.modules)"
     )
     command = [sys.executable, "-P", "-c", code]

@@ -202,7 +202,7 @@ def _rewritten(folder):
 def _read_log(path):
     from rich.console import Console
 
-    from flangeye.cli.terminal import print_log
+    from flangeye.cli.details import print_log
     from flangeye.log.read import read_notes, read_run
 
     log = read_run(path)

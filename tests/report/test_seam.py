@@ -11,7 +11,7 @@ from rich.console import Console
 
 from flangeye import result as r
 from flangeye import types as t
-from flangeye.cli.terminal import print_result
+from flangeye.cli.details import print_details
 from flangeye.log.read import read_run
 from flangeye.log.record import Recorder
 from flangeye.report.facts import Facts
@@ -78,7 +78,7 @@ def test_the_terminal_tells_the_seam() -> None:
                                 seed=0, notes=[]),
     )  # fmt: skip
     out = io.StringIO()
-    print_result(Console(file=out, width=120), result)
+    print_details(Console(file=out, width=120), result)
     assert out.getvalue().splitlines()[3:] == [
         "seam: CAD plate on a scan",
         "  from (500.0, 0.1, 270.0) to (700.0, 0.1, 270.0) mm in base, 200.000 mm along",

@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from flangeye import FlangeyeError
-from flangeye.cli.terminal import print_result
+from flangeye.cli.details import print_details
 from flangeye.log.read import RunLog, read_run
 from flangeye.report import write_report
 from flangeye.report.account import idle_of, set_aside_of, timings_of, without_numbers
@@ -172,7 +172,7 @@ def test_an_arm_that_waited_says_how_long(make_run: Make) -> None:
     facts.result.timing["0.acquire.live"] = StageTiming(seconds=9.0, calls=3, idle=0.123)
     assert idle_of(facts) == "12.3%"
     out = io.StringIO()
-    print_result(Console(file=out, width=120), facts.result)
+    print_details(Console(file=out, width=120), facts.result)
     assert "  arm idle           12.3% of its session" in out.getvalue()
 
 

@@ -8,7 +8,7 @@ import yaml
 from rich.console import Console
 
 from flangeye import result as r
-from flangeye.cli.terminal import print_result
+from flangeye.cli.details import print_details
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.run.folder import calibration_yaml
 from flangeye.types import (
@@ -66,7 +66,7 @@ def document(calibration, figures=None):
 
 def told(result):
     out = io.StringIO()
-    print_result(Console(file=out, width=200), result)
+    print_details(Console(file=out, width=200), result)
     return out.getvalue()
 
 

@@ -7,7 +7,7 @@ Modules are imported inside the commands, so that ``--help`` answers at once; ``
 import os
 import sys
 
-from flangeye.cli.saying import end_in_words
+from flangeye.cli.console import end_in_words
 from flangeye.files.collector import collector_paused
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -23,7 +23,7 @@ def main() -> None:
 
 
 def _command() -> None:
-    from flangeye.cli.unparsed import answered
+    from flangeye.cli.fast_path import answered
 
     words = sys.argv[1:]
     with collector_paused(keep=True):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.saying import say, say_notes
+from flangeye.cli.console import say, say_notes
 from flangeye.errors import FlangeyeError
 from flangeye.files.collector import collector_paused
 

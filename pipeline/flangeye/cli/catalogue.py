@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import app, ask
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 
 
 @app.command()

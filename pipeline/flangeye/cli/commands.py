@@ -7,7 +7,7 @@ import typer
 from typer.main import get_command_name
 from typer.models import CommandInfo
 
-from flangeye.cli import running, drafting, page, offering, catalogue
+from flangeye.cli import running, drafting, page, plugins, catalogue
 from flangeye.cli import logs, watching, exporting, hardware
 from flangeye.cli.app import app
 
@@ -19,8 +19,8 @@ __all__ = [
     "hardware",
     "logs",
     "named_in",
-    "offering",
     "page",
+    "plugins",
     "running",
     "watching",
 ]

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import app, ask, load_plugins
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 from flangeye.errors import RecipeError
 
 TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, app, load_plugins
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 from flangeye.errors import FlangeyeError, StageError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, ask, load_plugins, read_recipe
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 
 tactile = typer.Typer(no_args_is_help=True, help="Calibrate tactile fingers.")
 app.add_typer(tactile, name="tactile")

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
+from flangeye.cli.console import at_work, say, say_notes
+from flangeye.cli.fast_path import say_report
 from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
-from flangeye.cli.saying import at_work, say, say_notes
-from flangeye.cli.unparsed import say_report
 from flangeye.errors import RecipeError
 from flangeye.files.collector import collector_paused
 
@@ -23,7 +23,7 @@ def show(log: LogFile) -> None:
     """Show what happened in a run, step by step; also for a run that was killed."""
     from rich.console import Console
 
-    from flangeye.cli.terminal import print_log
+    from flangeye.cli.details import print_log
     from flangeye.log.read import read_run
 
     read = read_run(log)

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
-from flangeye.cli.saying import at_work, say
+from flangeye.cli.console import at_work, say
 from flangeye.errors import FlangeyeError, NothingMoved
 
 if TYPE_CHECKING:
     from flangeye.batch.request import Tls
+    from flangeye.doctor.diagnosis import Finding
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.load import Recipe
     from flangeye.result import Result
@@ -137,7 +138,7 @@ def run(  # noqa: PLR0913  one for each option
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, recipe or checked.name, registry, folder, start)
         if result.status == "refused":
-            _advise(folder.log, registry, measured=result.holdout is not None)
+            _explain_refusal(folder.log, registry, result)
     if result.status == "refused" or (result.weld and not result.weld.completed):
         raise typer.Exit(1)
 
@@ -158,36 +159,40 @@ def _refuse(options: object, why: str) -> None:
         raise StageError(why)
 
 
-def _advise(log: Path, registry: Registry, measured: bool) -> None:
-    """Say what to do about a refusal: the doctor's command, and what it finds first.
+def _explain_refusal(log: Path, registry: Registry, result: Result) -> None:
+    """Print a refusal in three parts; the doctor looks for the mistake behind it."""
+    from rich.console import Console
 
-    Args:
-        log: Of the run.
-        registry: For the checks.
-        measured: Whether poses were held out: then they agree with one answer, but not well enough.
-    """
-    from flangeye.cli.foreign import of_foreign
-    from flangeye.doctor import examine, examine_cell, fix_lines, open_cell, open_session
+    from flangeye.cli.summary import print_refusal
     from flangeye.files.elsewhere import with_urls
 
-    say(with_urls(f"\nwhat to do: flangeye doctor {log}"))
+    wrong = str(result.refused)
+    doctor = with_urls(f"flangeye doctor {log}")
+    finding = _first_finding(log, registry)
+    if finding:
+        known = f"{wrong}. Doctor: {finding.name}"
+        print_refusal(Console(), finding.what, known, finding.choices[:2] or [doctor])
+        return
+    known = "no mistake was recognised in poses or scans"
+    if result.holdout:
+        known = "poses the solver never saw disagree with it; " + known
+    more = "add poses turned by 20 deg or more; the arm itself may be off (joint_offsets: auto)"
+    print_refusal(Console(), wrong, known, [doctor, more] if result.holdout else [doctor])
+
+
+def _first_finding(log: Path, registry: Registry) -> Finding | None:
+    """Return the mistake that explains most of a run's errors, if the doctor finds one."""
+    from flangeye.cli.foreign import of_foreign
+    from flangeye.doctor import examine, examine_cell, open_cell, open_session
+
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
         with of_foreign(log, "it cannot be examined"), at_work("looking for the mistake"):
             cell = open_cell(log, registry)
-            told = examine_cell(*cell) if cell else examine(open_session(log, registry), checks)
+            found = examine_cell(*cell) if cell else examine(open_session(log, registry), checks)
     except FlangeyeError:
-        return  # the doctor needs more than this log has, and says so when it is asked
-    if findings := told.findings:
-        say(f"  likely: {findings[0].name}: {findings[0].what}")
-        say("\n".join(fix_lines(findings[0], "  ")))
-    elif measured:
-        say(
-            "  it finds no mistake in poses or scans: the arm itself may be off by as much, which "
-            "joint_offsets: auto in the solver looks for; more poses, turned further, tell more"
-        )
-    else:
-        say("  it finds no mistake that it knows in poses or scans")
+        return None  # the doctor needs more than this log has, and says so when it is asked
+    return next(iter(found.findings), None)
 
 
 def _recipe_of(
@@ -232,36 +237,43 @@ def _point(
 def _record(
     recipe: Recipe, called: str, registry: Registry, folder: RunFolder, start: Start
 ) -> Result:
-    """Run with a log and a progress bar, and say what came of it."""
+    """Run with a log and a progress bar, and print the result."""
     from rich.console import Console
 
-    from flangeye.cli.terminal import ProgressBar, print_result
+    from flangeye.cli.progress import RunProgress
+    from flangeye.cli.summary import print_summary
     from flangeye.files.elsewhere import with_urls
-    from flangeye.run.restart import restart_hint, resumable
     from flangeye.run.session import record_run
 
     try:
-        with ProgressBar(Console(stderr=True)) as progress:
+        labels = [step.label for step in recipe.steps]
+        with RunProgress(Console(stderr=True), labels) as progress:
             registry.hooks.register(progress)
             result = record_run(recipe, registry, folder, start)
     except FlangeyeError:
         if folder.log.exists():
-            seen = f"flangeye report {quote(str(folder.path))} shows it"
-            again = restart_hint(recipe, called, folder.log)
-            say(with_urls(f"what was gathered is in {folder.log}; {seen}"), err=True)
-            say(with_urls(f"with other parameters: {again}"), err=True)
-            if resumable(recipe):
-                moving = " --move" if start.motion.allowed else ""
-                say(
-                    with_urls(f"resume it: flangeye run --resume {folder.path}{moving}"),
-                    err=True,
-                )
+            _say_how_to_go_on(recipe, called, folder, start)
         raise
-    print_result(Console(), result)
-    names = ("report.html", "calibration.yaml", "result.json", "run.mcap")
-    written = [name for name in names if (folder.path / name).exists()]
-    say(with_urls(f"\n{folder.path}/: {'  '.join(written)}"))
+    run = with_urls(quote(str(folder.path)))
+    print_summary(Console(), result, run, len(registry.exports()), progress.said)
     return result
+
+
+def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Start) -> None:
+    """Say where the captures of a run that failed are, and the commands that use them."""
+    from flangeye.files.elsewhere import with_urls
+    from flangeye.run.restart import restart_hint, resumable
+
+    seen = f"flangeye report {quote(str(folder.path))} shows it"
+    lines = [
+        f"what was gathered is in {folder.log}; {seen}",
+        f"with other parameters: {restart_hint(recipe, called, folder.log)}",
+    ]
+    if resumable(recipe):
+        moving = " --move" if start.motion.allowed else ""
+        lines.append(f"resume it: flangeye run --resume {folder.path}{moving}")
+    for line in lines:
+        say(with_urls(line), err=True)
 
 
 def _tls(ca: Path | None, cert: Path | None, key: Path | None) -> Tls | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, app, load_plugins
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 
 if TYPE_CHECKING:
     from flangeye.doctor.monitor import Check, StoredCalibration

@@ -12,6 +12,13 @@ def millimetres(metres: float) -> str:
     return f"{value:z.{decimals}f}"
 
 
+def rounded_mm(metres: float) -> str:
+    """Return a length [m] in mm without its unit, as far as it matters at the work: 0.16."""
+    value = metres * 1e3
+    decimals = 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
+    return f"{value:.{decimals}f}"
+
+
 def degrees(radians: float) -> str:
     """Return an angle [rad] in degrees without its unit, to four decimals."""
     return f"{math.degrees(radians):z.4f}"
@@ -26,7 +33,19 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-6 else "0 ms"
 
 
-LENGTHS = ("rms", "median", "p95", "max", "worst", "distance", "offset", "sigma", "shift", "error")
+LENGTHS = (
+    "rms",
+    "median",
+    "p95",
+    "max",
+    "worst",
+    "distance",
+    "offset",
+    "sigma",
+    "shift",
+    "error",
+    "limit",
+)
 ANGLES = ("tilt", "angle", "rotation", "turn")
 
 

@@ -98,8 +98,9 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     arm was found, ``corrected_rms``, ``corrected_rms_inliers``, ``corrected_median`` and
     ``corrected_p95`` are those of the pose and the arm so corrected.
 
-    Figures [m, rad]: these, ``folds``, ``poses``, ``tilt_rms`` where normals were measured, and
-    ``predicted_worst_p95``: with 95 % probability no point of the workspace is off by more.
+    Figures [m, rad]: these, ``folds``, ``limit``, ``poses``, ``tilt_rms`` where normals were
+    measured, and ``predicted_worst_p95``: with 95 % probability no point of the workspace is off by
+    more.
     """
     from flangeye.maths.kinematics import Arm
 
@@ -124,6 +125,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     source = None if observations is None else observations.source
     figures = {
         "folds": float(len(folds)),
+        "limit": params.max_rms,
         **_figures(held, outlying),
         **(_corrected_figures(whole, outlying) if whole is not held else {}),
         "predicted_worst_p95": _predicted_worst_p95(calibration, workspace, source),

@@ -1,4 +1,4 @@
-"""How commands say something, and how mistakes end them; nothing here takes time to import."""
+"""How commands print, and how errors end them; nothing here takes time to import."""
 
 from __future__ import annotations
 
@@ -17,10 +17,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from contextlib import AbstractContextManager
 
+    from rich.console import Console
+
 
 def say(text: object, err: bool = False) -> None:
     """Write a line; what others wrote in it reaches the terminal as text, never as commands."""
     print(printable(str(text)), file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def write(console: Console, text: str, style: str = "") -> None:
+    """Write lines in a colour, where the output is a terminal; no markup of others is followed."""
+    console.print(printable(text), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def say_notes(notes: Sequence[str]) -> None:

@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins
-from flangeye.cli.saying import say
+from flangeye.cli.console import say
 
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
     """Check a recipe without running it: print every mistake with its line, and the unknowns."""
-    from flangeye.cli.unparsed import say_verdict
+    from flangeye.cli.fast_path import say_verdict
 
     say_verdict(recipe, overrides or ())
 

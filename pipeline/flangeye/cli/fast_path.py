@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from flangeye.cli.saying import say, say_notes
+from flangeye.cli.console import say, say_notes
 from flangeye.files.deferred import defer
 
 

@@ -1,4 +1,4 @@
-"""What people see in the terminal: progress while a run goes on, and its result."""
+"""``flangeye show``: what happened in a run, step by step, and every figure of its result."""
 
 from __future__ import annotations
 
@@ -6,102 +6,43 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
+from flangeye.cli.console import write
 from flangeye.files.printable import printable
 from flangeye.maths.geometry import rpy_from_rotation
-from flangeye.plugin.hookspecs import hookimpl
 from flangeye.result import (
     CorrectionResult,
     HoldoutResult,
     Result,
     TransformResult,
+    TruthResult,
     Vector,
+    expected_error,
     logged_result,
+    status_of,
 )
-from flangeye.types import Rejection, Source
+from flangeye.types import records_of
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from flangeye.log.read import RunLog
 
 
-class ProgressBar:
-    """Shows captures as they go through; a hook implementation like any other."""
-
-    def __init__(self, console: Console) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        self._console = console
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("captures", total=None)
-
-    @hookimpl
-    def flangeye_run_started(self, source: Source, total: int | None) -> None:
-        """Start the bar and tell what the source reports."""
-        for note in source.notes:
-            _say(self._console, f"note: {note}")
-        self._progress.update(self._task, total=total)
-        self._progress.start()
-
-    @hookimpl
-    def flangeye_capture_rejected(self, rejection: Rejection) -> None:
-        """Say what was set aside, and why."""
-        line = f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}"
-        _say(self._console, line)
-
-    @hookimpl
-    def flangeye_capture_finished(self, capture: str) -> None:
-        """Move the bar."""
-        self._progress.advance(self._task)
-
-    @hookimpl
-    def flangeye_stage_finished(
-        self, step: str, capture: str | None, value: Any, seconds: float
-    ) -> None:
-        """Name the steps that run once, after the captures."""
-        if capture is None:
-            self._progress.update(self._task, description=step.partition(".")[2])
-
-    def __enter__(self) -> ProgressBar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Take the bar away."""
-        self._progress.stop()
-
-
-def print_result(console: Console, result: Result) -> None:
-    """Print the matrix, how far it can be trusted, and how that is known."""
+def print_details(console: Console, result: Result) -> None:
+    """Print the verdict, every figure, both answers, seam and weld, and the notes."""
     used = sum(o.used for o in result.observations)
-    lines = [result.title, f"{result.status}: {used} of {len(result.observations)} captures used"]
-    lines += [f"warning: {each.text}; {each.fix}" for each in result.warnings]
-    lines += [f"note: {note}" for note in result.notes]
+    count = f"{used} of {len(result.observations)} captures used"
+    lines = [result.title, f"{status_of(result)}: {count}"]
+    lines += [f"refused: {result.refused}"] if result.refused else []
+    lines += [f"warning: {each.text}\n  -> {each.fix}" for each in result.warnings]
     for name, estimate in result.transforms.items():
         lines += ["", f"{name} (maps {name.split('_T_')[1]} to {name.split('_T_')[0]}, metres)"]
         lines += ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
         lines += ["", *_uncertainty(name.partition("_T_")[0], estimate)]
-    lines += _errors(result)
-    lines += _idle(result)
-    lines += _answers(result)
-    lines += _seam(result)
-    lines += _weld(result)
-    if result.refused:
-        lines += ["", f"refused: {result.refused}"]
-    _say(console, "\n".join(lines))
+    lines += [*_errors(result), *_idle(result), *_answers(result), *_seam(result), *_weld(result)]
+    lines += ["", *(f"note: {note}" for note in result.notes)] if result.notes else []
+    write(console, "\n".join(lines))
 
 
 def _uncertainty(parent: str, estimate: TransformResult) -> list[str]:
@@ -131,31 +72,35 @@ def _motion(direction: Vector) -> str:
 
 def _errors(result: Result) -> list[str]:
     lines = []
-    if result.workspace:
-        w = result.workspace
-        size = " x ".join(f"{x * 1e3:.0f}" for x in w.size)
-        lines.append(
-            f"  predicted error    {_mm(w.predicted_rms)} rms, 95 % below {_mm(w.predicted_p95)} "
-            f"over the workspace ({size} mm)"
-        )
-    if result.holdout:
-        h = result.holdout
+    if found := expected_error(result):
+        rms, bound = found
+        below = "" if bound is None else f", 95 % below {_mm(bound)}"
+        lines.append(f"  expected error     {_mm(rms)} rms at the work{below}")
+    if h := result.holdout:
         lines.append(
             f"  held-out error     {_mm(h.rms)} rms, {_mm(h.median)} median, "
             f"95 % below {_mm(h.p95)} ({_over(h)})"
         )
-    if result.truth:
-        t = result.truth
-        if t.at_work is not None:
-            told = f"{_mm(t.at_work)} rms at poses that took no part"
-            if t.at_work_corrected is not None:
-                told += f", {_mm(t.at_work_corrected)} with the arm corrected"
-            lines.append(f"  true at the work   {told}")
+    if w := result.workspace:
+        size = " x ".join(f"{x * 1e3:.0f}" for x in w.size)
         lines.append(
-            f"  true error         {_mm(t.rms_over_workspace)} rms over the workspace, "
-            f"{_mm(t.error_at_centroid)} at its centre, {np.degrees(t.rotation_error):.4f} deg"
+            f"  of the pose alone  {_mm(w.predicted_rms)} rms, 95 % below {_mm(w.predicted_p95)} "
+            f"over the workspace ({size} mm)"
         )
-    return lines
+    return lines + (_truth(result.truth) if result.truth else [])
+
+
+def _truth(truth: TruthResult) -> list[str]:
+    lines = []
+    if truth.at_work is not None:
+        figure = f"{_mm(truth.at_work)} rms at poses the solver never saw"
+        if truth.at_work_corrected is not None:
+            figure += f", {_mm(truth.at_work_corrected)} with the arm corrected"
+        lines.append(f"  true at the work   {figure}")
+    over = f"{_mm(truth.rms_over_workspace)} rms over the workspace"
+    centre = f"{_mm(truth.error_at_centroid)} at its centre"
+    turn = f"{np.degrees(truth.rotation_error):.4f} deg"
+    return [*lines, f"  true error         {over}, {centre}, {turn}"]
 
 
 def _over(held: HoldoutResult) -> str:
@@ -168,11 +113,11 @@ def _over(held: HoldoutResult) -> str:
 
 
 def _answers(result: Result) -> list[str]:
-    """Tell both answers, where an error of the arm was found."""
+    """Return both answers, where an error of the arm was found."""
     answers = result.answers
     if answers is None or answers.corrected is None:
         return []
-    lines = ["", "Two answers: never use the pose of one with the arm of the other"]
+    lines = ["", "Two answers: use each pose only with its own arm model"]
     for name, answer in (
         ("arm as it reports", answers.as_reported), ("arm corrected", answers.corrected)
     ):  # fmt: skip
@@ -221,7 +166,7 @@ def _weld(result: Result) -> list[str]:
         return []
     lines = [f"  weld               {weld.mode}, {weld.seconds:.1f} s"]
     if weld.correction_rms is not None:
-        lines.append(f"  felt off the plan  {_mm(weld.correction_rms)} rms")
+        lines.append(f"  off the plan (felt){_mm(weld.correction_rms)} rms")
     if weld.truth:
         lines.append(
             f"  torch off the seam {_mm(weld.truth.rms)} rms, {_mm(weld.truth.max)} at most"
@@ -244,35 +189,35 @@ def print_log(console: Console, log: RunLog) -> None:
 
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
-    _say(console, f"{log.path}: {state}")
+    write(console, f"{log.path}: {state}")
     # Centres or poses of a target that somebody had found already are no captures.
     measured = any(entry.stage.startswith("acquire.") for entry in log.entries)
     arrived = "" if measured else f"{len(log.poses)}{expected} captures arrived, "
     went = f"{len(log.finished)}{expected} measurements" if measured else f"{len(log.finished)}"
-    _say(console, f"{arrived}{went} went through")
-    for note in log.source.notes if log.source else ():
-        _say(console, f"note: {note}")
+    write(console, f"{arrived}{went} went through")
+    for note in records_of(log.source.notes) if log.source else ():
+        write(console, f"note: {note}")
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("step", "values", "seconds", "set aside"):
+    for column in ("step", "values", "seconds", "rejected"):
         table.add_column(column, justify="left" if column == "step" else "right")
-    set_aside = Counter(r.stage for r in log.rejections)
+    rejected = Counter(r.stage for r in log.rejections)
     for step, poses in _by_acquire_step(log).items():
         seconds = sum(pose["seconds"] for pose in poses)
         table.add_row(Text(printable(step)), str(len(poses)), f"{seconds:.2f}", "0")
     for step in dict.fromkeys(entry.step for entry in log.entries):
         entries = [entry for entry in log.entries if entry.step == step]
         seconds = sum(entry.seconds for entry in entries)
-        aside = set_aside[entries[0].stage]
-        table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(aside))
+        count = rejected[entries[0].stage]
+        table.add_row(Text(printable(step)), str(len(entries)), f"{seconds:.2f}", str(count))
     console.print(table)
     for rejection in log.rejections:
-        _say(console, f"set aside {rejection.id}: {rejection.stage}: {rejection.reason}")
+        write(console, f"rejected {rejection.id}: {rejection.stage}: {rejection.reason}")
     if log.finished and not log.complete:
         last = [e for e in log.entries if e.capture == log.finished[-1]]
         after = f", last step {last[-1].step}" if last else ""
-        _say(console, f"last finished capture: {log.finished[-1]}{after}")
+        write(console, f"last finished capture: {log.finished[-1]}{after}")
     if result:
-        print_result(console, result)
+        print_details(console, result)
 
 
 def _state(log: RunLog) -> str:
@@ -290,7 +235,3 @@ def _by_acquire_step(log: RunLog) -> dict[str, list[dict[str, Any]]]:
     for pose in log.poses.values():
         steps.setdefault(pose["step"], []).append(pose)
     return steps
-
-
-def _say(console: Console, line: str) -> None:
-    console.print(printable(line), markup=False, highlight=False, soft_wrap=True)

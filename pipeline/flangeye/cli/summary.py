@@ -1,0 +1,127 @@
+"""What a run prints at its end: the verdict, two errors, the matrix, and what to do next."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Collection, Iterable, Iterator
+from typing import TYPE_CHECKING
+
+from flangeye.cli.console import write
+from flangeye.report.units import rounded_mm
+from flangeye.result import Result, expected_error, status_of
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+UNLIMITED = 100
+"""Columns of a line that goes to a file or another program, whose width nobody knows."""
+COLOURS = {"verified": "bold green", "unverified": "bold yellow", "refused": "bold red"}
+
+
+def print_summary(
+    console: Console, result: Result, run: str, formats: int, said: Collection[str] = ()
+) -> None:
+    """Print the result of a run on one screen.
+
+    Args:
+        console: Where to.
+        result: Of the run.
+        run: The run's folder, as a command takes it.
+        formats: How many formats ``flangeye export`` writes.
+        said: Warnings that were printed before.
+    """
+    used = sum(o.used for o in result.observations)
+    write(console, result.title, "bold")
+    verdict = status_of(result).replace(result.status, result.status.upper())
+    colour = COLOURS.get(result.status, "bold")
+    rows(console, [(verdict, f"{used} of {len(result.observations)} captures used", "")], colour)
+    for each in result.warnings:
+        if each.text not in said:
+            write(console, wrapped(console, f"warning: {each.text}"), "yellow")
+            write(console, wrapped(console, f"  -> {each.fix}"), "yellow")
+    rows(console, errors(result))
+    for name, estimate in result.transforms.items() if not result.refused else ():
+        matrix = ["  " + "  ".join(f"{x:10.6f}" for x in row) for row in estimate.matrix]
+        write(console, "\n".join([f"{name} [m]", *matrix]))
+    rows(console, _welding(result))
+    rows(console, _next_steps(result, run, formats))
+
+
+def errors(result: Result) -> Iterator[tuple[str, str, str]]:
+    """Yield the expected and the held-out error: name, figure, and what it is over."""
+    if found := expected_error(result):
+        rms, bound = found
+        below = "" if bound is None else f"(95 % below {rounded_mm(bound)} mm)"
+        yield "Expected error at the work", f"{rounded_mm(rms)} mm", below
+    answers = result.answers
+    if answers and answers.corrected and answers.corrected.expected_rms is not None:
+        figure = f"{rounded_mm(answers.corrected.expected_rms)} mm"
+        yield "  with the arm corrected", figure, "needs its correction too: calibration.yaml"
+    if held := result.holdout:
+        over = f"{held.folds} folds, poses the solver never saw"
+        limit = held.figures.get("limit")
+        over += "" if limit is None else f"; limit {rounded_mm(limit)} mm"
+        yield "Held-out error", f"{rounded_mm(held.rms)} mm", over
+
+
+def _welding(result: Result) -> Iterator[tuple[str, str, str]]:
+    if seam := result.seam:
+        tube = f"95 % within {rounded_mm(max(seam.tube))} mm of the plan"
+        yield "Seam", f"{seam.length * 1e3:.0f} mm", tube
+    if weld := result.weld:
+        off = f"torch off the seam {rounded_mm(weld.truth.rms)} mm rms" if weld.truth else ""
+        yield "Weld", f"{weld.seconds:.1f} s", off
+        if not weld.completed:
+            yield "Weld stopped", weld.reason, ""
+
+
+def _next_steps(result: Result, run: str, formats: int) -> Iterator[tuple[str, str, str]]:
+    yield "Report", f"{run}/report.html", ""
+    if result.transforms and not result.refused:
+        use = f"flangeye export {run} --to ros2_launch{_camera_of_several(result)}"
+        yield "Use it", use, f"({formats} formats: flangeye export --list)"
+    notes, warnings = len(result.provenance.notes), len(result.warnings)
+    action = f"{_count(warnings, 'warning')} above" if warnings else "none needs action"
+    yield "Details", f"flangeye show {run}", f"{_count(notes, 'note')}, {action}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _camera_of_several(result: Result) -> str:
+    """Return the option that chooses a camera, where a cell has several."""
+    cameras = dict.fromkeys(o.camera for o in result.observations if o.camera)
+    return f" --camera {next(iter(cameras))}" if cameras else ""
+
+
+def print_refusal(console: Console, wrong: str, known: str, next_steps: Collection[str]) -> None:
+    """Print what is wrong, how it is known, and what to do next."""
+    write(console, wrapped(console, f"What is wrong   {wrong}", 16), "red")
+    write(console, wrapped(console, f"How it is known {known}", 16))
+    for name, step in zip(("Next step", "or"), next_steps, strict=False):
+        write(console, wrapped(console, f"{name:<15} {step}", 16))
+
+
+def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "") -> None:
+    """Print rows of a name, a value and a remark, aligned; a remark that is too long goes below."""
+    listed = [*rows]
+    name_width, value_width = (max((len(row[i]) for row in listed), default=0) for i in (0, 1))
+    for name, value, remark in listed:
+        line = f"{name:<{name_width}}   {value:<{value_width}}   {remark}".rstrip()
+        if len(line) > width(console) and remark:
+            line = f"{name:<{name_width}}   {value}\n" + wrapped(console, f"   {remark}", 3)
+        write(console, line, colour)
+
+
+def wrapped(console: Console, text: str, indent: int = 2) -> str:
+    """Return a text in the lines that the terminal shows; commands stay whole."""
+    return textwrap.fill(
+        text, width(console), subsequent_indent=" " * indent, break_long_words=False,
+        break_on_hyphens=False, drop_whitespace=True, replace_whitespace=False,
+    )  # fmt: skip
+
+
+def width(console: Console) -> int:
+    """Return how many columns a line may have."""
+    return console.width if console.is_terminal else UNLIMITED

@@ -1,0 +1,121 @@
+"""What a run prints at its end, line by line, on wide and narrow terminals."""
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from flangeye import result as r
+from flangeye.cli.console import write
+from flangeye.cli.progress import RunProgress
+from flangeye.cli.summary import print_refusal, print_summary, wrapped
+from flangeye.types import Source, Warn
+
+SCALE = {"text": "the target is 1.3 % larger than configured", "fix": "feature.size: 40.52 mm"}
+
+
+def result(**more: Any) -> r.Result:
+    pose = r.TransformResult(
+        matrix=np.eye(4).tolist(), covariance=np.eye(6).tolist(), about=[0.0, 0.0, 0.0]
+    )
+    given: dict[str, Any] = {
+        "title": "A cell",
+        "status": "verified",
+        "simulated": True,
+        "transforms": {"base_T_camera": pose},
+        "observations": [r.ObservationResult(id="1", used=True)],
+        "verifications": {},
+        "timing": {},
+        "holdout": r.HoldoutResult(
+            folds=5, rms=1.63e-4, median=1e-4, p95=2e-4, figures={"limit": 5e-4}
+        ),
+        "provenance": r.Provenance(
+            versions={}, plugins={}, recipe="", recipe_hash="", input_hash="", seed=0, notes=["one"]
+        ),
+    }
+    return r.Result(**given | more)
+
+
+def printed(found: r.Result, width: int = 0, said: tuple[str, ...] = ()) -> str:
+    out = io.StringIO()
+    console = Console(file=out, width=width or None, force_terminal=bool(width), no_color=True)
+    print_summary(console, found, "runs/now", 20, said)
+    return out.getvalue()
+
+
+def test_a_run_prints_one_screen_and_nothing_else() -> None:
+    assert printed(result()).splitlines() == [
+        "A cell",
+        "VERIFIED (simulated)   1 of 1 captures used",
+        "Held-out error   0.16 mm   5 folds, poses the solver never saw; limit 0.50 mm",
+        "base_T_camera [m]",
+        "    1.000000    0.000000    0.000000    0.000000",
+        "    0.000000    1.000000    0.000000    0.000000",
+        "    0.000000    0.000000    1.000000    0.000000",
+        "    0.000000    0.000000    0.000000    1.000000",
+        "Report    runs/now/report.html",
+        "Use it    flangeye export runs/now --to ros2_launch   (20 formats: flangeye export --list)",
+        "Details   flangeye show runs/now                      1 note, none needs action",
+    ]
+
+
+def test_a_real_run_is_not_called_simulated() -> None:
+    assert "VERIFIED   1 of 1" in printed(result(simulated=False))
+
+
+def test_a_warning_is_printed_with_what_mends_it() -> None:
+    found = result(warnings=[r.WarningResult(**SCALE)])
+    text = printed(found)
+    assert f"warning: {SCALE['text']}\n  -> {SCALE['fix']}\n" in text
+    assert "1 note, 1 warning above" in text
+    assert SCALE["text"] not in printed(found, said=(SCALE["text"],))
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_no_line_is_wider_than_the_terminal(width: int) -> None:
+    found = result(warnings=[r.WarningResult(text="long words " * 12, fix="line " * 20)])
+    lines = printed(found, width).replace("\x1b", "\n\x1b").splitlines()
+    assert max(len(line.partition("m")[2] if "\x1b" in line else line) for line in lines) <= width
+
+
+def test_a_file_has_no_colours() -> None:
+    assert "\x1b" not in printed(result(status="refused", refused="why"))
+
+
+def test_a_refused_matrix_is_not_there_to_copy() -> None:
+    text = printed(result(status="refused", refused="why"))
+    assert "base_T_camera" not in text
+    assert "export" not in text
+
+
+def test_a_refusal_has_three_parts() -> None:
+    out = io.StringIO()
+    print_refusal(Console(file=out), "what", "how", ["do this", "or that", "never shown"])
+    assert [line.split("  ")[0] for line in out.getvalue().splitlines()] == [
+        "What is wrong", "How it is known how", "Next step", "or",
+    ]  # fmt: skip
+
+
+def test_commands_stay_whole_when_lines_are_wrapped() -> None:
+    console = Console(file=io.StringIO(), width=20, force_terminal=True)
+    assert "--to-a-long-option" in wrapped(console, "flangeye export run --to-a-long-option")
+
+
+def test_warnings_of_the_source_are_printed_before_the_run() -> None:
+    out = io.StringIO()
+    progress = RunProgress(Console(file=out), ["0.acquire.toy"])
+    with progress:
+        progress.flangeye_run_started(
+            source=Source(fingerprint="", notes=("record", Warn("wrong", "mend"))), total=3
+        )
+    assert out.getvalue() == "warning: wrong\n  -> mend\n"
+    assert progress.said == ["wrong"]
+
+
+def test_markup_of_others_is_not_followed() -> None:
+    out = io.StringIO()
+    write(Console(file=out), "[bold]x[/bold] \x1b[31m")
+    assert out.getvalue().startswith("[bold]x[/bold] ")
+    assert "\x1b" not in out.getvalue()
