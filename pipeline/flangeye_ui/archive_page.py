@@ -7,6 +7,7 @@ import csv
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from nicegui import ui
@@ -20,7 +21,7 @@ from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
-from flangeye_ui.run_page import FLANGE, SCAN
+from flangeye_ui.scan_page import FLANGE, SCAN
 from flangeye_ui.scene import draw_cloud, new_scene
 
 COLUMNS = [
@@ -40,13 +41,17 @@ def add(project: Project) -> None:
 
     @ui.page("/archive")
     def archive() -> None:
-        with page("Archive"):
+        with page(project, "Archive"):
             rows = [row_of(run) for run in project.runs()]
             if not rows:
                 ui.label("There is no run in this folder yet.")
                 return
-            ui.table(columns=COLUMNS, rows=rows, row_key="run").classes("w-full").props(
-                "dense wrap-cells"
+            table = ui.table(columns=COLUMNS, rows=rows, row_key="run")
+            table.classes("w-full").props("dense wrap-cells")
+            table.on(
+                "rowClick",
+                lambda e: ui.navigate.to(f"/result?run={quote(e.args['run'])}"),
+                js_handler="(_, row) => emit(row)",
             )
             if len(rows) > 1:
                 ui.echart(comparison(rows)).classes("w-full h-48").props('aria-label="Errors"')

@@ -13,9 +13,16 @@ from flangeye.files.bundled import bundled
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye_ui.layout import command_line, mistake, page
+from flangeye_ui.layout import command_line, mistake, next_step, page
 from flangeye_ui.project import Mistake, Project, at
 
+WORDS = {
+    "acquire.simulated": "Take simulated scans", "acquire.live": "Move the arm and scan",
+    "acquire.archive": "Read recorded scans", "acquire.samples": "Read recorded samples",
+    "segment.flange": "Find the flange", "fit.rim": "Measure its rim",
+    "solve.robust": "Find the scanner's place", "verify.holdout": "Check on poses held out",
+}  # fmt: skip
+"""What people say for the steps that most recipes have."""
 CONFIGURATIONS = ["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"]
 
 
@@ -24,7 +31,7 @@ def add(project: Project) -> None:
 
     @ui.page("/")
     def cell() -> None:
-        with page("Cell"), ui.row().classes("w-full gap-6 items-start"):
+        with page(project, "Cell"), ui.row().classes("w-full gap-6 items-start"):
             Form(project)
 
 
@@ -53,6 +60,7 @@ class Form:
         _, mistakes = self._project.check()
         if not mistakes:
             ui.label("The recipe is valid.").classes("text-positive").props('role="status"')
+            next_step("Poses", "Next: poses")
         for each in mistakes:
             mistake(f"line {each.line}: {each.path}: {each.text}" if each.line else each.text)
 
@@ -61,12 +69,13 @@ class Form:
         """Show the header and every step, with what is wrong at each field."""
         data, (_, mistakes) = self._project.data(), self._project.check()
         self._header(data, mistakes)
-        for index, entry in enumerate(data.get("steps") or []):
-            self._step(index, entry, mistakes)
-        stages = sorted(self._project.registry.stages)
-        ui.select(stages, label="Add a step", with_input=True, on_change=self._add).classes(
-            "w-full"
-        )
+        wrong = any(m.path.startswith("steps") for m in mistakes)
+        with ui.expansion("Advanced: every step and its fields", value=wrong).classes("w-full"):
+            for index, entry in enumerate(data.get("steps") or []):
+                self._step(index, entry, mistakes)
+            stages = sorted(self._project.registry.stages)
+            add = ui.select(stages, label="Add a step", with_input=True, on_change=self._add)
+            add.classes("w-full")
 
     def _start_from(self) -> None:
         def take(event: Any) -> None:
@@ -96,7 +105,11 @@ class Form:
     def _choice(self, label: str, path: list[str], chosen: Any, known: list[str]) -> None:
         options = known if chosen in (None, *known) else [chosen, *known]
         ui.select(
-            options, label=label, value=chosen, on_change=lambda e: self._set(path, e.value)
+            options,
+            label=label,
+            value=chosen,
+            with_input=True,
+            on_change=lambda e: self._set(path, e.value),
         ).classes("w-full")
 
     def _step(self, index: int, entry: Any, mistakes: list[Mistake]) -> None:
@@ -104,9 +117,13 @@ class Form:
         given = (entry[name] if isinstance(entry, dict) else None) or {}
         stage = self._project.registry.stages.get(name)
         wrong = [m for m in mistakes if f"{m.path}.".startswith(f"steps.{index}.")]
-        with ui.expansion(f"{index}. {name}", value=bool(wrong)).classes("w-full").props("dense"):
+        with (
+            ui.expansion(f"{index + 1}. {WORDS.get(name, name)}", value=bool(wrong))
+            .classes("w-full")
+            .props("dense")
+        ):
             if stage:
-                ui.label(stage.summary).classes("text-caption")
+                ui.label(f"{name}: {stage.summary}").classes("text-caption")
                 self._parameters(index, name, stage, given, wrong)
             ui.button("Remove", on_click=lambda: self._remove(index)).props("flat dense")
         fields = (stage.params.model_fields if stage and stage.params else {}).keys()
@@ -246,9 +263,12 @@ def _field(name: str, schema: dict[str, Any], value: Any, required: bool) -> ui.
         shown = str(value).lower() if isinstance(value, bool) else value
         chosen = shown if shown in allowed else None
         return ui.select(
-            allowed, label=f"{name}, {told}" if told else name, value=chosen, clearable=True
+            allowed,
+            label=", ".join(filter(None, [name.replace("_", " "), told])),
+            value=chosen,
+            clearable=True,
         )
-    return ui.input(name, value=_shown(value), placeholder=told)
+    return ui.input(name.replace("_", " "), value=_shown(value), placeholder=told)
 
 
 _EVENTS: dict[type, str] = {ui.input: "change", ui.select: "update:model-value"}

@@ -60,12 +60,14 @@ class Project:
         codes: What the terminal shows and a move asks for.
         run: The run that was started here last, if any.
         owner: The page that started it.
+        planned: The recipe whose poses were checked last.
     """
 
     def __init__(self, folder: Path, registry: Registry, codes: MoveCodes) -> None:
         self.folder, self.registry, self.codes = folder, registry, codes
         self.run: RunProcess | None = None
         self.owner = ""
+        self.planned = ""
         if not self.recipe_path.exists():
             self.recipe_path.write_text(NEW, encoding="utf-8")
 
@@ -101,6 +103,26 @@ class Project:
             return load_recipe(self.recipe_path, self.registry), []
         except FlangeyeError as error:
             return None, [_mistake(line) for line in str(error).splitlines()]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether scans come from a simulation, or an arm or a scanner is an emulator."""
+        data = self.data()
+        drivers = [(data.get(part) or {}).get("driver") or {} for part in ("robot", "scanner")]
+        steps = data.get("steps") or [""]
+        first = next(iter(steps[0])) if isinstance(steps[0], dict) else str(steps[0])
+        return ".simulated" in first or any("emulator" in driver for driver in drivers)
+
+    def done(self) -> set[str]:
+        """Return the steps that are done: of the recipe, and of the newest run."""
+        sound = self.check()[0] is not None
+        newest = next(iter(self.runs()), None)
+        found = {"Cell", *({"Poses"} if self.planned == self.text or newest else ())}
+        if newest and (newest / "result.json").exists():
+            found.add("Scan")
+            found |= {"Result"} if (newest / "calibration.yaml").exists() else set()
+            found |= {"Use"} if any(newest.glob("exports/*")) else set()
+        return found if sound else found - {"Cell", "Poses"}
 
     def runs(self) -> list[Path]:
         """Return the folders of all runs, newest first."""

@@ -15,7 +15,15 @@ from nicegui import app, ui
 
 from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
-from flangeye_ui import archive_page, cell_page, foreign, plan_page, run_page, verdict_page
+from flangeye_ui import (
+    archive_page,
+    cell_page,
+    foreign,
+    poses_page,
+    result_page,
+    scan_page,
+    use_page,
+)  # fmt: skip
 from flangeye_ui.gate import Gate, Keys
 from flangeye_ui.permission import MoveCodes
 from flangeye_ui.project import Project
@@ -42,7 +50,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     at = f"http://{f'[{host}]' if ':' in host else host}:{port}/?token="
     keys = Keys(lambda token: say(f"for another browser, once: {at}{token}"))
     project = Project(folder.resolve(), registry, MoveCodes(say))
-    for each in (cell_page, plan_page, run_page, verdict_page, archive_page):
+    for each in (cell_page, poses_page, scan_page, result_page, use_page, archive_page):
         each.add(project)
     foreign.add(project.folder)
     app.add_middleware(Gate, keys=keys, host=host, port=port)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import http.server
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ attempt('opener', () => window.opener.document.title);
 attempt('parent', () => { if (parent === window) throw 0; parent.document.title = 'PWNED'; });
 addEventListener('load', () => {
   const frame = document.createElement('iframe');
-  frame.src = location.pathname.replace(/files.*/, 'run');
+  frame.src = location.pathname.replace(/files.*/, 'scan');
   document.body.append(frame);
   fetch(location.pathname.replace(/files.*/, '')).then(() => got.push('fetch'), () => {});
   setTimeout(() => {
@@ -50,6 +51,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         run = folder / "runs" / name
         run.mkdir(parents=True)
         (run / "run.mcap").write_bytes(b"no log")
+        os.utime(run / "run.mcap", (0, 0))  # a fresh one would be taken for one under way
         for page in ("monitor", "report", "certificate"):
             (run / f"{page}.html").write_text(HOSTILE)
     (folder / "runs" / "evil" / "drawing.svg").write_text("<svg onload='alert(1)'/>")
@@ -240,14 +242,14 @@ def test_a_hostile_run_reaches_nothing_from_the_archive(browser: Any, hostile: S
 def test_a_script_in_the_page_itself_cannot_move_the_arm(browser: Any, hostile: Served) -> None:
     page = entered(browser, hostile)
     before = sorted(hostile.folder.glob("runs/*"))
-    page.get_by_role("link", name="Run", exact=True).click()
-    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_role("link", name="Scan", exact=True).click()
+    page.get_by_role("button", name="Start: the arm moves").click()
     for _ in range(MOST_WRONG + 1):
         page.get_by_label("Code from the terminal").fill("000000")
         page.get_by_role("button", name="Move the arm").click()
         page.get_by_role("button", name="Move the arm").wait_for(state="hidden")
         page.wait_for_timeout(500)
-        page.get_by_role("button", name="Start", exact=True).click()
+        page.get_by_role("button", name="Start: the arm moves").click()
     page.get_by_text("too many wrong codes").first.wait_for()
     page.get_by_label("Code from the terminal").fill(hostile.code())
     page.get_by_role("button", name="Move the arm").click()
@@ -258,7 +260,7 @@ def test_a_script_in_the_page_itself_cannot_move_the_arm(browser: Any, hostile: 
 def test_a_neighbours_page_gets_no_cookie_and_does_no_harm(browser: Any, hostile: Served) -> None:
     page = entered(browser, hostile)
     own = page.url
-    target = f"<iframe src='{own}run'></iframe><img src='{own}files/runs/evil/report.html'>"
+    target = f"<iframe src='{own}scan'></iframe><img src='{own}files/runs/evil/report.html'>"
     with neighbour(target.encode()) as (port, brought):
         other = page.context.new_page()
         answers: list[int] = []

@@ -1,4 +1,4 @@
-"""Plan: the arm, its box, the scanner and the poses in 3D; nothing moves."""
+"""Poses: the arm, its box, the scanner and the poses in 3D; nothing moves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye_ui.layout import code, command_line, mistake, page
+from flangeye_ui.layout import code, command_line, mistake, next_step, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
 
@@ -25,13 +25,13 @@ HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 def add(project: Project) -> None:
     """Add the page."""
 
-    @ui.page("/plan")
-    def plan() -> None:
-        with page("Plan"):
+    @ui.page("/poses")
+    def poses() -> None:
+        with page(project, "Poses"):
             ui.label("Nothing moves on this page.")
             recipe, mistakes = project.check()
             if recipe is None:
-                mistake(f"The recipe has {len(mistakes)} errors; see the Cell page.")
+                mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
                 return
             Planner(project, recipe)
 
@@ -49,9 +49,10 @@ class Planner:
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()
                 if recipe.plans:
-                    ui.button("Check every pose and path", on_click=self._plan)
+                    ui.button("Check poses", on_click=self._plan).props("no-caps unelevated")
                 else:
-                    ui.label("Its poses come from its recordings or its simulation: no plan.")
+                    ui.label("Its poses come from recordings: there is nothing to check.")
+                    next_step("Scan", "Next: scan")
         self._checked = ui.column().classes("w-full")
         if recipe.plans:
             command_line(project.command(*self._words))
@@ -174,8 +175,24 @@ class Planner:
             with self._scene:
                 colour = "#d64545" if row["why_not"] else "#2e9e5b"
                 self._scene.sphere(0.012).move(*row["place"]).material(colour)
-        if any(row["why_not"] for row in rows):
-            ui.label("Red poses cannot be reached; the last column says why.")
+        if rows:
+            self._project.planned = self._project.text
+            next_step("Scan", "Next: scan")
+        barred = [row for row in rows if row["why_not"]]
+        if barred:
+            ui.label(f"{len(barred)} poses are left out (red). Choose one: the picture says why.")
+            ui.select(
+                {n: row["why_not"] for n, row in enumerate(barred)}, label="Poses left out",
+                on_change=lambda e: self._say(barred[e.value]),
+            ).classes("w-full")  # fmt: skip
+
+    def _say(self, row: dict[str, Any]) -> None:
+        """Write in the picture why a pose is left out."""
+        self._scene.delete_objects(lambda each: each.name == "reason")
+        with self._scene:
+            x, y, z = row["place"]
+            text = self._scene.text(row["why_not"], "background: #fff; color: #c02626")
+            text.with_name("reason").move(x, y, z + 0.03)
 
 
 def plan_in(printed: str) -> dict[str, Any]:

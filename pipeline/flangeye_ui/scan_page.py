@@ -1,4 +1,4 @@
-"""Run: asks before anything moves, shows what arrives, and stops as fast as Ctrl-C does."""
+"""Scan: asks before anything moves, shows what arrives, and stops as fast as Ctrl-C does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nicegui import Client, ui
 
 from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
-from flangeye_ui.layout import code_from_terminal, command_line, mistake, page
+from flangeye_ui.layout import code_from_terminal, command_line, mistake, next_step, page
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
 from flangeye_ui.scene import draw_cloud, new_scene, outline_of
@@ -33,9 +33,9 @@ BEAT = "setInterval(() => emitEvent('beat'), 500)"
 def add(project: Project) -> None:
     """Add the page."""
 
-    @ui.page("/run")
-    def run(client: Client) -> None:
-        with page("Run"):
+    @ui.page("/scan")
+    def scan(client: Client) -> None:
+        with page(project, "Scan"):
             Panel(project, client)
 
 
@@ -49,7 +49,7 @@ class Panel:
         self._recipe = recipe
         self._live = bool(recipe) and recipe.steps[0].stage.name == "acquire.live"  # type: ignore[union-attr]
         if mistakes:
-            mistake(f"The recipe has {len(mistakes)} errors; see the Cell page.")
+            mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
         self._buttons(sound=not mistakes)
         self._state = ui.label().props('role="status"').classes("text-subtitle1")
         with ui.row().classes("w-full gap-4 items-start"):
@@ -64,10 +64,13 @@ class Panel:
 
     def _buttons(self, sound: bool) -> None:
         with ui.row().classes("items-center gap-3"):
-            self._start = ui.button("Start", on_click=self._begin)
+            self._start = ui.button(
+                "Start: the arm moves" if self._live else "Start scanning", on_click=self._begin
+            ).props("no-caps unelevated")
             self._start.set_enabled(sound)
-            stop = ui.button("Stop (space bar)", on_click=self._stop, color="negative")
-            stop.props('aria-keyshortcuts="Space"').classes("text-h6")
+            self._halt = ui.button("Stop (space bar)", on_click=self._stop, color="negative")
+            self._halt.props('aria-keyshortcuts="Space" no-caps').classes("text-h6")
+            self._on = next_step("Result", "See the result")
             self._resume_button = ui.button("Resume", on_click=self._resume).props("outline")
         ui.keyboard(on_key=self._key)
 
@@ -150,6 +153,8 @@ class Panel:
         run = self._project.run
         if self._running and time.monotonic() - self._heard > SILENCE:
             self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
+        self._halt.set_visibility(self._running)
+        self._on.set_visibility(run is not None and run.code in (0, 1))
         left = self._project.unfinished()
         self._resume_button.set_visibility(left is not None)
         other = self._project.elsewhere()

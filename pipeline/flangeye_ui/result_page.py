@@ -1,14 +1,15 @@
-"""Verdict: warnings first, the matrix with what it is worth, and what would make it better."""
+"""Result: warnings first, the matrix with what it is worth, and what would make it better."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nicegui import ui
-from nicegui.events import ValueChangeEventArguments
 
 from flangeye.doctor import examine, open_session
 from flangeye.doctor.diagnosis import Finding
@@ -16,10 +17,11 @@ from flangeye.errors import FlangeyeError
 from flangeye.report.account import set_aside_of
 from flangeye.report.facts import Facts
 from flangeye.report.summary import headlines_of, transform_text, verdict_of
+from flangeye.report.units import millimetres
+from flangeye.result import expected_error
 from flangeye.run.outlook import Outlook, outlook_of_log
 from flangeye_ui.charts import coverage_drawing
-from flangeye_ui.foreign import address_of
-from flangeye_ui.layout import code, command_line, mistake, page, warning
+from flangeye_ui.layout import code, command_line, mistake, next_step, page, warning
 from flangeye_ui.project import Project
 
 TONES = {"verified": "text-positive", "unverified": "text-warning"}
@@ -28,29 +30,38 @@ TONES = {"verified": "text-positive", "unverified": "text-warning"}
 def add(project: Project) -> None:
     """Add the page."""
 
-    @ui.page("/verdict")
-    def verdict(run: str = "") -> None:
-        with page("Verdict"):
-            runs = project.runs()
-            chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
-            if chosen is None:
-                ui.label("There is no run yet; start one on the Run page.")
-                return
-            ui.select(
-                [r.name for r in runs], value=chosen.name, label="Run",
-                on_change=lambda e: ui.navigate.to(f"/verdict?run={e.value}"),
-            ).classes("w-full")  # fmt: skip
-            place = ui.column().classes("w-full gap-3")
-            ui.timer(0.05, lambda: _load(project, chosen, place), once=True)
+    @ui.page("/result")
+    def result(run: str = "") -> None:
+        with page(project, "Result"):
+            chosen_run(project, run, "/result", _show)
 
 
-async def _load(project: Project, run: Path, place: ui.column) -> None:
+Show = Callable[[Project, Path, Facts], None]
+
+
+def chosen_run(project: Project, run: str, address: str, show: Show) -> None:
+    """Let a run be chosen, the newest at first, and show it."""
+    runs = project.runs()
+    chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
+    if chosen is None:
+        ui.label("There is no run yet.")
+        next_step("Scan", "Go to step 3: scan")
+        return
+    ui.select(
+        [r.name for r in runs], value=chosen.name, label="Run", with_input=True,
+        on_change=lambda e: ui.navigate.to(f"{address}?run={quote(e.value)}"),
+    ).classes("w-full")  # fmt: skip
+    place = ui.column().classes("w-full gap-3")
+    ui.timer(0.05, lambda: _load(project, chosen, place, show), once=True)
+
+
+async def _load(project: Project, run: Path, place: ui.column, show: Show) -> None:
     """Read the log aside, so that the page answers meanwhile, and show it."""
     with place:
         spinner = ui.spinner()
         try:
             facts = await asyncio.to_thread(project.read, run)
-            _show(project, run, facts)
+            show(project, run, facts)
         except FlangeyeError as error:
             mistake(str(error))
         spinner.delete()
@@ -62,26 +73,21 @@ def _show(project: Project, run: Path, facts: Facts) -> None:
     ui.label(f"{found.label}: {found.sentence}").classes(f"text-h6 {tone}").props('role="status"')
     for line in warnings_of(facts):
         warning(line)
-    names = ["Verdict", "Doctor", *(["Certificate", "Export"] if facts.result.transforms else [])]
-    with ui.tabs().props("dense align=left").classes("w-full") as tabs:
-        for name in names:
+    expected = expected_error(facts.result)
+    if expected is not None:
+        ui.label(f"{millimetres(expected[0])} mm").classes("number")
+        ui.label("expected error at the work, rms")
+    if facts.result.transforms:
+        next_step("Use", "Next: use it")
+    with ui.tabs().props("dense align=left no-caps").classes("w-full") as tabs:
+        for name in ("Result", "Doctor"):
             ui.tab(name)
-    with ui.tab_panels(tabs, value="Verdict").classes("w-full").props("keep-alive"):
-        for name in names:
-            with ui.tab_panel(name).classes("q-px-none gap-3"):
-                _tab(name, project, run, facts)
-
-
-def _tab(name: str, project: Project, run: Path, facts: Facts) -> None:
-    if name == "Verdict":
-        _matrix(facts)
-        Better(project, run, facts)
-    elif name == "Doctor":
-        Doctor(project, run)
-    elif name == "Certificate":
-        _certificate(project, run)
-    else:
-        _exports(project, run)
+    with ui.tab_panels(tabs, value="Result").classes("w-full").props("keep-alive"):
+        with ui.tab_panel("Result").classes("q-px-none gap-3"):
+            _matrix(facts)
+            Better(project, run, facts)
+        with ui.tab_panel("Doctor").classes("q-px-none gap-3"):
+            Doctor(project, run)
 
 
 def warnings_of(facts: Facts) -> list[str]:
@@ -173,60 +179,4 @@ class Doctor:
     def _apply(self, line: dict[str, Any]) -> None:
         for name, params in line.items():
             self._project.write_line(name, params)
-        ui.notify("written into the recipe; look at the Cell page, then run it again")
-
-
-def _certificate(project: Project, run: Path) -> None:
-    """Let the certificate be written, with what only a person knows of the place."""
-    where = run.relative_to(project.folder)
-    asked = {
-        "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
-        "place": "Where it was done", "operator": "Who did it",
-    }  # fmt: skip
-    boxes: dict[str, ui.input] = {}
-
-    def words() -> list[str]:
-        given = {key: box.value for key, box in boxes.items() if box.value}
-        options = [f"--{key}={value}" for key, value in given.items()]
-        return ["certificate", str(where), *options]
-
-    async def write() -> None:
-        said = await asyncio.to_thread(project.run_command, [*words(), "--no-pdf"])
-        if said.startswith("error: "):
-            mistake(said.removeprefix("error: "))
-            return
-        line.text = project.command(*words())
-        link.set_visibility(True)
-
-    with ui.row().classes("w-full gap-4"):
-        for key, label in asked.items():
-            boxes[key] = ui.input(label).classes("w-64")
-    ui.button("Write the certificate", on_click=write)
-    there = address_of(project.folder, run / "certificate.html")
-    link = ui.link("Open the certificate", there, new_tab=True)
-    link.set_visibility((run / "certificate.html").exists())
-    line = command_line(project.command(*words()))
-
-
-def _exports(project: Project, run: Path) -> None:
-    """Show the calibration in every program's words, a tab each."""
-    names = sorted(n.removeprefix("export.") for n in project.registry.stages if n[:7] == "export.")
-    where = str(run.relative_to(project.folder))
-
-    async def show(event: ValueChangeEventArguments[Any]) -> None:
-        words = ["export", where, "--to", str(event.value)]
-        preview.text = await asyncio.to_thread(project.run_command, [*words, "--out", "-"])
-        line.text = project.command(*words)
-
-    async def save() -> None:
-        if tabs.value:
-            words = ["export", where, "--to", str(tabs.value)]
-            ui.notify(await asyncio.to_thread(project.run_command, words))
-
-    tabs = ui.tabs(on_change=show).classes("w-full").props("dense outside-arrows mobile-arrows")
-    with tabs:
-        for name in names:
-            ui.tab(name)
-    preview = code("choose a program above")
-    ui.button("Write the file", on_click=save)
-    line = command_line(project.command("export", where, "--to", "PROGRAM"))
+        ui.notify("written into the recipe; look at step 1, Cell, then scan again")
