@@ -391,7 +391,7 @@ def test_foreign_content_is_named_with_topic_and_number(
         ("report", f"{name}.mcap"),
         ("doctor", f"{name}.mcap"),
         ("watch", f"{name}.mcap", "--patience", "0.2"),
-        ("replay", f"{name}.mcap"),
+        ("show", "--replay", f"{name}.mcap"),
         ("run", "toy.yaml", "--from", f"{name}.mcap", "--at", "solve.toy", "--out", name),
     ):
         code, _, err = flangeye(*words)
@@ -460,7 +460,7 @@ def test_a_log_killed_before_its_first_message_says_so(
 def test_a_fifo_is_no_log(tmp_path: Path, flangeye: Callable[..., Any]) -> None:
     os.mkfifo(tmp_path / "f.mcap")
     for words in (("show", "f.mcap"), ("watch", "f.mcap"), ("doctor", "f.mcap"),
-                  ("report", "f.mcap"), ("replay", "f.mcap")):  # fmt: skip
+                  ("report", "f.mcap"), ("show", "--replay", "f.mcap")):  # fmt: skip
         assert "a file is needed" in one_line(flangeye(*words))
     os.mkfifo(tmp_path / "f.yaml")
     assert "f.yaml" in one_line(flangeye("check", "f.yaml"))
@@ -557,7 +557,7 @@ def test_a_file_that_cannot_be_written_is_said(
 def test_a_controller_with_options_that_cannot_be(
     flangeye: Callable[..., Any], words: tuple[Any, ...], said: str
 ) -> None:
-    code, _, err = flangeye("loopback", "ur5e", "--host", "127.0.77.9", *words)
+    code, _, err = flangeye("emulator", "ur5e", "--host", "127.0.77.9", *words)
     assert code == 2
     assert said in err
     assert "Traceback" not in err

@@ -1,4 +1,4 @@
-"""Writes the tables of recipes/README.md and README.md from the recipes: python -m tools.gallery"""
+"""Writes the tables of recipes/README.md and docs/reference/configurations.md from the recipes: python -m tools.gallery"""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from tools.outcomes import outcomes
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "recipes" / "README.md"
-FRONT = ROOT / "README.md"
+TABLES = ROOT / "docs" / "reference" / "configurations.md"
 TABLE = re.compile(r"(<!-- begin gallery -->\n).*?(<!-- end -->)", re.S)
 GRID = re.compile(r"(<!-- begin configurations -->\n).*?(<!-- end -->)", re.S)
 
@@ -75,34 +75,21 @@ def _arms(cell) -> str:
 
 
 def configurations() -> str:
-    """Return one row for each configuration: marker or not, closed form or maximum likelihood."""
+    """Return one row for each recipe of a configuration, with the errors it came to."""
     rows = [
-        "| configuration | marker: closed form | marker: maximum likelihood "
-        "| no marker: closed form | no marker: maximum likelihood |",
-        "|---|---|---|---|---|",
+        "| camera | target | solver | held-out [mm] | true [mm] | recipe in `configurations/` |",
+        "|---|---|---|---|---|---|",
     ]
-    for key, words in CONFIGURATIONS.items():
-        cells = [
-            ", ".join(_links(key, marker, how)) or "—"
-            for marker in (True, False)
-            for how in ("closed-form", "most-likely")
-        ]
-        rows.append(f"| {words} | " + " | ".join(cells) + " |")
+    known = outcomes()
+    order = [*CONFIGURATIONS]
+    names = [n.partition("/")[2] for n in recipe_names() if n.startswith("configurations/")]
+    for name in sorted(names, key=lambda n: (order.index(n.split("_")[0]), n)):
+        mounting, target, how, *_ = name.split("_")
+        found = known[f"configurations/{name}"]
+        errors = f"{found['held_out_mm']} | {found['true_mm']}"
+        cells = [CONFIGURATIONS[mounting], target.replace("-", " "), how.replace("-", " ")]
+        rows.append(f"| {' | '.join(cells)} | {errors} | `{name}` |")
     return "\n".join(rows) + "\n"
-
-
-def _links(key: str, marker: bool, how: str) -> list[str]:
-    found, known = [], outcomes()
-    for name in recipe_names():
-        folder, _, rest = name.partition("/")
-        words = rest.split("_")
-        if folder != "configurations" or words[0] != key or words[2] != how:
-            continue
-        if words[1].startswith("marker") is marker:
-            row = known[name]
-            error = f"{row['held_out_mm']} ({row['true_mm']})"
-            found.append(f"[{words[1]}](recipes/{name}.yaml) {error}")
-    return found
 
 
 def renewed(text: str) -> str:
@@ -112,5 +99,5 @@ def renewed(text: str) -> str:
 
 
 if __name__ == "__main__":
-    for page in (README, FRONT):
+    for page in (README, TABLES):
         page.write_text(renewed(page.read_text()))

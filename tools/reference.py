@@ -26,6 +26,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made |= {"assets/look.css": _look(), "assets/logo.svg": LOGO.replace("currentColor", "#ffffff")}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
+    picture = "pipeline/images/report.png"
+    files.append(File.generated(config, "images/report.png", abs_src_path=picture))
     return files
 
 
@@ -50,7 +52,7 @@ def _look() -> str:
 def _commands() -> str:
     group = get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
-    lines = ["# Commands", "", "`flangeye COMMAND --help` says the same.", ""]
+    lines = ["# Commands", "", "`flangeye COMMAND --help` prints the same.", ""]
     for name, command in sorted(group.commands.items()):
         if command.hidden:
             continue
@@ -58,10 +60,9 @@ def _commands() -> str:
         usage = " ".join([f"flangeye {name}", *command.collect_usage_pieces(context)])
         lines += [f"## {name}", "", (command.help or "").strip(), "", "```text", usage, "```", ""]
         rows = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-        shown = [row for row in rows if row and not row[0].startswith("-h")]
-        if shown:
-            lines += ["| | |", "|---|---|"]
-            lines += [f"| `{_cell(option)}` | {_cell(text)} |" for option, text in shown] + [""]
+        for row in rows:
+            if row and not row[0].startswith("-h"):
+                lines += [f"`{' '.join(row[0].split())}`", f":   {' '.join(row[1].split())}", ""]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -117,7 +117,7 @@ class Better:
     def __init__(self, project: Project, run: Path, facts: Facts) -> None:
         ui.label("What would make it better").classes("text-h6")
         self._place = ui.column().classes("w-full gap-1")
-        command_line(project.command("outlook", str(run.relative_to(project.folder))))
+        command_line(project.command("show", "--outlook", str(run.relative_to(project.folder))))
         self._log, self._registry = facts.log, project.registry
         ui.timer(0.05, self._load, once=True)
 

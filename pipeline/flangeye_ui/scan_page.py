@@ -199,7 +199,7 @@ class Panel:
                 ui.label(line).classes("text-warning" if line.startswith("missing") else "")
             if found.coverage:
                 ui.html(coverage_drawing(found.coverage), sanitize=False).classes("w-full")
-            command_line(self._project.command("outlook", f"runs/{run.path.name}"))
+            command_line(self._project.command("show", "--outlook", f"runs/{run.path.name}"))
         self._pose.offer([*found.residuals, *found.set_aside, *sorted(run.set_aside)])
 
     def _draw(self, run: RunProcess) -> None:

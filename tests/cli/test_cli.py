@@ -384,7 +384,7 @@ def test_a_runs_folder_is_as_good_as_its_log(
     page = (tmp_path / "here" / "report.html").read_bytes()
     assert flangeye("report", "here", "--out", "other.html") == (0, "other.html\n", "")
     assert (tmp_path / "other.html").read_bytes() == page
-    assert flangeye("replay", "here") == flangeye("replay", "here/run.mcap")
+    assert flangeye("show", "--replay", "here") == flangeye("show", "--replay", "here/run.mcap")
     assert flangeye("doctor", "here") == flangeye("doctor", "here/run.mcap")
     assert flangeye("show", "here/calibration.yaml") == flangeye("show", "here")
     assert flangeye("doctor", "here/result.json") == flangeye("doctor", "here")

@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from flangeye import result as r
+from flangeye.cli.app import GROUPS
+from flangeye.cli.commands import app
 from flangeye.cli.console import write
 from flangeye.cli.progress import RunProgress
 from flangeye.cli.summary import print_refusal, print_summary, wrapped
@@ -119,3 +122,11 @@ def test_markup_of_others_is_not_followed() -> None:
     write(Console(file=out), "[bold]x[/bold] \x1b[31m")
     assert out.getvalue().startswith("[bold]x[/bold] ")
     assert "\x1b" not in out.getvalue()
+
+
+def test_help_lists_every_command_in_its_group_with_a_whole_sentence() -> None:
+    told = CliRunner().invoke(app, ["--help"], terminal_width=80).output
+    listed = told[told.index("Calibrate:") :]
+    assert [title for title in GROUPS if f"{title}:\n" in listed] == list(GROUPS)
+    assert "More:" not in listed, "a command without a group"
+    assert "..." not in listed

@@ -153,7 +153,9 @@ def test_the_command_examines_the_log_of_a_cell(tmp_path: Path) -> None:
 def test_what_the_recipe_states_wrongly_is_put_right(tmp_path: Path) -> None:
     name, recorded = "configurations/arm-on-rail_marker_most-likely_simulated", tmp_path / "tables"
     assert CliRunner().invoke(app, ["run", name, "--out", str(tmp_path / "run")]).exit_code == 0
-    told = CliRunner().invoke(app, ["tables", str(tmp_path / "run"), "--out", str(recorded)])
+    told = CliRunner().invoke(
+        app, ["export", str(tmp_path / "run"), "--to", "tables", "--out", str(recorded)]
+    )
     assert told.exit_code == 0
     recipe = recorded / "recipe.yaml"
     table = "          file: second_marker.csv\n"

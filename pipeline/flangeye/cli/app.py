@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from flangeye.cli.console import say, say_notes
 from flangeye.errors import FlangeyeError
@@ -17,7 +18,38 @@ if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
     from flangeye.recipe.load import Recipe
 
+GROUPS = {
+    "Calibrate": ("init", "check", "run", "ui", "watch"),
+    "Judge": ("show", "report", "doctor", "certificate", "touch"),
+    "Use": ("export", "monitor", "layout"),
+    "Many": ("batch", "regress"),
+    "Extend": (
+        "new-plugin", "new-robot", "new-scanner", "plugins", "stages", "schema", "emulator",
+        "tactile",
+    ),
+    "Catalogue": ("recipes", "robots", "scanners", "standards"),
+}  # fmt: skip
+"""Commands by what a person wants to do, in the order in which ``--help`` lists them."""
+
+
+class GroupedCommands(TyperGroup):
+    """Lists commands under the headings of :data:`GROUPS`; those of no group come last."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one section for each group."""
+        shown = {name: each for name, each in self.commands.items() if not each.hidden}
+        grouped = {name for names in GROUPS.values() for name in names}
+        sections = {**GROUPS, "More": [name for name in shown if name not in grouped]}
+        space = formatter.width - 6 - max(map(len, shown))
+        for title, names in sections.items():
+            rows = [(n, shown[n].get_short_help_str(space)) for n in names if n in shown]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
 app = typer.Typer(
+    cls=GroupedCommands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -13,7 +13,7 @@ from flangeye.cli.console import say
 
 @app.command()
 def robots() -> None:
-    """List the robot models: joints, flange plate, and source of the values."""
+    """List robot models: joints, plate, source of values."""
     from flangeye.models.loading import load_model, model_names
 
     for name in model_names("robots"):
@@ -24,7 +24,7 @@ def robots() -> None:
 
 @app.command()
 def scanners() -> None:
-    """List the scanner models: principle, range, resolution, noise."""
+    """List scanner models: principle, range, noise."""
     from flangeye.models.loading import load_model, model_names
 
     for name in model_names("scanners"):
@@ -38,7 +38,7 @@ def scanners() -> None:
 
 @app.command()
 def standards() -> None:
-    """List the flange plates: diameters, threads, and whether sources agree."""
+    """List flange plates: diameters and threads."""
     from flangeye.models.standards import known_standards
 
     for plate in known_standards():
@@ -75,7 +75,7 @@ def new_robot(  # noqa: PLR0913  one for each option
     ] = None,
     out: Out = None,
 ) -> None:
-    """Create a robot model from a URDF, or from its joints, given or asked for."""
+    """Create a robot model from a URDF or from its joints."""
     from flangeye.models.new_model import require_new, robot_of_joints, write_robot
     from flangeye.models.urdf import robot_from_urdf
 
@@ -125,7 +125,10 @@ def new_scanner(  # noqa: PLR0913  one for each option
     ] = None,
     out: Out = None,
 ) -> None:
-    """Create a scanner model; archives need only the range, simulation all options."""
+    """Create a scanner model.
+
+    Archives need only the range, simulation needs all options.
+    """
     from flangeye.models.new_model import require_new, write_scanner
 
     path = out or Path(f"{name}.yaml")

@@ -86,7 +86,10 @@ def init(  # noqa: PLR0913  one for each option
     yes: Yes = False,
     out: Out = Path("recipe.yaml"),
 ) -> None:
-    """Create a recipe for recordings: inspect them and ask for what they do not show."""
+    """Write a recipe for a folder of recordings.
+
+    Inspects the folder and asks for what it does not show.
+    """
     from flangeye.recipe.draft import Questions, draft_recipe, look
     from flangeye.recipe.load import load_recipe
 

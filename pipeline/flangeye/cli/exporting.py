@@ -21,6 +21,7 @@ def _list_formats(wanted: bool) -> None:
     if wanted:
         for each in load_plugins().exports():
             say(f"{each.name.partition('.')[2]:<16}{each.summary}")
+        say(f"{'tables':<16}A cell's session as tables, with a recipe that reads them.")
         raise typer.Exit
 
 
@@ -51,12 +52,18 @@ def export(
         ),
     ] = False,
 ) -> None:
-    """Export the calibration for another program; --list shows the formats.
+    """Write the calibration for another program.
+
+    --to tables writes a cell's session as tables, one per arm and camera, with a recipe that reads
+    them, into the folder --out.
 
     Exit codes: 0 written, 1 the calibration was refused, 2 there is none.
     """
     from flangeye.files.written import write_whole
 
+    if to == "tables":
+        _write_tables(run, out)
+        return
     file = _exported(run, to.removeprefix("export."), values or [], anyway, camera)
     if out == Path("-"):
         typer.echo(file.text, nl=False)
@@ -66,12 +73,7 @@ def export(
     say(f"{path}: {file.use}")
 
 
-@app.command()
-def tables(
-    run: Annotated[Path, typer.Argument(help="A cell's run: its folder or run.mcap.")],
-    out: Annotated[Path | None, typer.Option(help="Output folder; default RUN/tables.")] = None,
-) -> None:
-    """Write a cell's session as tables, one per arm and camera, with a recipe that reads them."""
+def _write_tables(run: Path, out: Path | None) -> None:
     from flangeye.log.read import read_run
     from flangeye.run.tables import write_tables
 

@@ -81,7 +81,7 @@ def touch(  # noqa: PLR0913  one for each option
     out: Annotated[Path, typer.Option(help="Recipe step to write.")] = Path("touch.yaml"),
     overrides: Overrides = None,
 ) -> None:
-    """Touch points the scanner measured and compare predicted and actual positions.
+    """Touch scanned points and compare with the prediction.
 
     With --move the arm moves at 20 mm/s and keeps its orientation.
     """
@@ -94,7 +94,6 @@ def touch(  # noqa: PLR0913  one for each option
 
 
 @app.command()
-@app.command("loopback", hidden=True)  # its former name
 def emulator(  # noqa: PLR0913  one for each option
     robot: Annotated[str, typer.Argument(help="A robot model, for example ur5e, or a file.")],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
@@ -125,7 +124,7 @@ def emulator(  # noqa: PLR0913  one for each option
         ),
     ] = False,
 ) -> None:
-    """Emulate a robot controller on loopback, for the robot's driver to connect to."""
+    """Emulate a robot controller on this machine."""
     from flangeye.models.emulator import EmulatorOptions, find_emulator, read_height, read_joints
     from flangeye.models.loading import load_model
 

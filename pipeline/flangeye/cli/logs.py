@@ -11,36 +11,58 @@ from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.console import at_work, say, say_notes
 from flangeye.cli.fast_path import say_report
 from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
-from flangeye.errors import RecipeError
+from flangeye.errors import FlangeyeError, RecipeError
 from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
+    from flangeye.log.read import RunLog
     from flangeye.recipe.load import Recipe
 
 
 @app.command()
-def show(log: LogFile) -> None:
-    """Show what happened in a run, step by step; also for a run that was killed."""
-    from rich.console import Console
+def show(
+    log: LogFile,
+    outlook: Annotated[
+        bool,
+        typer.Option(
+            "--outlook",
+            help="Assess the poses so far instead: residuals, expected error, missing views. Also "
+            "for a run that is under way or was killed.",
+        ),
+    ] = False,
+    replay: Annotated[
+        bool,
+        typer.Option(
+            "--replay", help="Repeat the decisions in the log from its measurements and compare."
+        ),
+    ] = False,
+) -> None:
+    """Show what happened in a run: steps, figures, notes.
 
-    from flangeye.cli.details import print_log
+    Exit codes with --replay: 0 the same decisions, 1 others.
+    """
+    if outlook and replay:
+        raise FlangeyeError("--outlook and --replay: give one of them")
+    if replay:
+        _replay(log)
+        return
     from flangeye.log.read import read_run
 
     read = read_run(log)
+    if outlook:
+        _print_outlook(read)
+        return
+    from rich.console import Console
+
+    from flangeye.cli.details import print_log
+
     print_log(Console(), read)
     name_damage(read)
 
 
-@app.command()
-def outlook(log: LogFile) -> None:
-    """Assess the poses so far: residuals, expected error, coverage, missing views.
-
-    Works on a run that is under way, was killed, or is complete, with its own recipe.
-    """
-    from flangeye.log.read import read_run
+def _print_outlook(read: RunLog) -> None:
     from flangeye.run.outlook import outlook_of_log
 
-    read = read_run(log)
     require_gathered(read)
     registry = load_plugins()
     with of_foreign(read.path, "it cannot be judged"):
@@ -49,6 +71,21 @@ def outlook(log: LogFile) -> None:
         say(line)
     for note in read.notes:
         say(f"note: {note}", err=True)
+
+
+def _replay(log: Path) -> None:
+    from flangeye.run.replay import replay_steps
+
+    same = True
+    with of_foreign(log, "its decisions cannot be made again"):
+        redone_steps = list(replay_steps(log, load_plugins()))
+    for step, redone in redone_steps:
+        say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
+        for name, value in redone.figures.items():
+            say(f"  {name}: {value:.3g}")
+        same = same and redone.same
+    if not same:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -87,7 +124,7 @@ def certificate(  # noqa: PLR0913  one argument an option
         bool, typer.Option("--pdf/--no-pdf", help="Also print it to PDF with Chromium.")
     ] = True,
 ) -> None:
-    """Write a certificate: the calibration and its uncertainty (GUM), to print and sign."""
+    """Write a certificate after the GUM, to print and sign."""
     from flangeye.report.certificate import Conditions, print_pdf, write_certificate
 
     conditions = Conditions(temperature, spread, place, operator)
@@ -104,7 +141,7 @@ def layout(
         Path | None, typer.Option(help="File to write; default flangeye.json or flangeye.rbl.")
     ] = None,
 ) -> None:
-    """Write a viewer layout for run.mcap files: the cell, images, messages."""
+    """Write a layout for logs in Foxglove or Rerun."""
     from flangeye.errors import StageError
     from flangeye.log.layouts import foxglove_layout, write_rerun_blueprint
 
@@ -117,23 +154,6 @@ def layout(
     else:
         write_rerun_blueprint(path)
         say(f"{path}: rerun run.mcap {path}")
-
-
-@app.command("replay")
-def replay_log(log: LogFile) -> None:
-    """Repeat the decisions in a log from its measurements, and compare them."""
-    from flangeye.run.replay import replay_steps
-
-    same = True
-    with of_foreign(log, "its decisions cannot be made again"):
-        redone_steps = list(replay_steps(log, load_plugins()))
-    for step, redone in redone_steps:
-        say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
-        for name, value in redone.figures.items():
-            say(f"  {name}: {value:.3g}")
-        same = same and redone.same
-    if not same:
-        raise typer.Exit(1)
 
 
 @app.command()
@@ -173,7 +193,7 @@ def doctor(
     overrides: Overrides = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
-    """Diagnose recordings: each mistake with its evidence and the recipe line to change.
+    """Find mistakes in recordings, and the line that mends each.
 
     Exit codes: 0 nothing found, 1 something was, 2 the archive cannot be read.
     """

@@ -20,7 +20,7 @@ def local_page(
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
 ) -> None:
-    """Open the web page that guides through a calibration: cell, plan, run, verdict, archive."""
+    """Open the local web page: plan, run and judge."""
     from flangeye.errors import StageError
 
     try:

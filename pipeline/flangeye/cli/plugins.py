@@ -13,7 +13,10 @@ from flangeye.cli.console import say
 
 @app.command()
 def check(recipe: RecipeName, overrides: Overrides = None) -> None:
-    """Check a recipe without running it: print every mistake with its line, and the unknowns."""
+    """Check a recipe without running it.
+
+    Prints every mistake with its line, or the transforms that will be estimated.
+    """
     from flangeye.cli.fast_path import say_verdict
 
     say_verdict(recipe, overrides or ())
@@ -37,7 +40,10 @@ def stages(
         str | None, typer.Argument(help="A stage or part, or a kind such as solve.")
     ] = None,
 ) -> None:
-    """List stages and parts, or those of a kind; with NAME, its parameters, units and defaults."""
+    """List stages and parts; with NAME, its parameters.
+
+    NAME may be a kind (reader, solve, …) or one stage or part.
+    """
     if name is None:
         from flangeye.plugin.stage_list import list_stages
 
@@ -50,7 +56,7 @@ def stages(
 
 @app.command()
 def plugins() -> None:
-    """List the installed plugins, what each provides, and which could not be loaded."""
+    """List installed plugins and those that failed to load."""
     registry = load_plugins()
     registry.everything()
     for plugin, version in registry.versions().items():
@@ -67,7 +73,7 @@ def schema(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="File to write instead of printing.")] = None,
 ) -> None:
-    """Print the JSON Schema of recipes, for editors with YAML validation."""
+    """Print the JSON Schema of recipes, for YAML editors."""
     import json
 
     from flangeye.files.written import write_whole
@@ -90,7 +96,7 @@ def new_plugin(
     kind: Annotated[str, typer.Option(help="Kind of plugin: scanner, fit, solve, …")],
     into: Annotated[Path, typer.Option(help="Folder in which to create the package.")] = Path(),
 ) -> None:
-    """Create an installable package with one example plugin and its passing tests."""
+    """Create a package with an example plugin and its tests."""
     from flangeye.plugin.scaffold import write_plugin
 
     folder = write_plugin(name, kind, into)

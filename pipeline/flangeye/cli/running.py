@@ -319,7 +319,7 @@ def batch(  # noqa: PLR0913  one argument an option
         bool, typer.Option("--report/--no-report", help="Write report.html for each session.")
     ] = True,
 ) -> None:
-    """Run a recipe over archives, values and seeds, and compare the sessions.
+    """Run a recipe over many archives, values and seeds.
 
     Finished sessions are not run again. Exit codes: 0 every session gave a calibration, 1 one
     was refused, failed or crashed, 2 nothing could start.
@@ -353,7 +353,7 @@ def regress(
     ] = None,
     out: Annotated[Path, typer.Option(help="Output folder.")] = Path("regressions"),
 ) -> None:
-    """Regression test on known recordings: status, closure, and the doctor's findings.
+    """Run known recordings and compare with expectations.
 
     A manifest says where a recording is, how to read it and what to expect; missing
     recordings are reported as skipped. Exit codes: 0 all as expected, 1 one differs,

@@ -59,10 +59,11 @@ def monitor(  # noqa: PLR0913  one argument an option
         typer.Option(metavar="URL,NODE", help="Write the state to an OPC UA node."),
     ] = None,
 ) -> None:
-    """Check whether a calibration still holds: OK, DEGRADED or MOVED, since when, which part.
+    """Check whether a calibration still holds.
 
-    One JSON line a check. Exit codes, by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could
-    be checked: a script that stops the cell on 2 is safe either way.
+    Prints one JSON line per check: OK, DEGRADED or MOVED, since when, and which part. Exit codes,
+    by the last check: 0 OK, 1 DEGRADED, 2 MOVED or nothing could be checked: a script that stops
+    the cell on 2 is safe either way.
     """
     from flangeye.doctor.monitor import (
         CODES,

@@ -24,7 +24,7 @@ class Process:
 
     def __init__(self, *arguments, model="ur5e"):
         self.host = free_address()
-        command = [sys.executable, "-m", "flangeye.cli", "loopback", model, "--host", self.host]
+        command = [sys.executable, "-m", "flangeye.cli", "emulator", model, "--host", self.host]
         self._command = [*command, *arguments]
         self.start()
 

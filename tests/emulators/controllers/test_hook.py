@@ -46,7 +46,7 @@ def test_a_vendors_controller_is_found(
         "--fault",
         "b@moving",
     ]
-    monkeypatch.setattr(sys, "argv", ["flangeye", "loopback", "franka-panda", *arguments])
+    monkeypatch.setattr(sys, "argv", ["flangeye", "emulator", "franka-panda", *arguments])
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 0

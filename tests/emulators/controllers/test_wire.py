@@ -247,7 +247,7 @@ def loopback(
     """Run the command here, for what ends before anything listens."""
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["flangeye", "loopback", *arguments])
+        monkeypatch.setattr(sys, "argv", ["flangeye", "emulator", *arguments])
         with pytest.raises(SystemExit) as ended:
             main()
         return ended.value.code, capsys.readouterr().err
