@@ -32,8 +32,8 @@ BELIEF = 0.3
 SETTLING = 8e-3
 """Way in which an error of the torch is taken back at speed [m]."""
 
-LEAD_IN = 3.0
-"""So many tool lengths after it may weld first the torch has to be on the seam."""
+SHORT = 0.01
+"""A weld is done where no larger share of the planned seam was left out."""
 
 STEADY = 0.03e-3
 """A finger that scatters less is followed from one measurement to the next [m]."""
@@ -167,6 +167,19 @@ class Follower:
         self._period, self._climbs, self._put_off = math.inf, False, False
         self._swept: list[tuple[ToolPose, Touch]] = []
 
+    @property
+    def begins(self) -> float:
+        """Where the torch is to begin to weld, by arc length [m]."""
+        return max(self._settings.offset_along, 0.0)
+
+    @property
+    def share_welded(self) -> float:
+        """Share of the planned seam that was welded with the torch within ``max_error``."""
+        if self.lit is None:
+            return 0.0
+        end = self._plan.length
+        return max(min(self.torch, end) - self.lit, 0.0) / (end - self.begins)
+
     def kept(self) -> ResumePoint | None:
         """Return what is left to who goes on; None before the torch was on the seam."""
         if self.lit is None:
@@ -254,20 +267,26 @@ class Follower:
         variance = self._variance(float(pose.direction @ normal), pose.angle)
         self.sigma = math.sqrt(variance)
         self.band, self.bound = error + BAND * self.sigma, error + LIMIT * self.sigma
-        welds_from = max(self._settings.offset_along, 0.0)
-        if (
-            self.phase in ("seeking", "probing")
-            or not welds_from <= self.torch <= self._plan.length
+        if self.phase in ("seeking", "probing") or not (
+            self.begins <= self.torch <= self._plan.length
         ):
             return
         if self.lit is not None:
             self._trail.pass_by(pose.time, self.torch, raw, variance - self._unseen())
-        if self.bound <= self._settings.max_error:
-            self.lit = self.torch if self.lit is None else self.lit
-        elif self.lit is not None or self.torch > welds_from + LEAD_IN * self._belief.distance:
+        if self.bound > self._settings.max_error:
+            self._too_far()
+        elif self.lit is None:
+            self.lit = self.torch
+
+    def _too_far(self) -> None:
+        """Stop where the torch may be too far from the seam, or may not be lit in time."""
+        late = self.torch - self.begins > SHORT * (self._plan.length - self.begins)
+        if self.lit is not None:
             self._stop(self._too_uncertain())
-        if self._before is not None and self.lit is None and self.torch > self._before.torch:
+        elif self._before is not None and self.torch > self._before.torch:
             self._stop("the torch was not on the seam again where it had stopped; raise 'overlap'")
+        elif self._before is None and late:
+            self._stop(f"not begun: {self._too_uncertain()}")
 
     def _variance(self, slant: float, angle: float) -> float:
         """Return the variance of the torch's place across the seam [m^2].
@@ -460,7 +479,7 @@ class Follower:
     def _finish(self) -> None:
         """End the weld, if there was one."""
         if self._touching and self.lit is None:
-            self._stop(self._too_uncertain())
+            self._stop(f"not begun: {self._too_uncertain()}")
         else:
             self._enter("done")
 

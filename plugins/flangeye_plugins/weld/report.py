@@ -30,6 +30,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     truth: tuple[Floats, Floats] | None = None,
 ) -> WeldReport:
     """Return the report of a weld; ``truth`` is of a simulation: times, and the true torch."""
+    reason = reason and f"{reason}; {_extent(controller, plan)}"
     every = columns(weld_log.cycles)
     kept = np.unique(np.linspace(0, len(weld_log.cycles) - 1, SAMPLES).round().astype(int))
     kept = kept[: len(weld_log.cycles)]  # none where there was no cycle
@@ -65,6 +66,20 @@ def report_of(  # noqa: PLR0913  all that a weld had
     )
 
 
+def _extent(controller: Controller, plan: Path) -> str:
+    """Return which part of the seam was welded before the weld was stopped."""
+    root = follower_of(controller)
+    if root is None:
+        return f"its torch had come to {controller.torch * 1e3:.0f} mm"
+    if root.lit is None:
+        return "nothing was welded"
+    end = min(root.torch, plan.length)
+    return (
+        f"{root.share_welded:.0%} of the seam was welded, from {root.lit * 1e3:.0f} to "
+        f"{end * 1e3:.0f} of {plan.length * 1e3:.0f} mm"
+    )
+
+
 def _stated(deviations: Floats) -> Floats:
     """Return deviations (K,), or none where the controller states no finite ones."""
     return deviations if np.isfinite(deviations).all() else np.zeros(0)
@@ -88,6 +103,7 @@ def learned_figures(controller: Controller) -> Mapping[str, float]:
         "arm_dead_time": found.dead_time,
         "arm_lag": found.lag,
         "lit_from": -1.0 if root.lit is None else root.lit,
+        "share_welded": root.share_welded,
     }
 
 

@@ -126,13 +126,21 @@ def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
     assert stopped.reason.endswith(" mm only, max_error is 1 mm")
 
 
-def test_a_torch_has_three_tool_lengths_to_come_onto_the_seam() -> None:
-    assert doubtful(0.119, None).phase == "following"
+def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refused() -> None:
     long = straight(0.3)
-    assert doubtful(0.119, None, plan=long).phase == "following"
-    assert doubtful(0.121, None, plan=long).phase == "stopped"
-    assert doubtful(0.131, None, plan=long, offset_along="15 mm").phase == "following"
-    assert doubtful(0.136, None, plan=long, offset_along="15 mm").phase == "stopped"
+    assert doubtful(0.0029, None, plan=long).phase == "following"
+    told = doubtful(0.0031, None, plan=long)
+    assert told.phase == "stopped" and told.lit is None and told.share_welded == 0.0
+    assert told.reason.startswith("not begun: the torch is known to 3.")
+    assert doubtful(0.0178, None, plan=long, offset_along="15 mm").phase == "following"
+    assert doubtful(0.0179, None, plan=long, offset_along="15 mm").phase == "stopped"
+
+
+def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:
+    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), offset_along="10 mm")
+    assert found.share_welded == pytest.approx(0.05)
+    found.torch = 0.22  # the arc ends where the seam does
+    assert found.share_welded == pytest.approx(1.0)
 
 
 def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> None:
@@ -533,7 +541,9 @@ def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
     assert judged(make("ending"), torch=LENGTH, lit=0.0) == "done"
     never = make("ending")
     assert judged(never, torch=LENGTH, lit=None, bound=1.5e-3) == "stopped"
-    assert never.reason == "the torch is known to 1.50 mm only, max_error is 1 mm"
+    assert never.reason == (
+        "not begun: the torch is known to 1.50 mm only, max_error is 1 mm"
+    )
     assert judged(make("ending", touch=False), torch=LENGTH) == "done"
     stopped = make("stopped")
     stopped.reason = "why"

@@ -139,7 +139,7 @@ def test_what_the_sweep_found_is_among_the_figures() -> None:
     controller.learned = Learned(0.1, 0.02, -0.03e-3, 0.04, 0.05, 0.06)
     assert learned_figures(controller) == {
         "finger_gain_error": 0.1, "finger_play": 0.06e-3, "timestamps_late": 0.04,
-        "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0,
+        "arm_dead_time": 0.05, "arm_lag": 0.06, "lit_from": -1.0, "share_welded": 0.0,
     }  # fmt: skip
     controller.lit = 0.02
     assert learned_figures(controller)["lit_from"] == 0.02
@@ -149,7 +149,7 @@ def test_what_the_sweep_found_is_among_the_figures() -> None:
 
 def test_a_weld_that_ended_before_its_first_cycle_says_why() -> None:
     report = reported(logged(0), reason="the arm is lost")
-    assert report.reason == "the arm is lost" and not report.completed
+    assert report.reason == "the arm is lost; nothing was welded" and not report.completed
     assert report.time.shape == (0,) and report.tip.shape == report.torch.shape == (0, 3)
 
 
