@@ -311,6 +311,35 @@ class Profiler(Device, Protocol):
         ...
 
 
+@runtime_checkable
+class Arc(Device, Protocol):
+    """A welding power source. Opened by its driver in the process that guards the arm.
+
+    Opened, gas and arc are off; closed they are, whatever happened before.
+
+    Attributes:
+        name: For people.
+    """
+
+    name: str
+
+    def gas(self, on: bool) -> None:
+        """Open or close the gas valve; never waits.
+
+        Raises:
+            DeviceError: The power source, or what switches it, is lost.
+        """
+        ...
+
+    def burn(self, on: bool) -> None:
+        """Start or end wire and arc; never waits, raises as :meth:`gas` does."""
+        ...
+
+    def burning(self) -> bool | None:
+        """Return whether the arc is established; None where nothing says so. Never waits."""
+        ...
+
+
 @dataclass(frozen=True)
 class RobotDriver:
     """The recipe's ``robot.driver``, not yet opened.

@@ -129,6 +129,8 @@ PARTS = {
     "replay.tactile": "flangeye_plugins.replay.tactile:replay_tactile",
     "guide.tactile": "flangeye_plugins.guide.tactile:guide_tactile",
     "guide.tool": "flangeye_plugins.guide.tactile:guide_tool",
+    "arc.manual": "flangeye_plugins.arc.manual:arc_manual",
+    "arc.ur_digital": "flangeye_plugins.arc.ur_digital:arc_ur_digital",
     "profiler.tcp": "flangeye_plugins.profiler.tcp:profiler_tcp",
     "sensor.opencv": "flangeye_plugins.sensor.opencv:sensor_opencv",
     "sensor.image_folder": "flangeye_plugins.sensor.recorded:sensor_image_folder",

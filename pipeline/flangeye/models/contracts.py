@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from flangeye.devices import Profiler, Robot, Scanner, StateSource, TactileSensor
+from flangeye.devices import Arc, Profiler, Robot, Scanner, StateSource, TactileSensor
 from flangeye.maths.kinematics import Arm
 from flangeye.models.finger import Finger
 from flangeye.models.robots import RobotModel
@@ -70,6 +70,14 @@ class SensorPart(Protocol):
 
     def __call__(self, finger: Finger, robot: StateSource, seed: Seed) -> TactileSensor:
         """Return the open camera."""
+        ...
+
+
+class ArcPart(Protocol):
+    """``arc``: opens a welding power source; its parameters are :class:`ArcTimes` and its own."""
+
+    def __call__(self) -> Arc:
+        """Return the open power source, gas and arc off."""
         ...
 
 

@@ -156,6 +156,9 @@ PARTS: Mapping[str, PartKind] = {
         "a look at the bead behind the torch, for weld.tactile",
         "flangeye.models.contracts:ProfilerPart",
     ),
+    "arc": PartKind(
+        "a welding power source that weld.tactile switches", "flangeye.models.contracts:ArcPart"
+    ),
     "check": PartKind(
         "a mistake in recordings that flangeye doctor can name", "flangeye.doctor.diagnosis:Check"
     ),

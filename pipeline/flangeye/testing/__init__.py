@@ -9,6 +9,7 @@ from flangeye.testing.afterwards import CheckConformance, GuideConformance, Repl
 from flangeye.testing.base import Conformance
 from flangeye.testing.costs import CostConformance, ErrorConformance
 from flangeye.testing.devices import (
+    ArcConformance,
     ProfilerConformance,
     RobotConformance,
     ScannerConformance,
@@ -51,6 +52,7 @@ KITS = {
     "controller": ControllerConformance,
     "sensor": SensorConformance,
     "profiler": ProfilerConformance,
+    "arc": ArcConformance,
     "replay": ReplayConformance,
     "guide": GuideConformance,
     "check": CheckConformance,
@@ -61,6 +63,7 @@ KITS = {
 __all__ = [
     "KITS",
     "AcquireConformance",
+    "ArcConformance",
     "CheckConformance",
     "Conformance",
     "ControllerConformance",

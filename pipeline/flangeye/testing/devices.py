@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from flangeye import types as t
 from flangeye.devices import (
     GRACE,
     PATIENCE,
+    Arc,
     DeviceError,
     FrameDropped,
     Profiler,
@@ -329,6 +331,27 @@ class ProfilerConformance(DriverConformance):
             for _ in range(20):
                 took = _seconds(profiler.profile)
                 require(took < 0.05 + LATE / 5, f"profile() took {took:.3f} s")
+
+
+class ArcConformance(DriverConformance):
+    """An ``arc`` part: a power source whose wire and gas are away, so that nothing burns."""
+
+    kind = "arc"
+
+    def test_it_switches_gas_and_arc_without_waiting(self) -> None:
+        """The guard of the arm switches it between two of the arm's cycles."""
+        with self.opened() as arc:
+            require(isinstance(arc, Arc), "it lacks methods of devices.Arc")
+            for switch in (arc.gas, arc.burn, arc.burn, arc.gas):
+                for on in (True, False):
+                    took = _seconds(partial(switch, on))
+                    require(took < 0.05 + LATE / 5, f"switching took {took:.3f} s")
+
+    def test_it_says_whether_it_burns_or_that_it_does_not_know(self) -> None:
+        """None is not False: an arc that nothing watches is not one that went out."""
+        with self.opened() as arc:
+            says = arc.burning()
+        require(says in (True, False, None), f"burning() returned {says!r}")
 
 
 def _given(ask: Callable[[], _One | None], count: int, things: str) -> list[_One]:

@@ -60,6 +60,7 @@ class Belief:
         radius: Of the tip's ball [m].
         level_R_tool: Rows of the tool's axes in level ones; see :mod:`flangeye_plugins.weld.body`.
         behind: How far behind the torch a second look sees the bead [m]; None where nothing does.
+        arc: Gas before the arc; standing while it is struck; standing while the crater fills [s].
     """
 
     distance: float
@@ -75,6 +76,7 @@ class Belief:
     radius: float = 1.5e-3
     level_R_tool: tuple[tuple[float, ...], ...] = UPRIGHT
     behind: float | None = None
+    arc: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def joint(self) -> Joint | None:

@@ -9,7 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import numpy as np
+
 from flangeye.devices import DeviceError, RobotState
+from flangeye.motion.arc import OFF
 from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye_plugins.weld.bounds import Bounds
@@ -33,6 +36,7 @@ class Cell:
         tool: Translates between flange and plane.
         bounds: What the tip must keep to.
         steered: What is told what a look behind the torch sees, where there is one.
+        gas_after: Where there is a power source: for how long gas flows after its arc [s].
     """
 
     drive: Executor
@@ -40,6 +44,7 @@ class Cell:
     tool: Tool
     bounds: Bounds
     steered: Follower | None = None
+    gas_after: float | None = None
 
 
 def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
@@ -65,7 +70,17 @@ def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float
         return str(error)
     finally:
         cell.drive.stop()
+    _let_gas_flow(cell)
     return controller.reason
+
+
+def _let_gas_flow(cell: Cell) -> None:
+    """Wait by the bead while gas flows on; who owns the power source closes its valve."""
+    if not cell.gas_after:
+        return
+    until = cell.drive.tick().time_ns + round(cell.gas_after * 1e9)
+    while cell.drive.tick().time_ns < until:
+        pass
 
 
 class Clock:
@@ -141,9 +156,12 @@ def _turn(
             cell.steered.looked(profile)
     command = controller.step(pose, [touch_of(feeling) for feeling in felt])
     twist = cell.tool.twist(command, state.base_T_flange)
+    arc = OFF if cell.gas_after is None else float(getattr(controller, "arc", OFF))
+    if cell.gas_after is not None:
+        twist = np.append(twist, arc)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
     took = (clock.computing, clock.period, clock.answering)
-    weld_log.turned(cycle_of(pose, used, command, controller, took))
+    weld_log.turned(cycle_of(pose, used, command, controller, arc, took))
 
 
 def touch_of(feeling: TipDisplacement) -> Touch:
@@ -156,6 +174,7 @@ def cycle_of(
     used: tuple[int, ...],
     command: Command,
     controller: Controller,
+    arc: float,
     took: tuple[float, float, float],
 ) -> Cycle:
     """Return the record of a cycle."""
@@ -164,5 +183,5 @@ def cycle_of(
     return Cycle(
         pose.time, (x, y, z), pose.angle, used, (vx, vy, vz), command.turn, controller.phase,
         controller.tip, controller.torch, controller.wanted, controller.sigma, controller.bound,
-        controller.band, *took,
+        controller.band, arc, *took,
     )  # fmt: skip

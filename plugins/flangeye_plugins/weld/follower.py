@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.devices import WeldProfile
+from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
@@ -24,6 +25,7 @@ from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.search import STEEPER, Search
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.steering import SLOWEST, Steering
+from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
 
 BELIEF = 0.3
@@ -144,7 +146,9 @@ class Follower:
         gain = max(settings.cross_track_gain, settings.speed / SETTLING)
         self._steering = Steering(belief.distance, gain, settings.turn_rate)
         self._belief, self.learned = belief, Learned()
-        self.bias, self._trail = _bias_of(belief, settings), Trail()
+        self.bias, self._trail, self._striking = (
+            _bias_of(belief, settings), Trail(), Striking(belief.arc)
+        )  # fmt: skip
         self.sigma = self.bound = self.band = 0.0
         self.aim = self._offset = settings.offset_across
         self._weave = Weave(settings.weave_width, settings.weave_frequency)
@@ -171,6 +175,12 @@ class Follower:
     def begins(self) -> float:
         """Where the torch is to begin to weld, by arc length [m]."""
         return max(self._settings.offset_along, 0.0)
+
+    @property
+    def arc(self) -> float:
+        """What the arc is to do: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
+        over = self.phase in ("done", "stopped") or not self._touching
+        return OFF if over else self._striking.level(self._time or 0.0)
 
     @property
     def share_welded(self) -> float:
@@ -267,9 +277,11 @@ class Follower:
         variance = self._variance(float(pose.direction @ normal), pose.angle)
         self.sigma = math.sqrt(variance)
         self.band, self.bound = error + BAND * self.sigma, error + LIMIT * self.sigma
-        if self.phase in ("seeking", "probing") or not (
-            self.begins <= self.torch <= self._plan.length
-        ):
+        if self.phase in ("seeking", "probing"):
+            return
+        if self.begins - self.torch <= self._belief.arc[0] * self._settings.speed:
+            self._striking.gas(pose.time)
+        if not self.begins <= self.torch <= self._plan.length:
             return
         if self.lit is not None:
             self._trail.pass_by(pose.time, self.torch, raw, variance - self._unseen())
@@ -277,6 +289,7 @@ class Follower:
             self._too_far()
         elif self.lit is None:
             self.lit = self.torch
+            self._striking.strike(pose.time)
 
     def _too_far(self) -> None:
         """Stop where the torch may be too far from the seam, or may not be lit in time."""
@@ -478,6 +491,8 @@ class Follower:
 
     def _finish(self) -> None:
         """End the weld, if there was one."""
+        if self.lit is not None and not self._striking.filled(self._time or 0.0):
+            return
         if self._touching and self.lit is None:
             self._stop(f"not begun: {self._too_uncertain()}")
         else:
@@ -587,7 +602,7 @@ class Follower:
 
     def _pace(self, pose: ToolPose, normal: Floats) -> float:
         """Return the tip's speed along the seam: less where blind or crooked."""
-        if self.phase == "seeking":
+        if self.phase == "seeking" or self._striking.stands(pose.time):
             return 0.0
         settings, silence = self._settings, self._silence(pose.time)
         sight = 1.0

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
@@ -23,6 +24,7 @@ from flangeye_plugins.weld.follower import Follower, ResumePoint, within
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.response import Response
 from flangeye_plugins.weld.settings import Following, PassParams
+from flangeye_plugins.weld.striking import Striking
 from flangeye_plugins.weld.weave import Sway, Weave
 
 STEP = 0.5e-3
@@ -100,6 +102,7 @@ class Passes:
         self._response = Response()
         self._path = plan
         self._began: float | None = None
+        self._striking, self._now = Striking(belief.arc), 0.0
         self._take_over()
         if before is not None and before.number:
             self._go_on(before)
@@ -142,11 +145,18 @@ class Passes:
         """Where the torch first was within ``max_error`` in the root pass, by arc length [m]."""
         return self.root.lit
 
+    @property
+    def arc(self) -> float:
+        """What the arc is to do: OFF, GAS or BURN of :mod:`flangeye.motion.arc`."""
+        if not self.number:
+            return self.root.arc
+        return self._striking.level(self._now) if self.phase == "passing" else OFF
+
     def step(self, pose: ToolPose, touches: Sequence[Touch]) -> Command:
         """Return the command for this cycle; ``touches`` are the measurements not yet given."""
         if not self.number:
             return self._root_step(pose, touches)
-        coming = self._response.ahead(pose)
+        coming, self._now = self._response.ahead(pose), pose.time
         command = self._return(coming) if self.phase == "returning" else self._weld(coming)
         self._response.record(pose.time, command)
         return command
@@ -171,6 +181,7 @@ class Passes:
             return
         self.number += 1
         self._path, self._began = self._traced.path(self._pass), None
+        self._striking = Striking(self._belief.arc)
         self._weave = Weave(self._pass.weave_width, self._pass.weave_frequency)
         self._over, self._start = max(height, float(self._path.points[:, 2].max())) + OVER, 0.0
         self.phase, self.torch, self.tip = "returning", 0.0, self._belief.distance
@@ -207,8 +218,12 @@ class Passes:
         torch = pose.position[:2] - distance * ahead
         self.torch = self._path.advance(torch, self.torch, settings.speed * 0.1)
         self.tip = self.torch + self._pass.along + distance
+        self._striking.strike(self._now)
         if self.torch >= self._path.length:
-            self._next_pass(float(pose.position[2]))
+            if self._striking.filled(self._now):
+                self._next_pass(float(pose.position[2]))
+            return STILL
+        if self._striking.stands(self._now):
             return STILL
         self._began = pose.time if self._began is None else self._began
         sway = self._swayed(pose.time)

@@ -88,7 +88,8 @@ def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
 
 def controller_from(start: Mapping[str, Any]) -> Controller:
     """Return the controller of a logged weld, as it was at its start."""
-    belief = Belief(**{**start["belief"], "noise": tuple(start["belief"]["noise"])})
+    tuples = {name: tuple(start["belief"][name]) for name in ("noise", "arc")}
+    belief = Belief(**{**start["belief"], **tuples})
     settings = Following.model_validate(start["settings"])
     plan, kept = Path(np.array(start["points"])), start.get("kept")
     before = None if kept is None else _kept_from(kept)

@@ -186,6 +186,11 @@ class WeldTactileParams(Following):
         "{host: 192.168.1.20, port: 9000, behind: 30 mm}}: what it sees of heat, and of where the "
         "torch really is, is made up for.",
     )
+    arc: Annotated[BoundPart, Choose("arc")] | None = Field(
+        None,
+        description="The power source, for example {ur_digital: {host: 192.168.1.10, output: 3}}: "
+        "it is switched as the torch's bound allows, and goes off with any stop of the arm.",
+    )
     mode: Mode = Field(
         "tactile",
         description="tactile: follow the seam by touch. For comparison: vision follows the plan "
@@ -226,6 +231,13 @@ class WeldTactileParams(Following):
     start_angle: Angle = param(
         "0 deg", ge=-np.pi, le=np.pi, description="Angle of the tool to the seam at the start."
     )
+
+    @model_validator(mode="after")
+    def _arc_is_led_by_touch(self) -> Self:
+        """Refuse an arc where no bound says when it may burn."""
+        if self.arc is not None and self.mode != "tactile":
+            raise ValueError("'arc' goes with mode: tactile only: leave out one of them")
+        return self
 
     @model_validator(mode="after")
     def _look_has_one_pass(self) -> Self:

@@ -8,9 +8,11 @@ from typing import Any
 
 from flangeye.devices import MotionAllowed, Robot, RobotDriver
 from flangeye.errors import NothingMoved
+from flangeye.models.arc import ArcTimes
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
+from flangeye.motion.arc import with_arc
 from flangeye.motion.executor import Executor
 from flangeye.motion.leading import led
 from flangeye.motion.limits import limits_of
@@ -77,7 +79,11 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     kept = None if params.resume is None else resume_point_of(params.resume, points)
     if kept is not None:
         params = set_back(params, plan, body.distance, kept)
-    belief = belief_of(finger, body, seam.half_angle, params)
+    driver, times = _with_power_source(driver, params)
+    belief = replace(
+        belief_of(finger, body, seam.half_angle, params),
+        arc=(times.gas_before, times.ignition, times.crater),
+    )
     checks.check_tool(body, belief, params)
     passage = SeamReach(Task(model, allowed, finger, tool, plan, params, belief.set_down(params)))
     simulated = driver.simulated
@@ -98,6 +104,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         cell = Cell(
             Executor(robot, model, allowed, eyes.tell), eyes, tool, Bounds(finger, plan, params),
             None if params.look is None else follower_of(controller),
+            None if params.arc is None else times.gas_after,
         )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
         if not simulated:
@@ -105,6 +112,19 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         reason = follow(cell, controller, weld_log, _longest(plan.length + body.distance, params))
         truth = eyes.true_torch()
     return report_of(seam, plane, plan, body, controller, weld_log, reason, truth)
+
+
+def _with_power_source(
+    driver: RobotDriver, params: WeldTactileParams
+) -> tuple[RobotDriver, ArcTimes]:
+    """Return a driver that opens the power source with the arm, and its times; none without one."""
+    if params.arc is None:
+        return driver, ArcTimes.model_construct(
+            gas_before=0.0, ignition=0.0, crater=0.0, gas_after=0.0
+        )
+    given = params.arc.params
+    times = given if isinstance(given, ArcTimes) else ArcTimes()
+    return with_arc(driver, params.arc, times), times
 
 
 def _longest(way: float, params: WeldTactileParams) -> float:

@@ -69,6 +69,7 @@ class Desk:
         self.told, self.cycles, self.lost_at = list[Any](), 0, lost_at
         self.drive = self.robot = self.eyes = self.tool = self.bounds = self
         self.limits, self.steered = SimpleNamespace(acceleration=0.7), None
+        self.gas_after = None
 
     def lead(self) -> None:
         self.told.append("lead")

@@ -541,9 +541,7 @@ def test_a_weld_has_ended_where_the_torch_is_at_the_end_of_the_seam() -> None:
     assert judged(make("ending"), torch=LENGTH, lit=0.0) == "done"
     never = make("ending")
     assert judged(never, torch=LENGTH, lit=None, bound=1.5e-3) == "stopped"
-    assert never.reason == (
-        "not begun: the torch is known to 1.50 mm only, max_error is 1 mm"
-    )
+    assert never.reason == ("not begun: the torch is known to 1.50 mm only, max_error is 1 mm")
     assert judged(make("ending", touch=False), torch=LENGTH) == "done"
     stopped = make("stopped")
     stopped.reason = "why"

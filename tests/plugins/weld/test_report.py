@@ -57,7 +57,7 @@ def logged(count: int, images: int = 4, **more: Any) -> Any:
             "time": time, "position": [x, 2e-3, -1e-3], "angle": 0.1, "touches": touches,
             "velocity": [3e-3, 4e-3, 9.0], "turn": 0.01 * i, "phase": "following",
             "tip": x + LENGTH / 2, "torch": 1e-3 * i, "wanted": 2e-3, "sigma": 1e-4, "bound": 5e-4,
-            "band": 3e-4, "aim": 0.0, "computing": 1e-3, "answering": 2e-3, "period": 8e-3,
+            "band": 3e-4, "arc": 0.0, "aim": 0.0, "computing": 1e-3, "answering": 2e-3, "period": 8e-3,
         }  # fmt: skip
         cycles.append(SimpleNamespace(**{**row, **more}))
     return SimpleNamespace(cycles=cycles, felt=felt, sights=len(felt))

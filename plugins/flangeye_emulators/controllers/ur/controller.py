@@ -43,6 +43,8 @@ class URController:
         remote_control: Whether programs may come through the network.
         unlock_after: Time before a protective stop can be unlocked [s].
         digital_outputs: Bits: standard 0-7, configurable 8-15, tool 16-17.
+        wired: Whether standard inputs are as the outputs of their numbers: what an output starts
+            says through an input that it runs.
         analog_outputs: Two ratios, 0 to 1.
         payload: Mass [kg] and centre of gravity (3,) [m].
         log: (time, what happened), the last thousand.
@@ -59,7 +61,7 @@ class URController:
         self.runtime = Runtime.STOPPED
         self.remote_control = True
         self.unlock_after = UNLOCK_AFTER
-        self.digital_outputs = 0
+        self.digital_outputs, self.wired = 0, True
         self.analog_outputs = [0.0, 0.0]
         self.payload: tuple[float, Floats] = (0.0, np.zeros(3))
         self.log: deque[tuple[float, str]] = deque(maxlen=1000)
@@ -252,6 +254,7 @@ class URController:
             "safety": self.safety.name,
             "runtime": self.runtime.name,
             "remote_control": self.remote_control,
+            "digital_outputs": self.digital_outputs,
         }
 
     def tcp_pose(self) -> Floats:

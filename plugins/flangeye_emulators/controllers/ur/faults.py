@@ -9,10 +9,11 @@ from flangeye_emulators.controllers.ur.controller import URController
 
 
 class URFaultInjector(FaultInjector):
-    """Causes two more faults.
+    """Causes three more faults.
 
     * ``program-stop``: somebody stops the program at the pendant.
     * ``remote-control-off``: somebody takes local control.
+    * ``inputs-low``: what the digital outputs started does not run any more.
     """
 
     def __init__(self, box: URController, network: Network) -> None:
@@ -20,11 +21,12 @@ class URFaultInjector(FaultInjector):
         self._box = box
         self.kinds["program-stop"] = Kind(lambda _: box.stop_program("at the pendant"))
         self.kinds["remote-control-off"] = Kind(self._go_local)
+        self.kinds["inputs-low"] = Kind(lambda _: setattr(box, "wired", False))
 
     def clear(self) -> None:
-        """End local control too."""
+        """End local control too, and wire the inputs again."""
         super().clear()
-        self._box.remote_control = True
+        self._box.remote_control = self._box.wired = True
 
     def _go_local(self, seconds: float | None) -> None:
         del seconds

@@ -92,7 +92,9 @@ OUTPUTS: dict[str, Output] = {
     "target_TCP_pose": _POSE,
     "target_TCP_speed": _TWIST,
     "ft_raw_wrench": Output("VECTOR6D", _raw_wrench),
-    "actual_digital_input_bits": Output("UINT64", lambda box: (0,)),
+    "actual_digital_input_bits": Output(
+        "UINT64", lambda box: (box.digital_outputs & 0xFF,) if box.wired else (0,)
+    ),
     "actual_digital_output_bits": Output("UINT64", lambda box: (box.digital_outputs,)),
     "joint_temperatures": Output("VECTOR6D", lambda box: (25.0,) * 6),
     "actual_execution_time": Output("DOUBLE", lambda box: (box.program_time,)),

@@ -1,0 +1,147 @@
+"""An arc that burns only while the arm is led: switched in the process that guards the arm.
+
+The guard opens the power source with the arm. What the arm is told carries what the arc is to do: a
+seventh number after the six of the twist. What stops the arm (the guard, for any reason; a program
+that is silent, hangs or is gone) ends the arc with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flangeye.devices import Arc, Device, DeviceError, Robot, RobotDriver, RobotState
+from flangeye.models.arc import ArcTimes
+from flangeye.types import Floats, Transform
+
+OFF, GAS, BURN = 0.0, 1.0, 2.0
+"""What the seventh number asks for."""
+
+WATCHED_NS = 200_000_000
+"""An arc that is watched may be out for so long before the weld is stopped [ns]."""
+
+
+LETTING_GO = 1.5
+"""Longest flow of gas when the arm is let go of [s]: half of the time that a guard has to end."""
+
+
+def with_arc(driver: RobotDriver, open_arc: Callable[[], Arc], times: ArcTimes) -> RobotDriver:
+    """Return a driver that opens a power source with the arm, in the same process."""
+    return replace(driver, open=partial(_opened, driver.open, open_arc, times))
+
+
+def _opened(open_robot: Callable[[], Robot], open_arc: Callable[[], Arc], times: ArcTimes) -> Any:
+    robot = open_robot()
+    try:
+        return ArcedArm(robot, open_arc(), times)
+    except BaseException:
+        robot.close()
+        raise
+
+
+class ArcedArm(Device):
+    """An arm with a power source; see :class:`flangeye.devices.Robot`.
+
+    Attributes:
+        arc: The power source.
+    """
+
+    def __init__(self, robot: Robot, arc: Arc, times: ArcTimes) -> None:
+        self._robot, self.arc, self._times = robot, arc, times
+        self._level, self._lit_ns, self._out_ns = OFF, 0, 0
+        self._flows_until: int | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what else the arm has: its name, its period."""
+        return getattr(self._robot, name)
+
+    def state(self) -> RobotState:
+        """Return the arm's state."""
+        return self._robot.state()
+
+    def wait_cycle(self) -> None:
+        """Wait for the arm's next cycle, and see to gas and arc.
+
+        Raises:
+            DeviceError: The arm is lost, or the arc went out or was not established.
+        """
+        self._robot.wait_cycle()
+        now = self._robot.state().time_ns
+        if self._flows_until is not None and now >= self._flows_until:
+            self._flows_until = None
+            self.arc.gas(False)
+        if self._level == BURN:
+            self._watch(now)
+
+    def _watch(self, now: int) -> None:
+        burning = self.arc.burning()
+        if burning is not False:
+            self._out_ns = now
+            return
+        begun = now - self._lit_ns > self._times.ignition * 1e9
+        if begun and now - max(self._out_ns, self._lit_ns) > WATCHED_NS:
+            self.quench()
+            raise DeviceError(f"{self.arc.name}: the arc does not burn")
+
+    def move_velocity(self, twist: Floats, acceleration: float) -> None:
+        """Go on at a twist (6,); a seventh number is what the arc is to do."""
+        level = float(twist[6]) if len(twist) == 7 else OFF
+        self._robot.move_velocity(np.asarray(twist[:6]), acceleration)
+        if level != self._level:
+            self._switch(level)
+
+    def _switch(self, level: float) -> None:
+        if level == OFF:
+            self.quench()
+            return
+        self.arc.gas(True)
+        self._flows_until = None
+        self.arc.burn(level == BURN)
+        if level == BURN:
+            self._lit_ns = self._out_ns = self._robot.state().time_ns
+        self._level = level
+
+    def quench(self) -> None:
+        """End the arc at once; gas flows on for its time."""
+        if self._level == OFF:
+            return
+        burned, self._level = self._level == BURN, OFF
+        self.arc.burn(False)
+        after = self._times.gas_after if burned else 0.0
+        self._flows_until = self._robot.state().time_ns + round(after * 1e9)
+
+    def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
+        """Move to joint angles, without an arc."""
+        self.quench()
+        self._robot.move_joints(joints, speed, acceleration)
+
+    def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
+        """Move the flange straight, without an arc."""
+        self.quench()
+        self._robot.move_linear(base_T_flange, speed, acceleration)
+
+    def stop(self) -> None:
+        """End the arc, then brake."""
+        try:
+            with suppress(DeviceError):
+                self.quench()
+        finally:
+            self._robot.stop()
+
+    def close(self) -> None:
+        """End the arc, let the gas flow on for a little, and let go of both."""
+        until = time.monotonic() + LETTING_GO
+        try:
+            with suppress(DeviceError):
+                self.quench()
+                while self._flows_until is not None and time.monotonic() < until:
+                    self.wait_cycle()
+        finally:
+            self.arc.close()
+            self._robot.close()

@@ -1,0 +1,65 @@
+"""``arc.simulated``: a power source that only remembers how it was switched."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from flangeye.devices import Arc, Device, DeviceError
+from flangeye.models.arc import ArcTimes
+from flangeye.plugin.stage import Params, part
+
+
+class SimulatedArcParams(ArcTimes, Params):
+    """Parameters of ``arc.simulated``."""
+
+    fails_after: int | None = Field(
+        None, ge=1, description="After so many questions the arc is found to be out."
+    )
+
+
+class SimulatedArc(Device):
+    """Burns when it is told to.
+
+    Attributes:
+        name: For people.
+        history: What was switched: ``gas`` or ``burn``, and whether on.
+    """
+
+    def __init__(self, fails_after: int | None = None) -> None:
+        """Begin, switched off."""
+        self.name = "simulated power source"
+        self.history: list[tuple[str, bool]] = []
+        self._burns, self._fails_after, self._asked, self._closed = False, fails_after, 0, False
+
+    def gas(self, on: bool) -> None:
+        """Remember it."""
+        self._switch("gas", on)
+
+    def burn(self, on: bool) -> None:
+        """Remember it."""
+        self._switch("burn", on)
+        self._burns = on
+
+    def burning(self) -> bool | None:
+        """Return whether it was told to, until it fails."""
+        self._asked += self._burns
+        failed = self._fails_after is not None and self._asked > self._fails_after
+        return self._burns and not failed
+
+    def close(self) -> None:
+        """Switch all off."""
+        if not self._closed:
+            self.burn(False)
+            self.gas(False)
+        self._closed = True
+
+    def _switch(self, what: str, on: bool) -> None:
+        if self._closed:
+            raise DeviceError(f"{self.name}: is closed")
+        self.history.append((what, on))
+
+
+@part("arc.simulated")
+def arc_simulated(params: SimulatedArcParams) -> Arc:
+    """A simulated power source: nothing burns."""
+    return SimulatedArc(params.fails_after)

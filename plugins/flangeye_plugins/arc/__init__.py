@@ -1,0 +1,1 @@
+"""Kind ``arc``: welding power sources, for weld.tactile."""

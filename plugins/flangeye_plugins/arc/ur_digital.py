@@ -1,0 +1,170 @@
+"""``arc.ur_digital``: a power source on the digital outputs of a Universal Robots controller.
+
+Outputs and inputs go through RTDE, in a session beside the one that moves the arm (their
+*Real-Time Data Exchange guide*: packages of a length, a letter and a body, big-endian). In
+the controller's installation give both outputs the action "low when not running": they then go off
+with the arm's program, even where this computer is gone.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+import time
+
+from pydantic import Field
+
+from flangeye.devices import PATIENCE, Arc, Device, DeviceError
+from flangeye.models.arc import ArcTimes
+from flangeye.plugin.stage import Params, part
+
+PORT, VERSION = 30004, 2
+"""Of RTDE, by the guide."""
+
+RATE = 125.0
+"""Packages in a second [Hz]: what every generation of controller can send."""
+
+HEADER = struct.Struct(">HB")
+
+
+class UrDigitalParams(ArcTimes, Params):
+    """Parameters of ``arc.ur_digital``."""
+
+    host: str = Field(min_length=1, description="Address of the controller: 192.168.1.10.")
+    output: int = Field(ge=0, le=7, description="Standard digital output that starts the arc.")
+    gas: int | None = Field(
+        None, ge=0, le=7, description="Output of the gas valve, where the power source has none."
+    )
+    established: int | None = Field(
+        None, ge=0, le=7, description="Standard digital input that is high while the arc burns."
+    )
+
+
+class UrDigitalArc(Device):
+    """A power source behind a controller's outputs.
+
+    Attributes:
+        name: For people.
+    """
+
+    def __init__(self, params: UrDigitalParams) -> None:
+        """Connect and switch all off.
+
+        Raises:
+            DeviceError: The controller cannot be reached, or another client has its outputs.
+        """
+        self.name = f"arc on output {params.output} of {params.host}"
+        self._params, self._arrived, self._inputs, self._closed = params, b"", 0, False
+        self._until = time.monotonic() + PATIENCE
+        try:
+            self._line = socket.create_connection((params.host, PORT), PATIENCE)
+        except OSError as error:
+            raise DeviceError(f"{self.name}: {error}") from None
+        try:
+            self._negotiate()
+            self._off()
+        except DeviceError:
+            self._line.close()
+            raise
+
+    def gas(self, on: bool) -> None:
+        """Switch the gas valve, where it has an output of its own."""
+        if self._params.gas is not None:
+            self._set(self._params.gas, on)
+
+    def burn(self, on: bool) -> None:
+        """Switch the arc."""
+        self._set(self._params.output, on)
+
+    def burning(self) -> bool | None:
+        """Return whether the input is high in the newest package; None where there is no input."""
+        if self._params.established is None:
+            return None
+        self._read()
+        return bool(self._inputs >> self._params.established & 1)
+
+    def close(self) -> None:
+        """Switch all off, and let go of the controller."""
+        if self._closed:
+            return
+        try:
+            self._off()
+        except DeviceError:
+            pass  # it is gone; its outputs go low with the arm's program
+        finally:
+            self._closed = True
+            self._line.close()
+
+    def _off(self) -> None:
+        self.burn(False)
+        self.gas(False)
+
+    def _negotiate(self) -> None:
+        """Agree on what is sent: the inputs' bits one way, the outputs' the other."""
+        self._asked("V", struct.pack(">H", VERSION))
+        self._asked("O", struct.pack(">d", RATE) + b"actual_digital_input_bits")
+        names = b"standard_digital_output_mask,standard_digital_output"
+        self._recipe = self._asked("I", names)[:1]
+        self._asked("S", b"")
+
+    def _asked(self, kind: str, body: bytes) -> bytes:
+        """Return the answer to a request; what else comes meanwhile is passed over."""
+        self._say(kind, body)
+        while time.monotonic() < self._until:
+            self._receive(0.05)
+            for answered, answer in self._packages():
+                if answered == kind and answer[:1] in (b"", b"\0"):
+                    raise DeviceError(
+                        f"{self.name}: the controller refuses RTDE's {kind}; another client, or a "
+                        "fieldbus, may have its outputs"
+                    )
+                if answered == kind:
+                    return answer
+        raise DeviceError(f"{self.name}: the controller does not answer RTDE's {kind}")
+
+    def _set(self, output: int, on: bool) -> None:
+        if self._closed:
+            raise DeviceError(f"{self.name}: is closed")
+        self._read()  # what is never read would fill the controller's buffer
+        self._say("U", self._recipe + bytes([1 << output, on << output]))
+
+    def _say(self, kind: str, body: bytes) -> None:
+        try:
+            self._line.sendall(HEADER.pack(HEADER.size + len(body), ord(kind)) + body)
+        except OSError as error:
+            raise DeviceError(f"{self.name}: {error}") from None
+
+    def _read(self) -> None:
+        """Take in what has arrived; never waits."""
+        self._receive(0.0)
+        for kind, body in self._packages():
+            if kind == "U":
+                self._inputs = int.from_bytes(body[1:9], "big")
+
+    def _receive(self, patience: float) -> None:
+        while select.select([self._line], [], [], patience)[0]:
+            try:
+                arrived = self._line.recv(65536)
+            except OSError as error:
+                raise DeviceError(f"{self.name}: {error}") from None
+            if not arrived:
+                raise DeviceError(f"{self.name}: the controller has closed the connection")
+            self._arrived, patience = self._arrived + arrived, 0.0
+
+    def _packages(self) -> list[tuple[str, bytes]]:
+        """Return the whole packages that have arrived: letter and body of each."""
+        found = []
+        while len(self._arrived) >= HEADER.size:
+            size, kind = HEADER.unpack_from(self._arrived)
+            if len(self._arrived) < max(size, HEADER.size):
+                break
+            found.append((chr(kind), self._arrived[HEADER.size : size]))
+            self._arrived = self._arrived[max(size, HEADER.size) :]
+        return found
+
+
+@part("arc.ur_digital")
+def arc_ur_digital(params: UrDigitalParams) -> Arc:
+    """A power source that digital outputs of a Universal Robots controller switch."""
+    return UrDigitalArc(params)

@@ -1,0 +1,213 @@
+"""Power sources, and the arm that switches them."""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.devices import DeviceError, RobotDriver
+from flangeye.models.arc import ArcTimes
+from flangeye.motion.arc import BURN, GAS, OFF, ArcedArm, with_arc
+from flangeye.plugin.stage import BoundPart
+from flangeye.testing import ArcConformance
+from flangeye_emulators.arc.simulated import SimulatedArc, SimulatedArcParams, arc_simulated
+from flangeye_plugins.arc.manual import ManualArcParams, arc_manual
+from flangeye_plugins.arc.ur_digital import UrDigitalArc, UrDigitalParams, arc_ur_digital
+from tests.emulators.controllers.process import Process, free_address
+from tests.motion.stand_in import StandIn
+from tests.plugins.robot.cell import until
+
+STILL = np.zeros(6)
+
+
+class TestSimulated(ArcConformance):
+    part = arc_simulated
+    params = SimulatedArcParams()
+
+
+class TestManual(ArcConformance):
+    part = arc_manual
+    params = ManualArcParams()
+
+
+class TestUrDigital(ArcConformance):
+    part = arc_ur_digital
+    unreachable = UrDigitalParams(host=free_address(), output=3)
+
+    @pytest.fixture(autouse=True)
+    def controller(self) -> Any:
+        with Process() as controller:
+            self.host = controller.host
+            yield
+
+    def open(self) -> Any:
+        params = UrDigitalParams(host=self.host, output=3, gas=1, established=3)
+        return arc_ur_digital.function(params)
+
+
+# --- the arm with a power source ------------------------------------------------------------------
+
+
+def arced(arc: SimulatedArc, **times: str) -> ArcedArm:
+    return ArcedArm(StandIn(), arc, ArcTimes.model_validate(times))
+
+
+def lead(arm: ArcedArm, level: float, cycles: int = 1) -> None:
+    for _ in range(cycles):
+        arm.wait_cycle()
+        arm.move_velocity(np.append(STILL, level), 0.5)
+
+
+def test_gas_comes_before_the_arc_and_flows_on_after_it() -> None:
+    arc = SimulatedArc()
+    arm = arced(arc, gas_after="50 ms")
+    lead(arm, GAS)
+    lead(arm, BURN, 3)
+    assert arc.history == [("gas", True), ("burn", False), ("gas", True), ("burn", True)]
+    del arc.history[:]
+    lead(arm, OFF)
+    assert arc.history == [("burn", False)]
+    lead(arm, OFF, round(0.05 / arm.period) + 1)
+    assert arc.history == [("burn", False), ("gas", False)]
+
+
+@pytest.mark.parametrize(
+    "stop",
+    [
+        lambda arm: arm.stop(),
+        lambda arm: arm.close(),
+        lambda arm: arm.move_velocity(STILL, 0.5),
+        lambda arm: arm.move_joints(arm.state().joints, 0.1, 0.5),
+        lambda arm: arm.move_linear(arm.state().base_T_flange, 0.1, 0.5),
+    ],
+)
+def test_whatever_else_the_arm_is_told_ends_the_arc(stop: Any) -> None:
+    arc = SimulatedArc()
+    arm = arced(arc)
+    lead(arm, BURN, 2)
+    assert arc.burning()
+    stop(arm)
+    assert not arc.burning()
+
+
+def test_an_arc_that_goes_out_is_no_weld() -> None:
+    arm = arced(SimulatedArc(fails_after=20), ignition="0 s")
+    with pytest.raises(DeviceError, match="simulated power source: the arc does not burn"):
+        lead(arm, BURN, 400)
+    assert not arm.arc.burning()
+
+
+def test_an_arm_that_cannot_be_told_to_stop_has_no_arc_all_the_same() -> None:
+    class Lost(StandIn):
+        def stop(self) -> None:
+            raise DeviceError("lost")
+
+    arc = SimulatedArc()
+    arm = ArcedArm(Lost(), arc, ArcTimes())
+    lead(arm, BURN)
+    with pytest.raises(DeviceError, match="lost"):
+        arm.stop()
+    assert not arc.burning()
+
+
+def test_an_arm_is_let_go_of_where_its_power_source_cannot_be_opened() -> None:
+    robot = StandIn()
+
+    def refuse() -> Any:
+        raise DeviceError("no power source")
+
+    driver = with_arc(RobotDriver("robot.stand_in", lambda: robot), refuse, ArcTimes())
+    with pytest.raises(DeviceError, match="no power source"):
+        driver.open()
+    assert robot.closed
+
+
+# --- on the outputs of a controller ---------------------------------------------------------------
+
+
+def outputs(controller: Process) -> int:
+    return int(controller.control.state()["digital_outputs"])
+
+
+def test_outputs_go_high_and_low_and_the_input_says_whether_it_burns() -> None:
+    with Process() as controller:
+        params = UrDigitalParams(host=controller.host, output=3, gas=1, established=3)
+        with arc_ur_digital.function(params) as arc:
+            arc.gas(True)
+            until(lambda: outputs(controller) == 0b0010, 1.0)
+            assert arc.burning() is False
+            arc.burn(True)
+            until(lambda: outputs(controller) == 0b1010, 1.0)
+            until(arc.burning, 1.0)
+            controller.control.fault("inputs-low")
+            until(lambda: arc.burning() is False, 1.0)
+        until(lambda: outputs(controller) == 0, 1.0)
+        with pytest.raises(DeviceError, match="is closed"):
+            arc.burn(True)
+
+
+def test_an_arc_that_nothing_watches_does_not_say_that_it_is_out() -> None:
+    with Process() as controller:
+        params = UrDigitalParams(host=controller.host, output=3)
+        arc: Any = arc_ur_digital.function(params)
+        arc.gas(True)  # it has no valve of its own
+        arc.burn(True)
+        assert arc.burning() is None
+        until(lambda: outputs(controller) == 0b1000, 1.0)
+        arc.close()
+
+
+def test_outputs_that_another_client_has_are_refused() -> None:
+    with Process() as controller:
+        params = UrDigitalParams(host=controller.host, output=3)
+        with (
+            arc_ur_digital.function(params),
+            pytest.raises(DeviceError, match="refuses RTDE's I; another"),
+        ):
+            arc_ur_digital.function(params)
+
+
+def test_a_controller_that_says_nothing_is_given_up_on() -> None:
+    host = free_address()
+    with socket.create_server((host, 30004)):
+        began = time.monotonic()
+        with pytest.raises(DeviceError, match="does not answer RTDE's V"):
+            UrDigitalArc(UrDigitalParams(host=host, output=0))
+        assert time.monotonic() - began < 4.0
+
+
+def test_a_controller_that_is_gone_is_an_arc_that_is_lost() -> None:
+    with Process() as controller:
+        arc = arc_ur_digital.function(
+            UrDigitalParams(host=controller.host, output=3, established=3)
+        )
+        controller.end()
+        with pytest.raises(DeviceError, match="arc on output 3 of"):
+            for _ in range(100):
+                arc.burn(True)
+                arc.burning()
+        arc.close()
+
+
+def test_a_bound_power_source_opens_in_another_process() -> None:
+    driver = RobotDriver("robot.stand_in", StandIn)
+    arm: Any = with_arc(driver, BoundPart(arc_simulated, SimulatedArcParams()), ArcTimes()).open()
+    assert arm.arc.name == "simulated power source" and arm.name and arm.period > 0.0
+
+
+# --- by hand --------------------------------------------------------------------------------------
+
+
+def test_a_person_is_told_each_change_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with arc_manual.function(ManualArcParams()) as arc:
+        for _ in range(3):
+            arc.gas(True)
+            arc.burn(True)
+        assert arc.burning() is None
+    said = capsys.readouterr().err
+    told = [line.replace("\a", "").strip("<> ") for line in said.splitlines()]
+    assert told == ["GAS ON", "STRIKE THE ARC NOW", "END THE ARC NOW", "GAS OFF"]
