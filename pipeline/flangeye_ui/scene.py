@@ -32,7 +32,7 @@ def new_scene(width: int, height: int, fps: int = 20) -> ui.scene:
 
 def draw_arm(scene: ui.scene, robot: RobotModel, joints: Floats) -> None:
     """Draw the arm's capsules; where the model has none, its links as lines."""
-    frames = Arm(robot).frames(joints)
+    frames, robot = Arm(robot).frames(joints), robot.filled()
     with scene:
         for volume in robot.volumes:
             frame = frames[volume.link]

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from flangeye.maths.closed_form import Undecomposed
 from flangeye.maths.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
@@ -222,3 +223,31 @@ def test_seven_joints_are_solved_with_one_of_them_held(name: str) -> None:
         counts.append(len(found))
     assert min(counts) >= 1
     assert np.median(counts) >= 8  # of the continuum, a sample with several of its branches
+
+
+def test_what_eaik_does_not_solve_is_iterated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It raises RuntimeError on some arms, which stands in here for the joint that is held best."""
+    arm = Arm(load_model("robots", "kuka-iiwa14-r820"))
+    joints = np.array([0.3, 0.5, -0.2, 1.1, 0.4, 0.8, 0.1])
+    pose = arm.flange(joints)
+    best = arm._held[0]
+
+    def fails(pose):
+        raise Undecomposed("of the library")
+
+    arm._forms[best] = [fails] * 8
+    assert len(arm.inverse(pose)) > 1
+    for joint in range(7):
+        arm._forms[joint] = [fails]
+    found = arm.inverse(pose)
+    assert len(found) > 1
+    np.testing.assert_allclose(arm.flange(found), np.broadcast_to(pose, (len(found), 4, 4)),
+                               atol=2e-9)  # fmt: skip
+    monkeypatch.setattr("eaik.pybindings.EAIK.Robot.calculate_IK", fails_inside)
+    six = Arm(load_model("robots", "ur5e"))
+    pose = six.flange(joints[:6])
+    assert len(six.inverse(pose)) == 8
+
+
+def fails_inside(robot, pose):
+    raise RuntimeError("Can not calculate orientation IK")

@@ -19,6 +19,8 @@ from flangeye.models.urdf import robot_from_urdf
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
+from flangeye.recipe.verdict import verdict
+from flangeye.types import Warn
 
 ORIGINS = [  # of a KUKA KR 6 R900 sixx: its maker's table
     ("0 0 0.400", "0 0 -1", 170), ("0.025 0 0", "0 1 0", 120), ("0.455 0 0", "0 1 0", 156),
@@ -94,7 +96,7 @@ def test_the_slowest_joint_that_turns_bounds_its_speed(kuka: Path) -> None:
 
 
 def test_each_link_has_a_capsule_about_its_mesh(kuka: Path) -> None:
-    robot = robot_from_urdf(kuka)
+    robot = robot_from_urdf(kuka).filled()
     assert [volume.link for volume in robot.volumes] == list(range(7))
     half = np.array([0.06, 0.04, 0.03])
     assert robot.volumes[0].radius == pytest.approx(np.hypot(*half[1:]), rel=2e-3)
@@ -123,7 +125,7 @@ def test_meshes_as_they_are_published(kuka: Path, name: str) -> None:
     for file in (kuka.parents[1] / "m").glob("*.stl"):
         trimesh.load_mesh(file).export(file.with_suffix(f".{name}"))
     kuka.write_text(kuka.read_text().replace(".stl", f".{name}"))
-    radius = robot_from_urdf(kuka).volumes[0].radius
+    radius = robot_from_urdf(kuka).filled().volumes[0].radius
     assert radius == pytest.approx(0.05, rel=2e-3)
 
 
@@ -137,8 +139,69 @@ def test_missing_meshes_matter_where_a_plan_needs_them(kuka: Path, tmp_path: Pat
     assert "write robot: {packages: {kuka_support: FOLDER}}, where FOLDER holds m/" in str(
         error.value
     )
-    named = robot_from_urdf(moved, packages={"kuka_support": tmp_path / "kuka"})
+    named = robot_from_urdf(moved, packages={"kuka_support": tmp_path / "kuka"}).filled()
     assert len(named.volumes) == 7
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: re.sub("<mesh [^>]*>", '<sphere radius="0"/>', t),
+         "the <sphere> of link 'link_0' has a radius of 0 mm; give it one, or take the body away"),
+        (lambda t: t.replace('scale="0.001 0.001 0.001"', 'scale="1e400 1 1"', 1),
+         'scale="1e400 1 1" is not three finite numbers'),
+        (lambda t: re.sub("<collision>.*?</collision>", "", t), "no link of the arm has a coll"),
+    ],
+)  # fmt: skip
+def test_bodies_matter_where_something_moves(
+    kuka: Path, change: Callable[..., Any], words: str
+) -> None:
+    kuka.write_text(change(kuka.read_text()))
+    robot = robot_from_urdf(kuka)
+    assert Arm(robot).n == 6
+    with pytest.raises(StageError, match=words):
+        ArmVolume(robot)
+
+
+def test_which_links_were_taken_is_said(kuka: Path) -> None:
+    robot = robot_from_urdf(kuka)
+    assert robot.notes == (f"{kuka}: base 'base', flange 'tool0'",)
+    text = kuka.read_text().replace('name="base"', 'name="foot"').replace('"base"', '"foot"')
+    kuka.write_text(re.sub("<collision>.*?</collision>", "", text, count=2))
+    base, without = robot_from_urdf(kuka).notes
+    assert base == f"{kuka}: base 'link_0', flange 'tool0'"  # not the world above it
+    assert "2 of 7 links have no collision body (link_0, link_1)" in without
+
+
+def test_a_flange_that_looks_aside_is_said_with_the_line_that_turns_it(kuka: Path) -> None:
+    odd = robot_from_urdf(kuka, flange="flange").notes[1]
+    assert isinstance(odd, Warn)
+    assert f"{kuka}: z of flange 'flange' is 90 deg to the last axis, which is x of" in odd
+    line = odd.fix.partition("to the URDF: ")[2]
+    kuka.write_text(kuka.read_text().replace("</robot>", f"{line}</robot>"))
+    turned = robot_from_urdf(kuka, flange="flange_face")
+    assert len(turned.notes) == 1
+    assert Arm(turned).flange(np.zeros(6))[:3, 2] == pytest.approx([1, 0, 0], abs=1e-5)
+
+
+def test_an_arm_of_five_joints_is_sent_nowhere(kuka: Path, tmp_path: Path) -> None:
+    text = kuka.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"')
+    kuka.write_text(text)
+    recipe = tmp_path / "cell.yaml"
+    driver = "driver: {ur_rtde: {host: auto}}, limits: {box: {centre: [500 mm, 0 mm, 400 mm], "
+    driver += "size: [800 mm, 800 mm, 800 mm]}, joint_speed: 10 deg/s}"
+    head = f"title: T\nrobot: {{urdf: kuka/urdf/kr6.urdf, {driver}}}\n"
+    head += "feature: {standard: ISO 9409-1-40-4-M6}\n"
+    head += "scanner: {model: phoxi-m, driver: {watched_folder: {path: scans, unit: mm}}}\n"
+    steps = "segment.flange, fit.rim, solve.robust]\n"
+    recipe.write_text(f"{head}steps: [acquire.archive, {steps}")
+    registry = load_registry()
+    said = verdict(recipe, "", registry)
+    assert f"note: {kuka}: base 'base', flange 'tool0'" in said
+    view = "{view: {guess: {position: [620 mm, 0 mm, 980 mm]}}}"
+    recipe.write_text(f"{head}steps: [acquire.live: {view}, {steps}")
+    with pytest.raises(RecipeError, match="kr6_r900 has 5 joints, .* robot: {flange: ISO 9409"):
+        verdict(recipe, "", registry)
 
 
 def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
@@ -170,9 +233,8 @@ def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:
         (lambda t: re.sub('lower="[^"]*"', 'lower="nan"', t), 'lower="nan" is not one finite'),
         (lambda t: t.replace('axis xyz="0 0 -1"', 'axis xyz="0 0 0"'),
          r"kr6.urdf: joint axis: an axis needs a direction, for example \[0, 0, 1\]"),
-        (lambda t: t.replace('scale="0.001 0.001 0.001"', 'scale="1e400 1 1"', 1),
-         'scale="1e400 1 1" is not three finite numbers'),
-        (lambda t: re.sub("<mesh [^>]*>", '<sphere radius="-1"/>', t), "volume radius: "),
+        (lambda t: t.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><mimic joint="joint_1"/>'),
+         "joint 'joint_2' follows another one .mimic., .* robot: {flange: ISO 9409-1-50-4-M6}"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_urdf_is_one_line(

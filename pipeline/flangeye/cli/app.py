@@ -119,7 +119,7 @@ def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None =
         from flangeye.recipe.load import load_recipe
 
         recipe = load_recipe(find_recipe(name), registry, overrides or ())
-    say_notes(registry.notes())
+    say_notes([*registry.notes(), *recipe.notes])
     return recipe
 
 

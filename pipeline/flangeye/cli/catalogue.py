@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from flangeye.cli.app import app, ask
-from flangeye.cli.console import say
+from flangeye.cli.console import say, say_notes
 
 
 @app.command()
@@ -83,6 +83,7 @@ def new_robot(  # noqa: PLR0913  one for each option
     require_new(path)
     if urdf is not None:
         found = robot_from_urdf(urdf, base, flange, standard)
+        say_notes(found.notes)
         robot = found.model_copy(update={"model": name, "maker": maker})
     else:
         robot = robot_of_joints(name, maker, convention, joint or _ask_joints(), standard)

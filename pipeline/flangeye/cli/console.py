@@ -32,8 +32,11 @@ def write(console: Console, text: str, style: str = "") -> None:
 
 def say_notes(notes: Sequence[str]) -> None:
     """Say beside the output what the person should know."""
-    for note in notes:
-        say(f"note: {note}", err=True)
+    if notes:
+        from flangeye.types.notes import as_line
+
+        for note in notes:
+            say(as_line(note), err=True)
 
 
 def at_work(what: str) -> AbstractContextManager[object]:

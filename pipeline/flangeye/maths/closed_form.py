@@ -16,6 +16,11 @@ from flangeye.types import Floats
 ClosedForm = Callable[[Floats], Floats]
 """(4, 4) base_T_flange -> (K, 6) joint angles near its solutions [rad]."""
 
+
+class Undecomposed(ArithmeticError):
+    """EAIK met a pose that its decomposition of the arm does not solve."""
+
+
 CLOSE = 5e-3
 """Axes of a calibrated arm that were meant to meet or to be in line do so within this [m]."""
 
@@ -29,7 +34,8 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
         flange: (4, 4) base_T_flange, all joints at zero.
 
     Returns:
-        None where EAIK is not installed or knows no decomposition.
+        None where EAIK is not installed or knows no decomposition. The closed form raises
+        :class:`Undecomposed` where EAIK fails at a pose.
     """
     forms = (_decomposed(*axes, flange) for axes in as_meant(directions, points))
     return next((form for form in forms if form is not None), None)
@@ -64,12 +70,18 @@ def _decomposed(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
     # EAIK's subproblems hold for axes that point alike where they are parallel.
     signs = np.sign(directions[np.arange(6), np.abs(directions).argmax(axis=1)])
     places = np.vstack([np.zeros(3), points, flange[:3, 3]])
-    robot = Robot(signs * directions.T, np.diff(places, axis=0).T, flange[:3, :3], [], True)
+    try:
+        robot = Robot(signs * directions.T, np.diff(places, axis=0).T, flange[:3, :3], [], True)
+    except RuntimeError:
+        return None
     if not robot.has_known_decomposition():
         return None
 
     def solve(base_T_flange: Floats) -> Floats:
-        joints: Floats = np.asarray(robot.calculate_IK(base_T_flange).Q).reshape(-1, 6)
+        try:
+            joints: Floats = np.asarray(robot.calculate_IK(base_T_flange).Q).reshape(-1, 6)
+        except RuntimeError as error:
+            raise Undecomposed(str(error)) from None
         return np.asarray(signs * joints)
 
     return solve

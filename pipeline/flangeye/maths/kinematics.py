@@ -7,13 +7,14 @@ Angles [rad], lengths [m], frames as in :mod:`flangeye.types`. Twists are six-ve
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from flangeye.maths.closed_form import ClosedForm, closed_form
+from flangeye.maths.closed_form import ClosedForm, Undecomposed, closed_form
 from flangeye.maths.geometry import basis_of_plane, rigid, rotation_from_rpy
 from flangeye.maths.offset_wrist import OffsetWrist, offset_wrist
 from flangeye.types import Floats
@@ -175,6 +176,7 @@ class Arm:
         self._before = np.array([before for before, _ in fixed])
         self._after = np.array([after for _, after in fixed])
         self._tool = robot.link_T_flange
+        self._forms: dict[int, list[ClosedForm]] = {}
 
     def altered(self, lengths: Floats) -> Arm:
         """Return the arm with (n, 3) added to each joint's ``a``, ``d`` [m] and ``alpha`` [rad]."""
@@ -236,9 +238,9 @@ class Arm:
         differs a little from such a one, as a calibrated arm does, is polished from there. Six
         joints whose wrist is not spherical are mostly solved by a search over one of them
         (:mod:`flangeye.maths.offset_wrist`). Of the continuum of a seven-joint arm it gives a
-        sample: one joint is held at a row of angles, which leaves six. Else, and where those give
-        nothing, from many points of a fixed sequence, so that all branches of a six-joint arm are
-        normally found. Nothing random is in it.
+        sample: one joint is held at a row of angles, which leaves six; the next joint, where that
+        gives nothing. Else, and where a closed form fails, from many points of a fixed sequence,
+        so that all branches of a six-joint arm are normally found. Nothing random is in it.
 
         Args:
             base_T_flange: (4, 4) pose to reach.
@@ -249,12 +251,14 @@ class Arm:
             Distinct solutions, those nearest to the middle of the joints' ranges first.
         """
         if self._closed_form is not None:
-            return self._polished(base_T_flange, self._closed_form(base_T_flange))
-        if self._search is not None:
+            found = _solutions([self._closed_form], base_T_flange)
+            if found is not None:
+                return self._polished(base_T_flange, found)
+        elif self._search is not None:
             return self._polished(base_T_flange, self._search(base_T_flange), each=True)
-        if self._held:
-            found = np.concatenate([held(base_T_flange) for held in self._held])
-            if len(solved := self._polished(base_T_flange, found)):
+        for joint in self._held:
+            found = _solutions(self._forms_holding(joint), base_T_flange)
+            if found is not None and len(solved := self._polished(base_T_flange, found)):
                 return solved
         return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
 
@@ -308,17 +312,21 @@ class Arm:
         return (*self.axes(np.zeros(self.n)), self.flange(np.zeros(self.n)))
 
     @cached_property
-    def _held(self) -> list[ClosedForm]:
-        """The closed forms of seven joints with one of them held, at each angle of a row."""
+    def _held(self) -> list[int]:
+        """Which of seven joints are held, those first with which most poses are solved."""
         if self.n != 7 or self.slides.any():
             return []
-        joint = max(range(self.n), key=self._solved_when_held)
-        if not self._solved_when_held(joint):
-            return []
-        low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
-        angles = low + (np.arange(HELD) + 0.5) / HELD * (high - low)
-        forms = [self._form_holding(joint, angle) for angle in angles]
-        return [form for form in forms if form is not None]
+        solved = [self._solved_when_held(joint) for joint in range(self.n)]
+        return sorted(np.flatnonzero(solved).tolist(), key=lambda joint: -solved[joint])
+
+    def _forms_holding(self, joint: int) -> list[ClosedForm]:
+        """Return the closed forms of the other six with a joint held at each angle of a row."""
+        if joint not in self._forms:
+            low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
+            angles = low + (np.arange(HELD) + 0.5) / HELD * (high - low)
+            forms = [self._form_holding(joint, angle) for angle in angles]
+            self._forms[joint] = [form for form in forms if form is not None]
+        return self._forms[joint]
 
     def _solved_when_held(self, joint: int) -> int:
         """Return how many solutions of a few poses there are with a joint held amid its range."""
@@ -327,7 +335,9 @@ class Arm:
             return 0
         solved = 0
         for pose in self.flange(self._starting_points(TRIED)):
-            joints = form(pose)
+            joints = _solutions([form], pose)
+            if joints is None:
+                continue
             error = np.abs(self.flange(joints) - pose).max(axis=(1, 2), initial=0.0)
             solved += len(self._within_limits(joints[error < SOLVED]))
         return solved
@@ -402,6 +412,15 @@ class Arm:
             if not row[kept].any():
                 kept.append(i)
         return joints[kept]
+
+
+def _solutions(forms: Sequence[ClosedForm], base_T_flange: Floats) -> Floats | None:
+    """Return what closed forms give for a pose, (K, n); None where each of them fails."""
+    found = []
+    for form in forms:
+        with suppress(Undecomposed):
+            found.append(form(base_T_flange))
+    return np.concatenate(found) if found else None
 
 
 def _standard(joint: Joint) -> tuple[Floats, Floats]:

@@ -25,7 +25,7 @@ def write_robot(path: Path, robot: RobotModel) -> str:
     """
     if robot.flange.standard:
         load_standard(robot.flange.standard)
-    data = robot.model_dump(mode="json", exclude_unset=True)
+    data = robot.filled().model_dump(mode="json", exclude_unset=True)
     _write(path, data)
     written: RobotModel = load_model("robots", str(path))
     x, y, z = 1e3 * Arm(written).flange(np.zeros(len(written.joints)))[:3, 3]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, PrivateAttr, field_validator
 
+from flangeye.errors import RecipeError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.model import Model
-from flangeye.types import Floats
+from flangeye.types import Floats, Note
 from flangeye.units import Angle, AngularSpeed, JointPosition, Length, param
 
 NOWHERE = ("0 mm", "0 mm", "0 mm")
@@ -98,6 +99,19 @@ class Volume(Model):
     radius: Length = param(gt=0)
 
 
+class Bodies(Protocol):
+    """The collision bodies of an arm's URDF, which are read when something moves."""
+
+    @property
+    def volumes(self) -> tuple[Volume, ...]:
+        """Return a capsule for each body.
+
+        Raises:
+            RecipeError: A body is missing or wrong; names its link.
+        """
+        ...
+
+
 class RobotModel(Model):
     """An arm: its kinematics, its flange, and roughly the space it fills."""
 
@@ -126,6 +140,29 @@ class RobotModel(Model):
         "assumed.",
     )
     source: str
+    _bodies: Bodies | None = PrivateAttr(None)
+    _notes: tuple[Note, ...] = PrivateAttr(())
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        """What was concluded about the arm from its file, for people."""
+        return self._notes
+
+    def from_urdf(self, bodies: Bodies, notes: tuple[Note, ...]) -> RobotModel:
+        """Return the arm with the bodies of its URDF, not read yet, and what to say of it."""
+        arm = self.model_copy()
+        arm._bodies, arm._notes = bodies, notes
+        return arm
+
+    def filled(self) -> RobotModel:
+        """Return the arm with the space it fills, as its URDF's bodies have it."""
+        if self._bodies is None:
+            return self
+        try:
+            volumes = self._bodies.volumes
+            return self.model_copy(update={"volumes": volumes, "volumes_missing": ""})
+        except RecipeError as error:
+            return self.model_copy(update={"volumes_missing": str(error)})
 
     @property
     def link_T_flange(self) -> Floats:

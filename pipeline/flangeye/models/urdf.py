@@ -1,10 +1,11 @@
-"""An arm from its URDF: kinematics, limits, and capsules fitted to its collision meshes."""
+"""An arm from its URDF: kinematics and limits; its collision bodies are read when it moves."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,17 @@ from pydantic import ValidationError
 from flangeye.errors import RecipeError
 from flangeye.files.printable import require_name
 from flangeye.files.regular import read_text
-from flangeye.maths.geometry import invert, rigid, rotation_from_rpy, rpy_from_rotation
+from flangeye.maths.geometry import (
+    basis_of_plane,
+    invert,
+    rigid,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
-from flangeye.models.urdf_meshes import MissingMesh, capsule_of
+from flangeye.models.urdf_meshes import capsule_of
 from flangeye.models.urdf_numbers import numbers_of
-from flangeye.types import Floats
+from flangeye.types import Floats, Note, Warn
 from flangeye.units import SI
 
 MAX_BYTES = 10_000_000
@@ -26,6 +33,11 @@ TURNS = ("revolute", "continuous")
 MOVES = (*TURNS, "prismatic")
 FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame")
 """Ends of the names that makers give the flange's frame, z outwards; the surest first."""
+OUTWARDS = np.radians(5.0)
+"""A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link."""
+ARCHIVES = (
+    "recordings with the flange's poses need no kinematics: robot: {flange: ISO 9409-1-50-4-M6}"
+)
 
 
 @dataclass(frozen=True)
@@ -75,14 +87,18 @@ def robot_from_urdf(
         RecipeError: It is no URDF, or base and flange cannot be told: says which links there are.
     """
     urdf = read_urdf(path)
-    to_base = urdf.chain(_base(urdf, base))
-    to_flange = urdf.chain(_flange(urdf, flange))
+    flange = _flange(urdf, flange)
+    to_flange = urdf.chain(flange)
+    base = _base(urdf, base, to_flange)
+    to_base = urdf.chain(base)
     shared = _shared(to_base, to_flange)
     if any(joint.get("type") in MOVES for joint in to_base[shared:]):
         raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
     base_T_root = invert(_fixed(path, to_base[shared:]))
     try:
-        return _assemble(urdf, base_T_root, to_flange[shared:], standard, packages or {})
+        robot = _assemble(urdf, base_T_root, to_flange[shared:], standard)
+        bodies = UrdfBodies(urdf, base_T_root, to_flange[shared:], packages or {})
+        return robot.from_urdf(bodies, tuple(_notes(urdf, robot, base, flange, bodies)))
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
@@ -113,28 +129,77 @@ def read_urdf(path: Path) -> Urdf:
     return Urdf(path, name, links, above)
 
 
+@dataclass
+class UrdfBodies:
+    """The collision bodies of the links between base and flange.
+
+    Attributes:
+        urdf: The file.
+        base_T_first: (4, 4) pose of the chain's first link in the base [m].
+        chain: The joints from there to the flange.
+        packages: Where the packages are that meshes are named by.
+    """
+
+    urdf: Urdf
+    base_T_first: Floats
+    chain: list[ET.Element]
+    packages: Mapping[str, Path]
+
+    @cached_property
+    def volumes(self) -> tuple[Volume, ...]:
+        """Return the capsules round the bodies.
+
+        Raises:
+            RecipeError: A body is missing or wrong; names its link.
+        """
+        volumes = tuple(volume for link in self.links() for volume in self._of(*link))
+        if not volumes:
+            raise RecipeError(f"{self.urdf.path}: no link of the arm has a collision body")
+        return volumes
+
+    def without(self) -> list[str]:
+        """Return the moved links that have no body, nor has any link fixed to them."""
+        bodies: dict[int, list[str]] = {}
+        for link, index, _ in self.links():
+            of = self.urdf.links.get(link)
+            has = of is not None and of.find("collision/geometry/*") is not None
+            bodies.setdefault(index, []).append("" if has else link)
+        return [links[0] for links in bodies.values() if all(links)]
+
+    def links(self) -> Iterator[tuple[str, int, Floats]]:
+        """Yield each link, the number of moving joints before it, and its pose in their frame."""
+        before, moved = self.base_T_first, 0
+        yield end_of(self.chain[0], "parent"), moved, before
+        for joint in self.chain:
+            before = before @ origin_of(self.urdf.path, joint)
+            if joint.get("type") in MOVES:
+                before, moved = np.eye(4), moved + 1
+            yield end_of(joint, "child"), moved, before
+
+    def _of(self, link: str, index: int, pose: Floats) -> Iterator[Volume]:
+        for collision in self.urdf.links[link].findall("collision"):
+            geometry = collision.find("geometry")
+            if geometry is None or not len(geometry):
+                continue
+            placed = pose @ origin_of(self.urdf.path, collision)
+            capsule = capsule_of(geometry[0], self.urdf.path, self.packages)
+            if not capsule.radius > 0:
+                raise RecipeError(
+                    f"{self.urdf.path}: the <{geometry[0].tag}> of link '{link}' has a radius of "
+                    f"{1e3 * capsule.radius:g} mm; give it one, or take the body away"
+                )
+            ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
+            start, end = (tuple(map(SI, point)) for point in ends)
+            yield Volume(link=index, start=start, end=end, radius=SI(capsule.radius))
+
+
 def _assemble(
-    urdf: Urdf,
-    base_T_first: Floats,
-    chain: list[ET.Element],
-    standard: str | None,
-    packages: Mapping[str, Path],
+    urdf: Urdf, base_T_first: Floats, chain: list[ET.Element], standard: str | None
 ) -> RobotModel:
     joints: list[Joint] = []
-    volumes: list[Volume] = []
-    missing = ""
     before = base_T_first  # from the last moving link, or the base, to the link that is reached
-    reached = end_of(chain[0], "parent") if chain else ""
-    for joint in [*chain, None]:
-        try:
-            for volume in _volumes(urdf, reached, len(joints), before, packages):
-                volumes.append(volume)
-        except MissingMesh as error:
-            missing = str(error)
-        if joint is None:
-            break
+    for joint in chain:
         before = before @ origin_of(urdf.path, joint)
-        reached = end_of(joint, "child")
         if joint.get("type") in MOVES:
             joints.append(_joint(urdf, joint, before))
             before = np.eye(4)
@@ -147,8 +212,7 @@ def _assemble(
         joints=tuple(joints),
         flange_frame=Placement(**_pose(before)),
         flange=FlangeDetails(standard=standard),
-        volumes=() if missing else tuple(volumes),
-        volumes_missing=missing,
+        volumes_missing=f"the bodies of {urdf.path} were not read; name the URDF in the recipe",
         source=f"URDF {urdf.path.name}",
         **_joint_speed(urdf.path, chain),
     )
@@ -167,7 +231,7 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
     if joint.find("mimic") is not None:
         raise RecipeError(
             f"{urdf.path}: joint '{joint.get('name')}' follows another one (mimic), which is not "
-            "supported between base and flange"
+            f"supported between base and flange; {ARCHIVES}"
         )
     axis, limit = joint.find("axis"), joint.find("limit")
     lower, upper = -2 * np.pi, 2 * np.pi
@@ -182,35 +246,60 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
     )
 
 
-def _volumes(
-    urdf: Urdf, link: str, index: int, pose: Floats, packages: Mapping[str, Path]
-) -> Iterator[Volume]:
-    for collision in urdf.links[link].findall("collision") if link in urdf.links else ():
-        geometry = collision.find("geometry")
-        if geometry is None or not len(geometry):
-            continue
-        placed = pose @ origin_of(urdf.path, collision)
-        capsule = capsule_of(geometry[0], urdf.path, packages)
-        ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
-        start, end = (tuple(map(SI, point)) for point in ends)
-        yield Volume(link=index, start=start, end=end, radius=SI(capsule.radius))
+def _notes(
+    urdf: Urdf, robot: RobotModel, base: str, flange: str, bodies: UrdfBodies
+) -> Iterator[Note]:
+    """Yield which links were taken, and what is odd about them."""
+    yield f"{urdf.path}: base '{base}', flange '{flange}'"
+    if (odd := _sideways(urdf, robot, flange)) is not None:
+        yield odd
+    if without := bodies.without():
+        yield (
+            f"{urdf.path}: {len(without)} of {len(robot.joints) + 1} links have no collision body "
+            f"({', '.join(without)}); a planned move does not keep clear of them"
+        )
 
 
-def _base(urdf: Urdf, asked: str | None) -> str:
-    """Return the base: as asked, the frame ROS-Industrial calls ``base``, or the root."""
+def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
+    """Return a warning where the flange's z is not along the last axis, which says what is."""
+    joint, end = robot.joints[-1], robot.link_T_flange
+    axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
+    # How far the flange is along the axis from the joint before shows which way is outwards.
+    along = axis @ (rotation_from_rpy(*joint.rpy).T @ np.asarray(joint.xyz) + end[:3, 3])
+    seen = end[:3, :3].T @ axis * (-1.0 if along < 0 else 1.0)
+    known = abs(along) > 1e-3
+    off = np.arccos(np.clip(seen[2] if known else abs(seen[2]), -1, 1))
+    if off < OUTWARDS or joint.slides:
+        return None
+    rpy = " ".join(f"{angle:.6g}" for angle in rpy_from_rotation(basis_of_plane(seen).T))
+    name = f"{flange}_face"
+    return Warn(
+        f"{urdf.path}: z of flange '{flange}' is {np.degrees(off):.0f} deg to the last axis, "
+        f"which is {_axis_name(seen)} of '{flange}'; z of a flange points out of its plate",
+        f"name the link whose z does (robot: {{urdf: {urdf.path.name}, flange: LINK}}), or add one "
+        f'to the URDF: <link name="{name}"/><joint name="{name}" type="fixed"><parent '
+        f'link="{flange}"/><child link="{name}"/><origin rpy="{rpy}"/></joint>',
+    )
+
+
+def _axis_name(direction: Floats) -> str:
+    """Return the nearest axis of a frame: x, -y and so on."""
+    k = int(np.argmax(np.abs(direction)))
+    return ("-" if direction[k] < 0 else "") + "xyz"[k]
+
+
+def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
+    """Return the base: as asked, the frame ROS-Industrial calls ``base``, or where the first
+    moving joint stands.
+    """  # noqa: D205
     if asked is not None:
         return _known(urdf, asked, "base")
-    roots = [name for name in urdf.links if name not in urdf.above]
-    named = [
-        name for name in urdf.links if name in ("base", *(f"{p}base" for p in _prefixes(urdf)))
-    ]
-    if len(named) == 1 or len(roots) == 1:
-        return (named or roots)[0]
-    raise RecipeError(f"{urdf.path}: which link is the base? write base: {' or '.join(roots)}")
-
-
-def _prefixes(urdf: Urdf) -> Iterator[str]:
-    return (name.removesuffix("base_link") for name in urdf.links if name.endswith("base_link"))
+    prefixes = [name.removesuffix("base_link") for name in urdf.links if name.endswith("base_link")]
+    named = [name for name in urdf.links if name in ("base", *(f"{p}base" for p in prefixes))]
+    moving = [joint for joint in to_flange if joint.get("type") in MOVES]
+    if not moving:
+        raise RecipeError(f"{urdf.path}: no joint moves between base and flange")
+    return named[0] if len(named) == 1 else end_of(moving[0], "parent")
 
 
 def _flange(urdf: Urdf, asked: str | None) -> str:

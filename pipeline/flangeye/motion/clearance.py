@@ -21,6 +21,7 @@ class ArmVolume:
         Raises:
             StageError: What the arm fills is not known, so nothing can be said to be clear of it.
         """
+        robot = robot.filled()
         if robot.volumes_missing:
             raise StageError(
                 f"the space the arm fills is needed to plan its moves: {robot.volumes_missing}"

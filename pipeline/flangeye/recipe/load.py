@@ -57,7 +57,8 @@ class Recipe:
     @cached_property
     def files(self) -> dict[str, str]:
         """Name -> text of what repeats it elsewhere: itself resolved, and models of its own."""
-        data, models = written_out(self.header, self.context)
+        driven = self.header.robot is not None and self.header.robot.driver is not None
+        data, models = written_out(self.header, self.context, driven or self.archive is None)
         data["steps"] = self._steps_as_data()
         text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
         return {"recipe.resolved.yaml": text, **models}
@@ -78,6 +79,12 @@ class Recipe:
         """Whether its first step plans poses of an arm, which can be shown without a run."""
         needs = self.steps[0].stage.needs.values()
         return any(MotionAllowed in (need, *get_args(need)) for need in needs)
+
+    @property
+    def notes(self) -> tuple[t.Note, ...]:
+        """What was concluded from its own files, for people."""
+        robot = self.context.get(RobotModel)
+        return robot.notes if robot else ()
 
     def data(self) -> dict[str, Any]:
         """Return the same as plain data."""

@@ -31,7 +31,9 @@ def sections(header: Header) -> dict[str, Any]:
     return data
 
 
-def written_out(header: Header, context: Context) -> tuple[dict[str, Any], dict[str, str]]:
+def written_out(
+    header: Header, context: Context, moves: bool
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Return a recipe's sections as data, and the files of the models that are not bundled.
 
     A URDF and a factory calibration become a model's file as well: what was read of them.
@@ -39,17 +41,18 @@ def written_out(header: Header, context: Context) -> tuple[dict[str, Any], dict[
     Args:
         header: The sections.
         context: What they offered.
+        moves: Whether an arm moves, so that the space it fills is needed.
     """
     data = sections(header)
     files = {}
-    for section, key, name, model in _own(data, context):
+    for section, key, name, model in _own(data, context, moves):
         files[f"models/{name}.yaml"] = _text(model)
         section[key] = f"models/{name}.yaml"
     return data, files
 
 
 def _own(
-    data: dict[str, Any], context: Context
+    data: dict[str, Any], context: Context, moves: bool
 ) -> Iterator[tuple[dict[str, Any], str, str, Model]]:
     """Yield each section that names a model of one's own: it, the key, a name, the model."""
     robot = data.get("robot", {})
@@ -57,7 +60,8 @@ def _own(
         link = ("flange",) if "urdf" in robot else ()  # with a model, flange is its plate
         for key in ("urdf", "base", "packages", "factory", *link):
             robot.pop(key, None)
-        yield robot, "model", "robot", context[RobotModel]
+        arm = context[RobotModel]
+        yield robot, "model", "robot", arm.filled() if moves else arm
     if _is_file((second := data.get("second_robot", {})).get("model")):
         yield second, "model", "second_robot", context[SecondRobot].model
     for name, arm in data.get("cell", {}).get("arms", {}).items():

@@ -20,9 +20,14 @@ from flangeye.files.regular import noting_opened, read_regular
 from flangeye.plugin.installed import installed_digest, installed_plugins, package_of
 
 if TYPE_CHECKING:
+    from flangeye.models.robots import RobotModel
     from flangeye.plugin.registry import Registry
 
 SORT = "checks"
+FREEDOMS = 6
+"""Joints that reach a pose in any orientation."""
+SHARES = (0.3, 0.45, 0.6)
+"""Of each joint's range: poses that are looked for again, away from the middle's singular ones."""
 
 
 def recall_verdict(key: str) -> str | None:
@@ -44,15 +49,46 @@ def verdict(path: Path, key: str, registry: Registry, overrides: Sequence[str] =
     """
     from flangeye.models.cell import Cell
     from flangeye.models.configuration import Configuration
+    from flangeye.models.robots import RobotModel
     from flangeye.recipe.load import load_recipe
+    from flangeye.types.notes import as_line
 
     with noting_opened() as opened:
         checked = load_recipe(path, registry, overrides)
+    if checked.plans and RobotModel in checked.context:
+        _require_reached(path, checked.context[RobotModel])
     loop = checked.context.get(Cell) or checked.context[Configuration]
-    text = f"{path}: ok, {len(checked.steps)} steps\n{loop.describe()}"
+    lines = (f"{path}: ok, {len(checked.steps)} steps", loop.describe())
+    text = "\n".join([*lines, *map(as_line, checked.notes)])
     if not overrides and _follows_from_key(path, opened, registry) and key == key_of(path):
         keep(SORT, key, text)
     return text
+
+
+def _require_reached(path: Path, robot: RobotModel) -> None:
+    """Refuse an arm that cannot be sent to the poses of a plan.
+
+    Raises:
+        RecipeError: It has fewer than six joints, or does not find back to poses of its own.
+    """
+    import numpy as np
+
+    from flangeye.maths.kinematics import Arm
+
+    arm = Arm(robot)
+    if arm.n < FREEDOMS:
+        raise RecipeError(
+            f"{path}: robot: {robot.model} has {arm.n} joints, and the poses of a plan need "
+            f"{FREEDOMS}; record poses by hand and read them: robot: {{flange: ISO 9409-1-50-4-M6}}"
+        )
+    low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+    poses = [arm.flange(low + share * (high - low)) for share in SHARES]
+    if not any(len(arm.inverse(pose)) for pose in poses):
+        raise RecipeError(
+            f"{path}: robot: no joint angles of {robot.model} were found for {len(poses)} poses of "
+            "its own, so that it cannot be sent to a plan's; record poses by hand and read them: "
+            "robot: {flange: ISO 9409-1-50-4-M6}"
+        )
 
 
 def key_of(path: Path) -> str:

@@ -101,7 +101,7 @@ def result_of(
         seam=r.seam_result(outcome.seam, scan),
         weld=r.weld_result(outcome.weld, scan),
         simulated=outcome.source.simulated,
-        warnings=r.warnings_result([*outcome.source.notes, *_notes(outcome)]),
+        warnings=r.warnings_result([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),
         notes=t.records_of(_notes(outcome)),
         exports={file.name: file.text for file in outcome.exports},
         timing=_timing(watch),
@@ -144,5 +144,5 @@ def _provenance(outcome: Outcome, recipe: Recipe, registry: Registry) -> r.Prove
         recipe_hash=r.sha256(recipe.resolved()),
         input_hash=outcome.source.fingerprint,
         seed=recipe.header.seed,
-        notes=t.records_of([*outcome.source.notes, *_notes(outcome)]),
+        notes=t.records_of([*recipe.notes, *outcome.source.notes, *_notes(outcome)]),
     )

@@ -48,6 +48,11 @@ Note = Annotated[str, PlainValidator(_note), PlainSerializer(_plain)]
 as a text, and a :class:`Warn` as ``{text, fix}``."""
 
 
+def as_line(note: str) -> str:
+    """Return a note as commands say it: what it is, and what mends it."""
+    return f"warning: {note}; {note.fix}" if isinstance(note, Warn) else f"note: {note}"
+
+
 def warnings_of(notes: Iterable[str]) -> list[Warn]:
     """Return the notes that ask for something."""
     return [note for note in notes if isinstance(note, Warn)]
