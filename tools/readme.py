@@ -1,8 +1,10 @@
-"""Runs the commands the README shows and puts their real output into it: python -m tools.readme"""
+"""Makes the README's console block and its picture from one run: python -m tools.readme"""
 
+import hashlib
 import math
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -10,21 +12,57 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
+PICTURE = ROOT / "pipeline" / "images" / "report.png"
 NUMBER = re.compile(r" *-?\b\d+(?:\.\d+)?\b")
 SHOWN = re.compile(r"<!-- begin (flangeye .*?) -->\n(.*?)<!-- end -->", re.S)
 
 
-def output_of(command: str) -> str:
-    """Return what a command prints, as the README quotes it."""
+STAMP = "flangeye"
+"""Key of the PNG text that holds :func:`stamp`."""
+
+
+def output_of(command: str, picture: Path | None = None) -> str:
+    """Return what a command prints, as the README quotes it; optionally photograph its report."""
     words = shlex.split(command)[1:]
+    run = words[words.index("--out") + 1]
     with tempfile.TemporaryDirectory() as folder:
-        told = subprocess.run(
-            [sys.executable, "-m", "flangeye.cli", *words, "--out", f"{folder}/run"],
-            cwd=ROOT, capture_output=True, text=True, check=True,
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "flangeye.cli", *words],
+            cwd=folder, capture_output=True, text=True, check=True,
         )  # fmt: skip
-    name = words[1].rpartition("/")[2]
-    text = told.stdout.replace(f"{folder}/run/", f"runs/2026-11-21T02-46-14_{name}/")
-    return f"```console\n$ {command}\n{text}```\n"
+        quote = f"```console\n$ {command}\n{done.stdout}```\n"
+        if picture:
+            photograph(Path(folder, run, "report.html"), picture, stamp(quote))
+    return quote
+
+
+def stamp(quote: str) -> str:
+    """Return a hash of all that the picture shows: the run's output, and what draws its report."""
+    drawn = ("report.html.j2", "report.css", "report.js", "look.py", "summary.py")
+    texts = [(ROOT / "pipeline/flangeye/report" / name).read_text() for name in drawn]
+    return hashlib.sha256("".join([quote, *texts]).encode()).hexdigest()
+
+
+def photograph(page: Path, picture: Path, text: str) -> None:
+    """Write what a browser shows of a page, with a text in the PNG."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
+        tab = browser.new_page(viewport={"width": 1280, "height": 1280})
+        tab.goto(page.as_uri())
+        tab.wait_for_timeout(3000)  # plots are drawn after the page has loaded
+        tab.screenshot(path=picture)
+        browser.close()
+    info = PngInfo()
+    info.add_text(STAMP, text)
+    with Image.open(picture) as drawn:
+        drawn.convert("P", palette=Image.Palette.ADAPTIVE).save(
+            picture, pnginfo=info, optimize=True
+        )
 
 
 def shown() -> dict[str, str]:
@@ -50,5 +88,5 @@ def same(shown: str, printed: str) -> bool:
 if __name__ == "__main__":
     text = README.read_text()
     README.write_text(
-        SHOWN.sub(lambda m: f"<!-- begin {m[1]} -->\n{output_of(m[1])}<!-- end -->", text)
+        SHOWN.sub(lambda m: f"<!-- begin {m[1]} -->\n{output_of(m[1], PICTURE)}<!-- end -->", text)
     )

@@ -16,7 +16,7 @@ from flangeye.doctor.diagnosis import Finding
 from flangeye.errors import FlangeyeError
 from flangeye.report.account import set_aside_of
 from flangeye.report.facts import Facts
-from flangeye.report.summary import headlines_of, transform_text, verdict_of
+from flangeye.report.summary import banner_of, tiles_of, transform_text
 from flangeye.report.units import millimetres
 from flangeye.result import expected_error
 from flangeye.run.outlook import Outlook, outlook_of_log
@@ -68,7 +68,7 @@ async def _load(project: Project, run: Path, place: ui.column, show: Show) -> No
 
 
 def _show(project: Project, run: Path, facts: Facts) -> None:
-    found = verdict_of(facts)
+    found = banner_of(facts)
     tone = TONES.get(found.kind, "text-negative")
     ui.label(f"{found.label}: {found.sentence}").classes(f"text-h6 {tone}").props('role="status"')
     for line in warnings_of(facts):
@@ -98,7 +98,7 @@ def warnings_of(facts: Facts) -> list[str]:
 
 def _matrix(facts: Facts) -> None:
     with ui.row().classes("gap-6"):
-        for figure in headlines_of(facts):
+        for figure in tiles_of(facts):
             with ui.column().classes("gap-0"):
                 ui.label(figure.name).classes("text-caption")
                 ui.label(f"{figure.value} {figure.unit}").classes("text-h6")

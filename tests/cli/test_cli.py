@@ -371,7 +371,7 @@ def test_notes_for_the_record_are_shown_on_request_only(
     assert "refined" not in out + err
     assert "note: refined" in flangeye("show", "here")[1]
     page = (tmp_path / "here" / "report.html").read_text()
-    assert page.index("<li>refined</li>") < page.index('class="headlines"')
+    assert page.index("<li>refined</li>") > page.index('id="how"')
 
 
 def test_a_runs_folder_is_as_good_as_its_log(

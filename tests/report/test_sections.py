@@ -7,6 +7,7 @@ import io
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from flangeye.report import write_report
 from flangeye.report.account import idle_of, set_aside_of, timings_of, without_numbers
 from flangeye.report.facts import facts_of
 from flangeye.report.page import render
-from flangeye.report.summary import headlines_of, transform_text, verdict_of
+from flangeye.report.summary import banner_of, evidence_of, next_steps_of, tiles_of, transform_text
 from flangeye.report.units import degrees, duration, millimetres
 from flangeye.result import StageTiming
 
@@ -38,24 +39,22 @@ def test_a_verified_run_says_so_first(make_run: Make) -> None:
     text = text_of(make_run())
     assert text.startswith("Verified: UR5 and PhoXi M, simulated flangeye calibration report")
     assert "Held-out error 0.312 mm rms, within the limit of 1 mm" in text
-    assert "Held-out rms 0.312 mm on poses left out, 5 folds" in text
+    assert "Held-out error 0.31 mm rms, 5 folds, poses the solver never saw" in text
     assert "Poses used 12 of 12 captures" in text
     assert "Nothing was rejected." in text
 
 
-def test_headlines_carry_units_and_what_they_are_taken_over(make_run: Make) -> None:
+def test_the_evidence_carries_units_and_what_they_are_taken_over(make_run: Make) -> None:
     log = make_run()
     result = facts_of(log).result
-    shown = {(h.name, h.note): (h.value, h.unit) for h in headlines_of(facts_of(log))}
+    shown = {(h.name, h.note): (h.value, h.unit) for h in evidence_of(facts_of(log))}
     assert result.workspace is not None
     assert result.truth is not None
     predicted = millimetres(result.workspace.predicted_p95)
-    assert shown["Predicted error", "95 % of errors over the workspace are below"] == (
-        predicted,
-        "mm",
-    )
+    note = "95 % of the errors over the workspace below; the covariance of the pose alone"
+    assert shown["Pose alone", note] == (predicted, "mm")
     true = millimetres(result.truth.rms_over_workspace)
-    assert shown["True error", "rms over the workspace; the simulation knows"] == (true, "mm")
+    assert shown["True error", "rms over the workspace, known in simulation"] == (true, "mm")
 
 
 def test_the_matrix_can_be_copied_and_read_back(make_run: Make) -> None:
@@ -95,8 +94,8 @@ def test_a_refusal_comes_first_and_its_matrix_is_not_offered(make_run: Make) -> 
     log = make_run(verified=False, refused="held-out error 3.1 mm rms, above the limit of 1 mm")
     text = text_of(log)
     assert text.startswith("Refused: ")
-    assert "Refused Held-out error 3.1 mm rms, above the limit of 1 mm" in text
-    assert "The numbers are here to find out why, not to be used." in text
+    assert "REFUSED Held-out error 3.1 mm rms, above the limit of 1 mm" in text
+    assert "Refused: use these numbers to find the cause, not to drive the arm." in text
     assert "data-copies=" not in render(log).partition("<main>")[2].partition("<script>")[0]
 
 
@@ -104,23 +103,41 @@ def test_refused_before_solving_shows_no_residuals(make_run: Make) -> None:
     log = make_run(solved=False, refused="the flange's centres lie on a line")
     text = text_of(log)
     assert "There is no matrix: the solver gave none." in text
-    assert "There are no residuals, for there is no estimate." in text
+    assert "There is no estimate, so there are no residuals." in text
     assert "Circles measured 12 of 12 captures" in text
     assert "Nothing was rejected." in text
 
 
 def test_without_a_verify_step_it_says_what_that_means(make_run: Make) -> None:
-    verdict = verdict_of(facts_of(make_run(verified=None)))
+    verdict = banner_of(facts_of(make_run(verified=None)))
     assert (verdict.label, verdict.sentence) == (
         "Not verified",
         "No verify step checked this calibration; check it before anything relies on it",
     )
 
 
+def test_a_simulated_run_says_so_in_its_first_line(make_run: Make) -> None:
+    facts = facts_of(make_run())
+    real, simulated = (
+        facts.result.model_copy(update={"simulated": said}) for said in (False, True)
+    )
+    assert "SIMULATED" not in banner_of(replace(facts, result=real)).figures
+    assert "SIMULATED" in banner_of(replace(facts, result=simulated)).figures
+
+
+def test_what_to_do_next_depends_on_the_verdict(make_run: Make) -> None:
+    good = [command.split()[1] for _, command in next_steps_of(facts_of(make_run()))]
+    assert good == ["export", "touch", "monitor"]
+    bad = next_steps_of(facts_of(make_run(verified=False, refused="3 mm")))
+    assert [command.split()[1] for _, command in bad] == ["doctor"]
+    torn = next_steps_of(facts_of(make_run(finished=False)))
+    assert [command.split()[1] for _, command in torn] == ["show", "run"]
+
+
 def test_captures_kept_for_verification_are_counted(make_run: Make) -> None:
     log = make_run()
     log.poses["pose-03"]["role"] = "verification"
-    assert headlines_of(facts_of(log))[-1].note == "of 12 captures, and 1 kept for verification"
+    assert tiles_of(facts_of(log))[-1].note == "of 12 captures, 1 kept for verification"
 
 
 def test_what_was_rejected_is_counted_and_listed(make_run: Make) -> None:
@@ -140,7 +157,7 @@ def test_what_was_rejected_is_counted_and_listed(make_run: Make) -> None:
         "pose-08", "solve.svd", "residual 41.2 mm is beyond the gate",
     )  # fmt: skip
     text = text_of(log)
-    expected = "3 of 12 captures were not used: 2 set aside before solving, 1 by the solver."
+    expected = "3 of 12 captures were not used: 2 rejected before solving, 1 by the solver."
     assert expected in text
 
 
@@ -187,7 +204,7 @@ def test_notes_provenance_and_recipe_are_there(make_run: Make) -> None:
 def test_a_run_from_centres_has_no_clouds_but_all_else(make_run: Make) -> None:
     log = make_run(clouds=False, truth=False)
     text = text_of(log)
-    assert "The log holds no flange clouds with a fitted circle" in text
+    assert "The log holds no clouds with a fitted circle" in text
     assert "True error" not in text
     assert 'id="figure-cell"' in render(log)
     assert 'id="figure-cloud-1"' not in render(log)
@@ -197,7 +214,7 @@ def test_a_killed_run_shows_what_there_is(make_run: Make) -> None:
     log = make_run(finished=False, solved=False)
     text = text_of(log)
     assert (
-        "Incomplete The run ended before its result was written: 12 of 12 captures were finished, "
+        "INCOMPLETE The run ended before its result was written: 12 of 12 captures were finished, "
         "the solver had not finished; this is what the log holds"
     ) in text
     assert "Incomplete: A test" in text

@@ -75,14 +75,12 @@ def say_report(log: Path, out: Path | None = None) -> None:
     """
     from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
     from flangeye.log.read import read_run
-    from flangeye.plugin.registry import load_registry
     from flangeye.report import write_report
 
     read = read_run(log)
     path = out or read.path.parent / "report.html"
     require_gathered(read)
-    exports = load_registry().exports()
     with of_foreign(read.path, "no report can be made of it"):
-        write_report(read, path, exports)
+        write_report(read, path)
     say(path)
     name_damage(read)

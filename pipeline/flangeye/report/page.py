@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flangeye.files.bundled import VERSION
 from flangeye.files.written import write_whole
 from flangeye.log.read import RunLog
-from flangeye.plugin.stage import Stage
 from flangeye.report.account import idle_of, provenance_of, set_aside_of, timings_of
 from flangeye.report.cell import cell_drawing
 from flangeye.report.checks import drawings_of
 from flangeye.report.clouds import cloud_panels
-from flangeye.report.exports import exported
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.graph import graph_drawing
 from flangeye.report.images import image_view, missed_view
-from flangeye.report.look import css
+from flangeye.report.look import LOGO, css
 from flangeye.report.plotly_js import packed_plotly, plotly_js
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
 from flangeye.report.space import workspace_drawing
-from flangeye.report.summary import TransformText, headlines_of, transform_text, verdict_of
+from flangeye.report.summary import (
+    TransformText,
+    banner_of,
+    evidence_of,
+    next_steps_of,
+    tiles_of,
+    transform_text,
+)
 from flangeye.report.units import degrees, figure, millimetres, percent
 from flangeye.report.weld import weld_drawing
 
@@ -36,15 +40,12 @@ DRAWN = frozenset({"bar", "scatter", "scatter3d"})
 """The kinds of traces in a report."""
 
 
-def write_report(
-    log: RunLog, path: Path, exports: Sequence[Stage] = (), library: Path | None = None
-) -> None:
+def write_report(log: RunLog, path: Path, library: Path | None = None) -> None:
     """Write the report of a run, finished or not, as one HTML file that needs nothing else.
 
     Args:
         log: What :func:`flangeye.log.read.read_run` gave.
         path: The file to write.
-        exports: The formats in which the matrix can be copied, besides itself.
         library: A copy of plotly.js that several reports share, for example those of a batch; it
             is written if it is not there. Without it the page holds one.
 
@@ -54,14 +55,13 @@ def write_report(
     shared = None if library is None else os.path.relpath(library, path.parent)
     if library is not None and not library.exists():
         write_whole(library, plotly_js())
-    write_whole(path, render(log, exports, shared))
+    write_whole(path, render(log, shared))
 
 
-def render(log: RunLog, exports: Sequence[Stage] = (), library: str | None = None) -> str:
+def render(log: RunLog, library: str | None = None) -> str:
     """Return the page as text; see :func:`write_report`."""
     content = _content(facts_of(log))
     content |= {"library": library, "plotly_js": "" if library else packed_plotly(DRAWN)}
-    content |= {"exports": exported(content["result"], exports)}
     return _environment().get_template("report.html.j2").render(content)
 
 
@@ -79,8 +79,11 @@ def _content(facts: Facts) -> dict[str, Any]:
     return {
         "facts": facts,
         "result": facts.result,
-        "verdict": verdict_of(facts),
-        "headlines": headlines_of(facts),
+        "verdict": banner_of(facts),
+        "tiles": tiles_of(facts),
+        "evidence": evidence_of(facts),
+        "next_steps": next_steps_of(facts),
+        "logo": LOGO,
         "transforms": [transform_text(*item) for item in facts.result.transforms.items()],
         "corrected": _corrected(facts),
         "errors": errors,

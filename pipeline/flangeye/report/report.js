@@ -92,13 +92,6 @@
 
   for (const button of document.querySelectorAll("[data-copies]"))
     button.addEventListener("click", () => copy(button));
-  const tabs = [...document.querySelectorAll("[role=tab]")];
-  for (const tab of tabs) tab.addEventListener("click", () => {
-    for (const each of tabs) {
-      each.setAttribute("aria-selected", each === tab);
-      document.getElementById(each.getAttribute("aria-controls")).hidden = each !== tab;
-    }
-  });
   dark.addEventListener("change", retheme);
   addEventListener("beforeprint", fitPaper);
   drawAll();

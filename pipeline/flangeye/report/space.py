@@ -78,7 +78,7 @@ def _predicted(grid: Floats, sigma: Floats) -> Trace:
         "size": 5, "color": packed(sigma * 1e3), "colorscale": "Viridis", "colorbar": bar,
     }  # fmt: skip
     return scatter3d(
-        grid, "markers", marker=marker, name="predicted error", hoverinfo="text",
+        grid, "markers", marker=marker, name="pose alone", hoverinfo="text",
         hovertext=[f"predicted {millimetres(float(s))} mm" for s in sigma],
     )  # fmt: skip
 

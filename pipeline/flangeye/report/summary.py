@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from flangeye import result as r
 from flangeye import types as t
 from flangeye.maths.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.report.facts import INCOMPLETE, Facts
-from flangeye.report.units import degrees, millimetres
+from flangeye.report.units import degrees, millimetres, rounded_mm
 
 UNKNOWN = "not measured"
 _FRAMES = {
@@ -24,32 +25,43 @@ _FRAMES = {
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The first thing to read.
+class Banner:
+    """The first line of the report.
 
     Attributes:
         kind: verified, unverified, refused or incomplete; also a CSS class.
         label: One or two words.
-        sentence: What it means, or why.
+        figures: Expected error, limit, and whether it is simulated.
+        sentence: What the verdict means, or its reason.
     """
 
     kind: str
     label: str
+    figures: list[str]
     sentence: str
 
 
-def verdict_of(facts: Facts) -> Verdict:
+def banner_of(facts: Facts) -> Banner:
     """Return the verdict and what it means for whoever wants to use the matrix."""
     result = facts.result
+    figures = ["SIMULATED"] if result.simulated else []
     if result.status == "refused":
-        return Verdict("refused", "Refused", _sentence(result.refused or "no reason was given"))
+        reason = result.refused or "no reason was given"
+        return Banner("refused", "Refused", figures, _sentence(reason))
     if result.status == INCOMPLETE:
-        return Verdict(INCOMPLETE, "Incomplete", _sentence(_how_far(facts)))
+        return Banner(INCOMPLETE, "Incomplete", figures, _sentence(_how_far(facts)))
+    if found := r.expected_error(result):
+        figures = [f"{rounded_mm(found[0])} mm expected", *_limit(result), *figures]
     if result.status == "verified":
         reasons = "; ".join(v.reason for v in result.verifications.values())
-        return Verdict("verified", "Verified", _sentence(reasons))
+        return Banner("verified", "Verified", figures, _sentence(reasons))
     advice = "no verify step checked this calibration; check it before anything relies on it"
-    return Verdict("unverified", "Not verified", _sentence(advice))
+    return Banner("unverified", "Not verified", figures, _sentence(advice))
+
+
+def _limit(result: r.Result) -> list[str]:
+    limit = result.holdout and result.holdout.figures.get("limit")
+    return [f"limit {rounded_mm(limit)} mm"] if limit else []
 
 
 def _sentence(reason: str) -> str:
@@ -68,8 +80,8 @@ def _how_far(facts: Facts) -> str:
 
 
 @dataclass(frozen=True)
-class Headline:
-    """One headline number.
+class Figure:
+    """One number of a tile or of the evidence.
 
     Attributes:
         name: What it is.
@@ -84,53 +96,68 @@ class Headline:
     note: str
 
 
-def headlines_of(facts: Facts) -> list[Headline]:
-    """Return the numbers that decide whether to trust the matrix, errors first."""
-    result = facts.result
-    figures = []
+def tiles_of(facts: Facts) -> list[Figure]:
+    """Return the three numbers that decide whether to trust the matrix."""
+    result, tiles = facts.result, []
+    if found := r.expected_error(result):
+        rms, bound = found
+        note = "rms" if bound is None else f"95 % below {rounded_mm(bound)} mm"
+        tiles.append(Figure("Expected error at the work", rounded_mm(rms), "mm", note))
     if held := result.holdout:
-        note = f"on poses left out, {held.folds} folds, over all poses"
-        for name, value in (("rms", held.rms), ("median", held.median), ("95 %", held.p95)):
-            figures.append(Headline(f"Held-out {name}", millimetres(value), "mm", note))
-        if held.figures.get("outliers"):
-            value, note = (
-                held.figures["rms_inliers"],
-                f"without {held.figures['outliers']:.0f} outliers",
-            )
-            figures.append(Headline("Held-out rms", millimetres(value), "mm", note))
-    figures += _expected(result)
+        note = f"rms, {held.folds} folds, poses the solver never saw"
+        tiles.append(Figure("Held-out error", rounded_mm(held.rms), "mm", note))
+    return [*tiles, _poses(facts)]
+
+
+def evidence_of(facts: Facts) -> list[Figure]:
+    """Return the other errors that the report states, each with what it is taken over."""
+    result, found = facts.result, []
+    answers = result.answers
+    if answers and answers.corrected and answers.corrected.expected_rms is not None:
+        value = millimetres(answers.corrected.expected_rms)
+        found.append(Figure("Expected, arm corrected", value, "mm", "rms, with its correction"))
+    if held := result.holdout:
+        if outliers := held.figures.get("outliers"):
+            value = millimetres(held.figures["rms_inliers"])
+            found.append(Figure("Held-out", value, "mm", f"without {outliers:.0f} outliers"))
+        found.append(Figure("Held-out", millimetres(held.median), "mm", "median"))
+        found.append(Figure("Held-out", millimetres(held.p95), "mm", "95 % below"))
     if box := result.workspace:
-        note = "95 % of errors over the workspace are below"
-        figures.append(Headline("Predicted error", millimetres(box.predicted_p95), "mm", note))
+        note = "95 % of the errors over the workspace below; the covariance of the pose alone"
+        found.append(Figure("Pose alone", millimetres(box.predicted_p95), "mm", note))
     if truth := result.truth:
-        over = "rms over the workspace; the simulation knows"
-        figures.append(Headline("True error", millimetres(truth.rms_over_workspace), "mm", over))
+        over = "rms over the workspace, known in simulation"
+        found.append(Figure("True error", millimetres(truth.rms_over_workspace), "mm", over))
         centre = f"at the workspace's centre; rotation {degrees(truth.rotation_error)}°"
-        figures.append(Headline("True error", millimetres(truth.error_at_centroid), "mm", centre))
-    return [*figures, _poses(facts)]
+        found.append(Figure("True error", millimetres(truth.error_at_centroid), "mm", centre))
+    return found
 
 
-def _expected(result: r.Result) -> list[Headline]:
-    """Return the error to expect at the work, of both answers where there are two."""
-    if result.answers is None:
-        return []
-    named = {"the arm as its controller reports it": result.answers.as_reported}
-    if result.answers.corrected:
-        named["the arm corrected, with the pose that belongs to it"] = result.answers.corrected
+def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
+    """Return what to do next: a purpose, and its command."""
+    run = shlex.quote(str(facts.log.path.parent.name or "."))
+    if facts.result.status == "refused":
+        return [("Find the cause", f"flangeye doctor {run}/{facts.log.path.name}")]
+    if facts.result.status == INCOMPLETE:
+        return [
+            ("Assess the poses so far", f"flangeye show {run} --outlook"),
+            ("Continue a live run", f"flangeye run --resume {run} --move"),
+        ]
+    touch = f"flangeye touch {run} --seen 'X, Y, Z' --tip 'X, Y, Z' --move"
     return [
-        Headline("Expected at the work", millimetres(answer.expected_rms), "mm", f"rms; {note}")
-        for note, answer in named.items()
-        if answer.expected_rms is not None
+        ("Use the matrix", f"flangeye export {run} --to ros2_launch"),
+        ("Check it by touch", touch),
+        ("Watch it for drift", f"flangeye monitor {run} --archive LATER_SCANS"),
     ]
 
 
-def _poses(facts: Facts) -> Headline:
+def _poses(facts: Facts) -> Figure:
     poses = facts.result.observations
     kept = sum(meta["role"] == "verification" for meta in facts.log.poses.values())
-    note = f"of {len(poses)} captures" + (f", and {kept} kept for verification" if kept else "")
+    note = f"of {len(poses)} captures" + (f", {kept} kept for verification" if kept else "")
     if facts.estimate is None:
-        return Headline("Circles measured", str(len(facts.measured)), "", note)
-    return Headline("Poses used", str(sum(o.used for o in poses)), "", note)
+        return Figure("Circles measured", str(len(facts.measured)), "", note)
+    return Figure("Poses used", str(sum(o.used for o in poses)), "", note)
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,7 @@ def record_run(
         result = runner.run(start.point)
         folder.write(result, recipe.files)
         if report:
-            write_report(
-                read_run(folder.log), folder.path / "report.html", registry.exports(), library
-            )
+            write_report(read_run(folder.log), folder.path / "report.html", library)
     return result
 
 

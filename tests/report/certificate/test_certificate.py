@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 from flangeye.cli.commands import app
 from flangeye.errors import StageError
+from flangeye.log.read import read_run
 from flangeye.maths.geometry import covariance_at
 from flangeye.models.loading import load_model
 from flangeye.report.certificate import (
@@ -23,7 +25,8 @@ from flangeye.report.certificate import (
     write_certificate,
 )
 from flangeye.report.certificate.budget import shares_of
-from flangeye.report.certificate.page import sandbox
+from flangeye.report.certificate.page import render, sandbox, standard_text
+from flangeye.report.facts import facts_of
 from flangeye.report.units import millimetres
 from flangeye.result import Result
 from tests.report.conftest import WORKSPACE, Script, scripted
@@ -40,7 +43,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(run: Path) -> Result:
-    from flangeye.log.read import read_run
 
     return Result.model_validate(read_run(run / "run.mcap").result)
 
@@ -158,3 +160,51 @@ def test_the_browser_keeps_its_sandbox_but_for_root(monkeypatch: pytest.MonkeyPa
     assert sandbox() == []
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert sandbox() == ["--no-sandbox"]
+
+
+def test_printed_rows_reconcile_to_the_printed_total(run: Path, tmp_path: Path) -> None:
+    page = write_certificate(run, tmp_path / "c.html", Conditions(spread=8.0)).read_text()
+    _, use = re.findall(r"<tbody>((?:(?!<tbody>).)*)</tbody>\s*<tfoot>(.*?)</tfoot>", page, re.S)
+    parts = [_numbers(row)[-3:] for row in use[0].split("</tr>") if "<tr>" in row]
+    total = _numbers(use[1].split("</tr>")[0])
+    # Rows of one table are independent along each axis, each printed to half a micrometre.
+    rows = np.sqrt((np.array(parts) ** 2).sum(axis=0))
+    np.testing.assert_allclose(rows, total, atol=0.0005 * np.sqrt(len(parts)) + 0.0005)
+
+
+def _numbers(row: str) -> list[float]:
+    cells = re.findall(r'<td class="n">(.*?)</td>', row)
+    plain = [re.sub(r"below |< | mm|°", "", cell).replace("–", "0") for cell in cells]
+    return [float(cell) for cell in plain]
+
+
+def test_no_uncertainty_is_printed_as_zero(result: Result, run: Path, tmp_path: Path) -> None:
+    quiet = result.model_copy(deep=True)
+    assert quiet.holdout and quiet.workspace
+    quiet.holdout.rms = quiet.workspace.predicted_rms
+    for each in quiet.observations:
+        each.residual_in_base = [0.0, 0.0, 0.0]
+    arm = next(s for s in shares_of(quiet) if s.cause == "arm, pose by pose")
+    (one, *_) = [
+        c for c in use_budget_of(quiet, SCANNER).contributions if c.name.startswith("Arm and scan")
+    ]
+    for row in (arm, one):
+        assert row.bound
+        assert re.fullmatch(r"below 0\.\d*[1-9]\d* mm", standard_text(row))
+    assert f"below {re.findall('[0-9.]+', arm.evidence)[0]}" in arm.evidence
+    text = write_certificate(run, tmp_path / "c.html", Conditions()).read_text()
+    assert not re.search(r'<td class="n">0\.0+( mm|°)?</td>', text)
+
+
+def test_a_simulation_has_a_watermark_and_nothing_to_sign(run: Path, tmp_path: Path) -> None:
+    facts = facts_of(read_run(run / "run.mcap"))
+    pages = [
+        render(
+            replace(facts, result=facts.result.model_copy(update={"simulated": simulated})),
+            Conditions(),
+        )
+        for simulated in (True, False)
+    ]
+    assert ['class="watermark"' in page for page in pages] == [True, False]
+    assert ["Calibrated by" in page for page in pages] == [False, True]
+    assert ["not a certificate" in page for page in pages] == [True, False]

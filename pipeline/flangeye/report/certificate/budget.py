@@ -9,7 +9,7 @@ point :math:`p` is moved by :math:`\varphi \times (p - q) + \tau`, so the sensit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -64,6 +64,7 @@ class Contribution:
         sensitivity: (3,) derivative of the point's coordinates by it.
         freedom: Degrees of freedom; infinite where it is taken as known.
         evidence: Where the figure comes from.
+        bound: Whether the series shows no such error: ``standard`` is then what it could hide.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Contribution:
     sensitivity: Floats
     freedom: float
     evidence: str
+    bound: bool = False
 
     @property
     def size(self) -> float:
@@ -182,11 +184,19 @@ def use_budget_of(
 
 @dataclass(frozen=True)
 class Share:
-    """How much of the calibration's variance at the work one cause explains."""
+    """How much of the calibration's variance at the work one cause explains.
+
+    Attributes:
+        cause: The cause.
+        standard: Its part, one standard uncertainty [m].
+        evidence: Where the figure comes from.
+        bound: Whether the residuals show no such error: ``standard`` is what they could hide.
+    """
 
     cause: str
     standard: float
     evidence: str
+    bound: bool = False
 
 
 def shares_of(result: Result) -> list[Share]:
@@ -201,14 +211,16 @@ def shares_of(result: Result) -> list[Share]:
     total = float(np.sum(budget_of(result).standard ** 2))
     if len(used) < 3:
         return [Share("all causes", np.sqrt(total), _evidence(result))]
-    scans, arm, noise = _averaged(used, estimate, point)
+    scans, arm, noise, bound = _averaged(used, estimate, point)
     scale = min(1.0, total / (scans + arm))
     n = len(used)
+    below = "below " if bound else ""
     return [
         Share("scans, fit by fit", np.sqrt(scale * scans), f"covariances of {n} fitted centres"),
         Share(
             "arm, pose by pose", np.sqrt(scale * arm),
-            f"residuals beyond them, {np.sqrt(noise) * 1e3:.3f} mm per axis over {n} poses",
+            f"residuals beyond them, {below}{np.sqrt(noise) * 1e3:.3f} mm per axis over {n} poses",
+            bound,
         ),
         Share(
             "common to all poses", np.sqrt(max(total - scale * (scans + arm), 0.0)),
@@ -219,8 +231,12 @@ def shares_of(result: Result) -> list[Share]:
 
 def _averaged(
     used: Sequence[ObservationResult], estimate: TransformResult, point: Floats
-) -> tuple[float, float, float]:
-    """Return the variances [m^2] at ``point`` from the scans and the arm, and the arm's own."""
+) -> tuple[float, float, float, bool]:
+    """Return the variances [m^2] at ``point`` from the scans and the arm, and the arm's own.
+
+    Where the residuals show nothing beyond the scans' own covariances, the arm's is what they could
+    hide, and the last value is true.
+    """
     turn = np.array(estimate.matrix)[:3, :3]
     own = turn @ np.array([o.covariance for o in used]) @ turn.T
     seen = np.array([o.centre_in_camera for o in used], dtype=float)
@@ -229,13 +245,20 @@ def _averaged(
         places = np.array([o.tcp_in_base for o in used], dtype=float)
     residuals = np.array([o.residual_in_base for o in used], dtype=float)
     noise = excess_variance(residuals, own)
+    hidden = _standard_error(float(np.trace(own, axis1=1, axis2=2).mean() / 3), 3 * len(used))
+    bound, noise = noise < hidden, max(noise, hidden)
     weights = np.linalg.inv(own + max(noise, 1e-14) * np.eye(3))
     rows = _motions(places, np.array(estimate.about))
     information = np.einsum("nia,nij,njb->ab", rows, weights, rows)
     gains = np.linalg.pinv(information) @ rows.transpose(0, 2, 1) @ weights
     moved = _motions(point[None], np.array(estimate.about))[0] @ gains
     scans = np.einsum("nia,nab,nib->", moved, own, moved)
-    return float(scans), float(noise * np.sum(moved**2)), noise
+    return float(scans), float(noise * np.sum(moved**2)), noise, bound
+
+
+def _standard_error(variance: float, count: int) -> float:
+    """Return the standard error of a variance estimated from ``count`` Gaussian values."""
+    return variance * float(np.sqrt(2 / max(count, 1)))
 
 
 def _motions(points: Floats, about: Floats) -> Floats:
@@ -281,9 +304,12 @@ def _of_one_pose(result: Result) -> list[Contribution]:
     if held is None or box is None:
         return []
     poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
-    beyond = max(held.rms**2 - box.predicted_rms**2, 0.0)
+    hidden = _standard_error(held.rms**2, int(3 * poses))
+    beyond = held.rms**2 - box.predicted_rms**2
+    standard = np.sqrt(max(beyond, hidden) / 3)
     evidence = f"held-out error {held.rms * 1e3:.3f} mm rms beyond the calibration's own"
-    return _each_axis("Arm and scan at one pose", "A", np.sqrt(beyond / 3), evidence, 3 * poses)
+    rows = _each_axis("Arm and scan at one pose", "A", standard, evidence, 3 * poses)
+    return [replace(row, bound=beyond < hidden) for row in rows]
 
 
 def _distortion(scanner: ScannerModel) -> tuple[str, Literal["B"], float, str]:

@@ -19,13 +19,24 @@ from flangeye.models.loading import load_model
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.own_models import carried_files
 from flangeye.report.account import provenance_of
-from flangeye.report.certificate.budget import Conditions, budget_of, shares_of, use_budget_of
+from flangeye.report.certificate.budget import (
+    Conditions,
+    Contribution,
+    Share,
+    budget_of,
+    shares_of,
+    use_budget_of,
+)
 from flangeye.report.facts import Facts, facts_of
 from flangeye.report.look import css
 from flangeye.report.summary import transform_text
 from flangeye.report.units import degrees, millimetres
-from flangeye.result import result_of_camera, status_of
+from flangeye.result import expected_error, result_of_camera, status_of
 
+LEAST_LENGTH = 1e-6
+"""Smallest uncertainty that is printed as a number [m]; the page shows three decimals of a mm."""
+LEAST_ANGLE = 1.75e-6
+"""Smallest uncertainty that is printed as a number [rad]: 0.0001 degrees."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -89,8 +100,23 @@ def render(facts: Facts, conditions: Conditions) -> str:
         lstrip_blocks=True,
     )
     environment.globals["look"] = css
-    environment.filters |= {"mm": millimetres, "deg": degrees}
+    environment.filters |= {"mm": millimetres, "standard": standard_text, "part": part_text}
     return environment.get_template("certificate.html.j2").render(_content(facts, conditions))
+
+
+def standard_text(row: Contribution | Share) -> str:
+    """Return a standard uncertainty with its unit; one that is only bounded says so."""
+    angle = isinstance(row, Contribution) and row.unit == "rad"
+    shown, least = (degrees, LEAST_ANGLE) if angle else (millimetres, LEAST_LENGTH)
+    bound = row.standard < least or row.bound
+    return f"{'below ' if bound else ''}{shown(max(row.standard, least))}{'°' if angle else ' mm'}"
+
+
+def part_text(metres: float) -> str:
+    """Return how far one contribution moves the point along an axis [mm]."""
+    if metres == 0:
+        return "–"
+    return millimetres(metres) if abs(metres) >= LEAST_LENGTH / 2 else "< 0.001"
 
 
 def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
@@ -106,6 +132,7 @@ def _content(facts: Facts, conditions: Conditions) -> dict[str, Any]:
         "transform": transform_text(*next(iter(result.transforms.items()))),
         "objects": _objects(header, scanner),
         "conditions": conditions,
+        "expected": expected_error(result),
         "used": sum(o.used for o in result.observations),
         "provenance": provenance_of(facts),
         "version": VERSION,
