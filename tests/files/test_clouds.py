@@ -246,7 +246,7 @@ def npy(array: np.ndarray, tmp_path: Path) -> bytes:
 
 DEFECTS = {
     "empty": ("a.pcd", b"", "is empty (0 bytes)"),
-    "another format": ("a.stl", b"solid", "'.stl' is not a point cloud; known: .csv, .npy, .pcd, "
+    "another format": ("a.abc", b"solid", "'.abc' is not a point cloud; known: .csv, .npy, .pcd, "
                        ".ply, .pts, .txt, .xyz"),
     "not pcd": ("a.pcd", b"hello\nworld\n", "is not a PCD file: its header has no DATA line"),
     "not ply": ("a.ply", b"hello\nworld\n", "is not a PLY file: its header has no end_header line"),
@@ -473,3 +473,71 @@ def test_a_pointer_of_git_lfs_is_named_as_such(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
     with pytest.raises(StageError, match="a Git LFS pointer, not the file itself; fetch it: git l"):
         read_cloud(tmp_path / "a.pcd")
+
+
+MISSING: dict[str, tuple[list[float | None], str]] = {
+    "zeros": ([0, 0, 0], "(0, 0, 0)"),
+    "a number of no place": ([-10000, -10000, -10000], "(-10000, -10000, -10000)"),
+    "a far depth": ([None, None, 65535], "a depth of 65535"),
+}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".xyz", ".pcd"])
+@pytest.mark.parametrize("name", MISSING)
+def test_numbers_that_stand_for_missing_points_are_missing(
+    tmp_path: Path, name: str, suffix: str
+) -> None:
+    sentinel, shown = MISSING[name]
+    rng = np.random.default_rng(0)
+    xyz = (rng.random((3000, 3)) * [400, 300, 100] + [0, 0, 800]).astype(np.float32)
+    gone = rng.random(len(xyz)) < 0.6
+    for axis, value in enumerate(sentinel):
+        if value is not None:
+            xyz[gone, axis] = value
+    path = tmp_path / f"scan{suffix}"
+    if suffix == ".ply":
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xyz)}\n"
+        head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        path.write_bytes(head.encode() + xyz.tobytes())
+    elif suffix == ".npy":
+        np.save(path, xyz)
+    elif suffix == ".xyz":
+        np.savetxt(path, xyz, fmt="%.6g")
+    else:
+        write_cloud(path, PointCloud(CAMERA, xyz))
+    told: list[str] = []
+    read = read_cloud(path, "mm", told.append)
+    assert np.array_equal(np.isnan(read.xyz).all(axis=1), gone)
+    assert told == [f"scan{suffix}: {gone.sum()} of 3000 points have {shown}: taken as missing"]
+
+
+@pytest.mark.parametrize("change", [lambda xyz: xyz, lambda xyz: xyz * [1, 1, 0] + [0, 0, 800]])
+def test_points_on_a_plane_are_not_missing(tmp_path: Path, change: Any) -> None:
+    xyz = np.random.default_rng(0).random((3000, 3)) * 400
+    np.save(tmp_path / "a.npy", change(xyz))
+    told: list[str] = []
+    assert np.isfinite(read_cloud(tmp_path / "a.npy", told=told.append).xyz).all()
+    assert not told
+
+
+def test_a_viewpoint_is_said_and_applied_on_request(tmp_path: Path) -> None:
+    path, xyz = tmp_path / "a.pcd", np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    write_cloud(path, PointCloud(CAMERA, xyz))
+    raw = path.read_bytes()
+    half = np.sqrt(0.5)
+    words = f"0.5 0 1 {half:.9f} 0 0 {half:.9f}".encode()  # a quarter turn about z
+    path.write_bytes(raw.replace(b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT " + words))
+    told: list[str] = []
+    assert np.allclose(read_cloud(path, told=told.append).xyz, xyz)
+    assert "VIEWPOINT 0.5 0 1 0.707107 0 0 0.707107 is not applied" in told[0]
+    seen = read_cloud(path, from_viewpoint=True).xyz
+    assert np.allclose(seen, [[2, -0.5, 2], [5, -3.5, 5]], atol=1e-6)
+    path.write_bytes(raw.replace(b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 0 0 0 9 0 0 0"))
+    with pytest.raises(StageError, match="VIEWPOINT 0 0 0 9 0 0 0: no position and quaternion"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".las", ".e57"])
+def test_other_kinds_are_named_with_their_conversion(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(StageError, match=f"save it as .ply|as .ply: CloudCompare -O .*a{suffix}"):
+        read_cloud(tmp_path / f"a{suffix}")

@@ -62,6 +62,10 @@ class ArchiveParams(OpeningParams):
         description="Unit of the clouds. auto: what the layout says, else metres or millimetres, "
         "whichever fits the scanner's range; either is reported.",
     )
+    viewpoint: bool = Field(
+        False, description="Whether points stand in the frame in which a PCD's VIEWPOINT has the "
+        "scanner; they are turned into the scanner's."
+    )  # fmt: skip
     unreadable: Literal["refuse", "reject"] = Field(
         "refuse",
         description="What to do about a cloud that cannot be read: refuse the archive, or set the "
@@ -96,13 +100,13 @@ def acquire_archive(
     digests = digests_of(r.cloud for r in usable if r.cloud)
     check_distinct_clouds(usable, digests)
     scanner = scanner or ScannerData(model="the scanner")
-    unit, unit_told = _unit(recorded, usable, params.unit, scanner)
+    unit, unit_told = _unit(recorded, usable, params, scanner)
     images = [r.image for r in usable if r.image]
     digests |= digests_of([*recorded.files, *images])
-    told = [*notes, unit_told, *_camera_note(usable, params.camera)]
+    told = [*notes, *unit_told, *_camera_note(usable, params.camera)]
     source = source_of(recorded, told, digests)
     return Captures(
-        _captures(usable, unit, scanner, params.camera, cell),
+        _captures(usable, unit, scanner, params, cell),
         source,
         total=len(usable),
         recorded=True,
@@ -144,26 +148,30 @@ def _clouds(recordings: Iterable[Recording]) -> Iterator[tuple[Recording, Path]]
 
 
 def _unit(
-    archive: Archive, usable: Sequence[Recording], stated: StatedUnit, scanner: ScannerData
-) -> tuple[LengthUnit, str]:
-    """Return the unit of the clouds and the note that reports it."""
-    path, raw = _first_distance(archive.root, usable)
+    archive: Archive, usable: Sequence[Recording], params: ArchiveParams, scanner: ScannerData
+) -> tuple[LengthUnit, list[str]]:
+    """Return the unit of the clouds and the notes on the first of them."""
+    told: list[str] = []
+    path, raw = _first_distance(archive.root, usable, params.viewpoint, told)
     unit: LengthUnit
-    if stated != "auto":
-        unit, how = stated, "as stated"
+    if params.unit != "auto":
+        unit, how = params.unit, "as stated"
     elif archive.cloud_unit is not None:
         unit, how = archive.cloud_unit, "as the layout says"
     else:
         unit, how = detect_unit(path, raw, scanner), "detected"
     distance = raw / PER_METRE[unit]
     check_unit(path, distance, unit, scanner)
-    return unit, unit_note(unit, how, distance, scanner)
+    return unit, [*told, unit_note(unit, how, distance, scanner)]
 
 
-def _first_distance(root: Path, usable: Sequence[Recording]) -> tuple[Path, float]:
+def _first_distance(
+    root: Path, usable: Sequence[Recording], from_viewpoint: bool, told: list[str]
+) -> tuple[Path, float]:
     """Return the first cloud with a finite point, and its median distance in its own unit."""
     for _, path in _clouds(usable):
-        raw = median_distance(read_cloud(path))
+        told.clear()
+        raw = median_distance(read_cloud(path, "m", told.append, from_viewpoint))
         if math.isfinite(raw):
             return path, raw
     raise StageError(f"{root}: none of its {len(usable)} clouds has a finite point (all NaN)")
@@ -173,12 +181,12 @@ def _captures(
     usable: Iterable[Recording],
     unit: LengthUnit,
     scanner: ScannerData,
-    camera: CameraParams | None,
+    params: ArchiveParams,
     cell: Cell | None,
 ) -> Iterator[Capture]:
     """Read one cloud at a time, and the image beside it."""
     for recording, path in _clouds(usable):
-        cloud = read_cloud(path, unit)
+        cloud = read_cloud(path, unit, from_viewpoint=params.viewpoint)
         check_unit(path, median_distance(cloud), unit, scanner)
         yield Capture(
             recording.id,
@@ -187,7 +195,7 @@ def _captures(
             recording.joints,
             recording.time_ns,
             recording.role,
-            _image(recording, cloud, camera),
+            _image(recording, cloud, params.camera),
             recording.seen_by,
             recording.saw,
             recording.motion,

@@ -75,9 +75,9 @@ def test_clouds_are_read_one_at_a_time(
 ) -> None:
     read = []
 
-    def noted(path, *unit):
+    def noted(path, *unit, **options):
         read.append(path)
-        return read_cloud(path, *unit)
+        return read_cloud(path, *unit, **options)
 
     monkeypatch.setattr(module, "read_cloud", noted)
     stream = iter(acquire())

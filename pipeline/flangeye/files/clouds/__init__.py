@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 
 from flangeye.files.clouds.header import refuse
-from flangeye.files.clouds.pcd import open_pcd
+from flangeye.files.clouds.missing import mark_missing
+from flangeye.files.clouds.pcd import Viewpoint, open_pcd
 from flangeye.files.clouds.plain import array_of, holds_numbers, load_npy, open_npy, open_text
 from flangeye.files.clouds.ply import open_ply
 from flangeye.files.clouds.table import PointTable
@@ -25,6 +26,7 @@ from flangeye.types import CAMERA, PointCloud
 
 __all__ = [
     "CLOUD_SUFFIXES",
+    "CONVERSIONS",
     "PER_METRE",
     "LengthUnit",
     "array_of",
@@ -50,14 +52,36 @@ _OPENERS: Mapping[str, Callable[[Path], PointTable]] = {
 }
 CLOUD_SUFFIXES = tuple(_OPENERS)
 """Endings of the files that can be read."""
+_SAVE = "-C_EXPORT_FMT PLY -SAVE_CLOUDS"
+CONVERSIONS: Mapping[str, str] = {
+    ".e57": "is an E57 scan, which is not read; save it as .ply: CloudCompare -O {file} " + _SAVE,
+    **dict.fromkeys(
+        (".las", ".laz"),
+        "is a LAS scan, which is not read; save it as .ply: CloudCompare -O {file} " + _SAVE,
+    ),
+    **dict.fromkeys(
+        (".stl", ".obj"),
+        "is a mesh, not a scan; sample it to points as .ply: CloudCompare -O {file} "
+        "-SAMPLE_MESH POINTS 1000000 " + _SAVE,
+    ),
+}
+"""Ending -> what such a file is, and the command that turns it into one that can be read."""
 
 
-def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
+def read_cloud(
+    path: Path,
+    unit: LengthUnit = "m",
+    told: Callable[[str], None] | None = None,
+    from_viewpoint: bool = False,
+) -> PointCloud:
     """Read a point cloud.
 
     Args:
         path: A file with one of :data:`CLOUD_SUFFIXES`.
         unit: Unit of the file's coordinates, where its heading does not state one.
+        told: Takes what was concluded of it: numbers that stand for missing points, and a
+            VIEWPOINT of the file that is not the identity.
+        from_viewpoint: Whether to turn the points into the frame of the file's VIEWPOINT.
 
     Returns:
         The points in ``camera`` [m], organised (H, W, 3) if the file is; a missing point is NaN.
@@ -68,6 +92,14 @@ def read_cloud(path: Path, unit: LengthUnit = "m") -> PointCloud:
     with at_hand(path):
         table = _open(path)
         xyz = table.decode()
+    xyz = xyz if xyz.flags.writeable else xyz.copy()
+    missing = mark_missing(xyz)
+    viewpoint: Viewpoint | None = getattr(table, "viewpoint", None)
+    if viewpoint is not None and from_viewpoint:
+        xyz = viewpoint.seen_from(xyz)
+    for note in (missing, viewpoint.note(from_viewpoint) if viewpoint else ""):
+        if note and told:
+            told(f"{path.name}: {note}")
     stated = next((known for known in PER_METRE if known == getattr(table, "unit", "")), unit)
     if stated != "m":
         xyz /= np.float32(PER_METRE[stated])  # exact to the last bit, which times 0.001 is not
@@ -102,7 +134,9 @@ def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
 
 
 def _open(path: Path) -> PointTable:
-    opener = _OPENERS.get(path.suffix.lower())
+    opener, other = _OPENERS.get(path.suffix.lower()), CONVERSIONS.get(path.suffix.lower())
+    if other is not None:
+        refuse(path, other.format(file=path))
     if opener is None:
         refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(_OPENERS)}")
     table = opener(path)

@@ -1,23 +1,60 @@
 """PCD, the format of the Point Cloud Library (its file format documentation, version 0.7).
 
-The viewpoint is not applied: points are taken in the frame they are written in.
+Points are taken in the frame they are written in; a viewpoint is applied on request only.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from flangeye.files.clouds.header import axes_of, count_of, refuse, split_header
-from flangeye.files.clouds.table import BinaryTable, CompressedTable, PointTable, Shape, TextTable
+from flangeye.files.clouds.table import (
+    BinaryTable,
+    CompressedTable,
+    Points,
+    PointTable,
+    Shape,
+    TextTable,
+)
+from flangeye.maths.geometry import rotation_from_quaternion
 
 _KINDS = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
 MAX_RECORD = 65536
+IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
 Header = Mapping[str, list[str]]
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where the file says the scanner stood, in the frame of its points and their unit.
+
+    Attributes:
+        words: Position and quaternion, w first, as written.
+    """
+
+    words: tuple[float, ...]
+
+    def seen_from(self, xyz: Points) -> Points:
+        """Return points (N, 3) in the scanner's frame."""
+        w, x, y, z = self.words[3:]
+        turn = rotation_from_quaternion(np.array([x, y, z, w]))
+        return np.asarray((xyz - np.array(self.words[:3])) @ turn, dtype=np.float32)
+
+    def note(self, applied: bool) -> str:
+        """Return what to say of it."""
+        shown = f"VIEWPOINT {' '.join(f'{word:g}' for word in self.words)}"
+        if applied:
+            return f"points turned into the scanner's frame by {shown}"
+        return (
+            f"{shown} is not applied; if the points stand in another frame than the scanner's, "
+            "write viewpoint: true"
+        )
 
 
 def open_pcd(path: Path) -> PointTable:
@@ -34,17 +71,34 @@ def open_pcd(path: Path) -> PointTable:
     counts = _counts(path, header, len(names))
     record = _record(path, header, counts, axes)
     encoding = _words(path, header, "DATA")[0]
+    viewpoint = _viewpoint(path, header)
     if encoding == "ascii":
-        columns = [sum(counts[:axis]) for axis in axes]
-        n = math.prod(shape)
-        return TextTable(
-            path, shape, offset, sum(counts), (columns[0], columns[1], columns[2]), 0, n
-        )
+        x, y, z = (sum(counts[:axis]) for axis in axes)
+        n, width = math.prod(shape), sum(counts)
+        return replace(TextTable(path, shape, offset, width, (x, y, z), 0, n), viewpoint=viewpoint)
     if encoding == "binary":
-        return BinaryTable(path, shape, offset, record)
+        return BinaryTable(path, shape, offset, record, viewpoint)
     if encoding == "binary_compressed":
-        return CompressedTable(path, shape, offset, record)
+        return CompressedTable(path, shape, offset, record, viewpoint)
     refuse(path, f"its header says DATA {encoding}; known: ascii, binary, binary_compressed")
+
+
+def _viewpoint(path: Path, header: Header) -> Viewpoint | None:
+    """Return the viewpoint; None for the identity, or where there is none."""
+    words = header.get("VIEWPOINT")
+    if not words or [float(word) for word in words if _is_number(word)] == IDENTITY:
+        return None
+    numbers = tuple(float(word) for word in words if _is_number(word))
+    if len(numbers) != len(words) or len(numbers) != 7 or abs(math.hypot(*numbers[3:]) - 1) > 1e-3:
+        refuse(path, f"its header says VIEWPOINT {' '.join(words)}: no position and quaternion")
+    return Viewpoint(numbers)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
 
 
 def _words(path: Path, header: Header, key: str) -> list[str]:

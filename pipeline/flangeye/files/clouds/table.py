@@ -52,6 +52,7 @@ class TextTable:
         delimiter: What separates values, white space if None.
         unit: Of the coordinates, where a heading states it; else empty.
         comma: Whether decimals are behind a comma.
+        viewpoint: As for :class:`BinaryTable`.
     """
 
     path: Path
@@ -64,6 +65,7 @@ class TextTable:
     delimiter: str | None = None
     unit: str = ""
     comma: bool = False
+    viewpoint: Any = None
 
     def check(self) -> None:
         """Count the rows, and the values of the last one."""
@@ -113,12 +115,14 @@ class BinaryTable:
         shape: (N,) or (H, W).
         offset: Byte at which the records begin.
         record: Layout of a record, with fields ``x``, ``y``, ``z``.
+        viewpoint: Where the file says the scanner stood; None where it does not.
     """
 
     path: Path
     shape: Shape
     offset: int
     record: np.dtype[np.void]
+    viewpoint: Any = None
 
     def check(self) -> None:
         """Compare bytes; more than the records need is padding, which writers leave."""
@@ -152,12 +156,14 @@ class CompressedTable:
         shape: (N,) or (H, W).
         offset: Byte at which the two sizes and the stream begin.
         record: Layout one point would have, with fields ``x``, ``y``, ``z``.
+        viewpoint: As for :class:`BinaryTable`.
     """
 
     path: Path
     shape: Shape
     offset: int
     record: np.dtype[np.void]
+    viewpoint: Any = None
 
     def check(self) -> None:
         """Hold the two stated sizes against the header and the file."""

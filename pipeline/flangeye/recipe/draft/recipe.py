@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.files.clouds import read_cloud
+from flangeye.files.clouds import CONVERSIONS, read_cloud
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
 from flangeye.files.tables import tables_in
@@ -43,16 +43,7 @@ CLOSED = (".parquet", ".feather", ".pkl", ".pickle", ".xlsx", ".xls", ".ods")
 CONVERTED = {
     ".bag": "is a ROS 1 bag; convert it: pip install rosbags && "
     "rosbags-convert --src {file} --dst {stem}",
-    ".e57": "is an E57 scan, which is not read; save it as .ply: pip install pye57 open3d, or "
-    "open it in CloudCompare (CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
-    ".las": "is a LAS scan, which is not read; save it as .ply "
-    "(CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
-    ".laz": "is a LAS scan, which is not read; save it as .ply "
-    "(CloudCompare -O {file} -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
-    ".stl": "is a mesh, not a scan; sample it to points as .ply "
-    "(CloudCompare -O {file} -SAMPLE_MESH POINTS 1000000 -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
-    ".obj": "is a mesh, not a scan; sample it to points as .ply "
-    "(CloudCompare -O {file} -SAMPLE_MESH POINTS 1000000 -C_EXPORT_FMT PLY -SAVE_CLOUDS)",
+    **CONVERSIONS,
 }
 """Recordings that other programs turn into what is read, and how."""
 
@@ -295,14 +286,15 @@ def _summary(archive: Archive, reader: Any) -> list[str]:
 
 
 def _of_cloud(path: Path) -> str:
-    cloud = read_cloud(path)
+    notes: list[str] = []
+    cloud = read_cloud(path, told=notes.append)
     size = " x ".join(map(str, reversed(cloud.xyz.shape[:-1])))
     far = median_distance(cloud)
     try:
         unit = detect_unit(path, far, ScannerData(model="the scanner"))
     except StageError as error:
         return str(error)
-    return f"{path.name}: {size} points, at {far:.4g} {unit} (median)"
+    return "; ".join([f"{path.name}: {size} points, at {far:.4g} {unit} (median)", *notes])
 
 
 def _yaml(data: Mapping[str, Any]) -> str:
