@@ -60,8 +60,8 @@ class Calibration(Model):
     source: str
 
 
-class Finger(Model):
-    """A finger and its torch."""
+class FingerGeometry(Model):
+    """Where tag, camera, tip and torch of a finger are."""
 
     model: str
     tag: Tag
@@ -73,18 +73,7 @@ class Finger(Model):
     torch: Length = param(gt=0, description="How far the torch is behind the tip (||d||).")
     torch_aside: Length = param("0 mm", description="How far the torch is left of the tool's x.")
     torch_up: Length = param("0 mm", description="How far the torch's end is above the tip.")
-    torch_sigma: Length = param(
-        "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."
-    )
-    along_sigma: Length = param(
-        "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
-    )
-    tip_sigma: Length = param(
-        "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
-    )
     radius: Length = param(gt=0, description="Radius of the tip's ball.")
-    travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
-    calibration: Calibration | None = None
     source: str
 
     @property
@@ -97,6 +86,22 @@ class Finger(Model):
     def torch_from_tip(self) -> Floats:
         """(3,) from the tip to the torch, in the tool's axes [m]."""
         return np.array([-self.torch, self.torch_aside, self.torch_up])
+
+
+class Finger(FingerGeometry):
+    """What is known of a finger and its torch, and how well."""
+
+    torch_sigma: Length = param(
+        "0.05 mm", ge=0, description="Standard deviation of the torch across the tool."
+    )
+    along_sigma: Length = param(
+        "0.3 mm", ge=0, description="Standard deviation of the distance from the torch to the tip."
+    )
+    tip_sigma: Length = param(
+        "0.1 mm", ge=0, description="Standard deviation of the tip, along each axis of the flange."
+    )
+    travel: Length = param("6 mm", gt=0, description="How far the tip may be displaced.")
+    calibration: Calibration | None = None
 
     def force(self, displacement: Floats) -> float | None:
         """Return the force of a tip displaced by (3,) in the tool's axes [N], if it is known."""

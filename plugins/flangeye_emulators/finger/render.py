@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.maths.geometry import rotation_exp, rotation_log
-from flangeye.models.finger import Finger
+from flangeye.models.finger import FingerGeometry
 from flangeye.types import Floats, Image
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
@@ -86,7 +86,7 @@ def typical_compliance() -> Compliance:
 class FingerCamera:
     """Renders the tag of one finger."""
 
-    def __init__(self, finger: Finger, optics: Optics, rng: np.random.Generator) -> None:
+    def __init__(self, finger: FingerGeometry, optics: Optics, rng: np.random.Generator) -> None:
         """Print the tag; every image draws its noise from ``rng``."""
         import cv2
 

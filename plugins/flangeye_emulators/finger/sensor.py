@@ -9,6 +9,7 @@ from flangeye.devices import Device, DeviceError, SensorFrame, StateSource, Tact
 from flangeye.errors import StageError
 from flangeye.maths.geometry import rigid, rotation_from_rpy
 from flangeye.models.finger import Finger
+from flangeye.models.model import read_model
 from flangeye.models.workpiece import CadSeam, WorkpiecePath, load_workpiece
 from flangeye.motion.seam_following import ToolPose
 from flangeye.plugin.stage import Params, part
@@ -17,7 +18,7 @@ from flangeye.units import Angle, Duration, Length, param
 from flangeye_emulators.finger.render import FingerCamera, Optics, typical_compliance
 from flangeye_emulators.weld_world.clock import Shutter
 from flangeye_emulators.weld_world.groove import Section, Tip
-from flangeye_emulators.weld_world.settings import GapParams, WorldParams
+from flangeye_emulators.weld_world.settings import GapParams, ToolFile, ToolPath, WorldParams
 from flangeye_emulators.weld_world.world import Nominal, WeldWorld
 from flangeye_emulators.world import room
 from flangeye_plugins.weld.corners import corners_of
@@ -34,8 +35,11 @@ class SectionParams(Params):
 
 
 class SimulatedFingerParams(Params):
-    """Parameters of ``sensor.simulated_finger``."""
+    """Parameters of ``sensor.simulated_finger``: the world, whatever the controller's files say."""
 
+    tool: ToolPath = param(
+        "srm", description="The true finger and torch: one of data/worlds, or a .yaml file."
+    )
     workpiece: WorkpiecePath = param(
         "v-straight", description="One of data/workpieces, or a .yaml file of one's own."
     )
@@ -88,10 +92,9 @@ class SimulatedFinger(Device):
         tool: Where the tool truly is in the plane of the groove. A stage must not look.
     """
 
-    def __init__(
-        self, finger: Finger, robot: StateSource, seed: Seed, params: SimulatedFingerParams
-    ) -> None:
-        """Lay the workpiece down and mount the finger."""
+    def __init__(self, robot: StateSource, seed: Seed, params: SimulatedFingerParams) -> None:
+        """Lay the workpiece down and mount the true finger."""
+        finger = read_model(params.tool, ToolFile)
         self.name = f"simulated finger {finger.model}"
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._plane, nominal = _as_planned(finger, params)
@@ -188,7 +191,7 @@ def _truth(params: SimulatedFingerParams) -> WorldParams:
     )
 
 
-def _as_planned(finger: Finger, params: SimulatedFingerParams) -> tuple[WorkPlane, Nominal]:
+def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkPlane, Nominal]:
     """Return the plane of the work, and the seam as its CAD has it."""
     workpiece = load_workpiece(params.workpiece)
     if params.seam not in workpiece.seams:
@@ -205,7 +208,7 @@ def _as_planned(finger: Finger, params: SimulatedFingerParams) -> tuple[WorkPlan
         kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
         points = points[kept]
         plane = WorkPlane(points, openings[kept])
-    tip = Tip(radius=finger.radius)
+    tip = Tip(finger.radius, finger.lateral, finger.axial)
     return plane, Nominal(
         plane.points(points), _section(seam, params), tip, finger.torch_from_tip, np.eye(3)
     )
@@ -225,5 +228,13 @@ def _section(seam: CadSeam, params: SimulatedFingerParams) -> Section:
 def sensor_simulated_finger(
     finger: Finger, robot: StateSource, seed: Seed, params: SimulatedFingerParams
 ) -> TactileSensor:
-    """A compliant finger in a groove, simulated, on whatever arm the recipe drives."""
-    return SimulatedFinger(finger, robot, seed, params)
+    """A compliant finger in a groove, simulated, on whatever arm the recipe drives.
+
+    Args:
+        finger: What the controller knows of it: nothing here depends on it.
+        robot: Carries it.
+        seed: Of noise and of the world's own chance.
+        params: The world.
+    """
+    del finger
+    return SimulatedFinger(robot, seed, params)

@@ -1,11 +1,27 @@
-"""What is true in a simulated weld and differs from the controller's files; all zero by default."""
+"""What is true in a simulated weld: its tool's file, and by how much the rest is off."""
 
 from __future__ import annotations
 
-from pydantic import Field
+from pathlib import Path
+from typing import Annotated
 
+from pydantic import BeforeValidator, Field
+
+from flangeye.files.paths import WHOLE, bundled_file
+from flangeye.models.finger import FingerGeometry
 from flangeye.plugin.stage import Params
-from flangeye.units import Angle, Duration, Length, param
+from flangeye.units import Angle, Duration, Length, Stiffness, param
+
+
+class ToolFile(FingerGeometry):
+    """A world's finger and torch as they really are, in a file that no controller reads."""
+
+    lateral: Stiffness = param(gt=0, description="Across the finger, at its tip.")
+    axial: Stiffness = param(gt=0, description="Along the finger.")
+
+
+ToolPath = Annotated[Path, BeforeValidator(bundled_file("true tool", "worlds")), WHOLE]
+"""A parameter that names a world's tool: a bundled one, or a file beside the recipe."""
 
 
 class ArmTruth(Params):
@@ -22,7 +38,7 @@ class ArmTruth(Params):
 
 
 class ToolTruth(Params):
-    """Where tip and torch really are, beside where the finger's file puts them."""
+    """Where tip and torch really are, beside where the world's file puts them."""
 
     tip: tuple[Length, Length, Length] = param(
         ("0 mm", "0 mm", "0 mm"), description="Tip: ahead, to the left, up."
@@ -40,8 +56,10 @@ class ToolTruth(Params):
 class FingerTruth(Params):
     """How the finger deforms, and what its tag shows of it."""
 
-    lateral: float = Field(1.0, gt=0, description="Stiffness across, as a share of the file's.")
-    axial: float = Field(1.0, gt=0, description="Stiffness along, as a share of the file's.")
+    lateral: float = Field(
+        1.0, gt=0, description="Stiffness across, as a share of the world file's."
+    )
+    axial: float = Field(1.0, gt=0, description="Stiffness along, as a share of the world file's.")
     gain: float = Field(0.0, description="The tag shows displacements larger by this share.")
     drift: float = Field(0.0, description="Change of the gain in 60 s, as it warms.")
     rest: tuple[Length, Length, Length] = param(

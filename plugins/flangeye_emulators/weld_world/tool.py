@@ -14,7 +14,7 @@ class TrueTool:
     """Tip and torch of a tool whose file is wrong."""
 
     def __init__(self, truth: ToolTruth, torch: Floats) -> None:
-        """Take the file's torch (3,) from the tip, in the tool's axes [m]."""
+        """Take the world file's torch (3,) from the tip, in the tool's axes [m]."""
         self._tip = turned(np.asarray(truth.tip, dtype=np.float64), truth.yaw)
         aside = np.array([*truth.torch, truth.tip[2]])
         self._leans = leaning(truth.work, truth.travel)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye.files.bundled import bundled
+from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.finger.sensor import SimulatedFingerParams, sensor_simulated_finger
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
-from tests.plugins.weld.cell import HOME, MODEL
+from tests.plugins.weld.cell import HOME, MODEL, planned, run, true_line
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 
@@ -56,3 +58,60 @@ def test_the_torch_is_told_beside_the_plan_as_it_lies_beside_the_true_seam(workp
         told.append(float((torch[:2] - foot.point) @ foot.normal))
     np.testing.assert_allclose(told, off, rtol=0.03, atol=0.03e-3)
     assert np.ptp(off) > 1.5e-3
+
+
+# --- truth of its own ------------------------------------------------------------------------------
+
+
+def edited() -> list[tuple[str, Finger]]:
+    """The controller's file with each of its measures changed, one after the other."""
+    calibration = FINGER.calibration
+    assert calibration is not None
+    gain = tuple(tuple(1.5 * x for x in row) for row in calibration.gain)
+    known = calibration.model_copy(
+        update={"gain": gain, "rest": (1e-3, 2e-3, 40e-3), "lateral": 3e3, "axial": 1e3}
+    )
+    changes: dict[str, Any] = {
+        "model": "another", "tag": FINGER.tag.model_copy(update={"side": 9e-3, "id": 3}),
+        "camera": FINGER.camera.model_copy(update={"focal": (500.0, 510.0), "width": 300}),
+        "tip": (3e-3, -3e-3, 185e-3), "direction": 0.1, "torch": 45e-3, "torch_aside": 5e-3,
+        "torch_up": 2e-3, "torch_sigma": 1e-3, "along_sigma": 1e-3, "tip_sigma": 1e-3,
+        "radius": 2e-3, "travel": 9e-3, "calibration": known, "source": "guessed",
+    }  # fmt: skip
+    assert set(changes) == set(Finger.model_fields)
+    return [(name, FINGER.model_copy(update={name: value})) for name, value in changes.items()]
+
+
+def happenings(finger: Finger) -> list[Any]:
+    """All that a world does while an arm moves through it, as bytes."""
+    robot = SimulatedRobot(MODEL, SimulatedParams(period="16 ms", joints=HOME))
+    given = SimulatedFingerParams.model_validate({"latency": "0 ms", "jitter": "0 ms"})
+    sensor: Any = sensor_simulated_finger.function(finger, robot, 5, given)
+    seen = [sensor.name, sensor.camera_matrix.tobytes()]
+    for _ in range(12):
+        robot.move_velocity(np.array([0.01, 0.02, -0.03, 0.0, 0.0, 0.1]), 1.0)
+        robot.wait_cycle()
+        frame = sensor.frame()
+        if frame is not None:
+            seen += [frame.image.pixels.tobytes(), frame.time_ns]
+        seen += [sensor.world.tip.tobytes(), sensor.world.torch.tobytes(), sensor.world.off]
+    assert len(seen) > 2 + 3 * 12  # images came
+    return seen
+
+
+@pytest.mark.parametrize(("name", "finger"), edited())
+def test_no_measure_in_the_controller_s_file_moves_the_world(name: str, finger: Finger) -> None:
+    assert happenings(finger) == happenings(FINGER), name
+
+
+@pytest.mark.parametrize("wrong", [3, 5])
+def test_a_torch_that_the_file_has_wrong_is_scored_as_far_off(wrong: int, tmp_path: Path) -> None:
+    text = (bundled("data") / "fingers" / "srm.yaml").read_text()
+    file = tmp_path / "wrong.yaml"
+    file.write_text(f"{text}torch_aside: {wrong} mm\n")
+    report, _ = run(planned("v-straight", end=0.05), finger=str(file))
+    off = torch_deviation(report.true_torch, true_line("v-straight", 0.05)[5:], report.opening)
+    if report.figures["share_welded"]:
+        assert np.median(off) == pytest.approx(wrong * 1e-3, abs=0.3e-3)
+    else:
+        assert not report.completed

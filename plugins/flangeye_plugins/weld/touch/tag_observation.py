@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.models.finger import Finger
+from flangeye.models.finger import Finger, FingerGeometry
 from flangeye.types import Floats, Image
 
 CORNER_SIGMA = 0.1
@@ -118,7 +118,7 @@ class TagDetector:
         return rotation, translation
 
 
-def dictionary_of(finger: Finger) -> Any:
+def dictionary_of(finger: FingerGeometry) -> Any:
     """Return OpenCV's dictionary of the finger's tag.
 
     Raises:
