@@ -3,6 +3,7 @@
 import socket
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +147,39 @@ def test_foxglove_is_served_the_same_messages(log: Any) -> None:
     advertised = next(text for text in told if "advertise" in str(text))
     for topic in ("/capture/cloud", "/tf", "/step/2.fit.toy", "foxglove.PointCloud"):
         assert topic in str(advertised)
+
+
+@pytest.mark.parametrize(
+    ("origin", "lets_in"),
+    [
+        (None, True),
+        ("https://app.foxglove.dev", True),
+        ("file://", True),
+        ("null", False),
+        ("https://evil.example", False),
+        ("https://app.foxglove.dev.evil.example", False),
+        ("http://localhost:8080", False),
+    ],
+)
+def test_no_other_page_than_foxgloves_own_may_look(origin: str | None, lets_in: bool) -> None:
+    pytest.importorskip("foxglove")
+    websockets = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import InvalidStatus
+
+    from flangeye.log.watch.server import foxglove_server
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    refused = nullcontext() if lets_in else pytest.raises(InvalidStatus, match="403")
+    with (
+        foxglove_server(port),
+        refused,
+        websockets.connect(
+            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], origin=origin
+        ) as viewer,
+    ):
+        assert "serverInfo" in viewer.recv(timeout=10)
 
 
 def test_a_port_that_is_taken_is_one_line(log: Any) -> None:

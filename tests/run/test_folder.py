@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -38,13 +40,29 @@ def test_runs_of_the_same_second_are_kept_apart(
 
 def test_a_folder_that_was_named_is_taken_if_it_is_empty(tmp_path: Path) -> None:
     folder = RunFolder.create("toy", tmp_path / "new" / "run")
-    assert folder.path.is_dir()
-    assert RunFolder.create("toy", folder.path).path == folder.path
-    folder.log.touch()
+    assert folder.log.read_bytes() == b""
     with pytest.raises(FolderError, match="run: already holds files; name a new or empty folder"):
         RunFolder.create("toy", folder.path)
     with pytest.raises(FolderError, match=r"run.mcap: cannot be made: File exists"):
         RunFolder.create("toy", folder.log)
+    (tmp_path / "empty").mkdir()
+    assert RunFolder.create("toy", tmp_path / "empty").log.exists()
+
+
+def test_of_many_that_want_one_folder_at_once_one_gets_it(tmp_path: Path) -> None:
+    begin = threading.Barrier(8)
+
+    def claim(_: int) -> bool:
+        begin.wait()
+        try:
+            RunFolder.create("toy", tmp_path / "run")
+        except FolderError as error:
+            assert str(error).endswith("run: already holds files; name a new or empty folder")
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(claim, range(8))) == 1
 
 
 def test_a_run_without_a_result_leaves_no_empty_folders_and_takes_no_other(
@@ -70,7 +88,7 @@ def test_only_a_calibration_that_was_not_refused_is_there_for_other_programs(
         folder.write(result.model_copy(update=changes), {"recipe.resolved.yaml": "title: Toy\n"})
         return {str(p.relative_to(folder.path)) for p in folder.path.rglob("*") if p.is_file()}
 
-    always = {"recipe.resolved.yaml", "result.json"}
+    always = {"recipe.resolved.yaml", "result.json", "run.mcap"}
     exports = {"exports/cell.urdf"}
     assert written("whole", exports={"cell.urdf": "<robot/>"}) == (
         always | {"calibration.yaml"} | exports

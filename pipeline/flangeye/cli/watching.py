@@ -13,7 +13,6 @@ from flangeye.cli.console import say
 
 if TYPE_CHECKING:
     from flangeye.doctor.monitor import Check, StoredCalibration
-    from flangeye.doctor.monitor.history import Finding
     from flangeye.plugin.registry import Registry
 
 
@@ -31,7 +30,7 @@ Move = Annotated[
 ]
 HistoryFile = Annotated[
     Path | None,
-    typer.Option(help="History file; default monitor.parquet beside the calibration's log."),
+    typer.Option(help="History file; default monitor.jsonl beside the calibration's log."),
 ]
 
 
@@ -58,6 +57,13 @@ def monitor(  # noqa: PLR0913  one argument an option
         str | None,
         typer.Option(metavar="URL,NODE", help="Write the state to an OPC UA node."),
     ] = None,
+    opcua_security: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POLICY,MODE,CERTIFICATE,KEY",
+            help="OPC UA security for a server on another machine; none for an open connection.",
+        ),
+    ] = None,
 ) -> None:
     """Check whether a calibration still holds.
 
@@ -69,10 +75,12 @@ def monitor(  # noqa: PLR0913  one argument an option
         CODES,
         History,
         as_json,
+        only_user,
         stored_calibration,
         take,
         write_chart,
     )
+    from flangeye.doctor.monitor.opcua import write_state
     from flangeye.errors import StageError
     from flangeye.handeye.drift import DriftTest
     from flangeye.units import parse_quantity
@@ -84,16 +92,20 @@ def monitor(  # noqa: PLR0913  one argument an option
         test = DriftTest(false_alarms=false_alarms, limit=parse_quantity(limit, "length"))
     except ValueError as error:
         raise StageError(f"--limit: {error}") from None
+    url, node = _opcua_node(opcua, opcua_security) if opcua else ("", "")
     stored = stored_calibration(calibration)
-    kept = History.read(history or stored.path.parent / "monitor.parquet", stored.key)
+    place = history or stored.path.parent / "monitor.jsonl"
+    kept = History.read(place, stored.key)
     registry = load_plugins()
     for check in _checks(stored, registry, archive, (scans, move), overrides or ()):
-        finding = take(stored, kept, check, test)
-        kept.write()
+        with only_user(place):
+            kept = History.read(place, stored.key)
+            finding = take(stored, kept, check, test)
+            kept.write()
         say(as_json(kept, finding))
     write_chart(kept, test, kept.path.with_suffix(".html"))
     if opcua:
-        _tell(opcua, kept.findings[-1])
+        write_state(url, node, kept.findings[-1], opcua_security)
     raise typer.Exit(CODES[kept.findings[-1].state])
 
 
@@ -112,11 +124,12 @@ def _checks(
         yield from_arm(stored, registry, *live, overrides)
 
 
-def _tell(opcua: str, finding: Finding) -> None:
-    from flangeye.doctor.monitor.opcua import write_state
+def _opcua_node(opcua: str, security: str | None) -> tuple[str, str]:
+    from flangeye.doctor.monitor.opcua import require_secured
     from flangeye.errors import StageError
 
     url, comma, node = opcua.partition(",")
     if not comma:
         raise StageError(f"--opcua {opcua}: give URL,NODE: opc.tcp://plc:4840,ns=2;s=flangeye")
-    write_state(url, node, finding)
+    require_secured(url, security)
+    return url, node

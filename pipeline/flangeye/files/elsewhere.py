@@ -7,6 +7,7 @@ every file by its name: the small ones whole, scans and images empty until someb
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -30,6 +31,14 @@ SMALL = 1_000_000
 def is_url(place: str) -> bool:
     """Return whether a place is a URL, not a path."""
     return re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", place) is not None
+
+
+def is_this_machine(host: str) -> bool:
+    """Return whether a host's name or address is of this machine, and no other reaches it."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 @contextmanager

@@ -26,6 +26,7 @@ what counts is how far it surely moves a point of the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,9 @@ SURE = 1.64
 """Standard deviations: a drift counts when it is larger than its limit with 95 %."""
 LEVER = 0.5
 """What moves the work by a length turns it by the length over this [m]."""
+
+
+State = Literal["OK", "DEGRADED", "MOVED"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ class Verdict:
         statistic: The test's, over its threshold: above one something moved.
     """
 
-    state: str
+    state: State
     motion: Floats
     covariance: Floats
     shift: float
@@ -230,7 +234,8 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
     motion, covariance = _slow(checks, prior, test)
     shift = largest_shift(motion, corners)
     surely = shift - SURE * _deviation(motion, covariance, corners)
-    state = "MOVED" if surely > test.limit else "DEGRADED" if surely > test.limit / 2 else "OK"
+    drifted: State = "MOVED" if surely > test.limit else "DEGRADED"
+    state = drifted if surely > test.limit / 2 else "OK"
     since = None if state == "OK" else _began(checks, corners, prior, test)
     return Verdict(state, motion, covariance, shift, since, found[0])
 

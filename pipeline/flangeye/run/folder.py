@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Mapping
+from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -50,19 +51,32 @@ class RunFolder:
 
     @classmethod
     def create(cls, name: str, out: Path | None, under: Path = RUNS) -> RunFolder:
-        """Make ``out``, or a folder ``<time>_<name>`` under ``under``.
+        """Make ``out``, or a folder ``<time>_<name>`` under ``under``, for this run alone.
 
         Raises:
-            FolderError: It cannot be made, or it already holds files.
+            FolderError: It cannot be made, or it already holds files, were it another run's that
+                begins at the same time.
         """
-        path = out or _unused(under / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{name}")
+        first = under / f"{time.strftime('%Y-%m-%dT%H-%M-%S')}_{name}"
+        more = (first.with_name(f"{first.name}-{n}") for n in count(2))
+        for path in [out] if out else chain([first], more):
+            folder = cls(path)
+            if folder._claimed():
+                return folder
+        raise FolderError(f"{out}: already holds files; name a new or empty folder")
+
+    def _claimed(self) -> bool:
+        """Make the folder and its log, and return whether nothing and nobody was there before."""
         try:
-            if path.is_dir() and any(path.iterdir()):
-                raise FolderError(f"{path}: already holds files; name a new or empty folder")
-            path.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
+            if any(self.path.iterdir()):
+                return False
+            with suppress(FileExistsError):
+                self.log.open("xb").close()
+                return True
         except OSError as error:
-            raise FolderError(f"{path}: cannot be made: {error.strerror or error}") from None
-        return cls(path)
+            raise FolderError(f"{self.path}: cannot be made: {error.strerror or error}") from None
+        return False
 
     @property
     def log(self) -> Path:
@@ -88,11 +102,12 @@ class RunFolder:
             self._write(f"{EXPORTS}/{name}", text)
 
     def discard(self) -> None:
-        """Remove the folder: the run never got as far as a result worth keeping."""
-        shutil.rmtree(self.path, ignore_errors=True)
-        parent = self.path.parent
-        if parent.name in (RUNS.name, CHECKS) and parent.is_dir() and not any(parent.iterdir()):
-            parent.rmdir()
+        """Remove log and folder: the run never got as far as a result worth keeping."""
+        with suppress(OSError):  # somebody else put something there
+            self.log.unlink(missing_ok=True)
+            self.path.rmdir()
+            if self.path.parent.name in (RUNS.name, CHECKS):
+                self.path.parent.rmdir()
 
     def _write(self, name: str, text: str) -> None:
         write_whole(self.path / name, text, FolderError)
@@ -154,10 +169,3 @@ def _pose(name: str, estimate: TransformResult) -> dict[str, Any]:
         "sigma_translation_m": estimate.sigma[3:],
         **open_directions,
     }
-
-
-def _unused(path: Path) -> Path:
-    candidate, n = path, 2
-    while candidate.exists():
-        candidate, n = path.with_name(f"{path.name}-{n}"), n + 1
-    return candidate

@@ -7,7 +7,8 @@ per-capture steps. When the solver stops pulling, nothing more is acquired.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import fields, replace
 from functools import partial
 from itertools import chain, islice
@@ -51,6 +52,7 @@ class Runner:
         self._start = FromNothing()
         self._refined: list[Step] = []
         self._captures: t.Captures | None = None
+        self._working: Generator[t.Capture | t.Rejection] | None = None
         self._done: Callable[[], dict[str, Done]] = dict
 
     def run(self, start: FromNothing = FromNothing()) -> Result:  # noqa: B008  holds nothing
@@ -151,6 +153,8 @@ class Runner:
 
     def _finish_acquiring(self) -> None:
         """Let go of the source at once: a solver that has enough stops the arm."""
+        if self._working is not None:  # here, for the collector may do it in one of its threads
+            self._working.close()
         if self._captures is not None:
             self._captures.close()
             self._watch.idle[self._steps("acquire")[0].label] = self._captures.idle
@@ -159,7 +163,9 @@ class Runner:
         acquire = self._steps("acquire")[0]
         label = acquire.label
         self._captures = stream
-        captures = self._ahead(stream) if self._may_work_ahead(stream) else iter(stream)
+        captures: Iterator[t.Capture | t.Rejection] = iter(stream)
+        if self._may_work_ahead(stream):
+            captures = self._working = self._ahead(stream)
         while True:
             before = self._watch.seconds[label]
             with self._watch.timing(label):
@@ -186,11 +192,11 @@ class Runner:
         needs = [need for step in steps for need in step.stage.needs.values()]
         return stream.recorded and cores() > 1 and t.StageLog not in needs
 
-    def _ahead(self, stream: t.Captures) -> Iterator[t.Capture | t.Rejection]:
+    def _ahead(self, stream: t.Captures) -> Generator[t.Capture | t.Rejection]:
         """Yield the captures; the next ones are segmented and fitted meanwhile, on all cores."""
-        for capture, done in worked_ahead(iter(stream), self._meanwhile, cores()):
-            self._done = done
-            yield capture
+        with closing(worked_ahead(iter(stream), self._meanwhile, cores())) as working:
+            for capture, self._done in working:
+                yield capture
 
     def _meanwhile(self, capture: t.Capture | t.Rejection) -> dict[str, Done]:
         """Return what segment and fit make of a capture, by label; runs in any thread."""

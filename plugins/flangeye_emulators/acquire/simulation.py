@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -250,8 +251,9 @@ class _Session:
         if at_once == 1:
             yield from map(captured, range(self.count))
         else:
-            for _, made in worked_ahead(iter(range(self.count)), captured, at_once):
-                yield made()
+            with closing(worked_ahead(iter(range(self.count)), captured, at_once)) as working:
+                for _, made in working:
+                    yield made()
 
     def look(self, bodies: Sequence[Body], rng: np.random.Generator) -> PointCloud:
         """Scan other bodies, given in ``base``, with the same scanner from the same place."""

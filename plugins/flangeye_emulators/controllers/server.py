@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.emulator import EmulatorOptions
 from flangeye.types import Floats
 from flangeye_emulators.controllers import control
@@ -113,8 +114,9 @@ class Server:
         if options.floor is not None:
             box.arm.surfaces.append(Surface.floor(options.floor))
         self._publish: Callable[[int], None] = lambda cycle: None
-        # The control channel has a wire of its own, to which nothing happens.
-        self._behind = Network(options.host)
+        # The control channel has a wire of its own, to which nothing happens. Whoever reaches it
+        # moves the arm and causes faults: it does not leave this machine.
+        self._behind = Network(options.host if is_this_machine(options.host) else "127.0.0.1")
         self._behind.offer(PORT, lambda: control.ControlSession(self._behind, self._actions))
         self._schedule = Schedule(self._fault_injector.kinds)
         self._clock = Clock(box.cycle, self._step)
@@ -166,7 +168,15 @@ class Server:
         ports = ", ".join(f"{name} {port}" for name, port in self._ports.items())
         return (
             f"{self._options.robot.model} on {self._options.host}: {ports}, "
-            f"control {PORT}; Ctrl-C ends it"
+            f"control {PORT}{self._where_control_is()}; Ctrl-C ends it"
+        )
+
+    def _where_control_is(self) -> str:
+        if self._behind.host == self._options.host:
+            return ""
+        return (
+            f" on {self._behind.host} alone (from elsewhere: ssh -L {PORT}:{self._behind.host}:"
+            f"{PORT} HOST)"
         )
 
     def _farewell(self) -> str:

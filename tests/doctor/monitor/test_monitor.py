@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import hashlib
 import json
+import os
+import random
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +29,7 @@ from flangeye.handeye.drift import DriftTest
 from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.doctor.monitor.cell import calibrate, check
 from tests.doctor.sessions import clean
+from tests.fuzz.damage import spoilt
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +52,7 @@ def monitor(cell: Path, history: Path, *archives: str, options: tuple[str, ...] 
 
 
 def test_ok_then_moved_since_when_and_which_part(cell: Path, tmp_path: Path) -> None:
-    history = tmp_path / "h.parquet"
+    history = tmp_path / "h.jsonl"
     fine = monitor(cell, history, *(f"ok-{i:02}" for i in range(16)))
     assert fine.exit_code == 0, fine.output
     assert [json.loads(line)["state"] for line in fine.stdout.splitlines()] == ["OK"] * 16
@@ -65,15 +72,15 @@ def test_ok_then_moved_since_when_and_which_part(cell: Path, tmp_path: Path) -> 
 
 
 def test_the_chart_of_one_check_has_one_time(cell: Path, tmp_path: Path) -> None:
-    monitor(cell, tmp_path / "h.parquet", "ok-00")
-    history = History.read(tmp_path / "h.parquet", stored_calibration(cell / "calibration").key)
+    monitor(cell, tmp_path / "h.jsonl", "ok-00")
+    history = History.read(tmp_path / "h.jsonl", stored_calibration(cell / "calibration").key)
     (at,) = figure(history, DriftTest()).layout.xaxis.tickvals
     assert (at.year, at.microsecond) == (2001, 0)
-    assert "h.parquet: 1. A step" in (tmp_path / "h.html").read_text()
+    assert "h.jsonl: 1. A step" in (tmp_path / "h.html").read_text()
 
 
 def test_what_has_moved_stays_moved(cell: Path, tmp_path: Path) -> None:
-    history = tmp_path / "h.parquet"
+    history = tmp_path / "h.jsonl"
     monitor(cell, history, *(f"ok-{i:02}" for i in range(12)), "moved-0", "moved-1", "moved-2")
     again = monitor(cell, history, "ok-12")
     assert again.exit_code == 2 and json.loads(again.stdout)["since_check"] == 12
@@ -85,7 +92,7 @@ def test_a_slow_drift_is_degraded(cell: Path, tmp_path: Path) -> None:
         names.append(f"slow-{i}")
         check(cell / names[-1], seed=200 + i, shift=(6.5e-6 * i, 0.0, 0.0))
     options = ("--false-alarms", "1e-9")
-    done = monitor(cell, tmp_path / "h.parquet", *names, options=options)
+    done = monitor(cell, tmp_path / "h.jsonl", *names, options=options)
     states = [json.loads(line)["state"] for line in done.stdout.splitlines()]
     assert states[0] == "OK" and set(states) == {"OK", "DEGRADED"}
     assert done.exit_code == ["OK", "DEGRADED"].index(states[-1])
@@ -95,7 +102,7 @@ def test_one_scan_in_which_something_else_was_found_raises_no_alarm(
     cell: Path, tmp_path: Path
 ) -> None:
     check(cell / "wrong", seed=300, misfit=0.02)
-    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "wrong", "ok-01")
+    done = monitor(cell, tmp_path / "h.jsonl", "ok-00", "wrong", "ok-01")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line["state"] for line in lines] == ["OK"] * 3
     assert [line["set_aside"] for line in lines] == [[], ["scan-1"], []]
@@ -104,13 +111,13 @@ def test_one_scan_in_which_something_else_was_found_raises_no_alarm(
 
 def test_a_scanner_that_was_knocked_hard_is_no_misfit(cell: Path, tmp_path: Path) -> None:
     check(cell / "knocked", seed=301, shift=(0.02, 0.0, 0.0))
-    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "knocked")
+    done = monitor(cell, tmp_path / "h.jsonl", "ok-00", "knocked")
     assert done.exit_code == 2 and json.loads(done.stdout.splitlines()[-1])["set_aside"] == []
 
 
 def test_scans_that_contradict_each_other_check_nothing(cell: Path, tmp_path: Path) -> None:
     check(cell / "torn", seed=302, misfit=0.05, shift=(0.02, 0.0, 0.0))
-    done = monitor(cell, tmp_path / "h.parquet", "ok-00", "torn")
+    done = monitor(cell, tmp_path / "h.jsonl", "ok-00", "torn")
     assert isinstance(done.exception, StageError)
     assert str(done.exception).endswith(
         "torn: nothing is checked: no one change of scanner, flange or arm explains its 3 scans; "
@@ -120,7 +127,7 @@ def test_scans_that_contradict_each_other_check_nothing(cell: Path, tmp_path: Pa
 
 
 def test_the_same_scans_do_not_count_twice(cell: Path, tmp_path: Path) -> None:
-    history = tmp_path / "h.parquet"
+    history = tmp_path / "h.jsonl"
     twice = monitor(cell, history, "ok-00", "ok-00")
     assert isinstance(twice.exception, StageError)
     assert f"is already in {history}, as check 0" in str(twice.exception)
@@ -129,7 +136,7 @@ def test_the_same_scans_do_not_count_twice(cell: Path, tmp_path: Path) -> None:
 
 
 def test_the_history_comes_back_as_it_was(cell: Path, tmp_path: Path) -> None:
-    history, stored = tmp_path / "h.parquet", stored_calibration(cell / "calibration")
+    history, stored = tmp_path / "h.jsonl", stored_calibration(cell / "calibration")
     monitor(cell, history, *(f"ok-{i:02}" for i in range(4)))
     read = History.read(history, stored.key)
     last = read.findings.pop()
@@ -140,7 +147,7 @@ def test_the_history_comes_back_as_it_was(cell: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda p: p.write_bytes(b"PAR1 broken"), "cannot be read"),
+        (lambda p: p.write_bytes(b"PAR1 broken"), "is not a history of flangeye monitor"),
         (lambda p: History(p, "another", [], []).write(), "is the history of another calibration"),
     ],
     ids=["broken", "another"],
@@ -148,11 +155,103 @@ def test_the_history_comes_back_as_it_was(cell: Path, tmp_path: Path) -> None:
 def test_a_history_that_is_not_ours_is_refused(
     cell: Path, tmp_path: Path, write: Callable[..., Any], message: str
 ) -> None:
-    history = tmp_path / "h.parquet"
+    history = tmp_path / "h.jsonl"
     write(history)
     refused = monitor(cell, history, "ok-00")
     assert isinstance(refused.exception, StageError)
     assert message in str(refused.exception) and "\n" not in str(refused.exception)
+
+
+@pytest.fixture(scope="module")
+def written(cell: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    history = tmp_path_factory.mktemp("written") / "h.jsonl"
+    monitor(cell, history, "ok-00", "ok-01", "ok-02")
+    return history
+
+
+def test_a_spoilt_history_is_refused_in_one_line_or_holds_what_it_held(
+    cell: Path, written: Path, tmp_path: Path
+) -> None:
+    key, raw = stored_calibration(cell / "calibration").key, written.read_bytes()
+    chance, spoilt_file = random.Random(0), tmp_path / "h.jsonl"
+    refused = 0
+    for _ in range(700):
+        spoilt_file.write_bytes(spoilt(raw, chance))
+        try:
+            read = History.read(spoilt_file, key)
+        except StageError as error:
+            refused += 1
+            assert "\n" not in str(error)
+        else:
+            read.path = tmp_path / "again.jsonl"
+            read.write()
+            assert read.path.read_bytes() == raw
+    assert refused > 690
+
+
+CRAFTED: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "no finding": lambda r: r.pop("finding"),
+    "no sightings": lambda r: r["check"]["seen"].clear(),
+    "a text for a number": lambda r: r["finding"].update(shift="far"),
+    "an unknown state": lambda r: r["finding"].update(state="FINE"),
+    "another's finding": lambda r: r["finding"].update(check=7),
+    "since the future": lambda r: r["finding"].update(since=2),
+    "a motion of three": lambda r: r["finding"].update(motion=[0.0, 0.0, 0.0]),
+    "a time before all": lambda r: r["check"].update(time_ns=-1),
+    "a time beyond all": lambda r: r["check"].update(time_ns=10**30),
+    "a centre of two": lambda r: r["check"]["seen"][0]["feature"].update(centre=[1.0, 2.0]),
+    "a centre at infinity": lambda r: r["check"]["seen"][0]["feature"].update(centre=[1e999, 0, 0]),
+    "a covariance that is none": lambda r: r["check"]["seen"][0]["feature"].update(
+        covariance=[[0, 1e-8, 0], [1e-8, 0, 0], [0, 0, 1e-8]]
+    ),
+    "no pose of the flange": lambda r: r["check"]["seen"][0]["poses"].clear(),
+    "a pose that is no rotation": lambda r: r["check"]["seen"][0]["poses"]["flange"].update(
+        matrix=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    ),
+    "another kind of feature": lambda r: r["check"]["seen"][0].update(feature={}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", CRAFTED)
+def test_a_made_history_with_a_right_checksum_is_refused(
+    cell: Path, written: Path, tmp_path: Path, wrong: str
+) -> None:
+    head, *lines = [json.loads(line) for line in written.read_text().splitlines()]
+    CRAFTED[wrong](lines[1])
+    body = "".join(json.dumps(line) + "\n" for line in lines)
+    digest = hashlib.sha256(f"{head['calibration']}\n{body}".encode()).hexdigest()
+    made = tmp_path / "h.jsonl"
+    made.write_text(json.dumps(head | {"sha256": digest}) + "\n" + body)
+    with pytest.raises(StageError, match="h.jsonl: check 1: ") as error:
+        History.read(made, head["calibration"])
+    assert "\n" not in str(error.value)
+
+
+def test_two_checks_at_once_are_both_kept(cell: Path, tmp_path: Path) -> None:
+    history = tmp_path / "h.jsonl"
+    words = [sys.executable, "-m", "flangeye.cli", "monitor", str(cell / "calibration")]
+    at_once = [
+        subprocess.Popen([*words, "--archive", str(cell / f"ok-{i:02}"), "--history", str(history)])
+        for i in range(3)
+    ]
+    assert [one.wait(120) for one in at_once] == [0, 0, 0]
+    kept = History.read(history, stored_calibration(cell / "calibration").key)
+    assert {check.source[-5:] for check in kept.checks} == {"ok-00", "ok-01", "ok-02"}
+
+
+def test_what_cannot_be_written_is_not_said_and_harms_nothing(
+    cell: Path, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history = tmp_path / "h.jsonl"
+    shutil.copy(written, history)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    refused = monitor(cell, history, "ok-03")
+    assert str(refused.exception) == f"{history}: cannot be written: No space left on device"
+    assert refused.stdout == "" and history.read_bytes() == written.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -167,7 +266,7 @@ def test_a_history_that_is_not_ours_is_refused(
 def test_mistakes_are_one_line(
     cell: Path, tmp_path: Path, options: tuple[Any, ...], message: str
 ) -> None:
-    refused = monitor(cell, tmp_path / "h.parquet", options=options)
+    refused = monitor(cell, tmp_path / "h.jsonl", options=options)
     assert isinstance(refused.exception, FlangeyeError)
     assert "\n" not in str(refused.exception)
     assert message in str(refused.exception)
@@ -179,7 +278,7 @@ def test_a_run_of_another_robot_checks_nothing(robot: str, tmp_path: Path) -> No
     calibrate(tmp_path / "calibration", of("ur5e"))
     check(tmp_path / "same", 400, recipe=of("ur5e"))
     check(tmp_path / "other", 401, recipe=of(robot))
-    done = monitor(tmp_path, tmp_path / "h.parquet", "same", "other")
+    done = monitor(tmp_path, tmp_path / "h.jsonl", "same", "other")
     assert len(done.stdout.splitlines()) == 1
     assert isinstance(done.exception, StageError)
     assert str(done.exception).endswith(
@@ -225,6 +324,41 @@ def test_a_plc_that_does_not_answer_is_one_line() -> None:
         )
 
 
+def test_a_plc_on_another_machine_is_written_to_in_the_open_only_when_asked(cell: Path) -> None:
+    plc = "opc.tcp://192.0.2.1:4840"
+    words = ("--archive", str(cell / "ok-00"), "--opcua", f"{plc},ns=2;s=x")
+    refused = monitor(cell, cell / "never.jsonl", options=words)
+    assert str(refused.exception).startswith(f"{plc}: is on another machine")
+    assert "--opcua-security" in str(refused.exception) and not (cell / "never.jsonl").exists()
+
+
+def test_a_state_is_written_signed_and_encrypted(tmp_path: Path) -> None:
+    asyncua = pytest.importorskip("asyncua", reason="asyncua is not installed")
+    crypto = pytest.importorskip("asyncua.crypto.cert_gen")
+    cert, key = tmp_path / "cert.der", tmp_path / "key.pem"
+    name, url = "urn:example.org:FreeOpcUa:opcua-asyncio", "opc.tcp://127.0.0.1:48412"
+
+    async def serve() -> str:
+        await crypto.setup_self_signed_certificate(key, cert, name, "localhost", [], {})
+        server = asyncua.Server()
+        await server.init()
+        server.set_endpoint(url)
+        server.set_security_policy([asyncua.ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+        await server.load_certificate(str(cert))
+        await server.load_private_key(str(key))
+        node = await server.nodes.objects.add_variable("ns=1;s=state", "state", "")
+        await node.set_writable()
+        moved = Finding(0, "MOVED", 1e-3, (0.0,) * 6, 0, 2.0)
+        async with server:
+            with pytest.raises(StageError, match="cannot be written"):
+                await asyncio.to_thread(write_state, url, "ns=1;s=state", moved, "none")
+            secured = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
+            await asyncio.to_thread(write_state, url, "ns=1;s=state", moved, secured)
+            return await node.read_value()
+
+    assert asyncio.run(serve()) == "MOVED"
+
+
 def test_live_needs_a_calibration_that_was_live(cell: Path) -> None:
     from flangeye.plugin.registry import load_registry
 
@@ -232,13 +366,41 @@ def test_live_needs_a_calibration_that_was_live(cell: Path) -> None:
         from_arm(stored_calibration(cell / "calibration"), load_registry(), 3, move=False)
 
 
-def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Path) -> None:
+def part_of_sample(folder: Path, ids: range) -> Path:
+    """Copy some of the sample's scans and their poses."""
     sample = Path(__file__).parents[3] / "data" / "samples" / "ur5_phoxi-m"
-    done = CliRunner().invoke(app, ["run", "ur5_phoxi-m_sample", "--out", str(tmp_path / "run")])
+    head, *rows = (sample / "poses.csv").read_text().splitlines()
+    folder.mkdir()
+    (folder / "poses.csv").write_text("\n".join([head, *(rows[i] for i in ids)]))
+    for i in ids:
+        shutil.copy(sample / f"{i:04}.pcd", folder)
+    return folder
+
+
+def calibrated_from_six(scans: Path, out: Path, *more: str) -> None:
+    """Calibrate from the sample's first six scans."""
+    if not scans.exists():
+        part_of_sample(scans, range(6))
+    words = ["run", "ur5_phoxi-m_sample", "--archive", str(scans), "--out", str(out), *more]
+    done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    later = tmp_path / "later"
-    shutil.copytree(sample, later)
-    poses = [r.base_T_flange for r in folder(sample, FolderParams()).recordings]
+
+
+def test_the_calibrations_own_scans_are_no_check_even_fitted_anew(tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    calibrated_from_six(scans, tmp_path / "calibration")
+    calibrated_from_six(scans, tmp_path / "anew", "--set", "fit.rim.inlier=0.2 mm")
+    for again in ("calibration", "anew", "scans"):
+        refused = monitor(tmp_path, tmp_path / "h.jsonl", again)
+        assert str(refused.exception).endswith(
+            f"{again}: 6 of its scans are the calibration's own, which check nothing; scan again"
+        )
+
+
+def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Path) -> None:
+    later = part_of_sample(tmp_path / "later", range(6, 8))
+    calibrated_from_six(tmp_path / "earlier", tmp_path / "run")
+    poses = [r.base_T_flange for r in folder(later, FolderParams()).recordings]
     (later / "poses.csv").unlink()
     np.save(later / "arm.npy", poses)
     words = ["monitor", str(tmp_path / "run" / "calibration.yaml"), "--archive", str(later)]
@@ -248,13 +410,14 @@ def test_recordings_may_be_laid_out_otherwise_than_the_calibrations(tmp_path: Pa
     assert json.loads(found.stdout)["state"] == "OK"
 
 
-def table_of(folder: Path, count: int) -> None:
-    """Write centres that another program found, as a table."""
+def table_of(folder: Path, count: int) -> str:
+    """Write centres that another program found, as a table; return one more row of it."""
     folder.mkdir()
     session = clean(np.random.default_rng(0), count, "centres", turn=0.4)
     rows = np.hstack([session.poses.reshape(count, 16), session.centres])
-    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    *lines, last = [",".join(map(repr, row)) for row in rows.tolist()]
     (folder / "poses.csv").write_text("\n".join(lines))
+    return last
 
 
 TABLE = """
@@ -275,16 +438,15 @@ steps:
 
 
 def test_a_calibration_from_a_table_is_checked_with_tables_of_a_single_row(tmp_path: Path) -> None:
-    table_of(tmp_path / "calibrated", 20)
+    row = table_of(tmp_path / "calibrated", 21)
     (tmp_path / "recipe.yaml").write_text(TABLE)
     words = ["run", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "calibration")]
     assert CliRunner().invoke(app, words).exit_code == 0
-    row = (tmp_path / "calibrated" / "poses.csv").read_text().splitlines()[3]
     for name, aside in (("fine", 0.0), ("moved", 0.02)):
         (tmp_path / name).mkdir()
         *pose, x, y, z = map(float, row.split(","))
         numbers = [*pose, x + aside, y, z]
         (tmp_path / name / "poses.csv").write_text(",".join(map(repr, numbers)) + "\n")
-    done = monitor(tmp_path, tmp_path / "h.parquet", "fine", "moved")
+    done = monitor(tmp_path, tmp_path / "h.jsonl", "fine", "moved")
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert [(each["state"], each["sightings"]) for each in told] == [("OK", 1), ("MOVED", 1)]

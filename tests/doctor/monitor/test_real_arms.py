@@ -48,7 +48,7 @@ def test_a_real_arm_at_other_poses_is_no_alarm_and_a_knock_is_one(
     states: list[str],
 ) -> None:
     stored, seen = recorded
-    history = History(tmp_path / "h.parquet", stored.key)
+    history = History(tmp_path / "h.jsonl", stored.key)
     for i in range(4):
         later = seen[3 * i : 3 * i + 3]
         history.add(Check(str(i), tuple(_aside(o, shift if i > 1 else 0.0) for o in later)))

@@ -1,6 +1,7 @@
 """A controller in a process of its own, spoken to byte by byte; no client library is needed."""
 
 import contextlib
+import os
 import signal
 import socket
 import struct
@@ -15,9 +16,13 @@ import pytest
 from flangeye.cli import main
 from flangeye.errors import StageError
 from flangeye.maths.kinematics import Arm
+from flangeye.models.emulator import EmulatorOptions
 from flangeye.models.loading import load_model
+from flangeye_emulators.controllers import server
 from flangeye_emulators.controllers.client import EmulatorControl
 from flangeye_emulators.controllers.contact import Surface
+from flangeye_emulators.controllers.network import Network
+from flangeye_emulators.controllers.ur.server import serve
 from tests.emulators.controllers.desk import HOME, away
 from tests.emulators.controllers.process import Process, free_address
 
@@ -238,6 +243,32 @@ def test_the_end_is_orderly() -> None:
         words = own.end(signal.SIGINT)
         assert own.process.returncode == 0
         assert " cycles, late by " in words
+
+
+@pytest.mark.parametrize(
+    ("host", "where"),
+    [
+        ("127.0.0.9", "control 29998;"),
+        (
+            "0.0.0.0",
+            "control 29998 on 127.0.0.1 alone (from elsewhere: ssh -L 29998:127.0.0.1:29998 HOST);",
+        ),
+    ],
+)
+def test_the_control_channel_stays_on_this_machine(
+    host: str, where: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened = []
+
+    async def listen(network: Network) -> None:
+        opened.append(network.host)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Network, "listen", listen)
+    monkeypatch.setattr(server, "_take_precedence", lambda: None)
+    serve(EmulatorOptions(robot=load_model("robots", "ur5e"), host=host))
+    assert opened == [host, "127.0.0.1" if host == "0.0.0.0" else host]
+    assert where in capsys.readouterr().out
 
 
 @pytest.fixture

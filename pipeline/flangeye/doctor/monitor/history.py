@@ -1,24 +1,37 @@
-"""Every check of a calibration, in one Parquet file: what was seen and what was found."""
+"""Every check of a calibration, one JSON line each, under one checksum: what was seen and found."""
 
 from __future__ import annotations
 
-import io
+import hashlib
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from flangeye import types as t
 from flangeye.errors import StageError
+from flangeye.files.regular import read_regular
 from flangeye.files.written import write_whole
-from flangeye.types import Floats
+from flangeye.handeye.drift import State
+from flangeye.log.read import decode_json
+from flangeye.log.record import adapter
+from flangeye.log.records import DamageError, reason_of
 
-FORMAT = "flangeye.doctor.monitor.1"
+FORMAT = "flangeye.monitor.2"
+LONGEST = 1 << 30
+"""Longest history that is read [bytes]: a million sightings."""
+PATIENCE = 60.0
+"""How long to wait for another program that adds a check [s]; judging takes it about a second."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +46,7 @@ class Check:
 
     source: str
     seen: tuple[t.Observation, ...]
-    time_ns: int = 0
+    time_ns: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
 
 
 @dataclass(frozen=True)
@@ -53,13 +66,13 @@ class Finding:
     """
 
     check: int
-    state: str
-    shift: float
-    motion: tuple[float, ...]
-    since: int | None
-    statistic: float
+    state: State
+    shift: Finite
+    motion: Annotated[tuple[Finite, ...], Field(min_length=6, max_length=6)]
+    since: Annotated[int, Field(ge=0)] | None
+    statistic: Finite
     part: str = ""
-    probability: float = 0.0
+    probability: Finite = 0.0
     set_aside: tuple[str, ...] = ()
 
 
@@ -84,21 +97,29 @@ class History:
         """Read the file, or begin a history where there is none.
 
         Raises:
-            StageError: It cannot be read, or is the history of another calibration.
+            StageError: It cannot be read, was changed, or is the history of another calibration.
         """
+        history = cls(path, key)
         if not path.exists():
-            return cls(path, key)
-        table = _read(path)
-        meta = {k.decode(): v.decode() for k, v in (table.schema.metadata or {}).items()}
-        if meta.get("format") != FORMAT:
-            raise StageError(f"{path}: is not a history of flangeye monitor")
-        if meta["calibration"] != key:
+            return history
+        head, _, body = read_regular(path, LONGEST).partition(b"\n")
+        try:
+            about = decode_json(head)
+        except (ValueError, RecursionError):
+            about = {}
+        if about.get("format") != FORMAT:
+            raise StageError(f"{path}: is not a history of flangeye monitor, or is damaged")
+        if about.get("sha256") != _digest(str(about.get("calibration")), body):
+            raise StageError(
+                f"{path}: its checksum does not match: it was changed or damaged; restore it, or "
+                "begin a new one with --history"
+            )
+        if about["calibration"] != key:
             raise StageError(
                 f"{path}: is the history of another calibration; name a new file with --history"
             )
-        history = cls(path, key, findings=[_finding(x) for x in json.loads(meta["findings"])])
-        for row in table.to_pylist():
-            history._take(row)
+        for line in body.splitlines():
+            history._take(line)
         return history
 
     def sightings(self) -> tuple[list[t.Observation], NDArray[np.intp]]:
@@ -110,10 +131,11 @@ class History:
         """Add a check.
 
         Raises:
-            StageError: Its scans are those of an earlier check.
+            StageError: A scan of it is in an earlier check.
         """
+        new = prints_of(check.seen)
         for i, earlier in enumerate(self.checks):
-            if np.array_equal(earlier.seen[0].feature.centre, check.seen[0].feature.centre):
+            if new & prints_of(earlier.seen):
                 raise StageError(f"{check.source}: is already in {self.path}, as check {i}")
         self.checks.append(check)
 
@@ -123,25 +145,61 @@ class History:
         Raises:
             StageError: It cannot be written.
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+        pairs = zip(self.checks, self.findings, strict=True)
+        body = "".join(
+            json.dumps({"check": _plain(c), "finding": asdict(f)}, allow_nan=False) + "\n"
+            for c, f in pairs
+        ).encode()
+        digest = _digest(self.key, body)
+        head = {"format": FORMAT, "calibration": self.key, "sha256": digest}
+        write_whole(self.path, json.dumps(head).encode() + b"\n" + body)
 
-        rows = [_row(i, c, o) for i, c in enumerate(self.checks) for o in c.seen]
-        for row, finding in ((r, self.findings[r["check"]]) for r in rows):
-            row |= {"state": finding.state, "shift": finding.shift, "part": finding.part}
-        findings = json.dumps([asdict(f) for f in self.findings])
-        meta = {"format": FORMAT, "calibration": self.key, "findings": findings}
-        content = io.BytesIO()
-        pq.write_table(pa.Table.from_pylist(rows).replace_schema_metadata(meta), content)
-        write_whole(self.path, content.getvalue())
+    def _take(self, line: bytes) -> None:
+        number = len(self.checks)
+        try:
+            record = decode_json(line)
+            check = adapter(Check).validate_python(record["check"])
+            finding = adapter(Finding).validate_python(record["finding"])
+            _require_usable(number, check, finding)
+        except Exception as error:  # a made file can be wrong in any way
+            raise StageError(f"{self.path}: check {number}: {reason_of(error)}") from None
+        self.checks.append(check)
+        self.findings.append(finding)
 
-    def _take(self, row: dict[str, Any]) -> None:
-        seen = _observation(row)
-        if row["check"] == len(self.checks):
-            self.checks.append(Check(row["source"], (seen,), row["time_ns"]))
-        else:
-            last = self.checks[-1]
-            self.checks[-1] = Check(last.source, (*last.seen, seen), last.time_ns)
+
+@contextmanager
+def only_user(path: Path) -> Iterator[None]:
+    """Keep other programs from adding to a history while the context lasts.
+
+    Raises:
+        StageError: Another adds to it for longer than PATIENCE, or the lock cannot be made.
+    """
+    import fcntl  # not on every system, and nothing but this command needs it
+
+    lock, end = path.with_name(f".{path.name}.lock"), time.monotonic() + PATIENCE
+    try:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        with lock.open("ab") as file:
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > end:
+                        raise
+                    time.sleep(0.05)
+            yield
+    except BlockingIOError:
+        raise StageError(
+            f"{path}: another program has kept it for {PATIENCE:.0f} s; end it, and check again"
+        ) from None
+    except OSError as error:
+        raise StageError(f"{lock}: cannot be written: {error.strerror or error}") from None
+
+
+def prints_of(seen: Sequence[t.Observation]) -> set[bytes]:
+    """Return what tells scans from others: no two give the same centre to the last bit."""
+    return {each.feature.centre.tobytes() for each in seen}
 
 
 def as_json(history: History, finding: Finding) -> str:
@@ -173,50 +231,22 @@ def _when(check: Check) -> str | None:
     return datetime.fromtimestamp(check.time_ns / 1e9, UTC).isoformat(timespec="seconds")
 
 
-def _read(path: Path) -> Any:
-    try:
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise StageError("the history needs pyarrow: pip install 'flangeye[monitor]'") from None
-    try:
-        return pq.read_table(path)
-    except Exception as error:  # a damaged file can break the parser in any way
-        raise StageError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
+def _digest(key: str, body: bytes) -> str:
+    return hashlib.sha256(key.encode() + b"\n" + body).hexdigest()
 
 
-def _row(check: int, of: Check, seen: t.Observation) -> dict[str, Any]:
-    circle = seen.circle
-    return {
-        "check": check, "time_ns": of.time_ns, "source": of.source, "id": seen.id,
-        "centre": circle.centre.tolist(), "normal": _plain(circle.normal),
-        "covariance": circle.covariance.ravel().tolist(),
-        "normal_covariance": _plain(circle.normal_covariance),
-        "centre_in_flange": circle.centre_in_flange.tolist(),
-        "base_T_flange": seen.base_T_flange.matrix.ravel().tolist(),
-        "joints": _plain(seen.joints),
-    }  # fmt: skip
+def _plain(check: Check) -> Any:
+    return adapter(Check).dump_python(check, mode="json")
 
 
-def _finding(data: dict[str, Any]) -> Finding:
-    set_aside = tuple(data.get("set_aside", ()))
-    return Finding(**{**data, "motion": tuple(data["motion"]), "set_aside": set_aside})
-
-
-def _plain(values: Floats | None) -> list[float] | None:
-    return None if values is None else np.ravel(values).tolist()
-
-
-def _observation(row: dict[str, Any]) -> t.Observation:
-    normal, known = row["normal"], row["normal_covariance"]
-    circle = t.CircleFeature(
-        np.array(row["centre"]),
-        None if normal is None else np.array(normal),
-        {},
-        np.reshape(row["covariance"], (3, 3)),
-        None if known is None else np.reshape(known, (3, 3)),
-        0.0,
-        centre_in_flange=np.array(row["centre_in_flange"]),
-    )
-    pose = t.by_frame(t.Transform(t.BASE, t.FLANGE, np.reshape(row["base_T_flange"], (4, 4))))
-    joints: Sequence[float] | None = row["joints"]
-    return t.Observation(row["id"], circle, pose, None if joints is None else np.array(joints))
+def _require_usable(number: int, check: Check, finding: Finding) -> None:
+    """Refuse what no check leaves behind, though each of its values may be one."""
+    if finding.check != number or (finding.since or 0) > number:
+        raise DamageError("its finding is another check's")
+    if not check.seen:
+        raise DamageError("it has no sighting")
+    for seen in check.seen:
+        if t.FLANGE not in seen.poses:
+            raise DamageError(f"sighting {seen.id}: it has no pose of the flange")
+        if (np.linalg.eigvalsh(seen.circle.covariance) <= 0).any():
+            raise DamageError(f"sighting {seen.id}: its covariance is none")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import yaml
 
 from flangeye import types as t
 from flangeye.devices import MotionAllowed
-from flangeye.doctor.monitor.history import Check
+from flangeye.doctor.monitor.history import Check, prints_of
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
 from flangeye.files.yaml_lines import parse_yaml
@@ -39,20 +39,23 @@ def from_archive(
         overrides: Where the recordings are read in another way than the calibration's were.
 
     Raises:
-        StageError: It cannot be read, is of another robot, or shows the flange in no scan.
+        StageError: It cannot be read, is of another robot, holds scans of the calibration itself,
+            or shows the flange in no scan.
     """
     log = log_of(path)
     if log.suffix == ".mcap" and log.is_file():
         run = read_run(log)
         stored.refuse_another_arm(run)
-        return _checked(path, *_of_log(run))
+        used = {o.id for o in stored.used}
+        _refuse_own(path, _moments(run, set(run.poses)) & _moments(stored.log, used))
+        return _checked(stored, path, *_of_log(run))
     if not path.exists():
         raise StageError(f"{path}: does not exist")
     recipe = parse_recipe(
         _from_archive(stored), stored.path.name, registry, overrides, stored.log.models
     )
     seen = Runner(recipe, registry, t.ArchivePath(path)).take(None)
-    return _checked(path, seen, path.stat().st_mtime_ns)
+    return _checked(stored, path, seen, path.stat().st_mtime_ns)
 
 
 def from_arm(
@@ -79,7 +82,7 @@ def from_arm(
     recipe = recipe_of_log(stored.log, registry, overrides)
     folder = RunFolder.create("check", None, stored.path.parent / CHECKS)
     record_scans(recipe, registry, folder, MotionAllowed(move), scans)
-    return _checked(folder.path, *_of_log(read_run(folder.log)))
+    return _checked(stored, folder.path, *_of_log(read_run(folder.log)))
 
 
 def _of_log(log: RunLog) -> tuple[list[t.Observation], int]:
@@ -105,10 +108,28 @@ def _steps(stored: StoredCalibration) -> dict[str, Any]:
     return dict(parse_yaml(stored.recipe, stored.path.name).data)
 
 
-def _checked(path: Path, seen: list[t.Observation], time_ns: int = 0) -> Check:
+def _checked(
+    stored: StoredCalibration, path: Path, seen: list[t.Observation], time_ns: int
+) -> Check:
     circles = [o for o in seen if isinstance(o.feature, t.CircleFeature)]
     if not circles:
         raise StageError(
             f"{path}: the flange was found in none of its scans, so nothing is checked"
         )
+    _refuse_own(path, prints_of(circles) & prints_of(stored.used))
     return Check(str(path), tuple(circles), time_ns)
+
+
+def _refuse_own(path: Path, shared: Collection[Any]) -> None:
+    """Refuse scans that the calibration was made from: they agree with it whatever has moved."""
+    if shared:
+        raise StageError(
+            f"{path}: {len(shared)} of its scans are the calibration's own, which check nothing; "
+            "scan again"
+        )
+
+
+def _moments(log: RunLog, ids: set[str]) -> set[tuple[int, str]]:
+    """Return when and where scans were taken: they stay the same when they are fitted anew."""
+    told = (log.poses[name] for name in ids & set(log.poses))
+    return {(facts["time_ns"], str(facts["poses"])) for facts in told if facts["time_ns"]}

@@ -87,20 +87,21 @@ class StoredCalibration:
         return corners_of(box.centre, box.size) - self.estimate.about
 
     @cached_property
-    def _used(self) -> list[t.Observation]:
+    def used(self) -> list[t.Observation]:
+        """The sightings that it was made from."""
         return [pair.observation for pair in self.calibration.pairs if pair.used]
 
     @cached_property
     def pose_error(self) -> PoseError:
         """How wrong the arm's poses are, by this calibration's residuals."""
-        bare, circles = self._bare(self._used, _one_check(self._used))
+        bare, circles = self._bare(self.used, _one_check(self.used))
         return pose_error_of(bare.residuals, bare.effects, bare.covariances, circles)
 
     @cached_property
     def prior(self) -> Prior:
         """What this calibration tells of later sightings; its own are held against it as well."""
         variances = np.concatenate([FREE, self.pose_error.variances])
-        return prior_of(self.sightings(self._used, _one_check(self._used)), variances)
+        return prior_of(self.sightings(self.used, _one_check(self.used)), variances)
 
     def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> Sightings:
         """Return sightings of the flange, held against this calibration.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from flangeye.errors import StageError
+from flangeye.log.watch.gate import gate, hidden_address
 from flangeye.log.watch.tail import Channel, Message
 
 Send = Callable[[Message], None]
@@ -13,7 +14,7 @@ Send = Callable[[Message], None]
 
 @contextmanager
 def foxglove_server(port: int) -> Iterator[Send]:
-    """Serve on a port; what is given is sent to whoever watches.
+    """Serve on a port of this machine alone; what is given is sent to whoever may watch.
 
     Raises:
         StageError: foxglove-sdk is not installed, or the port is taken.
@@ -22,11 +23,15 @@ def foxglove_server(port: int) -> Iterator[Send]:
         import foxglove
     except ImportError:
         raise StageError("--foxglove needs foxglove-sdk: pip install 'flangeye[watch]'") from None
-    try:
-        server = foxglove.start_server(name="flangeye", port=port)
-    except (OSError, RuntimeError) as error:
-        raise StageError(f"--foxglove {port}: cannot serve there: {error}") from None
     channels: dict[str, foxglove.Channel] = {}
+    host, hidden = hidden_address()
+    opened = ExitStack()
+    try:
+        opened.enter_context(gate(port, (host, hidden)))
+        server = foxglove.start_server(name="flangeye", host=host, port=hidden)
+    except (OSError, RuntimeError) as error:
+        opened.close()
+        raise StageError(f"--foxglove {port}: cannot serve there: {error}") from None
 
     def send(message: Message) -> None:
         topic = message.channel.topic
@@ -39,6 +44,7 @@ def foxglove_server(port: int) -> Iterator[Send]:
     finally:
         for channel in channels.values():
             channel.close()
+        opened.close()
         server.stop()
 
 
