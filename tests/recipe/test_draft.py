@@ -531,3 +531,11 @@ def test_a_question_without_an_answer_names_the_option(folder: Path) -> None:
         "which arm ('flangeye robots', or a .urdf) (--robot): was not answered; give the option, "
         "or --yes for the defaults"
     )
+
+
+def test_a_bad_answer_is_asked_again(folder: Path) -> None:
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    said = init(typed="ur55\nur5\nflangee\nflange\nphoxi-m\nwall\nbase\n")
+    assert "ur55" in said
+    assert "wall: is none of base, flange" in said
+    assert recipe(folder).header.robot.model == "ur5"

@@ -161,3 +161,18 @@ def test_the_arms_of_a_cell_are_corrected_by_name() -> None:
     corrected = yaml.safe_load(calibration_yaml(result))["corrected_arm"]
     assert corrected["corrections"]["one"]["joint_offsets"] == OFFSETS.tolist()
     assert "correction" not in corrected
+
+
+def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
+    found = document(calibration(), FIGURES)
+    assert r.standing_warnings(found) == []
+    weak = found.model_copy(deep=True)
+    weak.transforms["base_T_camera"].unobservable = [[0, 0, 0, 0, 0, 1.0]]
+    assert "base_T_camera" in r.standing_warnings(weak)[0].text
+    unjudged = found.model_copy(update={"status": "unverified"})
+    assert [w.fix for w in r.standing_warnings(unjudged)] == [
+        "add '- verify.holdout' after the solver"
+    ]
+    seen = [r.ObservationResult(id=str(i), used=i < 2) for i in range(5)]
+    poor = found.model_copy(update={"observations": seen})
+    assert r.standing_warnings(poor)[0].text == "3 of 5 captures were rejected"

@@ -100,7 +100,10 @@ def print_refusal(console: Console, wrong: str, known: str, next_steps: Collecti
     write(console, wrapped(console, f"What is wrong   {wrong}", 16), "red")
     write(console, wrapped(console, f"How it is known {known}", 16))
     for name, step in zip(("Next step", "or"), next_steps, strict=False):
-        write(console, wrapped(console, f"{name:<15} {step}", 16))
+        if step.startswith("- "):  # a line of the recipe, to paste as it stands
+            write(console, f"{name:<15} write in the recipe:\n  {step}")
+        else:
+            write(console, wrapped(console, f"{name:<15} {step}", 16))
 
 
 def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "") -> None:

@@ -31,6 +31,8 @@ from flangeye.result.contract import (
     WorkspaceResult,
 )
 
+MOST = 0.5
+"""Share of captures that a sound session uses at least. Of our choice."""
 Robots = tuple[Layout, Arm | None]
 
 
@@ -79,6 +81,26 @@ def _listed(values: t.Array | None) -> Any:
 def warnings_result(notes: Iterable[t.Note]) -> list[WarningResult]:
     """Return the section ``warnings``: the notes that ask for something."""
     return [WarningResult(text=str(note), fix=note.fix) for note in t.warnings_of(notes)]
+
+
+def standing_warnings(result: Result) -> list[WarningResult]:
+    """Return what a finished result asks for, whatever its steps noted.
+
+    An estimate that is arbitrary in some direction, a calibration that nothing judged, and a
+    session most of whose captures were rejected.
+    """
+    found = []
+    if weak := [name for name, each in result.transforms.items() if each.unobservable]:
+        text = f"not observable from these poses: some directions of {' and '.join(weak)}"
+        found.append((text, "add the poses that flangeye show RUN --outlook names"))
+    if result.transforms and result.status == "unverified":
+        fix = "add '- verify.holdout' after the solver"
+        found.append(("no verify step judged this calibration", fix))
+    used, count = sum(o.used for o in result.observations), len(result.observations)
+    if used < MOST * count:
+        text = f"{count - used} of {count} captures were rejected"
+        found.append((text, "look for the cause: flangeye doctor RUN"))
+    return [WarningResult(text=text, fix=fix) for text, fix in found]
 
 
 def expected_error(result: Result) -> tuple[float, float | None] | None:

@@ -113,6 +113,7 @@ def result_of(
         result.workspace = r.workspace_result(calibration.camera, box)
         if truth := truths.cell:
             result.truth = r.truth_result(calibration, truth, box, _robots(recipe))
+    result.warnings += r.standing_warnings(result)
     return result
 
 

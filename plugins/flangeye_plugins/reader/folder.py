@@ -107,6 +107,9 @@ def _cells_of(pose: Transform, prefix: str = "") -> dict[str, float]:
     return {prefix + name: number for name, number in zip(names, numbers, strict=True)}
 
 
+_ADVICE = "; 'flangeye init FOLDER' writes a recipe for other tables"
+
+
 def _poses_file(path: Path) -> Path:
     if path.is_file() and path.name in POSE_FILES:
         return path
@@ -114,7 +117,7 @@ def _poses_file(path: Path) -> Path:
     if not found:
         clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in UNPAIRED_SUFFIXES)
         but = f"clouds ({clouds}), but " if clouds else ""
-        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(POSE_FILES)}")
+        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(POSE_FILES)}{_ADVICE}")
     if len(found) > 1:
         raise StageError(f"{path}: holds {' and '.join(f.name for f in found)}; keep one of them")
     return found[0]

@@ -151,7 +151,7 @@ def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
         if name not in known and not of_second and not _JOINT.fullmatch(name):
             raise StageError(
                 f"{file}:1: column '{name}' is not known; known: {', '.join(known)}, j1_rad, …, "
-                f"{SECOND}x_m, …"
+                f"{SECOND}x_m, …; 'flangeye init FOLDER' writes a recipe for other columns"
             )
 
 

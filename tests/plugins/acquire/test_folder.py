@@ -92,7 +92,8 @@ def test_a_unit_said_twice_must_agree(tmp_path: Path) -> None:
          ":1: the columns x_m, y_m, z_m (or x_mm, y_mm, z_mm) are missing"),
         (HEADING.replace("qw", "w") + ROW,
          ":1: column 'w' is not known; known: cloud, image, id, role, time_ns, x_m, y_m, z_m, x_mm, y_mm, "
-         "z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, second_x_m, …"),
+         "z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, second_x_m, …; 'flangeye init FOLDER' "
+         "writes a recipe for other columns"),
         (HEADING.replace("qw", "qx") + ROW, ":1: column 'qx' comes twice"),
         (HEADING.replace("cloud", "cloud,j1_rad,j2_rad") + ROW.replace(".pcd,", ".pcd,1,,"),
          ":2: poses.0.joints_rad.1: Input should be a valid number, unable to parse string as a "
@@ -173,7 +174,8 @@ def test_two_files_of_poses_are_refused(tmp_path: Path) -> None:
 def test_clouds_without_poses_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").touch()
     assert refused(tmp_path) == (
-        f"{tmp_path}: holds clouds (1), but none of poses.csv, poses.yaml, poses.yml, poses.json"
+        f"{tmp_path}: holds clouds (1), but none of poses.csv, poses.yaml, poses.yml, poses.json; "
+        "'flangeye init FOLDER' writes a recipe for other tables"
     )
 
 
@@ -189,7 +191,8 @@ def test_auto_refuses_what_nobody_knows_and_what_two_know(tmp_path: Path) -> Non
     assert str(error.value) == (
         f"{tmp_path}: no reader knows this layout: ancorasir (holds none of calib_data.json, "
         "calibration_robot_pose_data.npy, calibration_robot_pose_data.npz, data.txt, "
-        "readRobot.txt); folder (holds none of poses.csv, poses.yaml, poses.yml, poses.json)"
+        "readRobot.txt); folder (holds none of poses.csv, poses.yaml, poses.yml, poses.json; "
+        "'flangeye init FOLDER' writes a recipe for other tables)"
     )
     (tmp_path / "poses.csv").write_text(HEADING + ROW)
     (tmp_path / "data.txt").write_text("p_robot 6-DoF index:a\n[1, 2, 3, 0, 0, 0, 1]\n")

@@ -95,7 +95,7 @@ ROW = "a.pcd,1,2,3,0,1,0,0"
         ("second_id", "7",
          "poses.csv:1: column 'second_id' is not known; known: cloud, image, id, role, time_ns, x_m, "
          "y_m, z_m, x_mm, y_mm, z_mm, x, y, z, qx, qy, qz, qw, rx_rad, ry_rad, rz_rad, j1_rad, …, "
-         "second_x_m, …"),
+         "second_x_m, …; 'flangeye init FOLDER' writes a recipe for other columns"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_the_second_arms_columns_is_named(

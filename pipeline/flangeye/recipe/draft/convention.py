@@ -12,14 +12,21 @@ from flangeye.errors import RecipeError
 from flangeye.files.tables import Column, Table, read_table
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
-from flangeye.maths.pose_formats import APART, CONVENTIONS, MATRIX, AngleUnit, LengthUnit
+from flangeye.maths.pose_formats import (
+    APART,
+    CONVENTIONS,
+    MATRIX,
+    PLAIN,
+    AngleUnit,
+    LengthUnit,
+)
 from flangeye.maths.pose_formats import convention_of_maker as usual_of
 from flangeye.models.robots import RobotModel
 from flangeye.recipe.draft.evidence import Writing, mounting_of, writing_of
 from flangeye.recipe.draft.frames import is_inverse
 from flangeye.recipe.draft.headings import JOINTS, Headings, PoseColumns, as_joints, poses_by_name
 from flangeye.recipe.draft.numbers import FARTHEST, TURN, poses_by_number
-from flangeye.recipe.draft.questions import Questions
+from flangeye.recipe.draft.questions import Questions, one_of
 from flangeye.types import Floats
 
 COMMON = ("vector", "ZYX", "xyz", "XYZ", "ZYZ")
@@ -140,7 +147,8 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
     elif len(likely) > 1:
         known = ", ".join(p.name for p in likely)
         question = f"which poses are the arm's ({known})"
-        answer = questions.ask("table", question, None, likely[0].name)
+        names = [name for p in likely for name in (p.name, p.table.name)]
+        answer = questions.ask("table", question, None, likely[0].name, one_of(*names))
         matching = [p for p in likely if answer in (p.name, p.table.name)]
         if not matching:
             raise RecipeError(f"--table {answer}: is no table of poses; known: {known}")
@@ -412,7 +420,8 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
     question = f"how the rotation in columns {shown} is written ({known})"
-    return questions.ask(key, question, usual, "vector")
+    others = ("point", "joints", MATRIX, APART)
+    return questions.ask(key, question, usual, "vector", one_of(*CONVENTIONS, *PLAIN, *others))
 
 
 _FIRST = ("kuka", "quaternion_xyzw", "xyzw")
@@ -445,7 +454,8 @@ def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
         name = pose.called or pose.table.name
         questions.likely[f"{prefix}pose"] = (likely[0], f"{likely[1]}; {name} says {named}")
     whose = "the arm's" if not prefix else "the target's"
-    return questions.ask(f"{prefix}pose", f"which way round {whose} poses are", named or ways[0])
+    question = f"which way round {whose} poses are ({' or '.join(ways)})"
+    return questions.ask(f"{prefix}pose", question, named or ways[0], check=one_of(*ways))
 
 
 def _target_params(

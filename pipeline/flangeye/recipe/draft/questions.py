@@ -5,10 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from flangeye.errors import RecipeError
+from flangeye.errors import FlangeyeError, RecipeError
 
 Prompt = Callable[[str, str | None], str]
 """Asks a person; takes the question and the default, returns the answer."""
+Check = Callable[[str], object]
+"""Raises :class:`FlangeyeError` for an answer that cannot be used."""
+
+
+def one_of(*choices: str) -> Check:
+    """Return a check that only ``choices`` pass."""
+
+    def check(answer: str) -> None:
+        if answer not in choices:
+            raise RecipeError(f"{answer}: is none of {', '.join(choices)}")
+
+    return check
 
 
 @dataclass
@@ -27,14 +39,22 @@ class Questions:
     assumed: list[str] = field(default_factory=list)
     likely: dict[str, tuple[str, str]] = field(default_factory=dict)
 
-    def ask(self, flag: str, question: str, default: str | None, example: str = "") -> str:
-        """Return the answer to a question.
+    def ask(
+        self,
+        flag: str,
+        question: str,
+        default: str | None,
+        example: str = "",
+        check: Check | None = None,
+    ) -> str:
+        """Return the answer to a question; a person whose answer is refused is asked again.
 
         Args:
             flag: The option that answers it.
             question: For people.
             default: What is likely; None where nothing is.
             example: An answer, for the message where there is none.
+            check: Refuses an answer that is none.
 
         Raises:
             RecipeError: Nothing is likely, nobody can be asked; names the flag to add.
@@ -44,9 +64,22 @@ class Questions:
             return answer
         default, shown = self.likely.get(flag, (default, ""))
         if self.prompt is not None:
-            return self.prompt(f"{question} (--{flag})", default)
+            return self._asked(f"{question} (--{flag})", default, check)
         if default is None:
             raise RecipeError(f"{question}: nothing tells; add --{flag} {example}".rstrip())
         reason = f"{shown}; " if shown else ""
         self.assumed.append(f"{question}: {default} ({reason}--{flag} says otherwise)")
         return default
+
+    def _asked(self, question: str, default: str | None, check: Check | None) -> str:
+        assert self.prompt is not None  # noqa: S101  for type checkers
+        refused = ""
+        while True:
+            answer = self.prompt(f"{refused}{question}", default)
+            try:
+                if check:
+                    check(answer)
+            except FlangeyeError as error:
+                refused = f"{error}\n"
+            else:
+                return answer

@@ -21,11 +21,12 @@ from flangeye.models.cloud_unit import detect_unit, median_distance
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
+from flangeye.models.standards import load_standard
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.recipe.draft.convention import table_params
-from flangeye.recipe.draft.questions import Questions
+from flangeye.recipe.draft.questions import Questions, one_of
 from flangeye.recipe.draft.survey import FolderSurvey
 from flangeye.recipe.load import parse_recipe
 
@@ -91,10 +92,19 @@ def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, A
     """Return the arm as asked, or by the one URDF of the folder."""
     urdfs = survey.of((".urdf",))
     usual = os.path.relpath(urdfs[0], out.parent) if len(urdfs) == 1 else NONE
-    answer = questions.ask("robot", "which arm ('flangeye robots', or a .urdf)", usual)
+    question = "which arm ('flangeye robots', or a .urdf)"
+    answer = questions.ask("robot", question, usual, check=lambda a: _known_robot(a, out))
     if answer == NONE:
         return {}
     return {"urdf": answer} if answer.endswith(".urdf") else {"model": answer}
+
+
+def _known_robot(answer: str, out: Path) -> None:
+    """Refuse a robot that is neither in the catalogue nor a file beside the recipe."""
+    if answer.endswith(".urdf") and not (out.parent / answer).is_file():
+        raise RecipeError(f"{answer}: is no file")
+    if answer != NONE and not answer.endswith(".urdf"):
+        load_model("robots", answer, out.parent)
 
 
 # --- how the archive is read
@@ -114,7 +124,7 @@ def _reader(
     else:
         return "auto"
     if any(p.name.startswith("pos0") and p.suffix in (".yaml", ".yml") for p in survey.files):
-        return {"zivid": {"length": questions.ask("length", "unit of pos01.yaml and so on", "mm")}}
+        return {"zivid": {"length": _length_of_files(questions)}}
     if survey.tables:
         scans = bool(survey.of(CLOUDS) or survey.of(IMAGES))
         params = table_params(survey.tables, questions, _model(robot), scans)
@@ -182,11 +192,12 @@ def _what(archive: Archive, questions: Questions) -> tuple[str, dict[str, Any]]:
             "target",
             "what is seen (flange, sphere, charuco, checkerboard, circles, aruco)",
             "flange",
+            check=_target,
         )
         return "acquire.archive", _target(answer)
     if any(r.image for r in records):
         example = "'charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"
-        answer = questions.ask("target", "which printed target is seen", None, example)
+        answer = questions.ask("target", "which printed target is seen", None, example, _target)
         return "acquire.images", _target(answer)
     if any(r.camera_T_target is not None for r in records):
         return "acquire.samples", {}
@@ -212,10 +223,13 @@ def _head(
     feature = {"sphere": target["sphere"]} if "sphere" in target else {}
     if "flange" in target and not _has_plate(robot):
         question = "which plate the flange is ('flangeye standards')"
-        feature = {"standard": questions.ask("plate", question, PLATE)}
+        feature = {"standard": _plate(questions, question)}
     if "flange" in target and not robot:
         robot, feature = {"flange": feature["standard"]}, {}
-    scanner = questions.ask("scanner", "which scanner ('flangeye scanners')", NONE)
+    question = "which scanner ('flangeye scanners')"
+    scanner = questions.ask(
+        "scanner", question, NONE, check=lambda a: a == NONE or load_model("scanners", a)
+    )
     configuration = _configuration(target, questions)
     named: Any = robot["model"] if set(robot) == {"model"} else robot
     sections = {
@@ -223,6 +237,14 @@ def _head(
         "feature": feature, "configuration": configuration,
     }  # fmt: skip
     return head | {name: section for name, section in sections.items() if section}
+
+
+def _plate(questions: Questions, question: str) -> str:
+    return questions.ask("plate", question, PLATE, check=load_standard)
+
+
+def _length_of_files(questions: Questions) -> str:
+    return questions.ask("length", "unit of pos01.yaml and so on", "mm", check=one_of("m", "mm"))
 
 
 def _camera(archive: Archive, target: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,7 +265,8 @@ def _has_plate(robot: Mapping[str, Any]) -> bool:
 
 def _configuration(target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
     """Return who carries what; empty for a camera beside the robot that sees its flange."""
-    carried = questions.ask("camera", "what carries the camera (base or flange)", "base")
+    question = "what carries the camera (base or flange)"
+    carried = questions.ask("camera", question, "base", check=one_of("base", "flange"))
     if carried not in ("base", "flange"):
         raise RecipeError(f"--camera {carried}: is neither base nor flange")
     if carried == "flange":
