@@ -20,6 +20,7 @@ from flangeye.maths.geometry import rigid
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.draft.frames import frames_in
 from flangeye.recipe.load import load_recipe
+from flangeye.types import ArchivePath
 from tests.plugins.reader.bags import joint_state, point_cloud, stops, tf, write_bag
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples" / "ur5_phoxi-m"
@@ -167,6 +168,28 @@ def test_images_need_to_know_the_target(folder: Path) -> None:
     names = [step.stage.name for step in recipe(folder).steps]
     assert recipe(folder).steps[0].params.board.columns == 8  # it tells the camera too
     assert names == ["acquire.images", "fit.charuco", "solve.robust", "verify.holdout"]
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".npz"])
+def test_intrinsics_beside_images_are_used(folder: Path, suffix: str) -> None:
+    camera = np.array([[900.0, 0, 320], [0, 901, 240], [0, 0, 1]])
+    for name in ("images", "poses"):
+        (folder / name).mkdir()
+    for k, pose in enumerate(ARM):
+        cv2.imwrite(str(folder / "images" / f"img_{k}.png"), np.zeros((8, 8), np.uint8))
+        np.savetxt(folder / "poses" / f"pose_{k}.txt", pose)
+    if suffix == ".npz":
+        np.savez(folder / "calib.npz", mtx=camera, dist=np.zeros((1, 5)))
+    else:
+        storage = cv2.FileStorage(str(folder / "calib.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix", camera)
+        storage.release()
+    told = init("--target", "charuco: {columns: 8, rows: 6, square: 30 mm, marker: 22 mm}")
+    assert f"assumed: camera of rec/calib{suffix}: focal length 900.0, 901.0 px" in told
+    first = recipe(folder).steps[0]
+    assert (first.params.camera_file, first.params.board) == (f"calib{suffix}", None)
+    captures = list(first.stage.function(archive=ArchivePath(None), params=first.params))
+    assert all(np.allclose(c.image.camera_matrix, camera) for c in captures)
 
 
 def test_zivids_folder_is_known(folder: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import StageError, stage
+from flangeye.files.cameras import CameraFile, camera_in, cameras_in
 from flangeye.files.clouds import LengthUnit, read_cloud
 from flangeye.files.recording import Recording, check_poses, digests_of
 from flangeye.types import CAMERA, ArchivePath, Capture, Captures, Floats, Image, PointCloud
@@ -39,6 +40,11 @@ class ImagesParams(OpeningParams):
     distortion: tuple[float, ...] = Field(
         (), max_length=14, description="OpenCV's coefficients k1, k2, p1, p2, k3, …; none if given."
     )
+    camera_file: str | None = Field(
+        None, description="The camera's calibration, beside the images: camera_info, OpenCV's "
+        "storage, kalibr's camchain, COLMAP's cameras.txt, RealSense's or Zivid's intrinsics, "
+        ".npz; the only one there if not given."
+    )  # fmt: skip
     board: SeenBoardParams | None = Field(
         None,
         description="Find the camera by the views of this board; refine focal_length, if given.",
@@ -79,22 +85,47 @@ def _cameras(
     root: Path, usable: Sequence[Recording], params: ImagesParams
 ) -> tuple[dict[str, Camera], list[str]]:
     """Return the camera of each image by the pose's name, and what to tell of how it was found."""
+    given = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
+    filed = None if given else _filed(root, params.camera_file)
     if params.board is None:
-        cameras = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
-        if len(cameras) < len(usable):
+        cameras = given or dict.fromkeys((r.id for r in usable), filed and filed[1:3])
+        if len(cameras) < len(usable) or None in cameras.values():
             raise StageError(
-                f"{root}: has images, but no camera that took them; write focal_length: [fx, fy] "
-                "and principal_point: [cx, cy], or board: {kind: charuco, …} to find it"
+                f"{root}: has images, but no camera that took them; put its calibration beside "
+                "them, write focal_length: [fx, fy] and principal_point: [cx, cy], or board: "
+                "{kind: charuco, …} to find it"
             )
-        return cameras, []
+        return {n: c for n, c in cameras.items() if c}, [filed.note()] if filed else []
     images = {r.id: read_image(r.image) for r in usable if r.image is not None}
-    known = params.camera(usable[0])
+    known = given.get(usable[0].id) or (filed and filed[1:3])
     start = None if known is None else Image(images[usable[0].id], *known[:2])
     try:
         lens = lens_of(images, params.board.board, start)
     except StageError as error:
         raise StageError(f"{root}: {error}") from None
-    return dict.fromkeys(images, (lens.matrix, lens.distortion, lens.covariance)), [lens.note()]
+    told: list[str] = [filed.note()] if filed else []
+    told += [odd] if known and (odd := lens.against(known[0])) else []
+    camera = lens.matrix, lens.distortion, lens.covariance
+    return dict.fromkeys(images, camera), [*told, lens.note()]
+
+
+def _filed(root: Path, name: str | None) -> CameraFile | None:
+    """Return the calibration that lies beside the images.
+
+    Raises:
+        StageError: The named file holds none, or there are several and none is named.
+    """
+    folder = root if root.is_dir() else root.parent
+    if name is not None:
+        camera = camera_in(folder / name)
+        if camera is None:
+            raise StageError(f"{folder / name}: holds no camera's matrix")
+        return camera
+    found = cameras_in(folder)
+    if len(found) > 1:
+        names = ", ".join(str(camera.path.relative_to(folder)) for camera in found)
+        raise StageError(f"{folder}: which took the images? write camera_file: one of {names}")
+    return found[0] if found else None
 
 
 def _captures(

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from flangeye import Params, StageError
 from flangeye.models.boards import Board, Dictionary, Kind
 from flangeye.models.corners import Corners, find_corners
-from flangeye.types import Floats, Image, Rejected
+from flangeye.types import Floats, Image, Rejected, Warn
 from flangeye.units import Length, param
 
 FEWEST_VIEWS = 6
@@ -26,6 +26,8 @@ ALIKE = (
     "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
     "[fx, fy] and principal_point: [cx, cy]"
 )
+CONTRADICTED = 0.02
+"""By what share of itself a focal length may be off before a calibration is another camera's."""
 OUTLYING = 4.0
 """Times the median reprojection error beyond which a view takes no part."""
 COEFFICIENTS = ("k1", "k2", "p1", "p2")
@@ -82,6 +84,18 @@ class Lens(NamedTuple):
     def deviations(self) -> Floats:
         """(8,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
+
+    def against(self, known: Floats) -> Warn | None:
+        """Return a warning where the views contradict a camera's matrix (3, 3) [px]."""
+        stated, found = known[0, 0], self.matrix[0, 0]
+        if abs(stated / found - 1) < max(CONTRADICTED, 5 * self.deviations[0] / found):
+            return None
+        return Warn(
+            f"the camera's calibration says a focal length of {stated:.0f} px, {self.views} views "
+            f"of the board say {found:.0f} +- {self.deviations[0]:.0f} px, which was taken",
+            "calibrate the camera anew, or give the calibration of these images: another camera, "
+            "lens or image size has another one",
+        )
 
     def note(self) -> str:
         """Return what to tell of it."""

@@ -75,6 +75,15 @@ def test_a_camera_that_is_nearly_known_is_refined(views: Any) -> None:
     np.testing.assert_allclose(refined.matrix, lens_of(views, BOARD).matrix, atol=0.05)
 
 
+def test_a_calibration_that_the_images_contradict_is_said(views: Any) -> None:
+    wrong = MATRIX * [[1.4, 1, 1], [1, 1.4, 1], [1, 1, 1]]
+    found = lens_of(views, BOARD, Image(views["0"], wrong, np.zeros(0)))
+    said = found.against(wrong)
+    assert said is not None
+    assert said.startswith("the camera's calibration says a focal length of 1400 px, 12 views of")
+    assert found.against(MATRIX) is None
+
+
 def test_images_without_a_board_are_left_out_and_named(views: Any) -> None:
     blank = np.full_like(views["0"], 90)
     lens = lens_of({**views, "blank": blank}, BOARD)

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from flangeye.errors import RecipeError, StageError
+from flangeye.files.cameras import cameras_in
 from flangeye.files.clouds import CONVERSIONS, read_cloud
 from flangeye.files.recording import Archive, NotThisLayout
 from flangeye.files.scans import CLOUDS, IMAGES
@@ -83,7 +84,7 @@ def draft_recipe(
     head = _head(survey.folder, robot, target, questions)
     first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
-    first |= _camera(archive, target) if stage == "acquire.images" else {}
+    first |= _camera(archive, target, questions) if stage == "acquire.images" else {}
     data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
     return Draft(_yaml(data), _summary(archive, reader))
 
@@ -247,10 +248,18 @@ def _length_of_files(questions: Questions) -> str:
     return questions.ask("length", "unit of pos01.yaml and so on", "mm", check=one_of("m", "mm"))
 
 
-def _camera(archive: Archive, target: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the board that tells the camera, where the archive does not."""
+def _camera(archive: Archive, target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
+    """Return the file of the camera, or the board that tells it, where the archive does not."""
     ((kind, params),) = target.items()
-    if kind == "aruco" or any(r.camera for r in archive.recordings):
+    if any(r.camera for r in archive.recordings):
+        return {}
+    if cameras := cameras_in(archive.root):
+        name = str(cameras[0].path.relative_to(archive.root))
+        others = [camera.path.name for camera in cameras[1:]]
+        instead = f", not {', '.join(others)}" if others else ""
+        questions.assumed.append(f"{cameras[0].note()}{instead} (camera_file says otherwise)")
+        return {"camera_file": name}
+    if kind == "aruco":
         return {}
     called = {"spacing": "square", "diameter": "marker"}
     sizes = {called.get(name, name): value for name, value in params.items()}

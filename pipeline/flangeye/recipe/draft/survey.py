@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from flangeye.errors import FlangeyeError, RecipeError
+from flangeye.errors import FlangeyeError, RecipeError, StageError
+from flangeye.files.cameras import cameras_in
 from flangeye.files.pairs import natural
 from flangeye.files.scans import CLOUDS, IMAGES, VENDOR
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
@@ -63,11 +65,15 @@ def look(folder: Path) -> FolderSurvey:
     """
     if not folder.is_dir():
         raise RecipeError(f"{folder}: is no folder; name the one that holds the recordings")
+    cameras: set[Path] = set()
     found = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
     files = sorted(found, key=lambda path: natural(str(path)))
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
-    tables = [t for place, of in places(folder, files) for t in _tables(folder, place, len(of))]
+    with suppress(StageError):
+        cameras = {camera.path for camera in cameras_in(folder)}
+    others = [file for file in files if file not in cameras]
+    tables = [t for place, of in places(folder, others) for t in _tables(folder, place, len(of))]
     return FolderSurvey(folder, files, _whole(folder, tables))
 
 

@@ -1,0 +1,229 @@
+"""The calibration of a camera, from the files in which programs keep one.
+
+``camera_info`` of ROS, OpenCV's storage, kalibr's camchain, COLMAP's ``cameras.txt``, RealSense's
+and Zivid's intrinsics, and arrays of NumPy: each by its own names.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.files.regular import read_text
+from flangeye.files.tables.documents import KINDS, document_of
+from flangeye.types import Floats
+
+LARGEST = 1_000_000
+"""A file that is larger [bytes] holds recordings, and is not looked into."""
+MATRICES = (
+    "camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "intrinsic", "mtx", "matrix",
+    "k", "m1",
+)  # fmt: skip
+"""Names of the camera's matrix, in small letters."""
+DISTORTIONS = (
+    "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distcoeffs", "distortion",
+    "dist", "coeffs", "d", "d1",
+)  # fmt: skip
+"""Names of the distortion."""
+PINHOLE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"))
+"""Names of the matrix's entries one by one, the second of RealSense."""
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's coefficients."""
+COLMAP: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", *ORDER),
+}
+"""Parameters of COLMAP's models that are OpenCV's (COLMAP, camera models)."""
+MOST = 14
+"""OpenCV's longest row of coefficients."""
+CORNER = 0.5
+"""In COLMAP the centre of the first pixel is at this [px]; in OpenCV at 0."""
+OTHER_LENSES = ("equidistant", "fisheye", "kannala", "fov", "inverse", "omni", "ds", "eucm")
+"""In the name of a model whose coefficients are not OpenCV's."""
+
+
+NUMBERED = 3
+"""Files that are named alike but for a number hold a pose each."""
+
+
+class CameraFile(NamedTuple):
+    """A camera's calibration.
+
+    Attributes:
+        path: The file.
+        matrix: (3, 3) [px].
+        distortion: (k,) OpenCV's coefficients.
+        others: How many more cameras the file holds.
+    """
+
+    path: Path
+    matrix: Floats
+    distortion: Floats
+    others: int = 0
+
+    def note(self) -> str:
+        """Return what to say of it."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        lens = f"{len(self.distortion)} coefficients" if self.distortion.any() else "no distortion"
+        lens += f"; the first of {self.others + 1} in it" if self.others else ""
+        return (
+            f"camera of {self.path}: focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, "
+            f"{cy:.1f} px, {lens}"
+        )
+
+
+def cameras_in(folder: Path) -> list[CameraFile]:
+    """Return the calibrations in the files of a folder and of the folders in it.
+
+    Raises:
+        StageError: As :func:`camera_in`.
+    """
+    names = (*KINDS, ".txt")
+    inside = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.suffix.lower() in names)
+    files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= LARGEST)
+    alike = Counter(re.sub(r"\d+", "*", str(path)) for path in files)
+    found = (camera_in(p) for p in files if alike[re.sub(r"\d+", "*", str(p))] < NUMBERED)
+    return [camera for camera in found if camera is not None]
+
+
+def camera_in(path: Path) -> CameraFile | None:
+    """Return the calibration that a file holds; None where it holds none.
+
+    Raises:
+        StageError: Its lens is of another model than OpenCV's.
+    """
+    if path.suffix.lower() == ".txt":
+        return _colmap(path) if path.name == "cameras.txt" else _text(path)
+    try:
+        document = document_of(path)
+    except StageError:
+        return None
+    if document is None:
+        return None
+    if isinstance(document.data, np.ndarray):
+        return _checked(path, document.data, ())
+    found = [(values, matrix) for values in _mappings(document.data)
+             if (matrix := _matrix(values)) is not None and _is_camera(matrix)]  # fmt: skip
+    if not found:
+        return None
+    values, matrix = found[0]
+    _require_opencv(path, values)
+    others = sum(not np.array_equal(other, matrix) for _, other in found)
+    camera = _checked(path, matrix, _distortion(values))
+    return camera and camera._replace(others=others)
+
+
+def _mappings(data: Any) -> Iterator[dict[str, Any]]:
+    """Yield the mappings in a document, the outer first, names in small letters."""
+    if isinstance(data, Mapping):
+        yield {str(name).lower(): value for name, value in data.items()}
+        for value in data.values():
+            yield from _mappings(value)
+
+
+def _matrix(values: Mapping[str, Any]) -> Floats | None:
+    for names in PINHOLE:
+        if all(_is_number(values.get(name)) for name in names):
+            return _pinhole(*(float(values[name]) for name in names))
+    for name in MATRICES:
+        value = values.get(name)
+        if isinstance(value, Mapping):
+            value = _matrix({str(key).lower(): each for key, each in value.items()})
+        numbers = _numbers(value)
+        if numbers.size == 9:
+            return numbers.reshape(3, 3)
+        if numbers.size == 4:
+            return _pinhole(*numbers)
+    return None
+
+
+def _distortion(values: Mapping[str, Any]) -> Floats:
+    for name in DISTORTIONS:
+        value = values.get(name)
+        if isinstance(value, Mapping):
+            known = {str(key).lower(): each for key, each in value.items()}
+            value = known.get("data", [known.get(each, 0.0) for each in ORDER[:5]])
+        if (numbers := _numbers(value)).size:
+            return numbers
+    return np.zeros(0)
+
+
+def _require_opencv(path: Path, values: Mapping[str, Any]) -> None:
+    named = [str(values.get(name, "")).lower() for name in ("distortion_model", "model")]
+    other = next((name for name in named if any(word in name for word in OTHER_LENSES)), None)
+    if other and _distortion(values).any():
+        raise StageError(
+            f"{path}: its lens is of the model {other}, whose coefficients are not OpenCV's; "
+            "rectify the images, and write focal_length and principal_point of the rectified ones"
+        )
+
+
+def _colmap(path: Path) -> CameraFile | None:
+    """Return the first camera of COLMAP's list: its id, model, width, height, parameters."""
+    for line in read_text(path).splitlines():
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        names = COLMAP.get(words[1]) if len(words) > 1 else None
+        if names is None or len(words) != 4 + len(names):
+            return None
+        known = dict(zip(names, map(float, words[4:]), strict=True))
+        fx, fy = known.get("fx", known.get("f", 0.0)), known.get("fy", known.get("f", 0.0))
+        matrix = _pinhole(fx, fy, known["cx"] - CORNER, known["cy"] - CORNER)
+        return _checked(path, matrix, [known[name] for name in ORDER if name in known])
+    return None
+
+
+def _text(path: Path) -> CameraFile | None:
+    """Return the camera of nine numbers in three rows."""
+    rows = [line.replace(",", " ").split() for line in read_text(path).splitlines()]
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    if [len(row) for row in rows] != [3, 3, 3] or not all(_is_number(w) for r in rows for w in r):
+        return None
+    return _checked(path, np.array(rows, dtype=np.float64), ())
+
+
+def _checked(path: Path, matrix: Floats, lens: Iterable[float]) -> CameraFile | None:
+    """Return a calibration; None where the matrix is no camera's."""
+    coefficients = np.asarray(lens, dtype=np.float64).ravel()
+    sound = len(coefficients) <= MOST and np.isfinite(coefficients).all()
+    return CameraFile(path, matrix, coefficients) if sound and _is_camera(matrix) else None
+
+
+def _is_camera(matrix: Floats) -> bool:
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    (fx, _, cx), (zero, fy, cy), last = matrix.tolist()
+    return bool(zero == 0 and last == [0, 0, 1] and min(fx, fy, cx, cy) > 1)
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Floats:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _numbers(value: Any) -> Floats:
+    """Return the numbers of lists and arrays; none of anything else."""
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    try:
+        return np.asarray([] if value is None else value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False

@@ -1,0 +1,87 @@
+"""Calibrations of cameras, as programs write them."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.files.cameras import camera_in, cameras_in
+
+K = np.array([[1201.5, 0, 639.25], [0, 1203.5, 363.75], [0, 0, 1.0]])
+LENS = [-0.11, 0.07, 0.0011, -0.0012, 0.01]
+ROWS = ", ".join(map(str, K.ravel()))
+FOUR = "1201.5, 1203.5, 639.25, 363.75"
+WRITTEN = {
+    "camera_info.yaml": "image_width: 1280\nimage_height: 720\ncamera_name: a\ncamera_matrix:\n"
+    f"  rows: 3\n  cols: 3\n  data: [{ROWS}]\ndistortion_model: plumb_bob\n"
+    f"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: {LENS}\nprojection_matrix:\n"
+    f"  rows: 3\n  cols: 4\n  data: [{', '.join(['7'] * 12)}]\n",
+    "camchain.yaml": "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+    f"  distortion_coeffs: {LENS}\n  intrinsics: [{FOUR}]\n  resolution: [1280, 720]\n",
+    "zivid.yml": "CameraIntrinsics:\n  CameraMatrix:\n    CX: 639.25\n    CY: 363.75\n"
+    "    FX: 1201.5\n    FY: 1203.5\n  Distortion:\n    K1: -0.11\n    K2: 0.07\n    K3: 0.01\n"
+    "    P1: 0.0011\n    P2: -0.0012\n",
+    "realsense.json": '{"color": {"width": 1280, "height": 720, "ppx": 639.25, "ppy": 363.75, "fx": '
+    f'1201.5, "fy": 1203.5, "model": "distortion.brown_conrady", "coeffs": {LENS}}}}}',
+    "plain.json": f'{{"K": {K.tolist()}, "dist": [{LENS}], "rms": 0.2}}',
+    "cameras.txt": "# Camera list\n# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    "1 FULL_OPENCV 1280 720 1201.5 1203.5 639.75 364.25 -0.11 0.07 0.0011 -0.0012 0.01 0 0 0\n",
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_each_kind_is_read_by_its_own_names(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(WRITTEN[name])
+    camera = camera_in(tmp_path / name)
+    assert camera is not None
+    assert np.allclose(camera.matrix, K)
+    assert np.allclose(camera.distortion[:5], LENS)
+    assert "focal length 1201.5, 1203.5 px, principal point 639.2, 363.8 px" in camera.note()
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+@pytest.mark.parametrize("names", [("camera_matrix", "distortion_coefficients"), ("K", "D"),
+                                   ("cameraMatrix", "distCoeffs")])  # fmt: skip
+def test_opencvs_storage(tmp_path: Path, suffix: str, names: tuple[str, str]) -> None:
+    path = tmp_path / f"intrinsics{suffix}"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("rms", 0.3)
+    file.write(names[0], K)
+    file.write(names[1], np.array([LENS]))
+    file.release()
+    (camera,) = cameras_in(tmp_path)
+    assert np.allclose(camera.matrix, K)
+    assert np.allclose(camera.distortion, LENS)
+
+
+def test_arrays_and_nine_numbers(tmp_path: Path) -> None:
+    np.savez(tmp_path / "calib.npz", mtx=K, dist=np.array([LENS]), rvecs=np.zeros((9, 3, 1)))
+    np.savetxt(tmp_path / "K.txt", K)
+    np.save(tmp_path / "K.npy", K)
+    for k in range(5):  # poses, not cameras
+        np.savetxt(tmp_path / f"pose_{k}.txt", np.eye(3))
+    assert [c.path.name for c in cameras_in(tmp_path)] == ["K.npy", "K.txt", "calib.npz"]
+    assert all(np.allclose(c.matrix, K) for c in cameras_in(tmp_path))
+
+
+def test_several_cameras_in_a_file_are_said(tmp_path: Path) -> None:
+    text = WRITTEN["camchain.yaml"]
+    (tmp_path / "a.yaml").write_text(text + text.replace("cam0", "cam1").replace("1201.5", "900"))
+    camera = camera_in(tmp_path / "a.yaml")
+    assert camera is not None
+    assert camera.note().endswith("5 coefficients; the first of 2 in it")
+
+
+def test_a_lens_of_another_model_is_refused(tmp_path: Path) -> None:
+    text = WRITTEN["camchain.yaml"].replace("radtan", "equidistant")
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(StageError, match="model equidistant, whose coefficients are not OpenCV's"):
+        camera_in(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize("text", ["k: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]", "robot: 3", "K: x", "["])
+def test_what_is_no_camera_is_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    assert camera_in(tmp_path / "a.yaml") is None
