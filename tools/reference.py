@@ -6,6 +6,7 @@ mkdocs calls :func:`on_files` when it builds the documentation, so they are neve
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import typer
 import typer.core
@@ -13,6 +14,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
+from flangeye.cli.app import GROUPS
 from flangeye.cli.commands import app
 from flangeye.plugin.registry import load_registry
 from flangeye.plugin.stage import KINDS, PARTS, Plugin
@@ -42,28 +44,34 @@ def _look() -> str:
     rules = [
         f'[data-md-color-scheme="{name}"] {{ --md-primary-fg-color: {LIGHT["link"]}; '
         f"--md-accent-fg-color: {of['link']}; --md-typeset-a-color: {of['link']}; "
-        f"--md-default-bg-color: {of['paper']}; --md-code-bg-color: {of['panel']}; }}"
+        f"--md-default-bg-color: {of['paper']}; --md-code-bg-color: {of['panel']}; "
+        f"--md-default-fg-color: {of['ink']}; --md-default-fg-color--light: {of['muted']}; }}"
         for name, of in themes.items()
     ]
     type_ = f"body {{ --md-text-font-family: {SANS}; --md-code-font-family: {MONO}; }}"
-    return "\n".join([*rules, type_]) + "\n"
+    heads = ".md-typeset h1, .md-typeset h2, .md-typeset h3 { font-weight: 650; color: inherit; }"
+    return "\n".join([*rules, type_, heads]) + "\n"
 
 
 def _commands() -> str:
     group = get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
     lines = ["# Commands", "", "`flangeye COMMAND --help` prints the same.", ""]
-    for name, command in sorted(group.commands.items()):
-        if command.hidden:
-            continue
-        context = typer.Context(command, info_name=f"flangeye {name}")
-        usage = " ".join([f"flangeye {name}", *command.collect_usage_pieces(context)])
-        lines += [f"## {name}", "", (command.help or "").strip(), "", "```text", usage, "```", ""]
-        rows = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-        for row in rows:
-            if row and not row[0].startswith("-h"):
-                lines += [f"`{' '.join(row[0].split())}`", f":   {' '.join(row[1].split())}", ""]
+    for title, names in GROUPS.items():
+        lines += [f"## {title}", ""]
+        lines += [line for name in names for line in _command(name, group.commands[name])]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _command(name: str, command: Any) -> list[str]:
+    context = typer.Context(command, info_name=f"flangeye {name}")
+    usage = " ".join([f"flangeye {name}", *command.collect_usage_pieces(context)])
+    lines = [f"### {name}", "", (command.help or "").strip(), "", "```text", usage, "```", ""]
+    for parameter in command.get_params(context):
+        record = parameter.get_help_record(context)
+        if record and not record[0].startswith("-h"):
+            lines += [f"`{' '.join(record[0].split())}`", f":   {' '.join(record[1].split())}", ""]
+    return lines
 
 
 def _stages() -> str:

@@ -107,13 +107,17 @@ def print_refusal(console: Console, wrong: str, known: str, next_steps: Collecti
 
 
 def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "") -> None:
-    """Print rows of a name, a value and a remark, aligned; a remark that is too long goes below."""
+    """Print aligned rows: name, value, remark; remarks go below where one is too long."""
     listed = [*rows]
     name_width, value_width = (max((len(row[i]) for row in listed), default=0) for i in (0, 1))
+    longest = max((len(remark) for *_, remark in listed), default=0)
+    beside = name_width + value_width + longest + 6 <= width(console)
     for name, value, remark in listed:
-        line = f"{name:<{name_width}}   {value:<{value_width}}   {remark}".rstrip()
-        if len(line) > width(console) and remark:
-            line = f"{name:<{name_width}}   {value}\n" + wrapped(console, f"   {remark}", 3)
+        line = f"{name:<{name_width}}   {value}"
+        if beside:
+            line = f"{line:<{name_width + 3 + value_width}}   {remark}".rstrip()
+        elif remark:
+            line += "\n" + wrapped(console, f"   {remark}", 3)
         write(console, line, colour)
 
 
