@@ -68,7 +68,7 @@ def entries() -> Any:
         (session(0, **{"steps.0.noise": "0.1 mm", "steps.0.count": "5"}), outcome(1e-4)),
         (session(1, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}), outcome(2e-4)),
         (session(2, **{"steps.0.noise": "0.2 mm", "steps.0.count": "6"}),
-         SessionOutcome("failed", f"bad, {EVIL}", seconds=0.1)),
+         SessionOutcome("failed", f"bad, {EVIL}\x1b[2J", seconds=0.1)),
     ]  # fmt: skip
 
 
@@ -87,10 +87,11 @@ def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
     rows = table.to_pylist()
     assert len(read) == len(rows) == 3
     for text, row in zip(read, rows, strict=True):
-        assert text == {k: "" if v is None else str(v) for k, v in row.items()}
+        plain = {k: "" if v is None else str(v) for k, v in row.items()}
+        assert text == {k: v.replace("\x1b", "\\x1b") for k, v in plain.items()}
     assert rows[1]["holdout_rms_m"] == 2e-4
     assert rows[2]["holdout_rms_m"] is None
-    assert rows[2]["reason"] == f"bad, {EVIL}"
+    assert rows[2]["reason"] == f"bad, {EVIL}\x1b[2J"
     assert table.schema.field("steps.0.noise").type == pa.string()
     assert table.schema.field("steps.0.count").type == pa.int64()
     assert table.schema.field("true_rms_m").type == pa.float64()

@@ -1,6 +1,7 @@
 """Tables of every form are the same rows of named cells."""
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,19 @@ def test_a_file_is_found_by_its_name_and_others_by_a_pattern(tmp_path: Path) -> 
     assert files_at(tmp_path, "log[1].csv") == [tmp_path / "log[1].csv"]
     assert files_at(tmp_path, "*/pose.json") == [tmp_path / f"{n}/pose.json" for n in "ab"]
     assert files_at(tmp_path, "c/pose.json") == files_at(tmp_path, "/etc/*") == []
+
+
+@pytest.mark.parametrize(
+    "name", ["**/*.csv", "a**b", "x" * 5000, "x" * 300 + "*", "*\0", "a*" * 50]
+)
+def test_no_name_takes_long_or_ends_in_a_traceback(name: str, tmp_path: Path) -> None:
+    (tmp_path / ("a" * 200)).touch()
+    began = time.process_time()
+    try:
+        assert files_at(tmp_path, name) in ([], [tmp_path / ("a" * 200)])
+    except StageError as error:
+        assert "is no name of a file: " in str(error) and len(str(error)) < 300
+    assert time.process_time() - began < 1.0
 
 
 def test_a_value_that_is_missing_is_an_empty_cell(tmp_path: Path) -> None:

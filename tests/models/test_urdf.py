@@ -1,6 +1,7 @@
 """An arm from its URDF: the chain, the frames, the volumes, and what is said when one is wrong."""
 
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from flangeye.maths.capsules import fit_capsule
 from flangeye.maths.geometry import rotation_from_rpy
 from flangeye.maths.kinematics import Arm
 from flangeye.models.urdf import robot_from_urdf
+from flangeye.models.urdf_meshes import vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import load_recipe
@@ -244,6 +246,49 @@ def test_what_is_wrong_with_a_urdf_is_one_line(
     with pytest.raises(RecipeError, match=words) as error:
         robot_from_urdf(kuka)
     assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ["revolute", "fixed"])
+def test_long_chains_take_time_with_their_length_and_messages_stay_short(
+    kind: str, tmp_path: Path
+) -> None:
+    def seconds(count: int) -> float:
+        joints = (joint(i, "0 0 0.1", "0 0 1", 90, kind) for i in range(1, count))
+        links = (f'<link name="link_{i}"/>' for i in range(count))
+        path = tmp_path / "long.urdf"
+        path.write_text(f'<robot name="long">{"".join(links)}{"".join(joints)}</robot>')
+        began = time.process_time()
+        told: list[object] = []
+        for flange in (None, "x" * 99):
+            try:
+                told += robot_from_urdf(path, flange=flange).notes
+            except RecipeError as error:
+                told.append(error)
+        assert max(len(str(words)) for words in told) < 600
+        return time.process_time() - began
+
+    short, long = min(seconds(1000) for _ in range(3)), seconds(16_000)
+    assert long < 16 * 4 * short
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "words"),
+    [
+        (b"<!DOCTYPE COLLADA [<!ENTITY a 'x'>]><COLLADA/>", "m.dae", "declares a document type"),
+        (b"mtllib ../../secret.mtl\n", "m.gltf", "'.gltf' is no mesh that is read; known: .stl"),
+        (None, "m.stl", "is a device, a FIFO or a socket; a file is needed"),
+    ],
+)
+def test_meshes_come_through_the_one_door(
+    kuka: Path, content: bytes | None, name: str, words: str
+) -> None:
+    mesh = kuka.parent / name
+    if content is None:
+        mesh.symlink_to("/dev/zero")
+    else:
+        mesh.write_bytes(content)
+    with pytest.raises(RecipeError, match=re.escape(words)):
+        vertices(mesh)
 
 
 def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka: Path, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from flangeye.batch.tally import Batch, Tally
 from flangeye.batch.work import READY, STARTS, Job
 from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_url
+from flangeye.files.printable import printable
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -134,8 +135,14 @@ def _tell(job: Job, dataset: Dataset, ledger: Ledger, tally: Tally) -> None:
         writer.writerow(tally.columns)
         for table in dataset.blocks(ledger):
             tally.add(table)
-            writer.writerows(zip(*(table[n].to_pylist() for n in tally.columns), strict=True))
+            columns = (map(_plain, table[n].to_pylist()) for n in tally.columns)
+            writer.writerows(zip(*columns, strict=True))
     if tally.total:
         write_page(tally, job.place)
     else:
         job.place.remove(CSV)
+
+
+def _plain(cell: object) -> object:
+    """Return a cell without control characters: tables are shown in terminals."""
+    return printable(cell).replace("\n", " ") if isinstance(cell, str) else cell

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+LONGEST = 4000
+"""Of a line of an error, what is shown [characters]: names in it come from files."""
+
 
 def say(text: object, err: bool = False) -> None:
     """Write a line; what others wrote in it reaches the terminal as text, never as commands."""
@@ -97,5 +100,6 @@ def _fail(error: FlangeyeError) -> NoReturn:
         traceback.print_exception(error)
     with suppress(OSError):
         for line in printable(str(error)).splitlines():
-            sys.stderr.write(f"error: {line}\n")
+            more = f" ({len(line) - LONGEST} characters more)" if len(line) > LONGEST else ""
+            sys.stderr.write(f"error: {line[:LONGEST]}{more}\n")
     sys.exit(error.exit_code)

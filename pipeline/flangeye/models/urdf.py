@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flangeye.errors import RecipeError
+from flangeye.files.near import nearest
 from flangeye.files.printable import require_name
 from flangeye.files.regular import read_text
 from flangeye.maths.geometry import (
@@ -33,6 +34,8 @@ TURNS = ("revolute", "continuous")
 MOVES = (*TURNS, "prismatic")
 FLANGES = ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame")
 """Ends of the names that makers give the flange's frame, z outwards; the surest first."""
+NAMED = 8
+"""Links that a message names."""
 OUTWARDS = np.radians(5.0)
 """A flange's z is along the last axis; beyond this angle [rad] it is another frame of the link."""
 ARCHIVES = (
@@ -60,11 +63,26 @@ class Urdf:
         """Return the joints from the root to a link."""
         joints: list[ET.Element] = []
         while link in self.above:
-            joints.insert(0, self.above[link])
-            link = end_of(joints[0], "parent")
+            joints.append(self.above[link])
+            link = end_of(joints[-1], "parent")
             if len(joints) > len(self.links):
                 raise RecipeError(f"{self.path}: its joints go round in a circle at '{link}'")
-        return joints
+        return joints[::-1]
+
+    def moved(self) -> list[str]:
+        """Return the links that a joint moves, each looked at once."""
+        known: dict[str, bool] = {}
+        for name in self.links:
+            new, at = list[str](), name
+            while at in self.above and at not in known:
+                new.append(at)
+                at = end_of(self.above[at], "parent")
+                if len(new) > len(self.links):
+                    raise RecipeError(f"{self.path}: its joints go round in a circle at '{at}'")
+            moves = known.get(at, False)
+            for link in reversed(new):
+                moves = known[link] = moves or self.above[link].get("type") in MOVES
+        return [name for name in self.links if known.get(name)]
 
 
 def robot_from_urdf(
@@ -256,7 +274,7 @@ def _notes(
     if without := bodies.without():
         yield (
             f"{urdf.path}: {len(without)} of {len(robot.joints) + 1} links have no collision body "
-            f"({', '.join(without)}); a planned move does not keep clear of them"
+            f"({_some(without)}); a planned move does not keep clear of them"
         )
 
 
@@ -311,13 +329,12 @@ def _flange(urdf: Urdf, asked: str | None) -> str:
         if len(named) == 1:
             return named[0]
     parents = {end_of(joint, "parent") for joint in urdf.above.values()}
-    moved = [n for n in urdf.links if any(j.get("type") in MOVES for j in urdf.chain(n))]
-    ends = [name for name in moved if name not in parents]
+    ends = [name for name in urdf.moved() if name not in parents]
     if len(ends) == 1:
         return ends[0]
     raise RecipeError(
         f"{urdf.path}: which link is the flange, its origin in the plate's face and z outwards? "
-        f"write flange: {' or '.join(ends[:8]) or 'NAME'}"
+        f"write flange: {' or '.join(ends[:NAMED]) or 'NAME'}"
     )
 
 
@@ -325,9 +342,13 @@ def _known(urdf: Urdf, asked: str, what: str) -> str:
     if asked in urdf.links:
         return asked
     hint = "; the plate goes to feature: {standard: …}" if "9409" in asked else ""
-    raise RecipeError(
-        f"{urdf.path}: {what}: no link '{asked}'; links: {', '.join(urdf.links)}{hint}"
-    )
+    near = nearest(asked, urdf.links) or list(urdf.links)
+    raise RecipeError(f"{urdf.path}: {what}: no link '{asked}'; links: {_some(near)}{hint}")
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
 
 
 def _shared(first: list[ET.Element], second: list[ET.Element]) -> int:

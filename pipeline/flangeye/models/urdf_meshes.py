@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flangeye.errors import RecipeError
 from flangeye.files.printable import reason_of
+from flangeye.files.regular import read_regular
 from flangeye.maths.capsules import Capsule, fit_capsule
 from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats
 
 MAX_BYTES = 200_000_000
+MESHES = (".stl", ".obj", ".dae", ".ply")
 
 
 class MissingMesh(RecipeError):
@@ -52,7 +56,7 @@ def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Float
         return _cylinder(_number(body, "radius", urdf), _number(body, "length", urdf))
     if body.tag == "mesh":
         scale = np.array(numbers_of(urdf, body, "scale", "1 1 1"))
-        return np.asarray(_vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
+        return np.asarray(vertices(_find(body.get("filename", ""), urdf, packages)) * scale)
     raise RecipeError(f"{urdf}: <{body.tag}> is no body that URDF knows")
 
 
@@ -93,15 +97,22 @@ def _nearby(urdf: Path, package: str) -> list[Path]:
     return named + [folder / package for folder in above if (folder / package).is_dir()]
 
 
-def _vertices(path: Path) -> Floats:
+def vertices(path: Path) -> Floats:
+    """Return the vertices (V, 3) of a mesh, decoded from its bytes: it opens no other file.
+
+    Raises:
+        RecipeError: It is no regular file of a known kind, is too large, or is damaged.
+    """
     import trimesh
 
-    if path.stat().st_size > MAX_BYTES:
-        raise RecipeError(
-            f"{path}: a mesh of more than {MAX_BYTES} bytes; collision meshes are small"
-        )
+    kind = path.suffix.lower()
+    if kind not in MESHES:
+        raise RecipeError(f"{path}: '{kind}' is no mesh that is read; known: {', '.join(MESHES)}")
+    raw = read_regular(path, MAX_BYTES, RecipeError)
+    if kind == ".dae" and (b"<!DOCTYPE" in raw or b"<!ENTITY" in raw):
+        raise RecipeError(f"{path}: declares a document type or entities, which are not read")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh: Any = trimesh.load(io.BytesIO(raw), file_type=kind[1:], force="mesh")
     except Exception as error:  # trimesh raises whatever its readers do
         raise RecipeError(f"{path}: is no mesh that can be read: {reason_of(error)}") from None
     points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)

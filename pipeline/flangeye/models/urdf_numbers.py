@@ -31,5 +31,5 @@ def numbers_of(
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         words = {1: "one finite number", 3: "three finite numbers"}
-        raise RecipeError(f'{urdf}: {name}="{text}" is not {words[count]}')
+        raise RecipeError(f'{urdf}: {name}="{text[:80]}" is not {words[count]}')
     return numbers

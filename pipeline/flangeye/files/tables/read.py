@@ -14,6 +14,7 @@ from pathlib import Path
 
 from flangeye.errors import StageError
 from flangeye.files.pairs import natural
+from flangeye.files.printable import reason_of
 from flangeye.files.regular import read_text
 from flangeye.files.tables.documents import document_of
 from flangeye.files.tables.programs import program_rows
@@ -26,14 +27,21 @@ _SHARE = re.compile(r"([1-9]\d?)/([1-9]\d?)")
 
 
 def files_at(folder: Path, name: str) -> list[Path]:
-    """Return the file of a name, or those of a pattern, ``*.json`` or ``*/pose.json``, in order."""
-    if (folder / name).is_file():
-        return [folder / name]
-    name = name.partition(":")[0]
-    if (folder / name).is_file():
-        return [folder / name]
-    found = folder.glob(name) if "*" in name and not Path(name).is_absolute() else ()
-    return sorted((p for p in found if p.is_file()), key=lambda path: natural(str(path)))
+    """Return the file of a name, or those of a pattern, ``*.json`` or ``*/pose.json``, in order.
+
+    Raises:
+        StageError: No file can have such a name, or the pattern would look through all folders.
+    """
+    try:
+        for whole in (name, name.partition(":")[0]):
+            if (folder / whole).is_file():
+                return [folder / whole]
+        found = folder.glob(whole) if "*" in whole and not Path(whole).is_absolute() else ()
+        if found and "**" in whole:
+            raise ValueError("** is not known; write */ for each folder between")
+        return sorted((p for p in found if p.is_file()), key=lambda path: natural(str(path)))
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise StageError(f"{name[:80]!a}: is no name of a file: {reason_of(error)}") from None
 
 
 def read_table(folder: Path, name: str | Sequence[str]) -> Table:
