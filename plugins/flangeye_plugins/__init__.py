@@ -3,9 +3,10 @@
 By name and place: a module is imported when a recipe uses what is in it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from flangeye import hookimpl
+from flangeye.models.graph import Graph
 
 FORMATS = (
     "ros2_command",
@@ -148,3 +149,15 @@ def flangeye_stages() -> Mapping[str, str]:
 def flangeye_parts() -> Mapping[str, str]:
     """Offer the built-in parts."""
     return PARTS
+
+
+@hookimpl
+def flangeye_graphs() -> Mapping[str, Callable[[], Graph]]:
+    """Offer ROS 2."""
+    return {"ros2": _ros2}
+
+
+def _ros2() -> Graph:
+    from flangeye_plugins.ros2.graph import Ros2Graph
+
+    return Ros2Graph()

@@ -1,16 +1,20 @@
-"""``flangeye init``: a recipe for what a folder holds."""
+"""``flangeye init``: a recipe for what a folder holds, or for what runs."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import app, ask, load_plugins
+from flangeye.cli.app import app, ask, load_plugins, open_graph
 from flangeye.cli.console import say
 from flangeye.errors import RecipeError
+
+if TYPE_CHECKING:
+    from flangeye.plugin.registry import Registry
+    from flangeye.recipe.draft import Draft, Questions
 
 TARGETS = re.compile(r"^.*?: steps\.\d+\.fit\.", re.MULTILINE)
 """Where mistakes in a target are, in a recipe that was drafted."""
@@ -59,6 +63,24 @@ TargetPose = Annotated[
 Reader = Annotated[
     Answer, typer.Option(help="Reader as written in a recipe; replaces the options above.")
 ]
+Ros2 = Annotated[
+    bool, typer.Option("--ros2", help="Look at the arm and the camera that run under ROS 2.")
+]
+Trajectory = Annotated[
+    Answer, typer.Option(help="With --ros2: topic of the controller that moves the arm, or none.")
+]
+Scans = Annotated[Answer, typer.Option(help="With --ros2: topic of clouds or depth images.")]
+Trigger = Annotated[Answer, typer.Option(help="With --ros2: service that takes a scan, or none.")]
+View = Annotated[
+    Answer, typer.Option(help="With --ros2: where the scanner roughly stands: '620, 0, 980 mm'.")
+]
+LimitBox = Annotated[
+    Answer,
+    typer.Option(
+        "--box",
+        help="With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",
+    ),
+]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; use the defaults and print them.")]
 Out = Annotated[Path, typer.Option(help="Recipe file to write.")]
 
@@ -83,41 +105,67 @@ def init(  # noqa: PLR0913  one for each option
     target_angle: TargetAngle = None,
     target_pose: TargetPose = None,
     reader: Reader = None,
+    ros2: Ros2 = False,
+    trajectory: Trajectory = None,
+    scans: Scans = None,
+    trigger: Trigger = None,
+    view: View = None,
+    box: LimitBox = None,
     yes: Yes = False,
     out: Out = Path("recipe.yaml"),
 ) -> None:
-    """Write a recipe for a folder of recordings.
+    """Write a recipe for a folder of recordings, or with --ros2 for what runs.
 
-    Inspects the folder and asks for what it does not show.
+    Inspects the folder or the running graph and asks for what it does not show.
     """
-    from flangeye.recipe.draft import Questions, draft_recipe, look
+    from flangeye.recipe.draft import Questions
     from flangeye.recipe.load import load_recipe
 
     if out.exists():
         raise RecipeError(f"{out}: is there already; take another name with --out")
     registry = load_plugins()
-    survey = look(folder)
-    for line in survey.lines():
-        say(line)
     given = {
         "robot": robot, "plate": plate, "scanner": scanner, "camera": camera, "target": target,
         "table": table, "columns": columns, "rotation": rotation, "length": length,
         "angle": angle, "pose": pose, "target-columns": target_columns,
         "target-rotation": target_rotation, "target-length": target_length,
         "target-angle": target_angle, "target-pose": target_pose, "reader": reader,
+        "trajectory": trajectory, "scans": scans, "trigger": trigger, "view": view, "box": box,
     }  # fmt: skip
     questions = Questions(given, None if yes else _prompt)
-    draft = draft_recipe(survey, out, questions, registry)
-    out.write_text(draft.text, "utf-8")
+    draft = (_of_what_runs if ros2 else _of_folder)(folder, out, questions, registry)
+    for path, text in {**draft.files, out: draft.text}.items():
+        path.write_text(text, "utf-8")
     try:
         checked = load_recipe(out, registry)
     except RecipeError as error:
-        out.unlink()
+        for path in (out, *draft.files):
+            path.unlink()
         # Of the recipe that is not kept nobody knows: its target is what was asked for.
         raise RecipeError(TARGETS.sub("--target ", str(error))) from None
     for line in (*draft.told, *(f"assumed: {line}" for line in questions.assumed)):
         say(line)
     say(f"{out}: ok, {len(checked.steps)} steps; next: flangeye run {out}")
+
+
+def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
+    from flangeye.recipe.draft import draft_recipe, look
+
+    survey = look(folder)
+    for line in survey.lines():
+        say(line)
+    return draft_recipe(survey, out, questions, registry)
+
+
+def _of_what_runs(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
+    from flangeye.recipe.draft import draft_live
+
+    del folder
+    with open_graph(registry) as graph:
+        cell = graph.cell(questions.ask, out.stem)
+    for line in cell.seen:
+        say(line)
+    return draft_live(cell, questions, out)
 
 
 def _prompt(question: str, default: str | None) -> str:

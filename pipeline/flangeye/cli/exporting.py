@@ -1,20 +1,30 @@
-"""``flangeye export``: a run's calibration as another program takes it."""
+"""A run's calibration for others: as a file, as tables, or on a graph."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flangeye.cli.app import LogFile, app, load_plugins
+from flangeye.cli.app import LogFile, app, load_plugins, open_graph
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from flangeye.log.read import RunLog
     from flangeye.plugin.stage import Stage
-    from flangeye.types import ExportedFile
+    from flangeye.types import CalibratedPose, ExportedFile
+
+
+ROS2 = "export.ros2_launch"
+Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
+Anyway = Annotated[
+    bool,
+    typer.Option("--anyway", help="Export even if the calibration was refused; it is said."),
+]
 
 
 def _list_formats(wanted: bool) -> None:
@@ -36,15 +46,8 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="File to write, or - to print; default RUN/exports/.")
     ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Camera to export, for a cell with several.")
-    ] = None,
-    anyway: Annotated[
-        bool,
-        typer.Option(
-            "--anyway", help="Export even if the calibration was refused; the file says so."
-        ),
-    ] = False,
+    camera: Camera = None,
+    anyway: Anyway = False,
     _list: Annotated[
         bool,
         typer.Option(
@@ -73,6 +76,39 @@ def export(
     say(f"{path}: {file.use}")
 
 
+@app.command()
+def publish(
+    run: LogFile,
+    parent: Annotated[
+        str | None,
+        typer.Option(help="The graph's frame that carries the camera; by default the recipe's."),
+    ] = None,
+    child: Annotated[
+        str | None, typer.Option(help="The graph's frame of the camera; by default the recipe's.")
+    ] = None,
+    camera: Camera = None,
+    anyway: Anyway = False,
+) -> None:
+    """Keep the calibration on the ROS 2 graph as static transforms, until Ctrl-C.
+
+    The recipe names the frames in its export.ros2_launch step; without one they are ours.
+    """
+    from flangeye.run.recorded import recipe_of_log
+
+    registry = load_plugins()
+    log, pose = _calibrated(run, registry.stage(ROS2), anyway, camera)
+    steps = recipe_of_log(log, registry).steps
+    named: Any = next((step.params for step in steps if step.stage.name == ROS2), None)
+    frames = {
+        pose.transform.parent: parent or (named and named.parent),
+        pose.transform.child: child or (named and named.child),
+    }
+    with open_graph(registry) as graph, suppress(KeyboardInterrupt):
+        for line in graph.publish(pose, {own: name for own, name in frames.items() if name}):
+            say(f"{line}: published until Ctrl-C")
+        graph.stay()
+
+
 def _write_tables(run: Path, out: Path | None) -> None:
     from flangeye.log.read import read_run
     from flangeye.run.tables import write_tables
@@ -94,10 +130,7 @@ def _exported(
     run: Path, to: str, values: list[str], anyway: bool, camera: str | None
 ) -> ExportedFile:
     from flangeye.errors import StageError
-    from flangeye.log.read import read_run
-    from flangeye.models.configuration import CELL
     from flangeye.recipe.given import params_given
-    from flangeye.result import calibrated_pose, logged_result, require_one
 
     registry = load_plugins()
     name = _format_named(to, registry.exports())
@@ -109,6 +142,20 @@ def _exported(
     if camera and stage.params and "name" in stage.params.model_fields:
         values = [f"name={camera}", *values]  # else the files of all cameras have one name
     params = params_given(stage, values, registry)
+    _, pose = _calibrated(run, stage, anyway, camera)
+    file: ExportedFile = stage.function(pose=pose, **({"params": params} if params else {}))
+    return file
+
+
+def _calibrated(
+    run: Path, stage: Stage, anyway: bool, camera: str | None
+) -> tuple[RunLog, CalibratedPose]:
+    """Return a run's log and its calibration as a format takes it."""
+    from flangeye.errors import StageError
+    from flangeye.log.read import read_run
+    from flangeye.models.configuration import CELL
+    from flangeye.result import calibrated_pose, logged_result, require_one
+
     log = read_run(run)
     result = logged_result(log)
     log.require_sound()
@@ -116,6 +163,5 @@ def _exported(
         raise StageError(f"{log.path}: the run did not come to its end; there is nothing to export")
     pose = calibrated_pose(result, anyway, camera)
     if CELL not in stage.serves:
-        require_one(name, pose, result)
-    file: ExportedFile = stage.function(pose=pose, **({"params": params} if params else {}))
-    return file
+        require_one(stage.name, pose, result)
+    return log, pose

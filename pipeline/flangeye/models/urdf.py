@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -85,6 +85,15 @@ class Urdf:
         return [name for name in self.links if known.get(name)]
 
 
+class UrdfArm(NamedTuple):
+    """An arm, the links that were taken as its base and flange, and its joints' names in order."""
+
+    robot: RobotModel
+    base: str
+    flange: str
+    joints: list[str]
+
+
 def robot_from_urdf(
     path: Path,
     base: str | None = None,
@@ -104,8 +113,18 @@ def robot_from_urdf(
     Raises:
         RecipeError: It is no URDF, or base and flange cannot be told: says which links there are.
     """
-    urdf = read_urdf(path)
-    flange = _flange(urdf, flange)
+    return arm_of(read_urdf(path), base, flange, standard, packages).robot
+
+
+def arm_of(
+    urdf: Urdf,
+    base: str | None = None,
+    flange: str | None = None,
+    standard: str | None = None,
+    packages: Mapping[str, Path] | None = None,
+) -> UrdfArm:
+    """Return the arm of a URDF that was read; see :func:`robot_from_urdf`."""
+    path, flange = urdf.path, _flange(urdf, flange)
     to_flange = urdf.chain(flange)
     base = _base(urdf, base, to_flange)
     to_base = urdf.chain(base)
@@ -116,12 +135,14 @@ def robot_from_urdf(
     try:
         robot = _assemble(urdf, base_T_root, to_flange[shared:], standard)
         bodies = UrdfBodies(urdf, base_T_root, to_flange[shared:], packages or {})
-        return robot.from_urdf(bodies, tuple(_notes(urdf, robot, base, flange, bodies)))
+        robot = robot.from_urdf(bodies, tuple(_notes(urdf, robot, base, flange, bodies)))
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
         what = first["msg"].removeprefix("Value error, ")
         raise RecipeError(f"{path}: {error.title.lower()} {field}: {what}") from None
+    moving = [j.get("name", "") for j in to_flange[shared:] if j.get("type") in MOVES]
+    return UrdfArm(robot, base, flange, moving)
 
 
 def read_urdf(path: Path) -> Urdf:
@@ -130,7 +151,11 @@ def read_urdf(path: Path) -> Urdf:
     Raises:
         RecipeError: It is not XML, not a URDF, or a xacro that was not expanded.
     """
-    text = read_text(path, MAX_BYTES, RecipeError)
+    return parse_urdf(read_text(path, MAX_BYTES, RecipeError), path)
+
+
+def parse_urdf(text: str, path: Path) -> Urdf:
+    """Return the URDF in a text; raises as :func:`read_urdf`, of ``path``."""
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:

@@ -194,7 +194,8 @@ def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterato
     spawn = multiprocessing.get_context("spawn")
     heard, alarm = multiprocessing.Pipe(duplex=False)
     keep_current_folder_out()
-    with keys() as keyboard, _alarmed(alarm):
+    # Our end stays open: the guard may end before the last beat is written.
+    with heard, keys() as keyboard, _alarmed(alarm):
         process = spawn.Process(
             target=watchdog_process,
             args=(theirs, charge._replace(keyboard=keyboard), heard),
@@ -203,7 +204,6 @@ def _in_process(ours: Connection, theirs: Connection, charge: Charge) -> Iterato
         )
         process.start()
         theirs.close()
-        heard.close()
         try:
             yield
         finally:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from flangeye.models.emulator import Emulator
+    from flangeye.models.graph import Graph
     from flangeye.plugin.stage import Part, Stage
     from flangeye.types import Capture, Rejection, Source
 
@@ -38,6 +39,11 @@ def flangeye_parts() -> Iterable[Part] | Mapping[str, str]:  # type: ignore[empt
 @hookspec
 def flangeye_emulators() -> Iterable[Emulator]:  # type: ignore[empty-body]
     """Return the robot controllers this plugin can imitate, for ``flangeye emulator``."""
+
+
+@hookspec
+def flangeye_graphs() -> Mapping[str, Callable[[], Graph]]:  # type: ignore[empty-body]
+    """Return what joins the networks of nodes this plugin knows, by name."""
 
 
 @hookspec

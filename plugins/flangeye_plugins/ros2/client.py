@@ -20,7 +20,8 @@ from flangeye.files.children import python_command
 from flangeye.files.load import busy
 from flangeye.files.machine import find_named, settings_file
 from flangeye.files.pipe import Pipe, PipeEndedError
-from flangeye_plugins.ros2.messages import stamp_of, types
+from flangeye.models.graph import Topic
+from flangeye_plugins.ros2.messages import CLOCK, CLOCK_TYPE, stamp_of, types
 
 BRIDGE = Path(__file__).with_name("bridge")
 """Run by the other Python, and not imported here: this one may have no rclpy."""
@@ -34,26 +35,11 @@ STARTING = 10.0
 ANSWERING = 1.5
 """Longest time for an answer; finding a service takes the most, a second [s]."""
 
-DISCOVERY = 5.0
-"""Longest time until what runs on the network is known: DDS repeats what it says every 3 s [s]."""
+DISCOVERY = 3.0
+"""After its start a node knows what runs: DDS repeats what it says that often [s]."""
 
-CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
-
-
-class Topic(NamedTuple):
-    """A topic that runs.
-
-    Attributes:
-        name: With its namespace.
-        type: ``sensor_msgs/msg/PointCloud2``.
-        publishers: Names of the nodes that publish it.
-        subscribers: How many listen.
-    """
-
-    name: str
-    type: str
-    publishers: tuple[str, ...]
-    subscribers: int
+MATCHING = 0.5
+"""Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
 
 
 class Message(NamedTuple):
@@ -83,13 +69,12 @@ class Bridge(Device):
         middleware: The RMW implementation that the node uses.
     """
 
-    def __init__(self, asker: str, sim_time: bool = False, punctual: bool = False) -> None:
+    def __init__(self, asker: str, sim_time: bool = False) -> None:
         """Start it.
 
         Args:
             asker: Who is told of in errors.
             sim_time: Whether stamps are those of the topic ``/clock``.
-            punctual: Whether it may take precedence over other processes, as what watches an arm.
 
         Raises:
             DeviceError: There is no ROS 2 here, or its node does not start.
@@ -102,15 +87,17 @@ class Bridge(Device):
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._triggered: queue.Queue[dict[str, Any]] = queue.Queue()
         self._asking = threading.Lock()
-        words = [*ros_python(asker), str(BRIDGE), *(["punctual"] if punctual else [])]
+        words = [*ros_python(asker), str(BRIDGE)]
         try:
             self._pipe = Pipe(words, _environment())
         except OSError as error:
             raise DeviceError(f"{asker}: {words[0]} cannot be run ({error.strerror})") from None
         threading.Thread(target=self._listen, daemon=True).start()
         self._sim_time = sim_time
+        self._calls = 0
         try:
             self.middleware = str(self._answer(STARTING))
+            self._began = time.monotonic()
             if sim_time:
                 self.follow(CLOCK, CLOCK_TYPE)
         except DeviceError:
@@ -130,6 +117,14 @@ class Bridge(Device):
         """Return service -> type."""
         return dict(self._ask("services"))
 
+    def until_known(self) -> float:
+        """Return until when it is worth to wait for something, by ``time.monotonic`` [s]."""
+        return max(self._began + DISCOVERY, time.monotonic() + MATCHING)
+
+    def wait_until_known(self) -> None:
+        """Return when all that runs is known."""
+        time.sleep(max(self._began + DISCOVERY - time.monotonic(), 0.0))
+
     # --- what comes
 
     def follow(self, topic: str, kind: str, always: bool = True, take: Take | None = None) -> None:
@@ -146,7 +141,7 @@ class Bridge(Device):
         """
         if take:
             self._takers[topic] = take
-        until = time.monotonic() + DISCOVERY
+        until = self.until_known()
         while not self._ask("follow", topic=topic, type=kind, always=always):
             if time.monotonic() > until:
                 raise DeviceError(f"{self.asker}: nobody publishes {topic}; {self._others(kind)}")
@@ -174,6 +169,10 @@ class Bridge(Device):
         count = self._count(topic)
         self._ask("want", topic=topic)
         return count
+
+    def heard(self, topic: str) -> int:
+        """Return how many messages of a topic came since it was followed, wanted or not."""
+        return int(self._ask("heard", topic=topic))
 
     def local_ns(self, message: Message) -> int:
         """Return the moment of a message's stamp, by ``time.monotonic_ns``.
@@ -212,19 +211,26 @@ class Bridge(Device):
         """Publish a serialised message; never waits for an answer."""
         self._send({"ask": "publish", "topic": topic, "size": len(data)}, data)
 
+    def find(self, service: str) -> None:
+        """Find a ``std_srvs/srv/Trigger``; raises DeviceError where nobody offers it."""
+        self._ask("find", service=service)
+
     def trigger(self, service: str, patience: float) -> None:
-        """Call a ``std_srvs/srv/Trigger`` and wait for its answer.
+        """Call a service that was found and wait for its answer.
 
         Raises:
-            DeviceError: Nobody offers it, it does not answer in time, or says that it failed.
+            DeviceError: It has ended, does not answer in time [s], or says that it failed.
         """
-        self._ask("trigger", service=service)
-        try:
-            answer = self._triggered.get(timeout=patience)
-        except queue.Empty:
-            raise DeviceError(
-                f"{self.asker}: {service} did not answer within {patience:.1f} s"
-            ) from None
+        self._calls += 1
+        self._ask("trigger", service=service, call=self._calls)
+        until, answer = time.monotonic() + patience, dict[str, Any]()
+        while answer.get("call") != self._calls:  # an answer to an earlier call came too late
+            try:
+                answer = self._triggered.get(timeout=max(until - time.monotonic(), 0.0))
+            except queue.Empty:
+                raise DeviceError(
+                    f"{self.asker}: {service} did not answer within {patience:.1f} s{busy()}"
+                ) from None
         if not answer["triggered"]:
             raise DeviceError(
                 f"{self.asker}: {service} refused: {answer['message'] or 'no reason'}"

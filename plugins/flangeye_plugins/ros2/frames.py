@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.devices import DeviceError
 from flangeye.maths.geometry import invert, rigid, rotation_from_quaternion
 from flangeye.types import Floats
-from flangeye_plugins.ros2.client import DISCOVERY, Bridge, Message
+from flangeye_plugins.ros2.client import Bridge, Message
 from flangeye_plugins.ros2.messages import decoded
 
 TF, STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
@@ -42,7 +42,7 @@ class Frames:
             DeviceError: tf is wanted and nobody publishes it, or this ROS 2 has no tf2_msgs.
         """
         self.frames: dict[str, Frame] = {}
-        self._asker = bridge.asker
+        self._asker, self._bridge = bridge.asker, bridge
         if moving:
             bridge.follow(TF, TF_TYPE, take=self._moving)
         if STATIC in bridge.topics():
@@ -72,7 +72,7 @@ class Frames:
 
     def wait_for(self, parent: str, child: str) -> None:
         """Wait until a pose can be told; raises as :meth:`pose` when it cannot in time."""
-        until = time.monotonic() + DISCOVERY
+        until = self._bridge.until_known()
         while time.monotonic() < until:
             try:
                 self.pose(parent, child)

@@ -13,6 +13,13 @@ from flangeye import StageError
 from flangeye.files.images import decode_image
 from flangeye.types import Floats, Singles
 
+JOINT_STATE, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+CLOUD, IMAGE, COMPRESSED, INFO = (
+    f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "Image", "CompressedImage", "CameraInfo")
+)
+TEXT, EMPTY, TRIGGER = "std_msgs/msg/String", "std_msgs/msg/Empty", "std_srvs/srv/Trigger"
+CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
+
 SHORTEST = 12
 """A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

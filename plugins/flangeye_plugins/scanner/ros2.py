@@ -17,7 +17,13 @@ from flangeye.types import Floats, Image
 from flangeye.units import Duration, param
 from flangeye_plugins.ros2.client import Bridge, Message
 from flangeye_plugins.ros2.messages import (
+    CLOUD,
+    COMPRESSED,
+    EMPTY,
+    IMAGE,
+    INFO,
     PER_METRE,
+    TRIGGER,
     cloud_of,
     decoded,
     frame_of,
@@ -29,9 +35,6 @@ from flangeye_plugins.scanner.kinect_view import DepthView
 from flangeye_plugins.scanner.opened import OpenScanner
 
 NAME = "scanner.ros2"
-CLOUD, DEPTH = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-INFO, EMPTY = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/Empty"
 
 TRIGGER_MESSAGE = b"\x00\x01\x00\x00\x00"
 """An std_msgs/msg/Empty, serialised: ROS gives a message without fields one byte."""
@@ -116,7 +119,7 @@ class Ros2Scanner(OpenScanner):
         topics = bridge.topics()
         self._kinds: dict[str, str] = {}
         for topic, kinds in (
-            (params.cloud, [CLOUD]), (params.depth, [DEPTH]), (params.image, list(IMAGES)),
+            (params.cloud, [CLOUD]), (params.depth, [IMAGE]), (params.image, [IMAGE, COMPRESSED]),
         ):  # fmt: skip
             if topic:
                 runs = topics[topic].type if topic in topics else kinds[0]
@@ -176,13 +179,14 @@ class Ros2Scanner(OpenScanner):
         """
         services = self._bridge.services()
         if trigger in services:
+            self._bridge.find(trigger)
             return True
         runs = self._bridge.topics().get(trigger)
         if runs is None or runs.type != EMPTY:
-            known = sorted(s for s, kind in services.items() if kind == "std_srvs/srv/Trigger")
+            known = sorted(s for s, kind in services.items() if kind == TRIGGER)
             raise DeviceError(
                 f"{NAME}: {trigger} is neither a service nor a topic of {EMPTY} that runs; "
-                f"services of type std_srvs/srv/Trigger: {', '.join(known) or 'none'}"
+                f"services of type {TRIGGER}: {', '.join(known) or 'none'}"
             )
         self._bridge.offer(trigger, EMPTY)
         until = time.monotonic() + self._params.timeout
@@ -244,7 +248,7 @@ class Ros2Scanner(OpenScanner):
             return cloud_of(decoded(taken[cloud].data, CLOUD))  # type: ignore[return-value]
         if not (depth := self._params.depth) or not self._camera:
             return np.zeros((0, 3))
-        message = decoded(taken[depth].data, DEPTH)
+        message = decoded(taken[depth].data, IMAGE)
         if message.encoding not in PER_METRE:
             known = ", ".join(PER_METRE)
             raise DeviceError(

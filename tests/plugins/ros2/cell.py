@@ -7,14 +7,21 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from contextlib import contextmanager, suppress
 
 import numpy as np
 
+from flangeye.maths.geometry import rigid, rotation_from_quaternion
 from tests.plugins.ros2.installed import environment
+
+__all__ = ["environment"]
 
 FACING = [180.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 """Joint angles at which the UR5e holds its flange below the camera [deg]."""
+
+TOWARDS = [16.0, -119.0, -112.0, -39.0, -86.0, 164.0]
+"""Those at which the flange faces the camera, 0.6 m before it [deg]."""
 
 _domains = itertools.count()
 
@@ -103,6 +110,46 @@ class Camera(Peer):
         return np.array(self.ask(pose=True)["pose"])
 
 
+class Frames(Peer):
+    """The tf tree, rows of parent, child, and x y z qx qy qz qw."""
+
+    def __init__(self, env, static=(), tf=()):
+        super().__init__("frames", {"static": static, "tf": tf}, env)
+
+    def heard_of(self, child, patience=30.0):
+        """Return the parent and the pose (4, 4) that /tf_static gives a frame."""
+        until = time.monotonic() + patience
+        while child not in (told := self.ask(heard=True)["heard"]):
+            assert time.monotonic() < until, f"of {child} nothing was told, but of {[*told]}"
+            time.sleep(0.1)
+        parent, numbers = told[child]
+        return parent, rigid(rotation_from_quaternion(np.array(numbers[3:])), numbers[:3])
+
+
+class Terminal:
+    """A terminal in which ROS 2 is sourced, in a folder of its own."""
+
+    def __init__(self, folder, env):
+        self.folder, self._env = folder, env
+
+    def start(self, *words):
+        return subprocess.Popen(
+            [sys.executable, "-m", "flangeye.cli", *map(str, words)], cwd=self.folder,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL,
+            env=self._env,
+        )  # fmt: skip
+
+    def run(self, *words, expect=0, patience=240):
+        """Return what a command wrote, its output first."""
+        process = self.start(*words)
+        out, err = process.communicate(timeout=patience)
+        assert process.returncode == expect, (process.returncode, out, err)
+        return out, err
+
+    def result(self, run="run"):
+        return json.loads((self.folder / run / "result.json").read_text())
+
+
 @contextmanager
 def peers(*started):
     try:
@@ -110,6 +157,3 @@ def peers(*started):
     finally:
         for peer in started:
             peer.kill()
-
-
-__all__ = ["FACING", "Camera", "Controller", "Peer", "environment", "free_domain", "peers"]

@@ -1,7 +1,11 @@
 """The real rclpy, in an environment of its own: `make test` puts it beside the tests' Python."""
 
 import os
+import shutil
+import subprocess
 import sys
+import tempfile
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -26,15 +30,36 @@ def require():
         pytest.skip(f"no ROS 2 wheels in {folder()}: make test installs them")
 
 
+@cache
+def libraries():
+    """The wheels' libraries are where no loader looks."""
+    return os.pathsep.join(sorted({str(path.parent) for path in folder().rglob("*.so*")}))
+
+
+def tf2_msgs():
+    """The folder in which tf2_msgs is, built once."""
+    built = folder() / "tf2"
+    if not built.exists():
+        if shutil.which("g++") is None:
+            pytest.skip("no compiler for tf2_msgs, of which there is no wheel")
+        with tempfile.TemporaryDirectory(dir=folder()) as name:
+            env = os.environ | {"LD_LIBRARY_PATH": libraries()}
+            script = Path(__file__).with_name("tf2.py")
+            subprocess.run([folder() / "bin" / "python", script, name], check=True, env=env)
+            with suppress(OSError):  # another worker was faster
+                (Path(name)).rename(built)
+                Path(name).mkdir()
+    return built
+
+
 def environment(domain):
-    """The environment of a sourced terminal; the wheels' libraries are where no loader looks."""
-    libraries = sorted({str(path.parent) for path in folder().rglob("*.so*")})
+    """The environment of a sourced terminal."""
     return os.environ | {
-        "LD_LIBRARY_PATH": os.pathsep.join(libraries),
+        "LD_LIBRARY_PATH": libraries(),
         "FLANGEYE_PROGRAM_ROS2": str(folder() / "bin" / "python"),
         "FLANGEYE_TESTS_ROS2_SITE": str(site()),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(domain),
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-        "PYTHONPATH": str(Path(__file__).parents[3]),
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[3]), str(folder() / "tf2")]),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +57,12 @@ class Draft:
     Attributes:
         text: YAML.
         told: What was found in the archive, a line each.
+        files: Texts of files that it names.
     """
 
     text: str
     told: Sequence[str]
+    files: Mapping[Path, str] = field(default_factory=dict)
 
 
 def draft_recipe(
@@ -86,7 +88,7 @@ def draft_recipe(
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target, questions) if stage == "acquire.images" else {}
     data = head | {"steps": [{stage: first}, *_steps(stage, target)]}
-    return Draft(_yaml(data), _summary(archive, reader))
+    return Draft(yaml_of(data), _summary(archive, reader))
 
 
 def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, Any]:
@@ -329,7 +331,7 @@ def _of_cloud(path: Path) -> str:
     return "; ".join([f"{path.name}: {size} points, at {far:.4g} {unit} (median)", *notes])
 
 
-def _yaml(data: Mapping[str, Any]) -> str:
+def yaml_of(data: Mapping[str, Any]) -> str:
     """Return a recipe's text: a line a section, a line a step."""
     lines = [f"{key}: {_flow(value)}" for key, value in data.items() if key != "steps"]
     return "\n".join([*lines, "steps:", *(f"  - {_step(step)}" for step in data["steps"])]) + "\n"

@@ -15,10 +15,8 @@ from flangeye.types import Floats, Transform
 from flangeye.units import Duration, in_mm, param
 from flangeye_plugins.robot.ros2 import pieces
 from flangeye_plugins.robot.ros2.listener import Listener, ListenParams
-from flangeye_plugins.ros2.client import DISCOVERY, Bridge
-from flangeye_plugins.ros2.messages import encoded, message
-
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+from flangeye_plugins.ros2.client import Bridge
+from flangeye_plugins.ros2.messages import TRAJECTORY, encoded, message
 
 RENEWAL = 0.025
 """Between two pieces of a motion [s]."""
@@ -72,7 +70,7 @@ def robot_ros2(model: RobotModel, params: Ros2Params, reads_only: bool = False) 
     Raises:
         DeviceError: No ROS 2, no joint states of this arm, or no controller that listens.
     """
-    bridge = Bridge("robot.ros2", params.sim_time, punctual=True)
+    bridge = Bridge("robot.ros2", params.sim_time)
     try:
         listener = Listener if reads_only else Ros2Arm
         return listener("robot.ros2", model, params, bridge)  # type: ignore[return-value]
@@ -195,7 +193,7 @@ class Ros2Arm(Listener):
         self._began = np.inf  # it did set off
 
     def _require_listener(self) -> None:
-        until = time.monotonic() + DISCOVERY
+        until = self._bridge.until_known()
         while not self._bridge.listeners(self._topic):
             if time.monotonic() > until:
                 topics = self._bridge.topics().values()
@@ -246,10 +244,11 @@ class FreedriveArm(Listener):
         del speed, acceleration
         pose = self.arm.flange(joints)
         lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))
-        sys.stderr.write(
-            f"Move the flange on, for example to {in_mm(pose[:3, 3])}, leaning {lean:.0f} deg; the "
-            f"scan is taken when it has stood for {self._still:g} s\n"
-        )
+        if self._left is not None:  # the first scan is taken where the arm stands
+            sys.stderr.write(
+                f"Move the flange on, for example to {in_mm(pose[:3, 3])}, leaning {lean:.0f} deg; "
+                f"the scan is taken when it has stood for {self._still:g} s\n"
+            )
         self._awaited = True
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:

@@ -16,11 +16,9 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye_plugins.robot.tool_check import require_model
-from flangeye_plugins.ros2.client import DISCOVERY, Bridge, Message
+from flangeye_plugins.ros2.client import Bridge, Message
 from flangeye_plugins.ros2.frames import Frames
-from flangeye_plugins.ros2.messages import decoded
-
-JOINT_STATE = "sensor_msgs/msg/JointState"
+from flangeye_plugins.ros2.messages import JOINT_STATE, decoded
 
 STALE = 0.1
 """A sample older than this is no news of the arm [s]."""
@@ -28,11 +26,17 @@ STALE = 0.1
 SLOWEST = 0.05
 """Longest time between joint states with which an arm can be watched [s]."""
 
+LISTENING = 1.0
+"""For how long joint states are counted when an arm is opened [s]."""
+
 WINDOW_NS = 50_000_000
 """Over which speeds are taken [ns]: what some drivers publish as velocity is noise, or empty."""
 
 STANDING = 1e-3
 """No joint turns faster on an arm that stands [rad/s]."""
+
+
+NOTHING = "nothing came on it"
 
 
 class TfParams(Params):
@@ -119,7 +123,6 @@ class Listener(Device):
         """Return when the next joint state has come."""
         if not self._take(STALE):
             self._fresh()
-            raise DeviceError(f"{self.name}: {self._silence()}")
 
     def close(self) -> None:
         """Let go of ROS 2."""
@@ -141,15 +144,13 @@ class Listener(Device):
 
     def _measured_period(self) -> float:
         """Return the time between two joint states [s]."""
-        began, times = time.monotonic(), list[int]()
-        while len(times) < 10 and time.monotonic() - began < DISCOVERY:
-            if self._take(DISCOVERY / 2):
+        until, times = self._bridge.until_known() + LISTENING, list[int]()
+        while len(times) < 10 and time.monotonic() < until:
+            if self._take(LISTENING / 2):
                 times.append(self._samples[-1].received_ns)
         if len(times) < 2:
-            told = self._silence() if self._seen else "nothing came on it"
-            raise DeviceError(
-                f"{self._asker}: {self._params.joint_states}: {told}{self._missing()}"
-            )
+            topic = self._params.joint_states
+            raise DeviceError(f"{self._asker}: {topic}: {self._missing() or NOTHING}")
         period = float(np.median(np.diff(times))) * 1e-9
         if period > SLOWEST:
             raise DeviceError(
@@ -199,10 +200,13 @@ class Listener(Device):
     def _fresh(self) -> Sample:
         """Return the newest sample; raise DeviceError for one that is too old."""
         if not self._samples:
-            raise DeviceError(f"{self.name}: no joint state has come{self._missing()}")
+            raise DeviceError(f"{self.name}: {self._missing() or NOTHING}")
         newest = self._samples[-1]
-        if 1e-9 * (time.monotonic_ns() - newest.received_ns) > STALE:
-            raise DeviceError(f"{self.name}: {self._silence()}")
+        age = 1e-9 * (time.monotonic_ns() - newest.received_ns)
+        if age > STALE:
+            raise DeviceError(
+                f"{self.name}: silent for {age:.2f} s, at most {STALE} s are allowed{busy()}"
+            )
         off = 1e-9 * (newest.received_ns - newest.time_ns)
         if abs(off) > STALE:
             when = "before" if off > 0 else "after"
@@ -213,11 +217,6 @@ class Listener(Device):
             )
         return newest
 
-    def _silence(self) -> str:
-        last = self._bridge.newest(self._params.joint_states)
-        age = 1e-9 * (time.monotonic_ns() - last.received_ns) if last else np.inf
-        return f"silent for {age:.2f} s, at most {STALE} s are allowed{busy()}"
-
     def _missing(self) -> str:
         """Say which joints were looked for, where messages came without them."""
         last = self._bridge.newest(self._params.joint_states)
@@ -227,4 +226,4 @@ class Listener(Device):
         lost = [joint for joint in self._params.joints if joint not in names]
         if not lost:
             return ""
-        return f": it has no joint {', '.join(lost)}, but {', '.join(names)}"
+        return f"it has no joint {', '.join(lost)}, but {', '.join(names)}"

@@ -57,7 +57,9 @@ class Bridge:
     def __init__(self, node: Any, output: Output) -> None:
         self._node, self._output = node, output
         self._publishers: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
         self._wanted: dict[str, bool] = {}
+        self._heard: dict[str, int] = {}
 
     def graph(self) -> Any:
         """Return topic -> type, nodes that publish, and the number of those that listen."""
@@ -114,22 +116,38 @@ class Bridge:
         """Publish a serialised message."""
         self._publishers[topic].publish(body)
 
-    def trigger(self, service: str) -> Any:
-        """Call a service of type std_srvs/srv/Trigger; its answer comes as a frame of its own."""
+    def find(self, service: str) -> Any:
+        """Find a service of type std_srvs/srv/Trigger.
+
+        Its client is kept: the answer to a call is lost while the server does not know the client
+        yet, and nobody tells when it does.
+        """
         kind = getattr(importlib.import_module("std_srvs.srv"), "Trigger")  # noqa: B009
-        client = self._node.create_client(kind, service)
-        if not client.wait_for_service(timeout_sec=SERVICE):
+        self._clients[service] = self._node.create_client(kind, service)
+        if not self._clients[service].wait_for_service(timeout_sec=SERVICE):
             raise Refused(f"nobody offers the service {service}")
+
+    def trigger(self, service: str, call: int) -> Any:
+        """Call a service that was found; the answer comes as a frame with the call's number."""
+        client = self._clients[service]
+        if not client.service_is_ready():
+            raise Refused(f"nobody offers the service {service} any more")
 
         def answered(future: Any) -> None:
             done = future.result()
-            self._output.say({"triggered": bool(done.success), "message": done.message})
-            self._node.destroy_client(client)
+            self._output.say(
+                {"call": call, "triggered": bool(done.success), "message": done.message}
+            )
 
-        client.call_async(kind.Request()).add_done_callback(answered)
+        client.call_async(client.srv_type.Request()).add_done_callback(answered)
+
+    def heard(self, topic: str) -> Any:
+        """Return how many messages of a topic have come since it was followed."""
+        return self._heard.get(topic, 0)
 
     def _passes_on(self, topic: str, always: bool) -> Callable[[bytes], None]:
         def passes_on(body: bytes) -> None:
+            self._heard[topic] = self._heard.get(topic, 0) + 1
             if self._wanted[topic]:
                 self._wanted[topic] = always
                 now = time.monotonic_ns()
@@ -185,7 +203,11 @@ def answer(bridge: Bridge, request: Request) -> Request:
 
 
 def be_punctual() -> None:
-    """Let nothing on a busy machine delay this process, where the user may ask for that."""
+    """Let nothing on a busy machine delay this process, where the user may ask for that.
+
+    An arm is watched through it, and a cloud that is sent without acknowledgement is lost to a
+    process that is late: on two cores with a load of fourteen 6 of 10 came, and 1 without this.
+    """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 
@@ -193,8 +215,7 @@ def be_punctual() -> None:
 def main() -> None:
     """Open a node, say so, and serve."""
     output = Output()
-    if "punctual" in sys.argv:
-        be_punctual()
+    be_punctual()
     rclpy.init()
     node = rclpy.create_node(
         f"flangeye_{os.getpid()}", enable_rosout=False, start_parameter_services=False

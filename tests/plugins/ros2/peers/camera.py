@@ -8,9 +8,11 @@ where nothing was measured, captured by a service. ``depth``: 16-bit millimetres
 """
 
 import json
+import os
 import sys
 import threading
 import time
+from contextlib import suppress
 
 import numpy as np
 from rosgraph_msgs.msg import Clock
@@ -104,7 +106,7 @@ class Camera:
     def publish(self):
         while self.joints is None or (self.options["sim_time"] and self.now is None):
             time.sleep(0.01)
-        stamp = (self.now if self.options["sim_time"] else time.time()) + self.offset
+        stamp = self.now if self.options["sim_time"] else time.time()
         joints = self.joints
         if self.seen[0] is None or np.abs(self.seen[0] - joints).max() > 1e-7:
             self.seen = joints, self.look(joints)
@@ -113,14 +115,14 @@ class Camera:
                 joints,
                 self.seen[1] * np.nan if self.options["layout"] != "image" else self.seen[1],
             )
+        message = getattr(self, f"as_{self.options['layout']}")(self.seen[1])
         if self.silent:
             return
         self.count += 1
-        header = {"frame_id": f"{self.options['prefix']}optical_frame"}
-        message = getattr(self, f"as_{self.options['layout']}")(self.seen[1])
+        stamp += self.offset
         for each in message:
             each.header.stamp.sec, each.header.stamp.nanosec = int(stamp), int(stamp % 1 * 1e9)
-            each.header.frame_id = header["frame_id"]
+            each.header.frame_id = f"{self.options['prefix']}optical_frame"
             (self.info if isinstance(each, CameraInfo) else self.out).publish(each)
 
     def look(self, joints):
@@ -190,6 +192,8 @@ class Camera:
 
 def main():
     options = json.loads(sys.argv[1])
+    with suppress(OSError):  # a real camera has a computer of its own
+        os.nice(-15)
     rclpy.init()
     node = rclpy.create_node("camera", namespace=options["namespace"] or "/")
     serve(node, Camera(node, options).obey)

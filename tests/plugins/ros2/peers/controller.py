@@ -155,8 +155,6 @@ class Controller:
         self.truth.publish(real)
 
     def run(self):
-        with suppress(OSError):  # as a real controller: on a machine that is busy with tests, too
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         count, due = 0, time.monotonic()
         while True:
             with self.lock:
@@ -169,6 +167,8 @@ class Controller:
 
 def main():
     options = json.loads(sys.argv[1])
+    with suppress(OSError):  # as a real controller: on a machine that is busy with tests, too
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     rclpy.init()
     node = rclpy.create_node("controller_manager")
     controller = Controller(node, options)

@@ -1,0 +1,206 @@
+"""The ROS 2 graph of this terminal: what runs there as a recipe names it, and a pose told to it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from flangeye.devices import Device, DeviceError
+from flangeye.maths.geometry import invert, quaternion_from_rotation
+from flangeye.models.graph import Ask, RunningCell, Topic
+from flangeye.types import CAMERA, CalibratedPose, Floats
+from flangeye_plugins.ros2.client import MATCHING, Bridge
+from flangeye_plugins.ros2.frames import STATIC, TF, TF_TYPE, Frames
+from flangeye_plugins.ros2.messages import (
+    CLOCK,
+    CLOUD,
+    IMAGE,
+    JOINT_STATE,
+    TEXT,
+    TRIGGER,
+    decoded,
+    encoded,
+    message,
+)
+from flangeye_plugins.ros2.survey import (
+    Heard,
+    arm_driver,
+    described_arm,
+    scanner_driver,
+    scans_of,
+    states_of,
+)
+
+COUNTED = 1.5
+"""For how long messages are counted [s]; a camera that runs by itself gives one in that time."""
+
+
+DAY = 86400.0
+"""[s]"""
+
+
+class Ros2Graph(Device):
+    """What runs; see :class:`flangeye.models.graph.Graph`."""
+
+    def __init__(self) -> None:
+        """Join it.
+
+        Raises:
+            DeviceError: There is no ROS 2 in this terminal.
+        """
+        self._bridge = Bridge("ROS 2")
+
+    def close(self) -> None:
+        """Leave it."""
+        self._bridge.close()
+
+    def topics(self) -> list[Topic]:
+        """Return the topics that run, by name, 3 s after joining: then all are known."""
+        self._bridge.wait_until_known()
+        known = self._bridge.topics()
+        return [known[n] for n in sorted(known) if known[n].publishers or known[n].subscribers]
+
+    def cell(self, ask: Ask, name: str) -> RunningCell:
+        """Return the arm and the camera that run; publishes nothing and calls no service.
+
+        Raises:
+            DeviceError: No arm or no camera runs.
+            RecipeError: The URDF does not tell which links are base and flange.
+        """
+        topics = self.topics()
+        path = Path(f"{name}.urdf")
+        text = self._description(topics, ask)
+        found = described_arm(text, path)
+        heard = self._listen(topics)
+        states, angles = states_of(heard, found.joints)
+        scans = scans_of(heard, ask)
+        driver = arm_driver(topics, found.joints, states, ask)
+        triggers = [s for s, kind in self._bridge.services().items() if kind == TRIGGER]
+        camera = scanner_driver(scans, triggers, ask)
+        if any(topic.name == CLOCK and topic.publishers for topic in topics):
+            for params in (camera, *driver.values()):
+                params["sim_time"] = True
+        base, frame = found.section["base"], scans.frame or CAMERA
+        return RunningCell(
+            robot=found.section | {"driver": driver},
+            scanner={"driver": {"ros2": camera}},
+            flange=found.arm.flange(angles),
+            camera=self._place(base, frame),
+            files={path.name: text},
+            steps=[{"export.ros2_launch": {"parent": base, "child": frame}}],
+            seen=[
+                f"{found.name}: {base} to {found.section['flange']}, {len(found.joints)} joints",
+                *(each.line for each in heard),
+            ],
+        )
+
+    def publish(self, pose: CalibratedPose, frames: Mapping[str, str]) -> list[str]:
+        """Put a pose on ``/tf_static``; see :class:`flangeye.models.graph.Graph`.
+
+        A camera whose driver publishes a tree of its own frames is joined at the tree's root, for a
+        frame has one parent.
+
+        Raises:
+            DeviceError: Something joins a camera to its carrier already, or this ROS 2 has no
+                ``tf2_msgs``.
+        """
+        tree = self._tree()
+        self._bridge.offer(STATIC, TF_TYPE, latched=True)
+        told, transforms = [], []
+        for each in (pose.transform, *pose.others):
+            parent, child = (frames.get(n, n) for n in (each.parent, each.child))
+            root, above = tree.root(child), tree.root(parent)
+            if root == above:
+                raise DeviceError(
+                    f"ROS 2: {STATIC} joins {child} to {parent} already: end what publishes that, "
+                    "or choose other frames, --set child=NAME"
+                )
+            matrix = each.matrix @ invert(tree.pose(root, child))
+            transforms.append(self._stamped(parent, root, matrix))
+            told.append(f"{parent} to {root}" + (f", which carries {child}" * (root != child)))
+        self._bridge.publish(STATIC, encoded(message(TF_TYPE, transforms=transforms)))
+        return told
+
+    def stay(self) -> None:
+        """Never return; see :class:`flangeye.models.graph.Graph`."""
+        while True:
+            self._bridge.wait("", 0, DAY)
+
+    # --- what runs
+
+    def _description(self, topics: Sequence[Topic], ask: Ask) -> str:
+        """Return the URDF that a node publishes, or of a file."""
+        known = [
+            t.name
+            for t in topics
+            if t.type == TEXT and t.publishers and t.name.endswith("robot_description")
+        ]
+        question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
+        chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
+        if chosen not in known:
+            try:
+                return Path(chosen).read_text("utf-8")
+            except OSError as error:
+                raise DeviceError(
+                    f"--robot {chosen}: is no topic that runs ({', '.join(known) or 'none'}), and "
+                    f"no file ({error.strerror})"
+                ) from None
+        self._bridge.follow(chosen, TEXT)
+        latched = self._bridge.wait(chosen, 0, COUNTED)
+        if latched is None:
+            raise DeviceError(f"{chosen}: nothing came within {COUNTED:g} s; --robot takes a file")
+        return str(decoded(latched.data, TEXT).data)
+
+    def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
+        """Count the messages of all arms and cameras at once."""
+        some = [t for t in topics if t.publishers and t.type in (JOINT_STATE, CLOUD, IMAGE)]
+        for topic in some:
+            self._bridge.follow(topic.name, topic.type, always=topic.type == JOINT_STATE)
+            self._bridge.want(topic.name)
+        time.sleep(MATCHING)
+        before = {topic.name: self._bridge.heard(topic.name) for topic in some}
+        time.sleep(COUNTED)
+        return [
+            Heard(
+                topic,
+                (self._bridge.heard(topic.name) - before[topic.name]) / COUNTED,
+                self._bridge.newest(topic.name),
+            )
+            for topic in some
+        ]
+
+    def _place(self, base: str, frame: str) -> Floats | None:
+        """Return where the camera stands by tf (4, 4); None where tf does not join it."""
+        with suppress(DeviceError):
+            return self._tree().pose(base, frame)
+        return None
+
+    def _tree(self) -> Frames:
+        """Return the frames that run, as soon as those that stand have come."""
+        moving = any(t.name == TF and t.publishers for t in self.topics())
+        frames = Frames(self._bridge, moving)
+        time.sleep(MATCHING)
+        return frames
+
+    def _stamped(self, parent: str, child: str, matrix: Floats) -> Any:
+        """Return a pose (4, 4) as a TransformStamped."""
+        now = time.time_ns()
+        stamp = message("builtin_interfaces/msg/Time", sec=now // 10**9, nanosec=now % 10**9)
+        move, turn = matrix[:3, 3].tolist(), quaternion_from_rotation(matrix[:3, :3]).tolist()
+        return message(
+            "geometry_msgs/msg/TransformStamped",
+            header=message("std_msgs/msg/Header", stamp=stamp, frame_id=parent),
+            child_frame_id=child,
+            transform=message(
+                "geometry_msgs/msg/Transform",
+                translation=message(
+                    "geometry_msgs/msg/Vector3", **dict(zip("xyz", move, strict=True))
+                ),
+                rotation=message(
+                    "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))
+                ),
+            ),
+        )

@@ -1,0 +1,102 @@
+"""From a terminal in which ROS 2 runs to a verified matrix on the graph; in realtime."""
+
+import itertools
+import signal
+
+import numpy as np
+import pytest
+
+from flangeye.maths.geometry import rigid, rotation_exp
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
+from tests.plugins.ros2 import installed
+from tests.plugins.ros2.cell import (
+    TOWARDS,
+    Camera,
+    Controller,
+    Frames,
+    Terminal,
+    environment,
+    free_domain,
+    peers,
+)
+
+pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
+
+QUICK = ("--set", "robot.limits.speed=500 mm/s", "--set", "robot.limits.joint_speed=60 deg/s")
+FEW = ("--set", "acquire.live.poses.next_best.count=8")
+LINK = [0.01, 0.02, -0.03, -0.5, 0.5, -0.5, 0.5]
+
+
+@pytest.fixture
+def terminal(tmp_path):
+    installed.require()
+    return Terminal(tmp_path, environment(free_domain()))
+
+
+def found(terminal, run="run"):
+    result = terminal.result(run)
+    assert result["status"] == "verified"
+    return np.array(result["transforms"]["base_T_camera"]["matrix"])
+
+
+def require_near(matrix, truth):
+    assert np.abs((matrix - truth)[:3, 3]).max() < 3e-3
+    assert np.abs((matrix - truth)[:3, :3]).max() < 5e-3
+
+
+@pytest.mark.parametrize("layout", ["realsense", "zivid"])
+def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(terminal, layout):
+    installed.tf2_msgs()
+    env = terminal._env
+    own = [["camera_link", "optical_frame", LINK]] if layout == "realsense" else []
+    arm = Controller(env, seed=1, joints=TOWARDS)
+    eye = Camera(env, layout, resolution=0.3 if own else 0.4)
+    with peers(arm, eye, Frames(env, own)) as (_, camera, tree):
+        out, _ = terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
+                              "--trigger", "/camera/capture")  # fmt: skip
+        assert "ur5e: base_link to tool0, 6 joints" in out
+        terminal.run("run", "recipe.yaml", "--move", "--out", "run", *QUICK, *FEW)
+        matrix = found(terminal)
+        require_near(matrix, camera.pose())
+        publishing = terminal.start("publish", "run")
+        parent, pose = tree.heard_of("camera_link" if own else "camera")
+        assert parent == "base_link"
+        link_T_camera = tree.heard_of("optical_frame")[1] if own else np.eye(4)
+        assert np.allclose(pose @ link_T_camera, matrix, atol=1e-6)
+        publishing.send_signal(signal.SIGINT)
+        said, wrong = publishing.communicate(timeout=30)
+        assert publishing.returncode == 0, wrong
+        assert "published until Ctrl-C" in said
+
+
+def test_an_arm_without_a_controller_is_calibrated_without_permission_to_move(terminal):
+    env = terminal._env
+    poses = leaning()
+    with peers(
+        Controller(env, controller=None, joints=TOWARDS, prefix="left_", namespace="/cell"),
+        Camera(env, "phoxi", resolution=0.4, namespace="/cell/eye"),
+    ) as (arm, camera):
+        terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
+                     "--trigger", "/cell/eye/capture")  # fmt: skip
+        told = []
+        with terminal.start("run", "recipe.yaml", "--out", "run", *FEW) as run:
+            for line in run.stderr:
+                told.append(line)
+                if line.startswith("Move the flange on"):
+                    arm.tell(hand=next(poses).tolist(), seconds=1.0)
+        assert run.returncode == 0, told
+        require_near(found(terminal), camera.pose())
+
+
+def leaning():
+    """Joint angles (6,) [rad] at which the flange faces the camera, each leaning another way."""
+    arm = Arm(load_model("robots", "ur5e"))
+    start = np.radians(TOWARDS)
+    for i in itertools.count():
+        turn, around = 0.35 * np.array([np.cos(2.4 * i), np.sin(2.4 * i), 0.0]), arm.flange(start)
+        shift = 0.06 * np.array([np.sin(1.9 * i), np.cos(1.3 * i), np.sin(2.9 * i)])
+        pose = rigid(around[:3, :3] @ rotation_exp(turn), around[:3, 3] + shift)
+        near = [q for q in arm.inverse(pose) if np.abs(q - start).max() < 1.0]
+        if near:
+            yield near[0]
