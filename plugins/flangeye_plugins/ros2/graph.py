@@ -10,7 +10,9 @@ from typing import Any
 
 from flangeye.devices import Device, DeviceError
 from flangeye.maths.geometry import invert, quaternion_from_rotation
+from flangeye.files.regular import read_text
 from flangeye.models.graph import Ask, RunningCell, Topic
+from flangeye.models.urdf import MAX_BYTES
 from flangeye.types import CAMERA, CalibratedPose, Floats
 from flangeye_plugins.ros2.client import MATCHING, Bridge
 from flangeye_plugins.ros2.frames import STATIC, TF, TF_TYPE, Frames
@@ -141,13 +143,11 @@ class Ros2Graph(Device):
         question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
         if chosen not in known:
-            try:
-                return Path(chosen).read_text("utf-8")
-            except OSError as error:
+            if not Path(chosen).exists():
                 raise DeviceError(
-                    f"--robot {chosen}: is no topic that runs ({', '.join(known) or 'none'}), and "
-                    f"no file ({error.strerror})"
-                ) from None
+                    f"--robot {chosen}: is no topic that runs ({', '.join(known) or 'none'}) and no file"
+                )
+            return read_text(Path(chosen), MAX_BYTES, DeviceError)
         self._bridge.follow(chosen, TEXT)
         latched = self._bridge.wait(chosen, 0, COUNTED)
         if latched is None:
