@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 GROUPS = {
     "Calibrate": ("init", "check", "run", "ui", "watch"),
     "Judge": ("show", "report", "doctor", "certificate", "touch"),
-    "Use": ("export", "monitor", "layout"),
+    "Use": ("export", "publish", "monitor", "layout"),
     "Many": ("batch", "regress"),
     "Extend": (
         "new-plugin", "new-robot", "new-scanner", "plugins", "stages", "schema", "emulator",

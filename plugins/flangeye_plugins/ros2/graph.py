@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.devices import Device, DeviceError
-from flangeye.maths.geometry import invert, quaternion_from_rotation
 from flangeye.files.regular import read_text
+from flangeye.maths.geometry import invert, quaternion_from_rotation
+from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, RunningCell, Topic
 from flangeye.models.urdf import MAX_BYTES
 from flangeye.types import CAMERA, CalibratedPose, Floats
@@ -75,7 +76,7 @@ class Ros2Graph(Device):
         topics = self.topics()
         path = Path(f"{name}.urdf")
         text = self._description(topics, ask)
-        found = described_arm(text, path)
+        found, section = described_arm(text, path)
         heard = self._listen(topics)
         states, angles = states_of(heard, found.joints)
         scans = scans_of(heard, ask)
@@ -85,16 +86,16 @@ class Ros2Graph(Device):
         if any(topic.name == CLOCK and topic.publishers for topic in topics):
             for params in (camera, *driver.values()):
                 params["sim_time"] = True
-        base, frame = found.section["base"], scans.frame or CAMERA
+        base, frame = found.base, scans.frame or CAMERA
         return RunningCell(
-            robot=found.section | {"driver": driver},
+            robot=section | {"driver": driver},
             scanner={"driver": {"ros2": camera}},
-            flange=found.arm.flange(angles),
+            flange=Arm(found.robot).flange(angles),
             camera=self._place(base, frame),
             files={path.name: text},
             steps=[{"export.ros2_launch": {"parent": base, "child": frame}}],
             seen=[
-                f"{found.name}: {base} to {found.section['flange']}, {len(found.joints)} joints",
+                f"{found.robot.model}: {base} to {found.flange}, {len(found.joints)} joints",
                 *(each.line for each in heard),
             ],
         )
@@ -143,10 +144,6 @@ class Ros2Graph(Device):
         question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
         if chosen not in known:
-            if not Path(chosen).exists():
-                raise DeviceError(
-                    f"--robot {chosen}: is no topic that runs ({', '.join(known) or 'none'}) and no file"
-                )
             return read_text(Path(chosen), MAX_BYTES, DeviceError)
         self._bridge.follow(chosen, TEXT)
         latched = self._bridge.wait(chosen, 0, COUNTED)

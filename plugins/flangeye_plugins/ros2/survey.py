@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.devices import DeviceError
-from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, Topic
-from flangeye.models.urdf import base_link, flange_link, moving_joints, parse_urdf, robot_of
+from flangeye.models.urdf import UrdfArm, arm_of, parse_urdf
 from flangeye.types import Floats
 from flangeye_plugins.ros2.client import Message
 from flangeye_plugins.ros2.messages import CLOUD, IMAGE, JOINT_STATE, TRAJECTORY, decoded, frame_of
@@ -46,29 +45,18 @@ class Heard(NamedTuple):
         return f"{name}: {kind}, {often}{frame}, by {' and '.join(self.topic.publishers)}"
 
 
-class DescribedArm(NamedTuple):
-    """The arm of a URDF: its section of a recipe, its joints' names, and its kinematics."""
-
-    section: dict[str, Any]
-    joints: list[str]
-    arm: Arm
-    name: str
-
-
-def described_arm(text: str, path: Path) -> DescribedArm:
-    """Return the arm of a URDF that is to be saved at ``path``; base and flange by their names.
+def described_arm(text: str, path: Path) -> tuple[UrdfArm, dict[str, Any]]:
+    """Return the arm of a URDF that is to be saved at ``path``, and its section of a recipe.
 
     Raises:
         RecipeError: It is none, or does not tell which links are base and flange.
     """
-    urdf = parse_urdf(text, path)
-    base, flange = base_link(urdf), flange_link(urdf)
     packages = packages_of(text)
-    model = robot_of(urdf, base, flange, None, packages)
-    section: dict[str, Any] = {"urdf": path.name, "base": base, "flange": flange}
+    found = arm_of(parse_urdf(text, path), packages=packages)
+    section: dict[str, Any] = {"urdf": path.name, "base": found.base, "flange": found.flange}
     if packages:
         section["packages"] = {name: str(folder) for name, folder in packages.items()}
-    return DescribedArm(section, moving_joints(urdf, base, flange), Arm(model), urdf.name)
+    return found, section
 
 
 def packages_of(text: str) -> dict[str, Path]:
