@@ -13,13 +13,13 @@ from flangeye.cli.console import say, say_notes
 
 @app.command()
 def robots() -> None:
-    """List robot models: joints, plate, source of values."""
+    """List robot models: joints, plate."""
     from flangeye.models.loading import load_model, model_names
 
     for name in model_names("robots"):
         robot = load_model("robots", name)
-        plate = robot.flange.standard or "plate: feature.standard"
-        say(f"{name:20}  {robot.maker:17}  {len(robot.joints)} joints  {plate:23}  {robot.source}")
+        plate = robot.flange.standard or "say the plate: feature.standard"
+        say(f"{name:20}  {robot.maker:17}  {len(robot.joints)} joints  {plate}")
 
 
 @app.command()

@@ -37,13 +37,48 @@ class Corners(NamedTuple):
     points: Floats
 
 
-def find_corners(board: Board, image: Image) -> Corners | Rejected:
-    """Find a board's corners in an image."""
+def find_corners(board: Board, image: Image, thorough: bool = True) -> Corners | Rejected:
+    """Find a board's corners in an image.
+
+    Args:
+        board: What to look for.
+        image: Where.
+        thorough: Whether a checkerboard that is not found is looked for in every way; a large
+            image without one takes seconds then.
+    """
     grey = _grey(image)
-    finders = {
-        "charuco": _charuco, "checkerboard": _checkerboard, "marker": _marker, "circles": _circles,
-    }  # fmt: skip
+    if board.kind == "checkerboard":
+        return _checkerboard(board, grey, thorough)
+    finders = {"charuco": _charuco, "marker": _marker, "circles": _circles}
     return finders[board.kind](board, grey, image)
+
+
+def board_seen(image: Image) -> str:
+    """Return which board an image shows, of any that is known, and what to write for it."""
+    import cv2
+
+    grey = _grey(image)
+    markers = _of_other_families(Board("charuco", 3, 3, 1.0, 0.5), grey)
+    if markers:
+        return markers.removeprefix("; ") + " and kind: charuco, or fit.aruco"
+    by = min(1.0, 2 * WIDTH / grey.shape[1])
+    small: Grey = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA).astype(
+        np.uint8
+    )
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+    if found:
+        rows, columns = (length + 1 for length in np.asarray(meta).shape[:2])
+        pixels = np.asarray(corners, dtype=np.float64).reshape(rows - 1, columns - 1, 2)
+        board = Board("checkerboard", columns, rows, 1.0)
+        upright = Corners(_upright(pixels, small).reshape(-1, 2), board.inner_corners())
+        if not _wrong_squares(upright, board, small):
+            long, short = max(columns, rows), min(columns, rows)
+            return (
+                f"a checkerboard of {long} x {short} squares is seen: write kind: checkerboard, "
+                f"columns: {long}, rows: {short}"
+            )
+    return "no board that is known is seen in it"
 
 
 def _grey(image: Image) -> Grey:
@@ -101,13 +136,13 @@ def _marker(board: Board, grey: Grey, image: Image) -> Corners | Rejected:
     return Corners(corners_of_square(grey, pixels, image), board.outer_corners())
 
 
-def _checkerboard(board: Board, grey: Grey, _image: Image) -> Corners | Rejected:
+def _checkerboard(board: Board, grey: Grey, thorough: bool) -> Corners | Rejected:
     import cv2
 
     pattern = (board.columns - 1, board.rows - 1)
     flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCornersSB(grey, pattern, flags=flags)
-    if not found:  # slower, and seldom needed
+    if not found and thorough:  # slower, and seldom needed
         flags |= cv2.CALIB_CB_EXHAUSTIVE
         found, corners = cv2.findChessboardCornersSB(grey, pattern, flags=flags)
     if not found:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from flangeye import Params, StageError
 from flangeye.models.boards import Board, Dictionary, Kind
-from flangeye.models.corners import Corners, find_corners
+from flangeye.models.corners import Corners, board_seen, find_corners
 from flangeye.types import Floats, Image, Rejected, Warn
 from flangeye.units import Length, param
 
@@ -28,6 +28,8 @@ ALIKE = (
 )
 CONTRADICTED = 0.02
 """By what share of itself a focal length may be off before a calibration is another camera's."""
+FIRST = 8
+"""Images that are looked at first: a set that shows the board in half of its images passes."""
 OUTLYING = 4.0
 """Times the median reprojection error beyond which a view takes no part."""
 COEFFICIENTS = ("k1", "k2", "p1", "p2")
@@ -126,7 +128,7 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     if len(sizes) > 1:
         raise StageError(f"images of {len(sizes)} sizes are not one camera's")
     (size,) = sizes
-    looked = {n: find_corners(board, Image(pixels, np.eye(3))) for n, pixels in images.items()}
+    looked = _looked(images, board)
     seen = {name: found for name, found in looked.items() if isinstance(found, Corners)}
     _require_views(len(seen), looked)
     _require_tilted(seen)
@@ -141,6 +143,29 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     found = lens[0]._replace(left_out=left_out)
     _require_certain(found)
     return found
+
+
+def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rejected]:
+    """Return what is seen of a board in each image.
+
+    Raises:
+        StageError: The first to be looked at, spread over all, do not show it.
+    """
+    views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
+    if len(views) <= FIRST:
+        return {name: find_corners(board, view) for name, view in views.items()}
+    first = [list(views)[i] for i in np.linspace(0, len(views) - 1, FIRST).astype(int)]
+    early = {name: find_corners(board, views[name], thorough=False) for name in first}
+    early |= {n: find_corners(board, views[n]) for n in first[:2] if isinstance(early[n], Rejected)}
+    why = [found.reason for found in early.values() if isinstance(found, Rejected)]
+    if len(why) == len(early):
+        instead = why[0] if board.kind == "charuco" else board_seen(views[first[0]])
+        raise StageError(
+            f"none of {len(early)} of the {len(images)} images, spread over all, shows the board "
+            f"({board.kind}, {board.columns} x {board.rows}); {first[0]}: {instead}"
+        )
+    seen = {name: found for name, found in early.items() if isinstance(found, Corners)}
+    return {name: seen.get(name) or find_corners(board, view) for name, view in views.items()}
 
 
 def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:

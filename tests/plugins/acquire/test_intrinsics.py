@@ -11,6 +11,7 @@ import pytest
 from flangeye import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
 from flangeye.models.boards import Board
+from flangeye.models.corners import find_corners
 from flangeye.types import ArchivePath, Image
 from flangeye.units import SI
 from flangeye_emulators.world.board_image import BoardCamera, render_board
@@ -82,6 +83,35 @@ def test_a_calibration_that_the_images_contradict_is_said(views: Any) -> None:
     assert said is not None
     assert said.startswith("the camera's calibration says a focal length of 1400 px, 12 views of")
     assert found.against(MATRIX) is None
+
+
+OTHER = Board("checkerboard", 9, 6, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("shown", "said"),
+    [
+        (BOARD, "of 4X4_250 are seen: write dictionary: 4X4_250 and kind: charuco, or fit.aruco"),
+        (OTHER, "a checkerboard of 9 x 6 squares is seen: write kind: checkerboard, columns: 9,"),
+        (None, "0: no board that is known is seen in it"),
+    ],
+)
+def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_named(
+    shown: Board | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (600, 800), dtype=np.uint8)
+    seen = images(shown, 12, 0.2) if shown else {str(k): pixels for k in range(12)}
+    looked = []
+
+    def counted(board, image, thorough=True):
+        looked.append(thorough)
+        return find_corners(board, image, thorough)
+
+    monkeypatch.setattr("flangeye_plugins.acquire.intrinsics.find_corners", counted)
+    with pytest.raises(StageError, match="none of 8 of the 12 images, spread over all") as refused:
+        lens_of(seen, Board("checkerboard", 10, 7, 0.02))
+    assert said in str(refused.value)
+    assert (len(looked), sum(looked)) == (10, 2)
 
 
 def test_images_without_a_board_are_left_out_and_named(views: Any) -> None:
