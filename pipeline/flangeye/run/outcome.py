@@ -132,8 +132,8 @@ def _timing(watch: Stopwatch) -> dict[str, r.StageTiming]:
 
 
 def _notes(outcome: Outcome) -> list[str]:
-    """Return the notes of the solver and of the scan of the workpiece."""
-    told = (outcome.calibration, outcome.scan)
+    """Return the notes of the solver, of the scan of the workpiece, and of the weld."""
+    told = (outcome.calibration, outcome.scan, outcome.weld)
     return [note for value in told if value is not None for note in value.notes]
 
 

@@ -16,6 +16,7 @@ from flangeye_emulators.weld_world.trial import Start, Trial, run_trial
 from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import Body, body_from
+from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.checks import check_tool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import controller_of
@@ -67,6 +68,7 @@ def try_condition(
     body = built_for(settings)
     section, belief = known(condition, body, settings)
     check_tool(body, belief, settings)
+    check_bound(plan, belief, settings)
     passes = 1 + len(settings.passes)
     controller = controller_of(plan, belief, settings, "tactile")
     watch(controller)

@@ -13,9 +13,6 @@ from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.joint import Joint, joint_of
 from flangeye_plugins.weld.settings import Following
 
-LIMIT = 4.0
-"""The torch's stated bound, in standard deviations."""
-
 BAND = 2.0
 """The torch's 95 % band, in standard deviations."""
 

@@ -23,7 +23,8 @@ from __future__ import annotations
 import bisect
 import math
 
-from flangeye_plugins.weld.belief import LIMIT
+BEYOND = 4.0
+"""A look that is farther off contradicts what is known, in standard deviations."""
 
 CONTRADICTIONS = 5
 """So many looks in succession that contradict what is known stop the weld; fewer are spatter."""
@@ -71,6 +72,7 @@ class Bias:
     Attributes:
         value: How far the torch is to the left of where it is measured to be [m].
         doubt: What the newest look contradicts, once enough have; else nothing.
+        prior: Variance before any look [m^2].
     """
 
     def __init__(self, prior: float, distortion: float, length: float) -> None:
@@ -82,7 +84,7 @@ class Bias:
             length: Of the tool, from the torch to the tip, L [m].
         """
         self.value, self.doubt = 0.0, ""
-        self._prior, self._length = prior, length
+        self.prior, self._length = prior, length
         self._growth = distortion**2 / length
         self._variance, self._seen, self._sigma = prior, -math.inf, 0.0
         self._contradicted = 0
@@ -98,9 +100,9 @@ class Bias:
         Looks that are all wrong alike are no better than one of them.
         """
         if not self.looked:
-            return self._prior
+            return self.prior
         grown = self._variance + self._growth * max(s - self._seen, 0.0)
-        return min(grown + self._sigma**2, self._prior + self.value**2)
+        return min(grown + self._sigma**2, self.prior + self.value**2)
 
     def look(self, s: float, bias: float, sigma: float, others: float) -> None:
         """Take in a look.
@@ -114,11 +116,11 @@ class Bias:
         way = s - self._seen
         if way <= 0.0:
             return
-        grown = self._prior
+        grown = self.prior
         if self.looked:
-            grown = min(self._variance + self._growth * way, self._prior + self.value**2)
+            grown = min(self._variance + self._growth * way, self.prior + self.value**2)
         one = sigma**2 + others
-        if self._contradicts(bias, grown + one, self._prior + one):
+        if self._contradicts(bias, grown + one, self.prior + one):
             return
         noise = one * max(self._length / way, 1.0)
         gain = grown / (grown + noise)
@@ -127,14 +129,14 @@ class Bias:
 
     def _contradicts(self, bias: float, now: float, before: float) -> bool:
         """Return whether a look is beyond what is known now, or beyond what the files state."""
-        wrong = abs(bias - self.value) > LIMIT * math.sqrt(now)
-        wrong = wrong or abs(bias) > LIMIT * math.sqrt(before)
+        wrong = abs(bias - self.value) > BEYOND * math.sqrt(now)
+        wrong = wrong or abs(bias) > BEYOND * math.sqrt(before)
         self._contradicted = self._contradicted + 1 if wrong else 0
         if self._contradicted >= CONTRADICTIONS:
             self.doubt = (
                 f"the look behind the torch sees the bead {bias * 1e3:+.2f} mm to the left of "
                 f"where the torch was taken to be; {self.value * 1e3:+.2f} mm were known, and the "
-                f"files allow {LIMIT * math.sqrt(before) * 1e3:.2f} mm: calibrate the tool "
+                f"files allow {BEYOND * math.sqrt(before) * 1e3:.2f} mm: calibrate the tool "
                 "(flangeye tactile calibrate), or state more 'distortion'"
             )
         return wrong

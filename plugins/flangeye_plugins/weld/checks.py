@@ -11,7 +11,7 @@ from flangeye.models.finger import Finger
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seam
-from flangeye_plugins.weld.belief import LIMIT, Belief
+from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
@@ -71,34 +71,22 @@ def check_controller(mode: Mode, driver: RobotDriver) -> None:
 
 
 def check_tool(body: Body, belief: Belief, settings: Following) -> None:
-    """Refuse a tool that cannot hold its tip, know its torch, reach the seam or swing as asked.
+    """Refuse a tool that cannot hold its tip, reach the seam or swing as asked.
 
     Raises:
         StageError: Which, and what would do.
     """
-    check_belief(belief, settings)
+    check_seat(belief, settings)
     check_body(body, belief, settings)
     check_weave(body.distance, settings)
 
 
-def check_belief(belief: Belief, settings: Following) -> None:
-    """Refuse a tip that would climb its wall, and a torch that is not known well enough.
+def check_seat(belief: Belief, settings: Following) -> None:
+    """Refuse a tip that would not lie where the joint's two walls meet.
 
     Raises:
-        StageError: Which, and what would do.
+        StageError: Why, and what would do.
     """
-    _check_seat(belief, settings)
-    bound = LIMIT * float(np.sqrt(belief.fixed_variance(settings)))
-    if bound > settings.max_error:
-        raise StageError(
-            f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best ({LIMIT:.0f} sigma "
-            "of torch_sigma in the finger's file, of arm_sigma and of distortion), max_error is "
-            f"{settings.max_error * 1e3:.3g} mm; calibrate the tool, or raise 'max_error'"
-        )
-
-
-def _check_seat(belief: Belief, settings: Following) -> None:
-    """Refuse a tip that would not lie where the joint's two walls meet."""
     if settings.joint == "butt" and belief.joint is None:
         raise StageError(
             "weld.tactile: a butt joint with square edges is felt by a ball that rests on both: "

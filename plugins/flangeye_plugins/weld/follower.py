@@ -12,7 +12,7 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, LIMIT, MINUTE, Belief
+from flangeye_plugins.weld.belief import BAND, MINUTE, Belief
 from flangeye_plugins.weld.bias import Bias, Trail
 from flangeye_plugins.weld.checks import SEATING
 from flangeye_plugins.weld.consistency import LASTING, Seating
@@ -183,6 +183,12 @@ class Follower:
         return OFF if over else self._striking.level(self._time or 0.0)
 
     @property
+    def share_fixed(self) -> float:
+        """Share of the torch's variance that a look behind it alone could lessen."""
+        fixed = self.bias.variance(self.torch) if self.bias.looked else self.bias.prior
+        return fixed / max(self.sigma**2, fixed)
+
+    @property
     def share_welded(self) -> float:
         """Share of the planned seam that was welded with the torch within ``max_error``."""
         if self.lit is None:
@@ -276,7 +282,8 @@ class Follower:
         error = abs(raw - (self.aim - self.bias.value)) + self.refined.doubt(self.torch)
         variance = self._variance(float(pose.direction @ normal), pose.angle)
         self.sigma = math.sqrt(variance)
-        self.band, self.bound = error + BAND * self.sigma, error + LIMIT * self.sigma
+        self.band = error + BAND * self.sigma
+        self.bound = error + self._settings.sigmas * self.sigma
         if self.phase in ("seeking", "probing"):
             return
         if self.begins - self.torch <= self._belief.arc[0] * self._settings.speed:

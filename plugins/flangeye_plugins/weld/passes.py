@@ -19,7 +19,7 @@ import numpy as np
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.belief import BAND, LIMIT, Belief
+from flangeye_plugins.weld.belief import BAND, Belief
 from flangeye_plugins.weld.follower import Follower, ResumePoint, within
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.response import Response
@@ -255,7 +255,7 @@ class Passes:
         again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
         seam = self._traced.sigma(self.torch + self._pass.along)
         self.sigma = math.sqrt(seam**2 + again)
-        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, LIMIT))
+        self.band, self.bound = (abs(error) + k * self.sigma for k in (BAND, settings.sigmas))
         if self.bound > settings.max_error:
             self.phase = "stopped"
             self.reason = (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.motion.seam_following import Controller, turned
-from flangeye.types import Floats, Seam, WeldReport
+from flangeye.types import Floats, Note, Seam, WeldReport
 from flangeye_plugins.weld.body import Body
 from flangeye_plugins.weld.frame import WorkPlane
 from flangeye_plugins.weld.path import Path
@@ -63,6 +63,22 @@ def report_of(  # noqa: PLR0913  all that a weld had
         band=_stated(np.array(every["band"])[kept]),
         true_torch=np.zeros((0, 3)) if truth is None else _at(cycle["time"], *truth),
         loop=_loop(weld_log),
+        notes=_advice(controller),
+    )
+
+
+FIXED = 0.5
+"""Share of the torch's variance from which a look behind the torch is recommended."""
+
+
+def _advice(controller: Controller) -> tuple[Note, ...]:
+    """Recommend a look behind the torch where what nothing ahead of it measures is most of it."""
+    root = follower_of(controller)
+    if root is None or root.bias.looked or root.lit is None or root.share_fixed < FIXED:
+        return ()
+    return (
+        f"{root.share_fixed:.0%} of the torch's variance is what the files state of it: "
+        "a look behind the torch ('look') would lessen it, nothing ahead of it can",
     )
 
 

@@ -94,7 +94,11 @@ class Following(Params):
     )
     max_error: Length = param(
         "1 mm", gt=0, description="The weld is refused or stopped where the torch's stated bound "
-        "(4 sigma and its control error) exceeds this.",
+        "exceeds this.",
+    )  # fmt: skip
+    sigmas: float = Field(
+        3.0, gt=0, le=6, description="The torch's bound: its control error and so many standard "
+        "deviations. True errors are beyond 3 in one weld of 370, beyond 4 in one of 16,000.",
     )  # fmt: skip
     arm_sigma: Length = param(
         "0.03 mm", ge=0, description="Standard deviation of what the arm is off by, across the "

@@ -24,6 +24,7 @@ from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.approach import approach
 from flangeye_plugins.weld.belief import Belief, belief_of
 from flangeye_plugins.weld.body import body_of
+from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
@@ -85,21 +86,21 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         arc=(times.gas_before, times.ignition, times.crater),
     )
     checks.check_tool(body, belief, params)
+    check_bound(plan, belief, params)
     passage = SeamReach(Task(model, allowed, finger, tool, plan, params, belief.set_down(params)))
-    simulated = driver.simulated
     checks.check_controller(params.mode, driver)
     controller = controller_of(plan, belief, params, params.mode, kept)
-    if not (motion.allowed or simulated):
+    if not (motion.allowed or driver.simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
         robot: Robot = opened.enter_context(led(driver, model, allowed))
         job = CameraJob(params.sensor, finger, robot.state(), seed, params.look)
-        reader: FingerCameraReader = SteppedReader(job) if simulated else CameraProcess(job)
+        reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
         eyes = opened.enter_context(reader)
         belief = replace(belief, behind=eyes.behind)
         if eyes.behind is not None:
             controller = controller_of(plan, belief, params, params.mode, kept)
-        weld_log = opened.enter_context(WeldLog(stage_log, not simulated, params.log_images))
+        weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
         cell = Cell(
             Executor(robot, model, allowed, eyes.tell), eyes, tool, Bounds(finger, plan, params),
@@ -107,7 +108,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
             None if params.arc is None else times.gas_after,
         )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
-        if not simulated:
+        if not driver.simulated:
             opened.enter_context(precedence(LEADING))
         reason = follow(cell, controller, weld_log, _longest(plan.length + body.distance, params))
         truth = eyes.true_torch()

@@ -98,7 +98,7 @@ def test_what_the_torch_is_stated_to_be_off_by_is_its_error_its_doubt_and_its_si
     error = 0.3e-3 + 0.2e-3
     assert found.sigma == pytest.approx(math.sqrt(found._variance(0.0, 0.0)))
     assert found.band == pytest.approx(error + 2 * found.sigma, abs=1e-6)
-    assert found.bound == pytest.approx(error + 4 * found.sigma, abs=1e-6)
+    assert found.bound == pytest.approx(error + 3 * found.sigma, abs=1e-6)
     vision = make(touch=False)
     vision._estimate(pose(tip, off))
     assert vision.bound == 0.0
@@ -859,7 +859,7 @@ def test_a_torch_is_led_and_judged_by_where_it_is_seen_to_be() -> None:
     felt_along(found, 0.0)
     found.bias.value, found.torch, found.lit = 0.25e-3, 0.05, 0.0
     found._estimate(pose(0.05 + DISTANCE, 0.1e-3 - 0.25e-3, time=6.0))
-    assert found.bound == pytest.approx(4 * found.sigma, abs=1e-6)
+    assert found.bound == pytest.approx(3 * found.sigma, abs=1e-6)
     (row,) = found._trail._rows
     assert row[0] == pytest.approx(-0.15e-3, abs=1e-6)
     assert row[1] == pytest.approx(found.sigma**2 - found._unseen())

@@ -13,7 +13,7 @@ from flangeye_emulators.weld_world.conditions import CONDITIONS
 from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_from, body_of, leaning
-from flangeye_plugins.weld.checks import check_belief, check_body
+from flangeye_plugins.weld.checks import check_body, check_seat
 from flangeye_plugins.weld.joint import Joint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
@@ -113,7 +113,7 @@ def test_the_torch_is_on_the_seam_of_every_joint(name: str) -> None:
 )
 def test_a_joint_that_would_not_hold_the_tip_is_refused(given, message: str) -> None:
     with pytest.raises(StageError, match=message):
-        check_belief(*believed(**given))
+        check_seat(*believed(**given))
 
 
 def test_a_remedy_is_one_where_the_tool_leans_too() -> None:

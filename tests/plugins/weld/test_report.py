@@ -17,7 +17,7 @@ from flangeye_plugins.weld.follower import Follower
 from flangeye_plugins.weld.frame import WorkPlane
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.probing import Learned
-from flangeye_plugins.weld.report import SAMPLES, learned_figures, report_of
+from flangeye_plugins.weld.report import SAMPLES, _advice, learned_figures, report_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.weld_log import WeldLog
 from tests.plugins.weld.bench import straight
@@ -157,3 +157,18 @@ def test_a_weld_of_one_cycle_has_no_period() -> None:
     loop = reported(logged(1)).loop
     assert loop["cycles"] == 1.0 and loop["computing_p99"] == 1e-3
     assert loop["period_median"] == loop["period_p99"] == 0.0
+
+
+@pytest.mark.parametrize(("torch_sigma", "told"), [(0.3e-3, True), (0.0, False)])
+def test_a_look_behind_is_recommended_where_the_files_are_most_of_what_is_unknown(
+    torch_sigma: float, told: bool
+) -> None:
+    controller = follower()
+    controller.bias.prior = torch_sigma**2
+    controller.sigma = 0.35e-3
+    assert _advice(controller) == ()  # nothing was welded
+    controller.lit = 0.0
+    advice = _advice(controller)
+    assert bool(advice) == told
+    if told:
+        assert advice[0].startswith("73% of the torch's variance is what the files state")

@@ -1,0 +1,126 @@
+"""How far the torch may be from the seam, predicted along the whole plan before anything moves.
+
+The variance of the torch across the seam, at each place of the plan, is the follower's own sum, as
+far as it is known beforehand: what the files state of torch, arm and heat; the torch's distance to
+the tip where the tool stands askew; the tip on the tool, of which only what the tool turns between
+feeling a place and welding it counts; the drift of the finger's gain; the weave. What only touch
+can show (play, noise, a gap) comes on top.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.types import Floats
+from flangeye_plugins.weld.belief import MINUTE, Belief
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.settings import Following
+from flangeye_plugins.weld.weave import Weave
+
+SPACING = 2e-3
+"""The bound is predicted at places so far from each other [m]."""
+
+REMEDIES = {
+    "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
+    "askew": ("along_sigma, as the tool stands askew there", "measure it: flangeye tactile tool"),
+    "tip": ("tip_sigma, as the tool turns there", "measure it: flangeye tactile tool"),
+    "felt": ("gain_drift and the weave", "weld faster, or lower 'deflection'"),
+}
+"""Of each part: what it is, and what lessens it."""
+
+
+class Predicted(NamedTuple):
+    """Variances of the torch along the plan, (K,) each [m^2].
+
+    Attributes:
+        s: Arc lengths [m].
+        fixed: Torch, arm, heat, creep: nothing at the weld measures them.
+        askew: The torch's distance from the tip, where the tool stands askew.
+        tip: The tip on the tool, where this turns.
+        felt: The finger's drift, and the weave.
+    """
+
+    s: Floats
+    fixed: Floats
+    askew: Floats
+    tip: Floats
+    felt: Floats
+
+    @property
+    def variance(self) -> Floats:
+        """(K,) all together."""
+        return self.fixed + self.askew + self.tip + self.felt
+
+    def largest(self, at: int) -> str:
+        """Return the name of the largest part at one of the places."""
+        return max(REMEDIES, key=lambda name: float(getattr(self, name)[at]))
+
+
+def predicted(plan: Path, belief: Belief, settings: Following) -> Predicted:
+    """Return the torch's variances along the plan."""
+    s = np.arange(0.0, plan.length + SPACING / 2, SPACING)
+    lets_go = (
+        plan.length - settings.ending - settings.speed * settings.deflection / settings.release
+    )
+    sine, turned = _stances(plan, s, belief.distance, settings.sign * settings.deflection)
+    free, _ = _stances(plan, s, belief.distance, 0.0)
+    least = np.minimum(np.abs(sine), np.abs(free))
+    sine = np.where(s + belief.distance < lets_go, sine, least)
+    minutes = (s + belief.distance) / settings.speed / MINUTE
+    weave = Weave(settings.weave_width, settings.weave_frequency)
+    drift = settings.gain_drift * minutes * settings.deflection
+    return Predicted(
+        s, np.full(len(s), belief.fixed_variance(settings)), (belief.along_sigma * sine) ** 2,
+        (belief.tip_sigma * turned) ** 2, drift**2 + weave.variance,
+    )  # fmt: skip
+
+
+def check_bound(plan: Path, belief: Belief, settings: Following) -> None:
+    """Refuse a weld whose bound cannot hold along its whole plan.
+
+    Raises:
+        StageError: Where, what is largest there, and what would do.
+    """
+    found = predicted(plan, belief, settings)
+    worst = int(np.argmax(found.variance))
+    bound = settings.sigmas * float(np.sqrt(found.variance[worst]))
+    if bound <= settings.max_error:
+        return
+    what, remedy = REMEDIES[found.largest(worst)]
+    raise StageError(
+        f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best at "
+        f"{found.s[worst] * 1e3:.0f} mm of the seam ({settings.sigmas:.3g} sigma, most of it "
+        f"{what}), max_error is {settings.max_error * 1e3:.3g} mm; {remedy}, or raise 'max_error'"
+    )
+
+
+def _stances(plan: Path, s: Floats, distance: float, aside: float) -> tuple[Floats, Floats]:
+    """Return the sine of the tool to the seam (K,) at arc lengths, and what the tool turns (K,).
+
+    That is the chord of the angle by which it turns between the tip's and the torch's passing. The
+    torch is on the plan, the undeformed tip ``aside`` to the left of it [m].
+    """
+    here, tangents = plan.evaluate(s)
+    there, along = _other_end(plan, s, distance)
+    pressed = aside * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    now = (there - here)[:, :2] + pressed
+    then = (here - _other_end(plan, s, -distance)[0])[:, :2] + pressed
+    now, then = (tool / np.linalg.norm(tool, axis=1, keepdims=True) for tool in (now, then))
+    sine = tangents[:, 0] * now[:, 1] - tangents[:, 1] * now[:, 0]
+    turned = np.linalg.norm(now - then, axis=1)
+    # Until the torch is on the seam the tool stands as it was set down, not along the plan.
+    return sine, np.where(s < distance, 0.0, turned)
+
+
+def _other_end(plan: Path, s: Floats, distance: float) -> tuple[Floats, Floats]:
+    """Return where the plan is a tool's length ahead or behind (K, 3), and its tangents there."""
+    here, _ = plan.evaluate(s)
+    other = s + distance
+    for _ in range(20):
+        there, _ = plan.evaluate(other)
+        away = np.linalg.norm((there - here)[:, :2], axis=1)
+        other = other + np.sign(distance) * (abs(distance) - away)
+    return plan.evaluate(other)

@@ -1,0 +1,81 @@
+"""The torch's bound, predicted along the plan before anything moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye_emulators.weld_world.bench import curved, try_condition
+from flangeye_emulators.weld_world.conditions import Condition
+from flangeye_plugins.weld.belief import Belief
+from flangeye_plugins.weld.bound import check_bound, predicted
+from flangeye_plugins.weld.path import Path
+from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import straight
+
+BEND, DISTANCE = 0.05, 0.04
+
+
+def following(**given: Any) -> Following:
+    return Following.model_validate(given)
+
+
+def arc() -> Path:
+    angle = np.linspace(0.0, 2.5, 400)
+    return Path(BEND * np.column_stack([np.sin(angle), 1.0 - np.cos(angle), 0.0 * angle]))
+
+
+@pytest.mark.parametrize("sigmas", [2.0, 3.0, 4.0])
+def test_the_files_are_known_to_so_many_sigma_within_the_error_that_is_allowed(
+    sigmas: float,
+) -> None:
+    plan, belief = Path(straight(0.12)), Belief(DISTANCE, torch_sigma=0.2e-3, along_sigma=0.0)
+    asked = following(sigmas=sigmas, gain_drift=0.0)
+    bound = sigmas * np.sqrt(belief.fixed_variance(asked))
+    check_bound(plan, belief, asked.model_copy(update={"max_error": 1.001 * bound}))
+    with pytest.raises(StageError, match=f"{bound * 1e3:.2f} mm at best at .* calibrate the tool"):
+        check_bound(plan, belief, asked.model_copy(update={"max_error": 0.999 * bound}))
+
+
+def test_in_a_bend_the_tool_stands_askew_and_turns() -> None:
+    """Tip and torch are both on a circle: the chord of 40 mm stands at half its arc to it."""
+    belief = Belief(DISTANCE, along_sigma=0.5e-3, tip_sigma=0.3e-3)
+    found = predicted(arc(), belief, following())
+    half = np.arcsin(DISTANCE / 2 / BEND) + 2e-3 / DISTANCE  # it is pressed to the left by 2 mm
+    middle = (found.s > 0.045) & (found.s < 0.05)
+    np.testing.assert_allclose(found.askew[middle], (0.5e-3 * np.sin(half)) ** 2, rtol=0.05)
+    np.testing.assert_allclose(found.tip[middle], (0.3e-3 * 2 * np.sin(half)) ** 2, rtol=0.2)
+    line = predicted(Path(straight(0.12)), belief, following())
+    assert line.askew.max() == pytest.approx((0.5e-3 * 2e-3 / DISTANCE) ** 2, rel=0.01)
+    assert line.tip.max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("belief", "asked", "told"),
+    [
+        ({"along_sigma": 2e-3}, {}, "most of it along_sigma, as the tool stands askew there"),
+        ({"tip_sigma": 2e-3}, {}, "most of it tip_sigma, as the tool turns there"),
+        ({}, {"gain_drift": 0.9}, "most of it gain_drift and the weave.*weld faster"),
+    ],
+)
+def test_what_is_largest_and_what_lessens_it_is_said(belief: Any, asked: Any, told: str) -> None:
+    with pytest.raises(StageError, match=told):
+        check_bound(arc(), Belief(DISTANCE, **belief), following(**asked))
+
+
+def test_the_follower_states_no_less_than_was_predicted() -> None:
+    """And little more where nothing is wrong: what it feels is all that comes on top."""
+    condition = Condition(
+        {}, {"max_error": "2 mm"}, (0.0, 0.0), {"along_sigma": 1e-3, "tip_sigma": 0.2e-3}
+    )
+    found = try_condition(condition, 0, 0.1, 16e-3)
+    expected = predicted(Path(curved(0.1)), Belief(DISTANCE, **condition.belief), Following())
+    inside = (found.column("torch_s") > 0.01) & (found.column("torch_s") < 0.09)
+    s, sigma = found.column("torch_s")[inside], found.column("bound")[inside] / 3.0
+    least = np.sqrt(np.interp(s, expected.s, expected.variance - expected.felt))
+    assert found.done
+    assert (sigma > 0.97 * least).all()
+    assert np.median(sigma / least) < 1.5
