@@ -114,6 +114,7 @@ PARTS = {
     "check.tool": "flangeye_plugins.check.changes:tool",
     "check.size": "flangeye_plugins.check.size:size",
     "check.motion": "flangeye_plugins.check.motion:motion",
+    "check.rounding": "flangeye_plugins.check.rounding:rounding",
     "robot.aubo": "flangeye_plugins.robot.aubo.driver:robot_aubo",
     "robot.franky": "flangeye_plugins.robot.franky.driver:robot_franky",
     "robot.manual": "flangeye_plugins.robot.manual.driver:robot_manual",

@@ -57,3 +57,35 @@ def test_a_recipe_that_reads_no_archive(flangeye: Callable[..., Any], toy_recipe
         "",
         "error: acquire.toy: reads no archive to examine; name a run's log, or recordings\n",
     )
+
+
+def test_a_folder_that_no_reader_knows_leads_to_init(
+    command: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "a.csv").write_text("1,2,3\n")
+    assert command("doctor", "rec") == (
+        2, "",
+        "error: rec: no reader knows this layout by itself, and no recipe says how it is read; "
+        "write one: flangeye init rec; then: flangeye doctor recipe.yaml\n",
+    )  # fmt: skip
+
+
+def test_what_the_run_set_aside_is_named_and_coarse_decimals_are_said(
+    command: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_with_inverted_targets(tmp_path)
+    poses = dict(np.load(tmp_path / "poses.npz"))
+    poses["target"] = np.linalg.inv(poses["target"])
+    poses["robot"][7, :3, 3] += [0.03, 0, 0]
+    poses["robot"][:, :3, 3] = np.round(poses["robot"][:, :3, 3], 3)
+    np.savez(tmp_path / "poses.npz", **poses)
+    (tmp_path / "cell.yaml").write_text(RECIPE)
+    assert command("run", "cell.yaml", "--out", "out")[0] == 0
+    _, out, _ = command("doctor", "out/run.mcap")
+    assert "note: set aside: the run's solver did not use 1 of the samples: '0007' " in out
+    said = "positions of the arm are whole multiples of 1 mm, and the recipe asks for 1 mm; if they"
+    assert f"note: rounded: {said} were rounded, that alone is 0.5 mm" in out
+    assert "fix: write positions with 4 or more decimals of a metre" in out

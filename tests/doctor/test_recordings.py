@@ -217,7 +217,7 @@ def test_nothing_found_is_exit_code_zero(
 ) -> None:
     code, out, _ = run(monkeypatch, capsys, folder(session_of()))
     assert code == 0
-    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 13 checks"
+    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 14 checks"
     assert out.splitlines()[-1] == "nothing found"
 
 
@@ -264,7 +264,7 @@ def test_json_for_programs(
         (lambda p: None, ["no-such"], "error: no-such: does not exist"),
         (lambda p: (p / "poses.csv").write_text("cloud,x_m,y_m,z_m,qx,qy,qz,qw\n"), ["."],
          "error: .: holds scans (folder, poses.csv), and nothing says what to look for in them; "
-         "add --recipe with the recipe that would run on it"),
+         "write a recipe: flangeye init .; then: flangeye doctor recipe.yaml"),
         (lambda p: (p / "x.mcap").write_bytes(b"no log"), ["x.mcap"],
          "error: x.mcap: is not an MCAP file"),
         (lambda p: None, [".", "--recipe", "ur5_phoxi-m_simulated"],

@@ -28,6 +28,8 @@ Arms = Literal["both", "first", "second"]
 FEWEST = 4
 """Samples below which every explanation fits."""
 
+USUAL_LIMIT = 1e-3
+"""Of verify.holdout, where no recipe asks for another [m]."""
 CERTAIN = float("inf")
 """Gain of a finding that needs no statistics, such as a pose that is exactly the identity."""
 
@@ -59,6 +61,7 @@ class RecordedSession:
         reader: The archive's reader, as the recipe writes it.
         acquire: Name of the recipe's first step.
         changes: Parameters of that step that differ from the recipe's, by what was mended.
+        limit: Smallest error that the recipe asks for [m].
         marks_open: Whether the recipe's solver marks translations that the motion cannot show.
         remarks: Mistakes that opening the archive has shown already, mended here.
         damage: What of the log could not be read or was changed, a line each.
@@ -80,6 +83,7 @@ class RecordedSession:
     reader: Reader = "auto"
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
+    limit: float = USUAL_LIMIT
     marks_open: bool = False
     remarks: tuple[Finding, ...] = ()
     damage: tuple[str, ...] = ()

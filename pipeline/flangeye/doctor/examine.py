@@ -44,12 +44,13 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
         StageError: There are too few samples to tell anything.
     """
     bound = [check.bind() for check in checks]
-    found, current = list(session.remarks), session
+    found, current = [r for r in session.remarks if not r.note], session
+    known = tuple(remark for remark in session.remarks if remark.note)
     require_enough(session)
     offered, idle = _offered(current, bound)
     if made_up := [f for f in offered if f.hopeless]:
         # What else these samples seem to show is made up like them.
-        return Diagnosis(session, (*found, made_up[0]), (), _names(bound), idle)
+        return Diagnosis(session, (*found, made_up[0]), known, _names(bound), idle)
     while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:
         found.append(max(mendable, key=lambda finding: finding.gain))
         current = found[-1].corrected_session or current
@@ -61,7 +62,7 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
         named = {f.name for f in found if not f.samples}
         offered = [f for f in offered if f.samples or f.name not in named]
     found += [f for f in offered if f.corrected_session is None and not f.note]
-    notes = tuple(f for f in offered if f.note)
+    notes = (*known, *(f for f in offered if f.note))
     return Diagnosis(session, tuple(found), notes, _names(bound), idle)
 
 

@@ -5,7 +5,7 @@ The reader's poses are taken as they are, whatever is wrong with them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ import numpy as np
 
 from flangeye import types as t
 from flangeye.doctor.as_recorded import State, in_configuration
-from flangeye.doctor.diagnosis import Finding, Reader, RecordedSession
+from flangeye.doctor.diagnosis import USUAL_LIMIT, Finding, Reader, RecordedSession
 from flangeye.doctor.finding import found_in
 from flangeye.errors import StageError
-from flangeye.files.recording import Archive, Recording, check_ids
-from flangeye.log.read import is_log, log_of, read_run
+from flangeye.files.recording import Archive, NotThisLayout, Recording, check_ids
+from flangeye.log.read import RunLog, is_log, log_of, read_run
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import DEFAULT, Configuration
@@ -31,6 +31,9 @@ from flangeye.recipe.steps import Step
 from flangeye.run.recorded import recipe_of_log
 from flangeye.run.runner import Runner
 from flangeye.types import Floats
+
+LISTED = 8
+"""Samples that are written out."""
 
 
 def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> RecordedSession:
@@ -94,7 +97,20 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     times = {meta["id"]: int(meta["time_ns"]) for meta in calibration}
     session = replace(_session({**given, **poses}, found, times), damage=tuple(log.notes))
     states = {meta["id"]: _state_of(meta) for meta in calibration}
-    return session if recipe is None else _as_recipe(session, recipe, states)
+    session = session if recipe is None else _as_recipe(session, recipe, states)
+    return replace(session, remarks=(*session.remarks, *_set_aside(log)))
+
+
+def _set_aside(log: RunLog) -> Iterator[Finding]:
+    """Yield a note on the observations that the run's solver did not use."""
+    of_solver = [o for o in (log.result or {}).get("observations", ()) if o["residual"] is not None]
+    gone = [o for o in of_solver if not o["used"]]
+    if gone:
+        worst = sorted(gone, key=lambda o: -o["residual"])
+        told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:LISTED])
+        what = f"the run's solver did not use {len(gone)} of the samples: {told} off"
+        fix = f"look at these samples; {worst[0]['reason']}"
+        yield Finding("set aside", what, fix, tuple(o["id"] for o in worst), note=True)
 
 
 def _state_of(meta: Mapping[str, Any]) -> State:
@@ -106,11 +122,17 @@ def _state_of(meta: Mapping[str, Any]) -> State:
 
 
 def _of_centres(path: Path, registry: Registry) -> RecordedSession:
-    archive: Archive = registry.part("reader.auto").bind()(path)
+    try:
+        archive: Archive = registry.part("reader.auto").bind()(path)
+    except NotThisLayout:
+        raise StageError(
+            f"{path}: no reader knows this layout by itself, and no recipe says how it is read; "
+            f"write one: flangeye init {path}; then: flangeye doctor recipe.yaml"
+        ) from None
     if not _ready_made(archive):
         raise StageError(
             f"{path}: holds scans ({archive.layout}), and nothing says what to look for in them; "
-            "add --recipe with the recipe that would run on it"
+            f"write a recipe: flangeye init {path}; then: flangeye doctor recipe.yaml"
         )
     return _of_archive(archive, _ready_made(archive))
 
@@ -215,11 +237,20 @@ def _as_recipe(
     return replace(
         in_configuration(session, configuration, arm, states),
         reach=reach,
+        limit=_limit(recipe),
         marks_open=any(getattr(s.params, "unobservable", None) == "mark" for s in recipe.steps),
         reader=reader,
         acquire=first.stage.name,
         changes={} if first.params is None else _given(first.params, {"reader"}),
     )
+
+
+def _limit(recipe: Recipe) -> float:
+    """Return the smallest error that the recipe asks for [m]."""
+    asked = [
+        getattr(s.params, name, None) for s in recipe.steps for name in ("max_rms", "required")
+    ]
+    return min([float(limit) for limit in asked if limit is not None], default=USUAL_LIMIT)
 
 
 def _written(reader: Any) -> Reader:
