@@ -29,7 +29,7 @@ if "--coverage" in sys.argv:
     atheris.instrument_imports(include=["flangeye", "flangeye_plugins"]).__enter__()
 
 from flangeye.files.children import keep_current_folder_out
-from tests.fuzz.damage import spoilt
+from tests.fuzz.damage import damaged
 from tests.fuzz.targets import SEEDS, TARGETS, Target, survives
 
 HANG = 20
@@ -95,7 +95,7 @@ def _fuzzed(name: str, folder: Path, cases: range, seed: int, counts) -> None:
     sound = target.seeds(folder)
     for number in cases:
         chance = random.Random(f"{seed} {name} {number}")
-        _once(name, target, folder, spoilt(chance.choice(sound), chance), counts)
+        _once(name, target, folder, damaged(chance.choice(sound), target.suffix, chance), counts)
 
 
 def _once(name: str, target: Target, folder: Path, raw: bytes, counts) -> None:

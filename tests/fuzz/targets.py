@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import zipfile
@@ -344,7 +345,248 @@ def _read_json(path):
         raise StageError(str(error) or type(error).__name__) from None
 
 
+def _histories(folder):
+    from flangeye.doctor.monitor.history import Check, Finding, History
+    from flangeye.types import BASE, FLANGE, CircleFeature, Observation, Transform, by_frame
+
+    def seen(i):
+        circle = CircleFeature(
+            np.array([0.1, 0.2, 1.0 + i / 1000]), np.array([0.0, 0.0, -1.0]), {"rim": 0.03},
+            1e-9 * np.eye(3), 1e-8 * np.eye(3), 0.9,
+        )  # fmt: skip
+        pose = by_frame(Transform(BASE, FLANGE, np.eye(4)))
+        return Observation(f"scan-{i}", circle, pose, np.zeros(6))
+
+    history = History(folder / "sound.jsonl", "a calibration")
+    for i in range(3):
+        history.checks.append(Check(f"run {i}", (seen(2 * i), seen(2 * i + 1)), 10**18 + i))
+        history.findings.append(Finding(i, "MOVED", 1e-3, (0.0,) * 6, i, 2.0, "scanner", 0.9))
+    history.write()
+    return [history.path.read_bytes()]
+
+
+def _read_history(path):
+    from flangeye.doctor.monitor.chart import _axis, sentence
+    from flangeye.doctor.monitor.history import History, as_json
+
+    history = History.read(path, "a calibration")
+    for finding in history.findings:
+        json.loads(as_json(history, finding))
+        sentence(finding)
+    _axis(history)
+    history.sightings()
+
+
+def _read_spoilt_history(path):
+    """What is read of a spoilt file is what was written, to the last bit."""
+    _read_history(path)
+    sound = _histories(path.parent)[0]
+    assert path.read_bytes().partition(b"\n")[2] == sound.partition(b"\n")[2], "read, and changed"
+
+
+def _read_signed_history(path):
+    """Its checksum is made anew, as whoever forges one would."""
+    body = path.read_bytes().partition(b"\n")[2]
+    digest = hashlib.sha256(b"a calibration\n" + body).hexdigest()
+    head = {"format": "flangeye.monitor.2", "calibration": "a calibration", "sha256": digest}
+    path.write_bytes(json.dumps(head).encode() + b"\n" + body)
+    _read_history(path)
+
+
+def _urdfs(folder):
+    joint = (
+        '<link name="link_{1}"><collision><origin xyz="0 0 0.1"/><geometry>{2}</geometry></collision>'
+        '</link><joint name="j{1}" type="revolute"><parent link="link_{0}"/><child link="link_{1}"/>'
+        '<origin xyz="0.1 0 0.2" rpy="0 1.57 0"/><axis xyz="0 0 1"/>'
+        '<limit lower="-2" upper="2" effort="0" velocity="1"/></joint>'
+    )
+    bodies = ('<cylinder radius="0.1" length="0.2"/>', '<box size="0.1 0.2 0.3"/>',
+              '<mesh filename="m.stl" scale="1 1 1"/>')  # fmt: skip
+    links = "".join(joint.format(i, i + 1, bodies[i]) for i in range(3))
+    flange = ('<link name="flange"/><joint name="f" type="fixed"><parent link="link_3"/>'
+              '<child link="flange"/></joint>')  # fmt: skip
+    return [f'<robot name="r"><link name="link_0"/>{links}{flange}</robot>'.encode()]
+
+
+def _read_urdf(path):
+    from flangeye.models.urdf import robot_from_urdf
+
+    (path.parent / "m.stl").write_bytes(_stl(path.parent)[0])
+    robot = robot_from_urdf(path)
+    assert max(len(str(note)) for note in robot.notes) < 2000
+    robot.filled()
+
+
+def _urdf_mesh(kind):
+    def made(folder):
+        import trimesh
+
+        box = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
+        raw = trimesh.exchange.export.export_mesh(box, None, file_type=kind)
+        return [raw.encode() if isinstance(raw, str) else raw]
+
+    return made
+
+
+def _read_urdf_mesh(path):
+    from flangeye.models.urdf_meshes import vertices
+
+    vertices(path)
+
+
+def _factories(folder):
+    rows = "\n".join(
+        f"delta_{name} = [ 0.001, -0.002, 0.0, 1e-4, 0.0, 0.0]"
+        for name in ("theta", "a", "d", "alpha")
+    )
+    return [f"[mounting]\n{rows}\ncalibration_status = 0 # Linearised\n".encode()]
+
+
+def _ros_factories(folder):
+    from flangeye.models.factory import LINKS, PLACE
+
+    each = {name: dict.fromkeys(PLACE, 0.1) for name in LINKS}
+    return [json.dumps({"kinematics": {**each, "hash": "calib_1"}}).encode()]
+
+
+def _read_factory(path):
+    from flangeye.models.factory import as_built
+    from flangeye.models.loading import load_model
+
+    as_built(load_model("robots", "ur5e"), path)
+
+
+def _names(folder):
+    return [b"poses.csv", b"*.json", b"a/pose_*.json", b"poses.csv:1/2", b"poses.json:robot,marker"]
+
+
+def _read_named(path):
+    from flangeye.files.tables import read_table
+
+    folder = path.with_suffix("")
+    (folder / "a").mkdir(parents=True, exist_ok=True)
+    (folder / "poses.csv").write_bytes(b"1,2,3\n4,5,6\n")
+    for i in range(3):
+        (folder / "a" / f"pose_{i}.json").write_text('{"x": 1, "y": 2}')
+    (folder / "poses.json").write_text('{"robot": [[1, 2, 3]], "marker": [[1, 2, 3]]}')
+    read_table(folder, path.read_bytes().decode("utf-8", "replace"))
+
+
+def _read_url(path):
+    from flangeye.files.elsewhere import is_url, print_of, results_at, system_of
+
+    url = path.read_bytes().decode("utf-8", "replace")
+    if is_url(url):
+        system_of(url)
+        print_of(url)
+    else:
+        with results_at(url):
+            pass
+
+
+def _read_request(path):
+    """A request as it comes over the wire: first line, then headers with cookies."""
+    import asyncio
+
+    from flangeye_ui.gate import Gate, Keys
+
+    first, *lines = path.read_bytes().split(b"\n")
+    method, _, rest = first.partition(b" ")
+    where, _, query = rest.partition(b"?")
+    headers = [(k.lower(), v.strip()) for k, _, v in (line.partition(b":") for line in lines)]
+    text = where.decode("latin-1")
+    scope = {"type": "http", "method": method.decode("latin-1"), "path": text, "root_path": "",
+             "raw_path": where, "query_string": query, "headers": headers, "scheme": "http",
+             "http_version": "1.1", "server": ("127.0.0.1", 8080), "client": ("127.0.0.1", 1)}  # fmt: skip
+    answers = []
+
+    async def receive():
+        return {"type": "http.request", "body": b""}
+
+    async def send(message):
+        answers.append(message)
+
+    async def app(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    keys = Keys.__new__(Keys)
+    keys.path, keys.token, keys._cookie, keys._sessions = "/x", "secret", "flangeye", [b"known"]
+    keys._issued = lambda token: None
+    asyncio.run(Gate(app, keys, "127.0.0.1", 8080)(scope, receive, send))
+    assert 200 <= answers[0]["status"] < 500, answers
+
+
+def _requests(folder):
+    return [
+        b"GET /x/archive?a=b HTTP/1.1\nHost: 127.0.0.1:8080\nCookie: a=b; flangeye=known\n",
+        b"GET /?token=secret HTTP/1.1\nHost: localhost:8080\nOrigin: http://localhost:8080\n",
+    ]
+
+
+def _results(folder):
+    held: dict[str, bytes] = {}
+    rewritten(sound_log(folder / "sound"), folder / "copy.mcap",
+              lambda name, data: (name, held.setdefault(name, data)))  # fmt: skip
+    return [held["result.json"]]
+
+
+def _read_certified(path):
+    from flangeye.report.certificate import Conditions, write_certificate
+
+    content, source = path.read_bytes(), sound_log(path.parent / "sound")
+    changed = rewritten(source, path.with_suffix(".mcap"),
+                        lambda n, data: (n, content if n == "result.json" else data))  # fmt: skip
+    write_certificate(changed, path.with_suffix(".html"), Conditions(None, None, "", ""))
+
+
+def _parquets(folder):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    out = io.BytesIO()
+    rows = [{"session": "a", "status": "verified", "report": None, "rms": 1.0}]
+    pq.write_table(pa.Table.from_pylist(rows, _batch_columns()), out)
+    return [out.getvalue()]
+
+
+@cache
+def _batch_columns():
+    import pyarrow as pa
+
+    return pa.schema({"session": pa.string(), "status": pa.string(), "report": pa.string(),
+                      "rms": pa.float64()})  # fmt: skip
+
+
+def _read_batch(path):
+    from flangeye.batch.dataset import FOLDER, Dataset
+    from flangeye.files.place import place_at
+
+    folder = path.with_suffix("")
+    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+    (folder / FOLDER / "000000-a.parquet").write_bytes(path.read_bytes())
+    schema = _batch_columns()
+    dataset = Dataset(place_at(str(folder)), dict(zip(schema.names, schema.types, strict=True)))
+    dataset._read(f"{FOLDER}/000000-a.parquet").to_pylist()
+
+
 TARGETS = {
+    "history": Target(".jsonl", _histories, _read_spoilt_history),
+    "history-signed": Target(".jsonl", _histories, _read_signed_history),
+    "urdf": Target(".urdf", _urdfs, _read_urdf),
+    "urdf-stl": Target(".stl", _urdf_mesh("stl"), _read_urdf_mesh),
+    "urdf-obj": Target(".obj", _urdf_mesh("obj"), _read_urdf_mesh),
+    "urdf-dae": Target(".dae", _urdf_mesh("dae"), _read_urdf_mesh),
+    "factory": Target(".conf", _factories, _read_factory),
+    "factory-ros": Target(".yaml", _ros_factories, _read_factory),
+    "name": Target(".txt", _names, _read_named),
+    "url": Target(
+        ".txt",
+        lambda f: [b"s3://a/b.csv", b"zip://x::https://h/a.zip", b"az://a/b", b"runs/a"],
+        _read_url,
+    ),
+    "request": Target(".http", _requests, _read_request),
+    "certificate": Target(".json", _results, _read_certified),
+    "batch": Target(".parquet", _parquets, _read_batch),
     "recipe": Target(".yaml", _recipes, _check_recipe),
     "set": Target(".txt", _overrides, _check_override),
     "model": Target(".yaml", _models, _read_model),

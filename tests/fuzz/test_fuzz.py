@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tests.fuzz.damage import NASTY, spoilt
+from tests.fuzz.damage import NASTY, damaged, spoilt
 from tests.fuzz.strategies import STRATEGIES
 from tests.fuzz.targets import SEEDS, TARGETS, survives
 
@@ -22,7 +22,7 @@ def test_spoilt_input_is_read_or_refused(name: Any, tmp_path: Path) -> None:
     sound = target.seeds(tmp_path)
     for number in range(CASES):
         path = tmp_path / f"{number}{target.suffix}"
-        path.write_bytes(spoilt(chance.choice(sound), chance))
+        path.write_bytes(damaged(chance.choice(sound), target.suffix, chance))
         survives(target, path)
         path.unlink()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2_000_000  # kB
@@ -36,7 +36,9 @@ def test_sound_seeds_are_read_and_texts_of_old_refused_or_read(name: Any, tmp_pa
         path = tmp_path / f"{number}{target.suffix}"
         path.write_bytes(raw)
         assert (
-            survives(target, path) or number >= len(sound) or name in ("poses", "records", "table")
+            survives(target, path)
+            or number >= len(sound)
+            or name in ("poses", "records", "table", "request", "url", "batch", "name")
         ), raw[:80]
 
 

@@ -220,7 +220,8 @@ class UrdfBodies:
             yield end_of(joint, "child"), moved, before
 
     def _of(self, link: str, index: int, pose: Floats) -> Iterator[Volume]:
-        for collision in self.urdf.links[link].findall("collision"):
+        of = self.urdf.links.get(link)
+        for collision in [] if of is None else of.findall("collision"):
             geometry = collision.find("geometry")
             if geometry is None or not len(geometry):
                 continue

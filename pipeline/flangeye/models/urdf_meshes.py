@@ -113,9 +113,9 @@ def vertices(path: Path) -> Floats:
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")
     try:
         mesh: Any = trimesh.load(io.BytesIO(raw), file_type=kind[1:], force="mesh")
+        points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever its readers do
         raise RecipeError(f"{path}: is no mesh that can be read: {reason_of(error)}") from None
-    points = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError(f"{path}: has no vertices, or some that are not finite")
     return points

@@ -76,6 +76,19 @@ class ObservationResult(_Part):
     used: bool
     reason: str | None = Field(None, description="Why it was not used.")
 
+    @model_validator(mode="after")
+    def _are_of_space(self) -> Self:
+        """Check the sizes, which JSON leaves open."""
+        points = (
+            self.centre_in_camera, self.normal_in_camera, self.tcp_in_base, self.residual_in_base,
+            *(self.covariance or []),
+        )  # fmt: skip
+        if any(point is not None and len(point) != 3 for point in points):
+            raise ValueError("a point of it has not 3 coordinates")
+        if self.covariance is not None and len(self.covariance) != 3:
+            raise ValueError("'covariance' is not 3x3")
+        return self
+
 
 class HoldoutResult(_Part):
     """Errors on poses that took no part in the estimate."""
