@@ -231,7 +231,7 @@ def test_a_layout_is_verified_without_an_edit(
     assert told.exit_code == 0, f"{told.output}{told.exception}"
     done = CliRunner().invoke(app, ["run", "recipe.yaml", "--out", "out"])
     assert done.exit_code == 0, f"{told.output}{done.output}{done.exception}"
-    assert "verified" in done.output
+    assert "\nVERIFIED " in done.output
 
 
 def test_the_page_lists_these_layouts() -> None:
