@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flangeye_emulators.weld_world.worlds import Verdict, judged
+from flangeye_emulators.weld_world.worlds import WorldScore, judged
 
 
 def worlds(
@@ -37,7 +37,7 @@ def worlds(
         print(line)
 
 
-def summary(verdicts: list[Verdict]) -> list[str]:
+def summary(verdicts: list[WorldScore]) -> list[str]:
     """Return what came of all of them, for people."""
     count = Counter(v.status for v in verdicts)
     done = [v for v in verdicts if v.status == "done"]

@@ -200,7 +200,7 @@ class Scanner(Device, Protocol):
 
 @runtime_checkable
 class KnowsTruth(Protocol):
-    """What a simulated scanner tells besides, for its error to be measured; no stage can ask.
+    """The truth of a simulated scanner, to score it; no stage can ask for it.
 
     Attributes:
         truth: Where it really stands.
@@ -211,7 +211,7 @@ class KnowsTruth(Protocol):
 
 @runtime_checkable
 class KnowsTorch(Protocol):
-    """What a simulated finger tells once a weld is over, for it to be scored; no stage can ask."""
+    """The truth of a simulated finger, to score a finished weld; no stage can ask for it."""
 
     def true_torch(self) -> tuple[Floats, Floats]:
         """Return times (K,) [s] and where the torch really was then (K, 3), in base [m]."""
@@ -220,7 +220,7 @@ class KnowsTorch(Protocol):
 
 @runtime_checkable
 class KnowsSeams(Protocol):
-    """What a simulated scanner tells besides, for a plan to be scored; no stage that plans sees it.
+    """The truth of a simulated scanner, to score a plan; no planning stage sees it.
 
     Attributes:
         true_seams: By name, (N, 3) in ``base`` [m].

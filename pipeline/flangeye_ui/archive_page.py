@@ -184,7 +184,7 @@ class Scrubber:
         self._at(0)
 
     def _at(self, index: int) -> None:
-        """Show one capture: the flange in it, and what became of it."""
+        """Show one capture: its flange and its outcome."""
         if self._log is None:
             return
         if not self._captures:
@@ -208,7 +208,7 @@ class Scrubber:
 
 
 def fate_of(log: RunLog, capture: str) -> str:
-    """Return what became of a capture, in words."""
+    """Return the outcome of a capture in words."""
     for rejection in log.rejections:
         if rejection.id == capture:
             return f"set aside by {rejection.stage}: {rejection.reason}"

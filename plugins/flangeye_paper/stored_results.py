@@ -1,4 +1,4 @@
-"""``verify.stored_results_as_in_paper``: what the authors' own results say of a calibration.
+"""``verify.stored_results_as_in_paper``: compares a calibration with the authors' own results.
 
 For three recordings they stored the 50 matrices that Algorithm 1 ended with, and what ICP gave
 for each. The verification clouds of two of them were never published; but a matrix H and its ICP

@@ -1,4 +1,4 @@
-"""Table 1 and the Kinect row: errors of the calibration from all poses, as ICP tells them."""
+"""Table 1 and the Kinect row: errors of the calibration from all poses, measured by ICP."""
 
 from __future__ import annotations
 

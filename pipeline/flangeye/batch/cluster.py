@@ -265,7 +265,7 @@ class Pace:
 def run_all(
     client: Client, job: Job, sessions: Iterable[tuple[int, BatchSession]], count: int
 ) -> Iterator[ChunkTold]:
-    """Yield what became of each chunk as it ends.
+    """Yield the outcome of each chunk as it ends.
 
     They are submitted as others end: what client and scheduler hold does not grow with their
     number.

@@ -47,7 +47,7 @@ _HEADINGS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One place of the table.
 
     Attributes:
@@ -120,11 +120,11 @@ def _groups(tally: Tally) -> list[dict[str, Any]]:
     ]
 
 
-def _cell(row: Row, name: str) -> Cell:
+def _cell(row: Row, name: str) -> TableCell:
     value = row[name]
     number = float(value) if isinstance(value, (int, float)) else None
     link = quote(row["report"]) if name == "session" and row["report"] else None
-    return Cell(_text(name, value), number, link, name)
+    return TableCell(_text(name, value), number, link, name)
 
 
 def _text(name: str, value: Any) -> str:

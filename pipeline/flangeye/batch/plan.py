@@ -43,7 +43,7 @@ class BatchSession:
 
     @property
     def number(self) -> str:
-        """Sixteen hexadecimal digits that tell it from all others."""
+        """Sixteen hexadecimal digits, unique to it."""
         return self.id[-16:]
 
 

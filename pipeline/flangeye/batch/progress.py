@@ -24,7 +24,7 @@ TOLD_AT_MOST = 10
 
 
 class BatchProgress:
-    """A bar of sessions; those that gave no calibration are told as they end."""
+    """A progress bar of sessions; those without a calibration are named as they end."""
 
     def __init__(self, console: Console, total: int) -> None:
         from rich.progress import (

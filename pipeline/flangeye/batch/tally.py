@@ -108,7 +108,7 @@ class Tally:
         return [] if self._worst is None else list(self._worst.to_pylist())
 
     def by(self) -> list[str]:
-        """Return the columns that tell variants apart."""
+        """Return the columns in which variants differ."""
         return [*(["archive"] if self._archives else []), *self.varied]
 
     def variants(self) -> list[VariantTold]:

@@ -1,4 +1,4 @@
-"""What commands say of a log that is damaged, that others wrote, or that holds nothing yet."""
+"""Messages about logs that are damaged, foreign or still empty."""
 
 from __future__ import annotations
 

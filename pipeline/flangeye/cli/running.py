@@ -201,7 +201,7 @@ def _recipe_of(
     registry: Registry,
     overrides: Sequence[str],
 ) -> tuple[Recipe, FromNothing | None]:
-    """Return the checked recipe, named or of the run to go on with; and that run."""
+    """Return the checked recipe, by name or from the run to resume, and that run."""
     from flangeye.errors import StageError
     from flangeye.run.restart import earlier_run
 

@@ -147,7 +147,7 @@ def _whole(observation: Observation) -> bool:
 
 
 def _is_point(observation: Observation) -> bool:
-    """Whether a table told a centre; one of a scan has a normal, and the scanner's unit."""
+    """Whether the centre comes from a table; that of a scan has a normal and the scanner's unit."""
     feature = observation.feature
     return isinstance(feature, CircleFeature) and feature.normal is None
 
@@ -264,7 +264,7 @@ def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]
 
 @dataclass(frozen=True)
 class Foretold:
-    """How well sightings are foretold that took no part.
+    """Prediction error of held-out sightings.
 
     Attributes:
         misfit: Medians over the sightings, of the pair where they are largest.
@@ -287,7 +287,7 @@ class Foretold:
 
 
 def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
-    """Return how well sightings are foretold by the others; infinite where there is no answer."""
+    """Return the error with which the others predict each sighting; infinite without a solution."""
     try:
         found = solve_cell(observations, cell, LIMITS).found
     except (FlangeyeError, np.linalg.LinAlgError):

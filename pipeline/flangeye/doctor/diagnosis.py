@@ -107,7 +107,7 @@ class RecordedSession:
         return self.links is None or self.carried == "target"
 
     def require_samples(self) -> None:
-        """Go on only with samples enough to tell anything from.
+        """Refuse a session with too few samples for any check.
 
         Raises:
             NotApplicable: There are too few with a target in them.

@@ -87,7 +87,7 @@ def _offered(
 
 
 def require_enough(session: RecordedSession) -> None:
-    """Go on only with samples enough to tell anything from.
+    """Refuse a session with too few samples for any check.
 
     Raises:
         StageError: There are fewer.

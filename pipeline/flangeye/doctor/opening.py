@@ -155,7 +155,7 @@ def _of_recipe(path: Path, registry: Registry, recipe: Recipe) -> RecordedSessio
 
 
 def _in_other_unit(session: RecordedSession, unit: str, why: str) -> RecordedSession:
-    """Return the session with the remark that the clouds are in another unit than was said."""
+    """Return the session with its clouds in another unit, and a remark on that."""
     corrected_session = session.with_changes(unit=unit)
     return replace(corrected_session, remarks=(Finding("unit", why, corrected_session.step()),))
 

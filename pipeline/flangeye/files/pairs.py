@@ -18,7 +18,7 @@ def natural(text: str) -> list[tuple[int, str]]:
 
 
 def numbers_of(names: Sequence[str]) -> list[tuple[int, ...]]:
-    """Return what numbers tell names apart: ``(7,)`` of cam0_07; empty where a name has none."""
+    """Return the numbers that distinguish names: ``(7,)`` of cam0_07; empty where there is none."""
     runs = [tuple(map(int, re.findall(r"\d+", name))) for name in names]
     if len({len(run) for run in runs}) > 1:
         return [run[-1:] for run in runs]

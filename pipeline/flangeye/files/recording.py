@@ -167,7 +167,7 @@ def _check_distinct(root: Path, recordings: Sequence[Recording]) -> None:
 
 
 def _repeated(names: Sequence[str], same: Indices, pose: Floats) -> str:
-    """Return what to say of poses that are one: most of them a driver made up."""
+    """Return the message for repeated poses; if most are equal, the driver made them up."""
     if len(same) > max(2, len(names) / 2):
         made_up = "the identity" if np.abs(pose - np.eye(4)).max() < SAME_POSE else "the same"
         told = f"{len(same)} of {len(names)} robot poses are {made_up}"

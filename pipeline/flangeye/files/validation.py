@@ -42,7 +42,7 @@ def _unknown_key(key: str, fields: list[str]) -> str:
 
 
 def _fields_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
-    """Return the field names of the model nested at ``loc``, where that can be told."""
+    """Return the field names of the model nested at ``loc``, if they can be determined."""
     for key in loc:
         if isinstance(key, int):  # one of several of the same model
             continue

@@ -109,7 +109,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Note:
+class JournalEntry:
     """One line of a step's log.
 
     Attributes:
@@ -162,7 +162,7 @@ class RunLog:
 
     @property
     def notes(self) -> list[str]:
-        """What whoever runs on this log must be told of its damage, in a few lines."""
+        """The log's damage in a few lines, for whoever runs on it."""
         kept = f"kept: {len(self.poses)} captures, {len(self.entries)} values of steps"
         told = [f"{self.path}: damaged: {what}; {kept}" for what in self.damage[:MAX_TOLD]]
         more = len(self.damage) - MAX_TOLD
@@ -353,7 +353,7 @@ def read_run(path: Path) -> RunLog:
     return log
 
 
-def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[Note]:
+def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[JournalEntry]:
     """Yield what steps wrote into their logs, in order, as far as the log goes.
 
     Args:
@@ -374,11 +374,11 @@ def read_notes(path: Path, steps: Set[str] | None = None) -> Iterator[Note]:
                 raise StageError(f"{path}: {_error_line(message, error)}") from None
 
 
-def _note(message: Message) -> Note:
+def _note(message: Message) -> JournalEntry:
     step, _, name = message.channel.topic.removeprefix("/note/").rpartition("/")
     if message.channel.schema == "foxglove.CompressedImage":
-        return Note(step, name, _decode_image(message.data))
-    return Note(step, name, decode_json(message.data)["value"])
+        return JournalEntry(step, name, _decode_image(message.data))
+    return JournalEntry(step, name, decode_json(message.data)["value"])
 
 
 def take(log: RunLog, message: Message, clouds: dict[str, t.PointCloud]) -> None:

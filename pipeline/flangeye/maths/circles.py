@@ -1,4 +1,4 @@
-"""Circles in flat points: what finding a flange and fitting it have in common. Arrays only.
+"""Circle detection in 2D points, shared by segmenting and fitting. Arrays only.
 
 Robust without drawing lots: every function gives the same answer whatever the order of the
 points, and there is no seed.

@@ -78,7 +78,7 @@ def _skew_part(r: Floats) -> Floats:
 
 
 def _rotation_log_anywhere(rotation: Floats) -> Floats:
-    """Return the rotation vectors by quaternions: near half a turn the sine tells no axis."""
+    """Return rotation vectors via quaternions: near 180 degrees the sine loses the axis."""
     q = quaternion_from_rotation(rotation)
     xyz, w = q[..., :3], q[..., 3:]
     length = np.linalg.norm(xyz, axis=-1, keepdims=True)

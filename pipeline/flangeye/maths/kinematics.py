@@ -41,7 +41,7 @@ LONGEST_STEP = 0.5
 """Largest change of a joint in one iteration [rad or m]; linearisation means nothing beyond."""
 
 
-class Joint(Protocol):
+class JointAxis(Protocol):
     """One joint: what comes before it, its axis, and its limits.
 
     Denavit-Hartenberg conventions read ``a, alpha, d, theta``, ``urdf`` reads ``xyz, rpy, axis``.
@@ -102,7 +102,7 @@ class SerialChain(Protocol):
     """A serial arm: its joints, how they are written, and the flange beyond them."""
 
     @property
-    def joints(self) -> Sequence[Joint]:
+    def joints(self) -> Sequence[JointAxis]:
         """Base to flange."""
         ...
 
@@ -117,7 +117,7 @@ class SerialChain(Protocol):
         ...
 
 
-def altered(joint: Joint, convention: str, lengths: Floats) -> dict[str, Any]:
+def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any]:
     """Return a joint's parameters with (3,) added to ``a``, ``d`` [m] and ``alpha`` [rad].
 
     A URDF's origin has the three as a step along its x and z, and a roll.
@@ -132,7 +132,7 @@ def altered(joint: Joint, convention: str, lengths: Floats) -> dict[str, Any]:
 class Altered:
     """A joint some of whose parameters are others."""
 
-    def __init__(self, joint: Joint, changes: dict[str, Any]) -> None:
+    def __init__(self, joint: JointAxis, changes: dict[str, Any]) -> None:
         self._joint, self._changes = joint, changes
 
     def __getattr__(self, name: str) -> Any:
@@ -423,15 +423,15 @@ def _solutions(forms: Sequence[ClosedForm], base_T_flange: Floats) -> Floats | N
     return np.concatenate(found) if found else None
 
 
-def _standard(joint: Joint) -> tuple[Floats, Floats]:
+def _standard(joint: JointAxis) -> tuple[Floats, Floats]:
     return np.eye(4), _screw_z(joint.d) @ _screw_x(joint.a, joint.alpha)
 
 
-def _modified(joint: Joint) -> tuple[Floats, Floats]:
+def _modified(joint: JointAxis) -> tuple[Floats, Floats]:
     return _screw_x(joint.a, joint.alpha) @ _screw_z(joint.d), np.eye(4)
 
 
-def _urdf(joint: Joint) -> tuple[Floats, Floats]:
+def _urdf(joint: JointAxis) -> tuple[Floats, Floats]:
     """Turn the joint's frame so that its z is the axis, and back behind the motion."""
     origin = rigid(rotation_from_rpy(*joint.rpy), np.asarray(joint.xyz))
     along = rigid(basis_of_plane(np.asarray(joint.axis)).T, np.zeros(3))

@@ -78,7 +78,7 @@ def fit_plane(points: Floats, towards: Floats) -> Plane:
 
 
 def thinned(points: NDArray[T], enough: int = ENOUGH) -> NDArray[T]:
-    """Return every n-th of N points: enough to tell one plane from another."""
+    """Return every n-th of N points: enough to distinguish planes."""
     return points[:: 1 + len(points) // enough]
 
 
@@ -248,7 +248,7 @@ def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
 
 
 def _differ(chosen: Mask, before: Mask, few: NDArray[np.floating]) -> Mask:
-    """Return (P,) whether more than a few (P,) of the points that a plane has chosen are new."""
+    """Return (P,) whether each of P planes gained more than a few points."""
     return np.asarray(_counts(chosen != before) > few)
 
 

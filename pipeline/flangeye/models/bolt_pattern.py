@@ -32,7 +32,7 @@ class HoleMatch(NamedTuple):
 
 
 def match_holes(flat: Floats, flange: Flange) -> HoleMatch | None:
-    """Return how the hole pattern lies in a face, or None where no pattern can be told.
+    """Return the angle of the hole pattern in a face, or None if no pattern is recognised.
 
     The face is empty where a hole is. How empty a ring about the pitch circle is, by angle, is
     compared with the known pattern at every rotation.

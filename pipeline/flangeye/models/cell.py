@@ -94,7 +94,7 @@ class Cell:
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Frames whose places controllers tell: of what moves, and of links."""
+        """Frames whose poses controllers report: of carriers and of links."""
         return (*self.movers, *self.links)
 
     @property
@@ -139,7 +139,7 @@ class Cell:
         return replace(motion, others={**motion.others, **placed})
 
     def joints(self, observations: Sequence[Observation]) -> dict[str, Floats]:
-        """Return (N, n) of the arms that told them at all of N observations [rad]."""
+        """Return (N, n) of the arms that reported them at all N observations [rad]."""
         told = [n for n in self.arms if all(n in o.arm_joints for o in observations)]
         return {name: np.array([o.arm_joints[name] for o in observations]) for name in told}
 

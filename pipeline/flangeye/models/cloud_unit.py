@@ -93,7 +93,7 @@ def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
 
 
 def unit_note(unit: LengthUnit, how: str, distance: float, scanner: ScannerData) -> str:
-    """Return what the person is told about the unit."""
+    """Return the note about the unit."""
     return (
         f"clouds in {unit} ({how}): the first has its median point at {distance:.3f} m; "
         f"{_range(scanner)}"

@@ -152,7 +152,7 @@ def _pose_of(carrier: str) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Carriers:
-    """What the controllers say of N observations.
+    """The controllers' poses at N observations.
 
     Attributes:
         camera: (N, 4, 4) base_T_camera_carrier.

@@ -149,7 +149,7 @@ class RobotModel(Model):
         return self._notes
 
     def from_urdf(self, bodies: Bodies, notes: tuple[Note, ...]) -> RobotModel:
-        """Return the arm with the bodies of its URDF, not read yet, and what to say of it."""
+        """Return the arm with the bodies of its URDF, not read yet, and the notes about it."""
         arm = self.model_copy()
         arm._bodies, arm._notes = bodies, notes
         return arm

@@ -1,4 +1,4 @@
-"""What a scan is searched for: the flange circle as a robot shows it, or a sphere."""
+"""Targets of a scan: the robot's flange circle, or a sphere."""
 
 from __future__ import annotations
 

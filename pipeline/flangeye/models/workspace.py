@@ -1,4 +1,4 @@
-"""Where the work is: the box at which errors are told."""
+"""Where the work is: the box over which errors are reported."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class WatchedArm:
         return self._state
 
     def go(self, route: Route) -> None:
-        """Set off along a checked route; the arm drives while the program goes on."""
+        """Start along a checked route without waiting for its end."""
         self._say("go", route)
 
     def wait(self) -> RobotState:

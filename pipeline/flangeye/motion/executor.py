@@ -105,7 +105,7 @@ class Executor:
         return state
 
     def stop(self) -> None:
-        """Tell the arm to stop; an arm that is lost cannot be told anything."""
+        """Command the arm to stop; a lost connection is ignored."""
         with suppress(DeviceError):
             self.robot.stop()
 

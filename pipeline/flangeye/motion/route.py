@@ -55,7 +55,7 @@ class Route(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """What the whole route takes."""
+        """Duration of the whole route [s]."""
         return sum(leg.seconds for leg in self.legs)
 
 

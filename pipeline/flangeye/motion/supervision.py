@@ -1,4 +1,4 @@
-"""Judge every sample of an arm: under way as told, arrived, or a reason to stop."""
+"""Judge each sample of an arm: moving as commanded, arrived, or a reason to stop."""
 
 from __future__ import annotations
 

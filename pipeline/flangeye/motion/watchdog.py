@@ -69,7 +69,7 @@ class Charge(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a guard tells the program.
+    """Messages from the guard to the program.
 
     Attributes:
         what: ``opened``, ``state``, ``cycle`` (a state that was asked for), ``arrived``,
@@ -274,7 +274,7 @@ class Watchdog:
         self._turned = time.monotonic()  # a command may wait until the arm rests
 
     def _tell_samples(self) -> None:
-        """Answer for an interval once it is over, or when no more will come of it."""
+        """Send the samples of an interval once it is over, or when no more will follow."""
         if self._wanted is None:
             return
         start_ns, end_ns = self._wanted

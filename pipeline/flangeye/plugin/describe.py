@@ -1,4 +1,4 @@
-"""The texts of ``flangeye stages``: what is on offer, and what each thing can be told."""
+"""The texts of ``flangeye stages``: stages and parts with their parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The hooks a plugin may implement: what it offers, and what it is told during a run."""
+"""The hooks a plugin may implement: what it offers, and the events of a run."""
 
 from __future__ import annotations
 

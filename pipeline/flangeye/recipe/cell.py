@@ -33,7 +33,7 @@ MoverSection = CellArmSection | RailSection | PositionerSection
 
 
 def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Complain) -> Cell | None:
-    """Return the cell a recipe describes, every mistake told; None where there is one.
+    """Return the cell of a recipe after reporting every mistake; None if there is one.
 
     Args:
         header: The sections.

@@ -43,7 +43,7 @@ Complain = Callable[[Sequence[Hashable], str], None]
 
 
 def context_of(header: Header, folder: Path, complain: Complain) -> Context:
-    """Return what the sections of a recipe offer, each mistake told.
+    """Return the values that a recipe's sections provide, after reporting every mistake.
 
     Args:
         header: The sections.

@@ -173,7 +173,7 @@ class _Checker:
         self._mistakes.append(f"{source}{'.'.join(map(str, keys))}: {message}")
 
     def _header(self, data: dict[Hashable, Any]) -> Header:
-        """Return the sections without what is wrong in them, each mistake told."""
+        """Return the sections without their mistakes, after reporting each."""
         rest = deepcopy(data)
         while True:
             try:

@@ -31,7 +31,7 @@ SHARES = (0.3, 0.45, 0.6)
 
 
 def recall_verdict(key: str) -> str | None:
-    """Return what was said under a key, None where the recipe must be checked."""
+    """Return the cached verdict of a key, None if the recipe must be checked."""
     return recall(SORT, key)
 
 

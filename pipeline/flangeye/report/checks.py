@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flangeye.errors import StageError
-from flangeye.log.read import Note, read_notes
+from flangeye.log.read import JournalEntry, read_notes
 from flangeye.report.facts import Facts
 from flangeye.report.images import data_uri
 from flangeye.report.plot import AXES, HELD_OUT, USED, Figure, layout2d, plain
@@ -53,7 +53,7 @@ def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[Drawing]:
             yield Drawing(note.step, summary, data_uri(note.value))
 
 
-def _figure(note: Note) -> Figure:
+def _figure(note: JournalEntry) -> Figure:
     """Return points by series over a value, as a step noted them."""
     value: dict[str, Any] = note.value
     traces = [

@@ -80,7 +80,7 @@ def _how_far(facts: Facts) -> str:
 
 
 @dataclass(frozen=True)
-class Figure:
+class KeyFigure:
     """One number of a tile or of the evidence.
 
     Attributes:
@@ -96,40 +96,40 @@ class Figure:
     note: str
 
 
-def tiles_of(facts: Facts) -> list[Figure]:
+def tiles_of(facts: Facts) -> list[KeyFigure]:
     """Return the three numbers that decide whether to trust the matrix."""
     result, tiles = facts.result, []
     if found := r.expected_error(result):
         rms, bound = found
         note = "rms" if bound is None else f"95 % below {rounded_mm(bound)} mm"
-        tiles.append(Figure("Expected error at the work", rounded_mm(rms), "mm", note))
+        tiles.append(KeyFigure("Expected error at the work", rounded_mm(rms), "mm", note))
     if held := result.holdout:
         note = f"rms, {held.folds} folds, poses the solver never saw"
-        tiles.append(Figure("Held-out error", rounded_mm(held.rms), "mm", note))
+        tiles.append(KeyFigure("Held-out error", rounded_mm(held.rms), "mm", note))
     return [*tiles, _poses(facts)]
 
 
-def evidence_of(facts: Facts) -> list[Figure]:
+def evidence_of(facts: Facts) -> list[KeyFigure]:
     """Return the other errors that the report states, each with what it is taken over."""
     result, found = facts.result, []
     answers = result.answers
     if answers and answers.corrected and answers.corrected.expected_rms is not None:
         value = millimetres(answers.corrected.expected_rms)
-        found.append(Figure("Expected, arm corrected", value, "mm", "rms, with its correction"))
+        found.append(KeyFigure("Expected, arm corrected", value, "mm", "rms, with its correction"))
     if held := result.holdout:
         if outliers := held.figures.get("outliers"):
             value = millimetres(held.figures["rms_inliers"])
-            found.append(Figure("Held-out", value, "mm", f"without {outliers:.0f} outliers"))
-        found.append(Figure("Held-out", millimetres(held.median), "mm", "median"))
-        found.append(Figure("Held-out", millimetres(held.p95), "mm", "95 % below"))
+            found.append(KeyFigure("Held-out", value, "mm", f"without {outliers:.0f} outliers"))
+        found.append(KeyFigure("Held-out", millimetres(held.median), "mm", "median"))
+        found.append(KeyFigure("Held-out", millimetres(held.p95), "mm", "95 % below"))
     if box := result.workspace:
         note = "95 % of the errors over the workspace below; the covariance of the pose alone"
-        found.append(Figure("Pose alone", millimetres(box.predicted_p95), "mm", note))
+        found.append(KeyFigure("Pose alone", millimetres(box.predicted_p95), "mm", note))
     if truth := result.truth:
         over = "rms over the workspace, known in simulation"
-        found.append(Figure("True error", millimetres(truth.rms_over_workspace), "mm", over))
+        found.append(KeyFigure("True error", millimetres(truth.rms_over_workspace), "mm", over))
         centre = f"at the workspace's centre; rotation {degrees(truth.rotation_error)}°"
-        found.append(Figure("True error", millimetres(truth.error_at_centroid), "mm", centre))
+        found.append(KeyFigure("True error", millimetres(truth.error_at_centroid), "mm", centre))
     return found
 
 
@@ -151,13 +151,13 @@ def next_steps_of(facts: Facts) -> list[tuple[str, str]]:
     ]
 
 
-def _poses(facts: Facts) -> Figure:
+def _poses(facts: Facts) -> KeyFigure:
     poses = facts.result.observations
     kept = sum(meta["role"] == "verification" for meta in facts.log.poses.values())
     note = f"of {len(poses)} captures" + (f", {kept} kept for verification" if kept else "")
     if facts.estimate is None:
-        return Figure("Circles measured", str(len(facts.measured)), "", note)
-    return Figure("Poses used", str(sum(o.used for o in poses)), "", note)
+        return KeyFigure("Circles measured", str(len(facts.measured)), "", note)
+    return KeyFigure("Poses used", str(sum(o.used for o in poses)), "", note)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ ANGLES = ("tilt", "angle", "rotation", "turn")
 
 
 def figure(name: str, value: float) -> str:
-    """Return a verification's figure with its unit, which its name tells.
+    """Return a verification's figure with its unit, which follows from its name.
 
     Figures are in SI; counts are whole numbers, and what no name tells stays as it is.
     """

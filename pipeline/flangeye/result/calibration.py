@@ -1,4 +1,4 @@
-"""The sections that tell of the calibration."""
+"""The sections about the calibration."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class TransformResult(_Part):
 
 
 class ObservationResult(_Part):
-    """One capture and what became of it; measured values are null when it was set aside early."""
+    """One capture and its outcome; measured values are null if it was rejected early."""
 
     id: str
     centre_in_camera: Vector | None = None

@@ -1,4 +1,4 @@
-"""The sections that tell of the seam and the weld."""
+"""The sections about the seam and the weld."""
 
 from __future__ import annotations
 

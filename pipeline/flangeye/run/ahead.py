@@ -47,7 +47,7 @@ class Done:
 
 
 def cores() -> int:
-    """Return how many threads may compute: the cores of this process, or what OpenMP is told."""
+    """Return the number of worker threads: the process's cores, or OMP_NUM_THREADS."""
     told = os.environ.get("OMP_NUM_THREADS", "")
     mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(mine or 1, int(told)) if told.isdigit() and int(told) else mine or 1

@@ -66,7 +66,7 @@ class RunFolder:
         raise FolderError(f"{out}: already holds files; name a new or empty folder")
 
     def _claimed(self) -> bool:
-        """Make the folder and its log, and return whether nothing and nobody was there before."""
+        """Create the folder and its log; return False if another run got there first."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if any(self.path.iterdir()):

@@ -1,4 +1,4 @@
-"""What a run came to, and the ``result.json`` that tells it."""
+"""The outcome of a run, and its ``result.json``."""
 
 from __future__ import annotations
 

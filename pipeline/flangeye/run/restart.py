@@ -191,7 +191,7 @@ class FromLog(FromNothing):
 
 @dataclass(frozen=True)
 class FromEarlierRun(FromNothing):
-    """A run that ended early and is gone on with (``--resume``).
+    """A run that ended early and is resumed (``--resume``).
 
     Attributes:
         log: Its log.
@@ -216,7 +216,7 @@ class FromEarlierRun(FromNothing):
         return len(self.retaken)
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:
-        """Return what is left to take, told what became of the rest."""
+        """Return the source's stream, with the outcomes of the earlier captures."""
         stream: t.Captures | t.Observations = acquire()
         if isinstance(stream, t.Captures):
             stream.outcomes.update(dict.fromkeys(sorted(self.resumed.done)))
@@ -318,7 +318,7 @@ def _stopped_in_weld(result: Mapping[str, Any]) -> bool:
 
 
 def _begun_weld(log: RunLog, recipe: Recipe) -> Step | None:
-    """Return the last weld that a run began, if it can be gone on with."""
+    """Return the last weld that a run began, if it can be resumed."""
     welds = [s for s in recipe.steps if s.params and "resume" in type(s.params).model_fields]
     begun = {note.step for note in read_notes(log.path, {s.label for s in welds})}
     return next((step for step in reversed(welds) if step.label in begun), None)

@@ -57,7 +57,7 @@ class CheckConformance(Conformance):
         require(not mistakes, f"found in good recordings: {'; '.join(mistakes)}")
 
     def test_too_little_is_no_crash(self) -> None:
-        """No sample, two, or some without a target tell nothing, and are looked at all the same."""
+        """Sessions of no sample, two samples, or some without a target must not crash a check."""
         blind = replace(session(), centres=np.full_like(session().centres, np.nan))
 
         def look(given: RecordedSession) -> Any:

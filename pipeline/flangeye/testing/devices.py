@@ -78,7 +78,7 @@ class DriverConformance(Conformance):
             yield device
 
     def test_closing_twice_is_safe_and_it_opens_again(self) -> None:
-        """A run that broke off is gone on with: the device must be free at once."""
+        """A run that broke off is resumed: the device must be free immediately."""
         for _ in range(3):
             device = self.open()
             require(device.name, "the device has no name")
@@ -133,7 +133,7 @@ class RobotConformance(DriverConformance):
             require(robot.state().time_ns > first, "20 cycles later the sample is as old as before")
 
     def test_a_joint_move_arrives_and_keeps_to_its_speed(self) -> None:
-        """There and back; never faster than was said."""
+        """There and back, never faster than the commanded limit."""
         with self.opened() as robot:
             start = robot.state().joints
             target = start + np.eye(len(start))[-1] * STEP

@@ -1,4 +1,4 @@
-"""What a step has to say to people: for the record, or because something is to be done."""
+"""Notes of a step: for the record, or warnings that need action."""
 
 from __future__ import annotations
 

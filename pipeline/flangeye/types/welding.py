@@ -1,4 +1,4 @@
-"""A planned seam, and what became of it."""
+"""A planned seam, and the outcome of its weld."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ class PlannedCell:
 
 
 class NextBest:
-    """Chooses the sighting that promises to tell most, by what was seen so far.
+    """Chooses the sighting with the largest expected information, given those so far.
 
     Until that tells where everything is, sightings are those a person would show: each pair in
     turn. A choice at which the camera does not see the target after all gives nothing, and counts.

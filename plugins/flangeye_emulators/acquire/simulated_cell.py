@@ -161,6 +161,6 @@ def _arms(moments: Moments, i: int, flange: Flange) -> list[Body]:
         if isinstance(mover, RobotModel):
             base = moments.place(i, f"{name}_base")
             at_flange: Floats = np.linalg.inv(base) @ moments.place(i, name)
-            arm = world.Cell(mover, flange, nowhere, nowhere)
+            arm = world.SimulatedCell(mover, flange, nowhere, nowhere)
             bodies += [b.moved(base) for b in arm.arm(Arm(mover).frames(angles[i]), at_flange)]
     return bodies

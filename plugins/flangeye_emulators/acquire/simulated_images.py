@@ -66,7 +66,7 @@ class BoardParams(Params):
 
 
 class LensParams(Params):
-    """The camera: what it is told to be is what it is."""
+    """The camera, exactly as configured."""
 
     size: tuple[int, int] = Field((1280, 1024), description="Columns and rows of the image [px].")
     focal_length: float = Field(1400.0, gt=0, description="Focal length in both directions [px].")

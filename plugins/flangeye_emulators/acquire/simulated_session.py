@@ -38,7 +38,7 @@ from flangeye_emulators.acquire.planned_session import (
     source_of,
 )
 from flangeye_emulators.world import materials
-from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.flange_mesh import flange_mesh
 from flangeye_emulators.world.raycast import Body
 from flangeye_emulators.world.scanner import ScannerQuality, before_camera, scanner_of
@@ -150,4 +150,6 @@ class _Set:
 
     def _arm(self, robot: RobotModel, joints: Floats, flange: Floats) -> list[Body]:
         nowhere = np.zeros(3)
-        return Cell(robot, self.flange, nowhere, nowhere).arm(Arm(robot).frames(joints), flange)
+        return SimulatedCell(robot, self.flange, nowhere, nowhere).arm(
+            Arm(robot).frames(joints), flange
+        )

@@ -43,7 +43,7 @@ from flangeye.units import in_mm
 from flangeye_emulators.acquire.planned_session import UNSEEN, noise_free
 from flangeye_emulators.acquire.simulated_params import SimulatedParams
 from flangeye_emulators.world.arm import ImperfectArm
-from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Body, Image
 from flangeye_emulators.world.scanner import before_camera, scanner_of
 from flangeye_emulators.world.structured_light import StructuredLight
@@ -97,7 +97,7 @@ def simulate(
     if motion and motion.plan_only:
         raise _plan_alone(stops, reach, site)
     unseen = [] if params.arm.is_default else _unseen(stops.plan, site, _rng(checking.spawn(1)[0]))
-    cell = Cell(robot, plate, stops.plan.centre, stops.plan.size, sphere)
+    cell = SimulatedCell(robot, plate, stops.plan.centre, stops.plan.size, sphere)
     session = _session(cell, scanner, stops, unseen, params, errors)
     source = session.source(_fingerprint(seed, robot, scanner, flange, params, sphere))
     whys = [pose.why for pose in stops.all]
@@ -197,7 +197,7 @@ class _Session:
     The joints, (N, n) as reported and as they are, go on with those of poses that take no part.
     """
 
-    cell: Cell
+    cell: SimulatedCell
     scanner: ScannerModel
     stops: _Stops
     params: SimulatedParams
@@ -283,7 +283,7 @@ class _Session:
 
 
 def _session(
-    cell: Cell,
+    cell: SimulatedCell,
     scanner: ScannerModel,
     stops: _Stops,
     unseen: Sequence[Floats],

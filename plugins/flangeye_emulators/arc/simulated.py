@@ -18,7 +18,7 @@ class SimulatedArcParams(ArcTimes, Params):
 
 
 class SimulatedArc(Device):
-    """Burns when it is told to.
+    """An arc that burns when commanded.
 
     Attributes:
         name: For people.
@@ -41,7 +41,7 @@ class SimulatedArc(Device):
         self._burns = on
 
     def burning(self) -> bool | None:
-        """Return whether it was told to, until it fails."""
+        """Return whether it is commanded on and has not failed."""
         self._asked += self._burns
         failed = self._fails_after is not None and self._asked > self._fails_after
         return self._burns and not failed

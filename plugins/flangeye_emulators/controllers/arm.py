@@ -11,7 +11,7 @@ from flangeye.types import Floats
 from flangeye_emulators.controllers.chain import Chain, Stance, UnreachableError
 from flangeye_emulators.controllers.compliance import ForceMode
 from flangeye_emulators.controllers.contact import Surface
-from flangeye_emulators.controllers.motion import Motion, stop
+from flangeye_emulators.controllers.motion import ControllerMotion, stop
 
 BRAKES = 10.0
 """Deceleration of the joints in a stop nobody planned [rad/s^2]. The maker measures 0.16 to 0.53 s
@@ -66,7 +66,7 @@ class SimulatedArm:
         self._tare = np.zeros(6)
         self.history: deque[tuple[Floats, Floats]] = deque(maxlen=round(HISTORY / cycle))
         self._fraction = 1.0
-        self._motion: Motion | None = None
+        self._motion: ControllerMotion | None = None
         self._braking = False
         self._claimed = False
         self.stance = self.chain.stance(np.array(joints, dtype=np.float64))
@@ -103,7 +103,7 @@ class SimulatedArm:
         """Return where the flange really is: ``base_T_flange`` (4, 4), joint errors included."""
         return self.chain.flange(self.stance.joints + self.zeros)
 
-    def drive(self, motion: Motion) -> None:
+    def drive(self, motion: ControllerMotion) -> None:
         """Let ``motion`` move the arm in this cycle; it must be said again in every cycle."""
         if self._motion is not motion:
             self._motion, self._braking = motion, False

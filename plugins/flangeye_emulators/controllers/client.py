@@ -1,4 +1,4 @@
-"""The other end of the control channel: faults on command, and what no real robot would tell."""
+"""Client of the control channel: injects faults and reads the emulator's inner state."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ KEPT = 60_000
 """Lateness is kept for so many cycles: two minutes at 500 Hz."""
 
 
-class Clock:
+class ControllerClock:
     """Calls a step once per cycle.
 
     Attributes:

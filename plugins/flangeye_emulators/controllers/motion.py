@@ -24,7 +24,7 @@ SERVO_GAIN = 300.0
 """Gain at which a servo's delay is its lookahead time."""
 
 
-class Motion(Protocol):
+class ControllerMotion(Protocol):
     """What moves the arm.
 
     Attributes:

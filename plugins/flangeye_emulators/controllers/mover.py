@@ -10,9 +10,9 @@ import numpy as np
 
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
-from flangeye_emulators.controllers.motion import Motion, Speed, stop
+from flangeye_emulators.controllers.motion import ControllerMotion, Speed, stop
 
-Plan = Callable[[], Motion]
+Plan = Callable[[], ControllerMotion]
 """Makes a motion from where the arm stands when its turn comes."""
 
 
@@ -27,7 +27,7 @@ class Mover:
     def __init__(self, arm: SimulatedArm) -> None:
         self.arm, self.begun = arm, 0
         self._queue: deque[Plan] = deque()
-        self._motion: Motion | None = None
+        self._motion: ControllerMotion | None = None
         self._cycles_left = math.inf
 
     @property
@@ -37,7 +37,7 @@ class Mover:
 
     @property
     def under_way(self) -> bool:
-        """Whether a motion goes on."""
+        """Whether a motion is in progress."""
         return self._motion is not None
 
     @property

@@ -70,7 +70,7 @@ class Waypoint(NamedTuple):
     blend: float = 0.0
 
 
-class Piece(NamedTuple):
+class RouteSegment(NamedTuple):
     """A part of a route: its length, its speed limit, and the target at a place along it.
 
     Attributes:
@@ -83,7 +83,9 @@ class Piece(NamedTuple):
     heading: int = 0
 
 
-def route(space: Space, start: Floats, waypoints: Sequence[Waypoint], grip: float) -> list[Piece]:
+def route(
+    space: Space, start: Floats, waypoints: Sequence[Waypoint], grip: float
+) -> list[RouteSegment]:
     """Return the pieces that lead from ``start`` through the waypoints to the last one.
 
     A waypoint with a blend radius is passed on a parabola that leaves the first line, and joins
@@ -97,7 +99,7 @@ def route(space: Space, start: Floats, waypoints: Sequence[Waypoint], grip: floa
     """
     corners = [start, *(waypoint.target for waypoint in waypoints)]
     lengths = [space.distance(a, b) for a, b in pairwise(corners)]
-    pieces: list[Piece] = []
+    pieces: list[RouteSegment] = []
     used = 0.0
     for i, waypoint in enumerate(waypoints):
         radius, corner = 0.0, None
@@ -116,19 +118,19 @@ def route(space: Space, start: Floats, waypoints: Sequence[Waypoint], grip: floa
 
 def _line(
     space: Space, ends: Sequence[Floats], length: float, cut: tuple[float, float], speed: float
-) -> Piece:
+) -> RouteSegment:
     """Return a straight line without ``cut`` at its two ends."""
     start, end = ends
 
     def at(place: float) -> Floats:
         return space.between(start, end, (cut[0] + place) / length)
 
-    return Piece(max(length - cut[0] - cut[1], 0.0), speed, at)
+    return RouteSegment(max(length - cut[0] - cut[1], 0.0), speed, at)
 
 
 def _corner(
     space: Space, ends: Sequence[Floats], radius: float, speed: float, grip: float
-) -> Piece | None:
+) -> RouteSegment | None:
     """Return the parabola that cuts a corner (de Casteljau), ``radius`` before and after it.
 
     A corner so sharp that stopping in it is quicker is not cut.
@@ -152,7 +154,7 @@ def _corner(
     def at(place: float) -> Floats:
         return curve(float(np.interp(place, places, samples)))
 
-    return Piece(float(places[-1]), limit, at)
+    return RouteSegment(float(places[-1]), limit, at)
 
 
 def _braking_time(way: float, speed: float, deceleration: float) -> float:

@@ -22,7 +22,7 @@ from flangeye.types import Floats
 from flangeye_emulators.controllers import control
 from flangeye_emulators.controllers.arm import SimulatedArm
 from flangeye_emulators.controllers.client import PORT
-from flangeye_emulators.controllers.clock import Clock
+from flangeye_emulators.controllers.clock import ControllerClock
 from flangeye_emulators.controllers.contact import Surface
 from flangeye_emulators.controllers.fault_injection import FaultInjector
 from flangeye_emulators.controllers.faults import Schedule, parse_fault
@@ -60,7 +60,7 @@ class ControllerBox(Protocol):
 
 
 def run_server(server: Server, publish: Callable[[int], None] = lambda cycle: None) -> None:
-    """Run a controller until the process is told to end.
+    """Run a controller until the process is asked to end.
 
     Args:
         server: The controller and its ports.
@@ -119,7 +119,7 @@ class Server:
         self._behind = Network(options.host if is_this_machine(options.host) else "127.0.0.1")
         self._behind.offer(PORT, lambda: control.ControlSession(self._behind, self._actions))
         self._schedule = Schedule(self._fault_injector.kinds)
-        self._clock = Clock(box.cycle, self._step)
+        self._clock = ControllerClock(box.cycle, self._step)
         self._cycle = 0
         self._actions: dict[str, control.Action] = {
             "truth": self._tell_truth,

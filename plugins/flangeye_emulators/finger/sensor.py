@@ -177,7 +177,7 @@ class SimulatedFinger(Device):
 
 
 def _truth(params: SimulatedFingerParams) -> WorldParams:
-    """Return the world with what the sensor's own parameters say of clock and workpiece."""
+    """Return the world with the clock and workpiece of the sensor's parameters."""
     own = {
         name: getattr(params, name) for name in ("rate", "latency", "jitter", "dropped", "hidden")
     }

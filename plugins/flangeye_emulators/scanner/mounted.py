@@ -65,7 +65,7 @@ class MountedScanner(OpenScanner):
     """
 
     def __init__(self, model: ScannerModel, params: MountedParams) -> None:
-        """Lay the workpiece down; the scanner's distortion is the same for every exposure."""
+        """Place the workpiece; the scanner's distortion is the same for every exposure."""
         distortion, clutter, self._noise = np.random.default_rng(params.seed).spawn(3)
         self._eye = scanner_of(model, params.resolution, params.noise, distortion)
         rows, columns = self._eye.pixels.shape

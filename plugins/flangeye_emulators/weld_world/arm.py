@@ -45,7 +45,7 @@ class ArmResponse:
     """An arm in the plane of the work that follows velocities late and lagging."""
 
     def __init__(self, truth: ArmTruth, pose: ToolPose, period: float) -> None:
-        """Stand still at a pose; time goes on by ``period`` [s]."""
+        """Stand still at a pose for ``period`` [s]."""
         self.pose = pose
         self._period = period
         self._commands: deque[Floats] = deque([np.zeros(4)] * round(truth.dead_time / period))

@@ -79,14 +79,14 @@ def try_condition(
 
 
 def built_for(settings: Following) -> Body:
-    """Return a tool whose torch's end is as high as its tip when it leans as it is told to."""
+    """Return a tool whose torch is as high as its tip at the planned lean."""
     up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
     torch = np.array([-DISTANCE, 0.0, float(up)])
     return body_from(torch, settings.sign * settings.work_angle, settings.travel_angle)
 
 
 def known(condition: Condition, body: Body, settings: Following) -> tuple[Section, Belief]:
-    """Return the joint as it is planned, and what the controller is told of tool and joint."""
+    """Return the planned joint, and the controller's model of tool and joint."""
     section, half_angle = condition.section, None
     if section is None:
         half_angle = condition.half_angle or SECTION.half_angle

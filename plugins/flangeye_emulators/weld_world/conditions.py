@@ -12,7 +12,7 @@ from flangeye_emulators.weld_world.settings import LookTruth, WorldParams
 
 
 class Condition(NamedTuple):
-    """A world, and how the weld is told to be.
+    """A simulated world, and the parameters of the weld in it.
 
     Attributes:
         world: What is true, by section.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye.types import Floats
-from flangeye_plugins.weld.joint import Joint, edges_half_angle
+from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle
 from flangeye_plugins.weld.path import Path, Place
 
 
@@ -183,9 +183,9 @@ class Contact:
         self.position = rest + np.array([*(aside_to - aside_from), rise])
         return self.position
 
-    def _section(self, wider: float) -> Joint:
+    def _section(self, wider: float) -> WeldJoint:
         section = self._groove.section
-        return Joint(section.half_angle + wider, section.lean)
+        return WeldJoint(section.half_angle + wider, section.lean)
 
     def _springs(self, place: Place, plane_R_tool: Floats | None) -> tuple[Floats, Floats]:
         """Return stiffness across and up (2, 2), and how the tip then slides along (2,).
@@ -208,7 +208,7 @@ class Contact:
         return self.position
 
     def _cross_section(
-        self, across: float, up: float, joint: Joint, stiff: Floats
+        self, across: float, up: float, joint: WeldJoint, stiff: Floats
     ) -> tuple[float, float]:
         """Return where the ball rests: across, and above the root."""
         beside, seat = joint.seat(self._tip.radius)
@@ -235,7 +235,7 @@ class Contact:
         return self._across, top
 
     def _between_walls(
-        self, across: float, up: float, joint: Joint, stiff: Floats
+        self, across: float, up: float, joint: WeldJoint, stiff: Floats
     ) -> tuple[float, float]:
         """Return the ball's place from where it touches both walls.
 

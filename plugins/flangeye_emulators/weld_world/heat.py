@@ -1,4 +1,4 @@
-"""How heat moves the seam: all of it as the arc goes on, and a piece of it around the torch."""
+"""How heat moves the seam: as a whole over time, and locally around the torch."""
 
 from __future__ import annotations
 

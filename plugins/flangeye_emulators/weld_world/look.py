@@ -1,4 +1,4 @@
-"""A second look behind the torch: how far the bead truly lies from the joint there."""
+"""Simulated sensor behind the torch: true offset of the bead from the joint."""
 
 from __future__ import annotations
 

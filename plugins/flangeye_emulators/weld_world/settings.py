@@ -141,7 +141,7 @@ class LookTruth(Params):
 
     @property
     def clock(self) -> ClockTruth:
-        """When it looks, and when that arrives."""
+        """Times at which the sensor takes images, and at which they arrive."""
         named = ("rate", "latency", "jitter", "dropped")
         return ClockTruth().model_copy(update={name: getattr(self, name) for name in named})
 

@@ -29,7 +29,7 @@ STATED = (0.02e-3, 0.12e-3)
 
 
 @dataclass(frozen=True)
-class Verdict:
+class WorldScore:
     """A weld in one world.
 
     Attributes:
@@ -164,17 +164,17 @@ def _workpiece(draw: _Draw) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def judged(seed: int) -> Verdict:
-    """Weld in a random world and compare what was said with what is true."""
+def judged(seed: int) -> WorldScore:
+    """Weld in a random world and compare the stated bound with the truth."""
     try:
         trial = try_condition(drawn(seed), seed, LENGTH, PERIOD)
     except StageError as refusal:
-        return Verdict(seed, "refused", str(refusal))
+        return WorldScore(seed, "refused", str(refusal))
     errors = trial.errors
     reason = "" if trial.done else trial.controller.reason or "not in time"
     if not len(errors):
-        return Verdict(seed, "refused", reason)
-    return Verdict(
+        return WorldScore(seed, "refused", reason)
+    return WorldScore(
         seed, "done" if trial.done else "stopped", reason, trial.share_welded,
         float((errors / _stated(trial, "bound")).max()), float(errors.max()),
         float(np.sqrt(np.mean(errors**2))), float(np.mean(errors <= _stated(trial, "band"))),

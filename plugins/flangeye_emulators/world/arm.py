@@ -83,7 +83,7 @@ class ArmErrors(Params):
 
     @property
     def is_default(self) -> bool:
-        """Whether nothing was asked for."""
+        """Whether no error is requested."""
         return self == ArmErrors()
 
 
@@ -141,7 +141,7 @@ class ImperfectArm:
         return self._actual.frames(angles)
 
     def stand(self, angles: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return link frames (..., n + 1, 4, 4) and flange (..., 4, 4), as they are this once.
+        """Return link frames (..., n + 1, 4, 4) and flange (..., 4, 4), with repeatability.
 
         Args:
             angles: (..., n) really, of :meth:`angles` [rad].

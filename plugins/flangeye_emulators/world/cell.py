@@ -31,7 +31,7 @@ DECOY = 1.15
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class SimulatedCell:
     """The things that stand around, in ``base``, and the arm among them.
 
     Attributes:

@@ -12,7 +12,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel, middle_of_view
 from flangeye.models.targets import plate_of
 from flangeye.types import Floats
-from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Image, Scene
 from flangeye_emulators.world.scanner import before_camera
 from flangeye_emulators.world.structured_light import StructuredLight
@@ -49,7 +49,7 @@ class CellScene:
         """
         plate = plate_of(robot)
         scanner: ScannerModel = eye.scanner
-        self._cell = Cell(robot, plate, middle_of_view(scanner, base_T_camera), workspace)
+        self._cell = SimulatedCell(robot, plate, middle_of_view(scanner, base_T_camera), workspace)
         self._around = self._cell.around()
         self._arm = Arm(robot)
         self._eye, self._base_T_camera = eye, base_T_camera

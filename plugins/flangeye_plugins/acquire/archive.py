@@ -114,7 +114,7 @@ def acquire_archive(
 
 
 def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[str]]:
-    """Return the recordings whose cloud can be read, verification first, and what to tell."""
+    """Return the recordings whose cloud can be read, verification first, and notes."""
     with_cloud = [r for r in archive.recordings if r.cloud]
     if not any(r.role == "calibration" for r in with_cloud):
         centres = sum(r.centre_in_camera is not None for r in archive.recordings)
@@ -204,7 +204,7 @@ def _captures(
 
 
 def _camera_note(usable: Iterable[Recording], camera: CameraParams | None) -> list[str]:
-    """Return what to tell of the images' camera, by the first one; nothing where it is stated."""
+    """Return a note on the images' camera, from the first image; none if the recipe states it."""
     first = next((r for r in usable if r.image), None)
     if camera is not None or first is None or first.image is None or first.cloud is None:
         return []

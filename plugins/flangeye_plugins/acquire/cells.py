@@ -1,4 +1,4 @@
-"""Recordings of a cell, held against what the recipe says stands in it."""
+"""Recordings of a cell, checked against the cell that the recipe describes."""
 
 from __future__ import annotations
 

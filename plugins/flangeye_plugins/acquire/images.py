@@ -84,7 +84,7 @@ def acquire_images(archive: ArchivePath, params: ImagesParams) -> Captures:
 def _cameras(
     root: Path, usable: Sequence[Recording], params: ImagesParams
 ) -> tuple[dict[str, Camera], list[str]]:
-    """Return the camera of each image by the pose's name, and what to tell of how it was found."""
+    """Return the camera of each image by the pose's name, and notes on how it was found."""
     given = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
     filed = None if given else _filed(root, params.camera_file)
     if params.board is None:

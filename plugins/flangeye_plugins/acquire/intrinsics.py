@@ -39,7 +39,7 @@ Grey = NDArray[np.uint8]
 
 
 class SeenBoardParams(Params):
-    """The board whose views tell the camera, as the step that fits it has it."""
+    """The board whose views calibrate the camera, as the fit step configures it."""
 
     kind: Kind = Field("charuco", description="charuco, checkerboard, or circles.")
     columns: int = Field(ge=3, description="Squares, or circles of a row, from left to right.")
@@ -64,7 +64,7 @@ class SeenBoardParams(Params):
 
 
 class Lens(NamedTuple):
-    """A camera as views of a board tell it.
+    """A camera calibrated from views of a board.
 
     Attributes:
         matrix: (3, 3) [px].
@@ -225,7 +225,7 @@ def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Fl
 
 
 def _require_tilted(seen: Mapping[str, Corners]) -> None:
-    """Refuse parallel boards: they look alike through any lens, and least squares do not tell."""
+    """Refuse parallel boards: the lens is not observable, which least squares does not show."""
     changes = np.array([_depth_change(corners) for corners in seen.values()])
     spread = np.linalg.norm(changes - changes.mean(axis=0), ord=2) / np.sqrt(len(changes))
     if spread < LEAST_TILT:

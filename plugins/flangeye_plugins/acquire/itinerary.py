@@ -153,7 +153,7 @@ class Itinerary:
         return replace(row, path="by home" if way.via else "direct", seconds=way.seconds)
 
     def _lost(self) -> set[int]:
-        """Return the places in the plan of poses that told nothing."""
+        """Return the indices in the plan of poses without a measurement."""
         return {
             place
             for place, capture in enumerate(self._planned)

@@ -224,7 +224,7 @@ class LiveCaptures(Captures):
 
 @dataclass(frozen=True, eq=False)
 class LiveSession:
-    """One visit to every stop.
+    """A session that visits every stop of the plan once.
 
     Attributes:
         itinerary: The stops.

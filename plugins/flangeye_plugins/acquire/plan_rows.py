@@ -94,5 +94,5 @@ def as_plan(
 
 
 def _place(point: Floats) -> tuple[float, ...]:
-    """Return a point [m] to 0.1 mm, by which the plan tells places apart."""
+    """Return a point [m] rounded to 0.1 mm, the resolution at which the plan compares places."""
     return tuple(round(float(x), 4) + 0.0 for x in point)

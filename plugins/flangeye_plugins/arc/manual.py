@@ -1,4 +1,4 @@
-"""``arc.manual``: a person strikes the arc and ends it, when told to."""
+"""``arc.manual``: a person strikes and ends the arc when asked."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ManualArc(Device):
         return None
 
     def close(self) -> None:
-        """Tell them to end all."""
+        """Ask the person to end the arc."""
         self.burn(False)
         self.gas(False)
 
@@ -54,5 +54,5 @@ class ManualArc(Device):
 
 @part("arc.manual")
 def arc_manual(params: ManualArcParams) -> Arc:
-    """A person strikes the arc and ends it when told to; nothing watches whether it burns."""
+    """A person strikes and ends the arc when asked; nothing measures whether it burns."""
     return ManualArc()

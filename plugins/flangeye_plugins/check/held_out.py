@@ -20,7 +20,7 @@ EXPLAINED = 0.2
 
 
 def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
-    """Whether a corrected session's samples are foretold better than those of the session.
+    """Whether held-out samples are predicted better with the correction than without.
 
     Positions count by their share of how far the samples are apart: to divide all lengths by a
     thousand divides the errors too, and explains nothing.

@@ -62,7 +62,7 @@ def best_of(
     tried: int | None = None,
     against: Indices | None = None,
 ) -> Significance:
-    """Return the alternative with the largest likelihood, held against the session as it is.
+    """Return the alternative with the largest likelihood ratio to the session as it is.
 
     Args:
         null: The session as it is: once, or on several choices of its samples.

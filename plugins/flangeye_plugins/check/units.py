@@ -1,4 +1,4 @@
-"""Lengths in other units than was said: positions of the arm, or of the target."""
+"""Lengths in other units than configured: positions of the arm or of the target."""
 
 from __future__ import annotations
 

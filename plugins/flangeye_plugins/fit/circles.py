@@ -90,7 +90,7 @@ def cauchy_weights(residual: Floats, scale: float) -> Floats:
 
 
 def cauchy_curvature(residual: Floats, scale: float) -> Floats:
-    """Return the (N,) derivatives of ``r / (1 + (r / scale)^2)``: what a residual tells."""
+    """Return the (N,) derivatives of the robust influence ``r / (1 + (r / scale)^2)``."""
     squared = (residual / scale) ** 2
     return np.asarray((1 - squared) / (1 + squared) ** 2)
 

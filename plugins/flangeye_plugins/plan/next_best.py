@@ -1,4 +1,4 @@
-"""``plan.next_best``: always the pose that promises to tell most about the matrix, at the work."""
+"""``plan.next_best``: the pose that reduces the expected error at the work most."""
 
 from __future__ import annotations
 
@@ -117,14 +117,14 @@ class Chooser:
         return np.asarray(np.einsum("pai,mij,paj->m", moved, covariance, moved))
 
     def _known(self) -> Floats:
-        """Return the (6, 6) information of the poses that were visited and told something."""
+        """Return the (6, 6) information of the poses that were visited and measured."""
         lost = self._site.lost()
         counted = [pose for i, pose in enumerate(self._visited) if i not in lost]
         told = self._information(np.array(counted).reshape(-1, 4, 4)).sum(axis=0)
         return np.asarray(np.diag(PRIOR**-2.0) + told)
 
     def _why(self, pose: Floats) -> str:
-        """Say what a pose promises: how much less error, and what it tells most of."""
+        """Describe a pose's benefit: the error reduction, and the direction it informs most."""
         known, told = self._known(), self._information(pose[None])[0]
         before, after = np.linalg.inv(known), np.linalg.inv(known + told)
         weight = np.einsum("pai,paj->ij", self._moved_by, self._moved_by) / len(self._moved_by)

@@ -43,7 +43,7 @@ NUMBER = "Column of the pose's number, or name, by which tables are joined."
 
 
 class OwnTableParams(ColumnsParams):
-    """A table of its own."""
+    """A separate table, joined by number or by time."""
 
     file: str = Field(description="The table's name, beside the others.")
     number: Column | None = Field(None, description=NUMBER)
@@ -144,7 +144,7 @@ class Moved:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class CameraTable:
     """What a camera recorded of a target: (4, 4), (3,) or a scan, None where it did not see it."""
 
     given: SightingsParams | ScansParams
@@ -215,17 +215,17 @@ def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
         yield Moved(name, text, values, _keys(text, given.number, times), times)
 
 
-def _sightings(folder: Path, params: CellParams) -> Iterator[Seen]:
+def _sightings(folder: Path, params: CellParams) -> Iterator[CameraTable]:
     for given in params.sightings:
         text = table_with_rows(folder, given.file)
         found = readings_of(text, given, _taken(given))
         values = found.values
         if given.pose == "target_T_camera" and given.rotation != POINT:
             values = [None if value is None else inverted(value) for value in values]
-        yield Seen(given, text, values, _keys(text, given.number, found.times), found.times)
+        yield CameraTable(given, text, values, _keys(text, given.number, found.times), found.times)
 
 
-def _scans(folder: Path, params: CellParams) -> Iterator[Seen]:
+def _scans(folder: Path, params: CellParams) -> Iterator[CameraTable]:
     for given in params.scans:
         text = table_with_rows(folder, given.file)
         names = text.texts(text.index(given.scan))
@@ -233,7 +233,7 @@ def _scans(folder: Path, params: CellParams) -> Iterator[Seen]:
             if name and not (folder / name).is_file():
                 raise StageError(f"{text.where(row)}: its scan '{name}' does not exist")
         scans = [folder / name if name else None for name in names]
-        yield Seen(given, text, scans, _keys(text, given.number, None), None)
+        yield CameraTable(given, text, scans, _keys(text, given.number, None), None)
 
 
 def _taken(given: OwnTableParams) -> list[Column]:
@@ -261,7 +261,7 @@ def _keys(text: Table, number: Column | None, times: Floats | None) -> dict[str,
 # --- joining
 
 
-def _require_one_join(seen: Seen, moved: Sequence[Moved]) -> None:
+def _require_one_join(seen: CameraTable, moved: Sequence[Moved]) -> None:
     for each in moved:
         if (each.times is None) != (seen.times is None):
             files = (seen.text.file, each.text.file)
@@ -273,14 +273,14 @@ def _require_one_join(seen: Seen, moved: Sequence[Moved]) -> None:
 
 
 def _joined(
-    seen: Seen, moved: Sequence[Moved], params: PairingParams
+    seen: CameraTable, moved: Sequence[Moved], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
     if seen.times is not None:
         return _by_time(seen, moved, params)
     return list(_by_number(seen, moved)), []
 
 
-def _by_number(seen: Seen, moved: Sequence[Moved]) -> Iterator[Recording]:
+def _by_number(seen: CameraTable, moved: Sequence[Moved]) -> Iterator[Recording]:
     for key, row in (seen.keys or {}).items():
         for each in moved:
             if key not in (each.keys or {}):
@@ -295,7 +295,7 @@ def _by_number(seen: Seen, moved: Sequence[Moved]) -> Iterator[Recording]:
 
 
 def _by_time(
-    seen: Seen, moved: Sequence[Moved], params: PairingParams
+    seen: CameraTable, moved: Sequence[Moved], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
     """Pair with the first arm's standstills; the others must stand still as well."""
     first = next((each for each in moved if each.values.ndim == 3), None)
@@ -377,7 +377,9 @@ def _mean(values: Sequence[Floats | Path | None]) -> Floats:
     return mean_pose(seen) if seen.ndim == 3 else np.asarray(seen.mean(axis=0))
 
 
-def _recording(seen: Seen, key: str, value: Floats | Path | None, moment: Moment) -> Recording:
+def _recording(
+    seen: CameraTable, key: str, value: Floats | Path | None, moment: Moment
+) -> Recording:
     given = seen.given
     found = Recording(
         f"{key}-{given.camera}-{given.target}",

@@ -70,7 +70,7 @@ def pair(
     signals: tuple[Signal, Signal] | None,
     params: PairingParams,
 ) -> tuple[list[Pair], list[str]]:
-    """Return the pairs in time, and what to tell of how they were made.
+    """Return the pairs in time, and notes on how they were made.
 
     Args:
         arm: Times (N,) [s] and poses (N, 4, 4) [m] of the arm.

@@ -228,7 +228,7 @@ def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) ->
 
 
 def _names(bag: Bag, topic: str) -> str:
-    """Return the joints that a topic tells of."""
+    """Return the joints that a topic reports."""
     return ", ".join(bag.joints[topic][1][0])
 
 
@@ -327,7 +327,7 @@ class Scans:
         return np.array(self.bag.stamps[self.first])
 
     def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
-        """How much each differs from the one before, where they come often enough to tell."""
+        """Difference of each from the one before, where they are frequent enough to compare."""
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / OFTEN:
             return None
         looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))

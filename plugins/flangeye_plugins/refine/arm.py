@@ -257,7 +257,7 @@ def _corrected(calibration: HandEye, found: _Found, arm: Arm) -> CorrectedArm:
 
 
 def _identifiability(known: Mask, combined: int, found: _Found) -> str:
-    """Say how much the poses tell of the arm."""
+    """Describe how well the poses determine the arm's errors."""
     turns = found.session.poses[:, :3, :3]
     cosine = (np.einsum("nij,mij->nm", turns, turns).min() - 1) / 2
     widest = np.arccos(np.clip(cosine, -1, 1))
@@ -309,7 +309,7 @@ def _branches_alike(found: _Found) -> list[str]:
 
 
 def _proposed(arm: Arm, found: _Found, prior: Floats, count: int) -> list[str]:
-    """Propose poses that would tell more of the arm."""
+    """Propose poses that would determine the arm's errors better."""
     candidates = _candidates(arm, found)
     if not count or not len(candidates.joints):
         return []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.log.read import Note, read_notes
+from flangeye.log.read import JournalEntry, read_notes
 from flangeye.models.finger import Finger
 from flangeye.motion.seam_following import Command
 from flangeye.plugin.stage import part
@@ -52,7 +52,7 @@ class WeldReplay(LoggedWeld):
         self._pixels: Any = None
         self._worst_feeling = self._worst_command = 0.0
 
-    def take(self, note: Note) -> None:
+    def take(self, note: JournalEntry) -> None:
         """Take in the next line of the log."""
         if note.name == "image":
             self._pixels = note.value

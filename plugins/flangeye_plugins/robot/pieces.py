@@ -38,7 +38,7 @@ class Ride:
         stop: Callable[[], None],
         arrive: Callable[[], None],
     ) -> None:
-        """Begin with an arm that was told to stop.
+        """Begin with an arm that was commanded to stop.
 
         Args:
             speed: Largest speed of the leading joint, or of the tool [rad/s, m/s].
@@ -53,7 +53,7 @@ class Ride:
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left to be commanded."""
+        """Whether every command has been sent."""
         return self._ended or time.monotonic() - self._renewed > SILENT
 
     def renew(self, rest: Floats, left: float, fastest: float) -> None:

@@ -238,7 +238,7 @@ class Bridge(Device):
 
     @property
     def closed(self) -> bool:
-        """Whether nothing can be asked of it any more."""
+        """Whether the connection is closed."""
         return bool(self._gone)
 
     def close(self) -> None:

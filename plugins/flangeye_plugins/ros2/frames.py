@@ -29,7 +29,7 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """The frames of a graph, as they are told of.
+    """The frames of a graph, as their transforms arrive.
 
     Attributes:
         frames: By name.
@@ -71,7 +71,7 @@ class Frames:
         return invert(self._from(parent, shared)) @ self._from(child, shared)
 
     def wait_for(self, parent: str, child: str) -> None:
-        """Wait until a pose can be told; raises as :meth:`pose` when it cannot in time."""
+        """Wait until a pose is available; raises like :meth:`pose` when time runs out."""
         until = self._bridge.until_known()
         while time.monotonic() < until:
             try:
@@ -88,7 +88,7 @@ class Frames:
         return found
 
     def _from(self, name: str, ancestor: str) -> Floats:
-        """Return the pose of a frame in one that it hangs in."""
+        """Return the pose of a frame in one of its ancestors."""
         pose = np.eye(4)
         while name != ancestor:
             frame = self.frames[name]

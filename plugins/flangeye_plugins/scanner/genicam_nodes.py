@@ -1,4 +1,4 @@
-"""What a GenICam 3D device must be told, and must say of itself (SFNC 2.7, chapter 3D scan)."""
+"""Settings and features of a GenICam 3D device (SFNC 2.7, chapter 3D scan)."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from flangeye_plugins.seam.planned import (
 from flangeye_plugins.seam.plates import CELL, Hollow, hollows
 from flangeye_plugins.seam.points import facing_camera, thinned
 from flangeye_plugins.seam.sections import Root, trace
-from flangeye_plugins.seam.stitched import Seen, seen_in_base
+from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
 
 STAGE = "seam.groove"
 SEED = 13
@@ -134,7 +134,7 @@ def seam_groove(  # noqa: PLR0913  what it asks the runner for
     return for_the_controller(seam, answer, robot, params)
 
 
-def _refuse_apart(seen: Seen, params: GrooveParams) -> None:
+def _refuse_apart(seen: PlacedScan, params: GrooveParams) -> None:
     """Refuse clouds of several places that do not agree where they show the same face."""
     if seen.apart is not None and seen.apart > params.max_apart:
         raise CalibrationRefused(
@@ -144,12 +144,12 @@ def _refuse_apart(seen: Seen, params: GrooveParams) -> None:
         )
 
 
-def _figures(root: Root, deviation: float, seen: Seen) -> dict[str, float]:
+def _figures(root: Root, deviation: float, seen: PlacedScan) -> dict[str, float]:
     figures = {"residual": root.residual, "registration": deviation, "sections": root.share}
     return figures if seen.apart is None else {**figures, "apart": seen.apart}
 
 
-def _grooves(seen: Seen, params: GrooveParams, seed: int) -> list[Groove]:
+def _grooves(seen: PlacedScan, params: GrooveParams, seed: int) -> list[Groove]:
     """Return the V-grooves of the scan that are long enough, the longest first."""
     points = seen.points
     rng = np.random.default_rng([SEED, seed])

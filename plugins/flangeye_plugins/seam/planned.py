@@ -79,7 +79,7 @@ def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
 def for_the_controller(
     seam: Seam, calibration: HandEye, robot: RobotModel | None, params: SeamParams
 ) -> Seam:
-    """Return a seam with each point where the controller has to be told to go to reach it.
+    """Return a seam with each point as the position to command in order to reach it.
 
     Args:
         seam: In ``base``, as the corrected arm has it.

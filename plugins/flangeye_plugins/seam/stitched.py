@@ -52,7 +52,7 @@ class OfPose(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PlacedScan:
     """A scan, and what is known of where it stands.
 
     Attributes:
@@ -95,7 +95,7 @@ class Seen:
 
 def seen_in_base(
     stage: str, scan: WorkpieceScan, answer: HandEye, robot: RobotModel | None
-) -> Seen:
+) -> PlacedScan:
     """Return a scan in the base, from wherever it was taken.
 
     Args:
@@ -115,7 +115,7 @@ def seen_in_base(
         raise CalibrationRefused(f"{stage}: the scanner {told}; scan the workpiece with {use}")
     points = scan.cloud.points().astype(np.float64)
     if not scan.places:
-        return Seen(points, camera.transform, _AsOnePlace(answer), np.zeros((1, 3)))
+        return PlacedScan(points, camera.transform, _AsOnePlace(answer), np.zeros((1, 3)))
     stands = [_stand(place, answer, robot) for place in scan.places]
     ends = np.cumsum([place.points for place in scan.places])
     clouds = np.split(points, ends[:-1])
@@ -125,7 +125,7 @@ def seen_in_base(
     of_pose = _AsSeveral(scan.places, answer, robot, shown)
     back = middle.inverse()
     eyes = back.apply(np.array([stand.translation for stand in stands]))
-    return Seen(back.apply(np.concatenate(seen)), middle, of_pose, eyes, _apart(shown))
+    return PlacedScan(back.apply(np.concatenate(seen)), middle, of_pose, eyes, _apart(shown))
 
 
 def _stand(place: ScanPlace, answer: HandEye, robot: RobotModel | None) -> Transform:

@@ -57,7 +57,7 @@ def _distinct(discs: list[Disc], apart: float) -> list[Disc]:
 
 
 def _hole_score(disc: Disc, cut: Singles, flange: Flange) -> float:
-    """Return how well a disc's holes are the flange's; BLANK where that cannot be told."""
+    """Return how well a disc's holes match the flange's; BLANK if undecidable."""
     points = cut.astype(np.float64)
     on_face = np.abs(disc.plane.heights(points)) < 3 * disc.plane.sigma + 1e-6
     face = points.compress(on_face, axis=0)

@@ -25,7 +25,7 @@ SEARCHED = 1.5e-3
 """How far off its patch's plane a part's plane may be, besides its scatter [m]."""
 
 
-class Piece(NamedTuple):
+class SurfacePiece(NamedTuple):
     """A smooth, connected piece of surface.
 
     Attributes:
@@ -61,7 +61,7 @@ class Part(NamedTuple):
     at: Indices
 
     @classmethod
-    def of(cls, piece: Piece, plane: Plane, members: Indices) -> Part:
+    def of(cls, piece: SurfacePiece, plane: Plane, members: Indices) -> Part:
         """Return the members of a piece that lie on a plane."""
         points = piece.points.take(thinned(members), axis=0)
         return cls(plane, points, piece.at.take(members))
@@ -77,7 +77,7 @@ class Patch(NamedTuple):
         rest: Which of them may belong to a part with its plane.
     """
 
-    piece: Piece
+    piece: SurfacePiece
     rough: Plane
     members: Indices
     rest: Indices
@@ -93,7 +93,7 @@ class Patch(NamedTuple):
         return np.asarray(rest[np.einsum("ij,ij->j", offsets, offsets) < reach**2])
 
 
-def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -> list[Part]:
+def flat_parts(pieces: list[SurfacePiece], reach: float, scatter: float, fewest: int) -> list[Part]:
     """Return the flat parts of pieces of surface: one of a piece that is flat as a whole.
 
     Where a scan is too coarse or too noisy to show the crease, a piece holds a face joined to
@@ -121,8 +121,8 @@ def flat_parts(pieces: list[Piece], reach: float, scatter: float, fewest: int) -
     return parts
 
 
-def _whole(pieces: list[Piece], scatter: float) -> tuple[list[Part], list[Indices]]:
-    """Return the pieces that are flat as a whole, and of every piece what is left to search."""
+def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[Part], list[Indices]]:
+    """Return the pieces that are flat as a whole, and the remainder of every piece to search."""
     samples = [thinned(piece.points, ENOUGH) for piece in pieces]
     rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]
     parts, bent = [], []
@@ -158,7 +158,7 @@ def _off(plane: Plane, points: Singles) -> Singles:
     return np.asarray(np.abs(points @ plane.normal.astype(np.float32) - level))
 
 
-def _flattest(piece: Piece, rest: Indices) -> Iterator[Patch]:
+def _flattest(piece: SurfacePiece, rest: Indices) -> Iterator[Patch]:
     """Yield the flattest patches of ``rest``, flattest first."""
     patches = piece.patches(rest)
     sort = np.argsort(patches, kind="stable")

@@ -11,7 +11,7 @@ from flangeye.types import Indices, Singles
 from flangeye_plugins.segment.crop import in_box
 from flangeye_plugins.segment.discs import Disc, DiscLimits, compare, of_size
 from flangeye_plugins.segment.grid import Grid, cells
-from flangeye_plugins.segment.parts import Part, Piece, flat_parts
+from flangeye_plugins.segment.parts import Part, SurfacePiece, flat_parts
 from flangeye_plugins.segment.surfaces import NOISE_GATE, connected_pieces, smooth_surface
 
 LEAST_SLAB = 3e-4
@@ -33,10 +33,10 @@ def find_discs(view: Grid, flange: Flange, limits: DiscLimits) -> list[Disc]:
     return _compared(discs, view, flange, limits)
 
 
-def _piece(view: Grid, index: Indices, flange: Flange) -> Piece:
+def _piece(view: Grid, index: Indices, flange: Flange) -> SurfacePiece:
     points = view.xyz.reshape(-1, 3).take(index, axis=0)
     side = 0.5 * flange.rim / (view.angle * points[0, 2])
-    return Piece(points, index, view.xyz.shape[1], max(3, round(side)))
+    return SurfacePiece(points, index, view.xyz.shape[1], max(3, round(side)))
 
 
 def _disc(part: Part, view: Grid, flange: Flange) -> Disc:

@@ -20,7 +20,7 @@ from flangeye.models.finger import Finger
 from flangeye.plugin.stage import Params, part
 from flangeye.types import Image, Seed
 from flangeye.units import Duration, param
-from flangeye_plugins.weld.touch.region_of_interest import Piece, shifted
+from flangeye_plugins.weld.touch.region_of_interest import ImageRegion, shifted
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 
@@ -144,11 +144,11 @@ def image_of(pixels: NDArray[np.uint8], finger: Finger) -> Image:
     return Image(pixels, finger.camera.matrix, np.array(finger.camera.distortion))
 
 
-def piece_of(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> Piece:
+def piece_of(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> ImageRegion:
     """Return logged pixels (h, w) as the piece they are of an image of the finger's camera."""
     start = (int(corner[0]), int(corner[1]))
     matrix = shifted(finger.camera.matrix, start)
-    return Piece(Image(pixels, matrix, np.array(finger.camera.distortion)), start)
+    return ImageRegion(Image(pixels, matrix, np.array(finger.camera.distortion)), start)
 
 
 def _whole(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> Image:

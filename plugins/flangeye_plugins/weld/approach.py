@@ -6,7 +6,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.types import Floats
-from flangeye_plugins.weld.execution import Cell
+from flangeye_plugins.weld.execution import WeldCell
 from flangeye_plugins.weld.reachability import SeamReach
 from flangeye_plugins.weld.settings import Mode
 from flangeye_plugins.weld.weld_log import WeldLog
@@ -18,7 +18,7 @@ AT_REST = 0.5e-3
 """A tip that touches nothing is displaced by less [m]."""
 
 
-def approach(cell: Cell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
+def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
     """Bring the tip above the planned start, the tool along the seam.
 
     Raises:
@@ -35,7 +35,7 @@ def approach(cell: Cell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> N
         weld_log.before(sight)
 
 
-def _watch(cell: Cell, weld_log: WeldLog) -> None:
+def _watch(cell: WeldCell, weld_log: WeldLog) -> None:
     """Look at the finger for a while; nothing moves."""
     began = cell.drive.tick().time_ns
     felt: list[Floats] = []

@@ -1,4 +1,4 @@
-"""What a controller is told of tool, finger and joint, and how well that is known."""
+"""The controller's model of tool, finger and joint, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from flangeye.models.finger import Finger
 from flangeye.types import Floats
 from flangeye_plugins.weld.body import Body
-from flangeye_plugins.weld.joint import Joint, joint_of
+from flangeye_plugins.weld.joint import WeldJoint, joint_of
 from flangeye_plugins.weld.settings import Following
 
 BAND = 2.0
@@ -76,9 +76,9 @@ class Belief:
     arc: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
-    def joint(self) -> Joint | None:
+    def joint(self) -> WeldJoint | None:
         """The walls, where they are known."""
-        return None if self.half_angle is None else Joint(self.half_angle, self.lean)
+        return None if self.half_angle is None else WeldJoint(self.half_angle, self.lean)
 
     @property
     def beside(self) -> float:

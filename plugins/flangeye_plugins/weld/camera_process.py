@@ -205,7 +205,7 @@ def camera_process(wire: Connection, job: CameraJob) -> None:
 
 
 def _answer(question: Any, seeing: Seeing) -> Any:
-    """Return where the torch was; or, told where the arm is, what is seen, or why nothing is."""
+    """Return the torch's pose; or, given the arm's pose, the sighting or why there is none."""
     if question == TORCH:
         return torch_of(seeing.sensor)
     seeing.latest.tell(question)

@@ -50,7 +50,7 @@ class _Sweep(NamedTuple):
 
 
 class _Up(NamedTuple):
-    """A tip that rose for certain: how far aside and up, and how high it is there [m]."""
+    """A tip that certainly rose: how far sideways and up, and its height there [m]."""
 
     aside: float
     rise: float
@@ -175,7 +175,7 @@ class Seating:
         return rise if rise > UNEVEN + LIKELY * sigma else 0.0
 
     def _doubt_newest(self, newest: Floats) -> None:
-        """Note how far the tip may have climbed; later ones are held against a seated tip.
+        """Record how far the tip may have climbed; later ones are compared with a seated tip.
 
         Args:
             newest: (K, 3) samples, the one to judge last.

@@ -27,7 +27,7 @@ SWITCH = 0.2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class WeldCell:
     """What a weld works with.
 
     Attributes:
@@ -47,7 +47,7 @@ class Cell:
     gas_after: float | None = None
 
 
-def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
+def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: float) -> str:
     """Follow the seam; return why it ended early, or nothing when it came to its end.
 
     Whatever happens the arm is told to stop, and the chronicle holds all up to then.
@@ -56,7 +56,7 @@ def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float
     cell.drive.lead()
     try:
         with _undisturbed():
-            clock = Clock()
+            clock = WeldClock()
             while controller.phase not in ("done", "stopped"):
                 cell.drive.robot.wait_cycle()
                 clock.start()
@@ -74,7 +74,7 @@ def follow(cell: Cell, controller: Controller, weld_log: WeldLog, longest: float
     return controller.reason
 
 
-def _let_gas_flow(cell: Cell) -> None:
+def _let_gas_flow(cell: WeldCell) -> None:
     """Wait by the bead while gas flows on; who owns the power source closes its valve."""
     if not cell.gas_after:
         return
@@ -83,7 +83,7 @@ def _let_gas_flow(cell: Cell) -> None:
         pass
 
 
-class Clock:
+class WeldClock:
     """How long a cycle takes: by this computer's clock, and by this thread's processor time.
 
     Attributes:
@@ -141,7 +141,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _turn(
-    cell: Cell, controller: Controller, weld_log: WeldLog, state: RobotState, clock: Clock
+    cell: WeldCell, controller: Controller, weld_log: WeldLog, state: RobotState, clock: WeldClock
 ) -> None:
     """One cycle: read, decide, command, log."""
     with clock.aside():  # in simulated time images are read, and logged, right here

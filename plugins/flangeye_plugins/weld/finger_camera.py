@@ -16,7 +16,7 @@ from flangeye.devices import (
 from flangeye.models.finger import Finger
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Seed
-from flangeye_plugins.weld.touch.region_of_interest import Piece, RegionOfInterest
+from flangeye_plugins.weld.touch.region_of_interest import ImageRegion, RegionOfInterest
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter, TipDisplacement
 
@@ -34,7 +34,7 @@ class TagObservation(NamedTuple):
     """
 
     time_ns: int
-    piece: Piece
+    piece: ImageRegion
     feeling: TipDisplacement | None
 
 
@@ -59,12 +59,12 @@ class Reader:
         self._region.follow(piece, None if reading is None else reading.corners)
         return self._observation(piece, frame.time_ns, reading)
 
-    def reread(self, piece: Piece, time_ns: int) -> TagObservation:
+    def reread(self, piece: ImageRegion, time_ns: int) -> TagObservation:
         """Return what is felt in a piece that was read before, from a log."""
         return self._observation(piece, time_ns, self._detector.find(piece.image))
 
     def _observation(
-        self, piece: Piece, time_ns: int, reading: TagReading | None
+        self, piece: ImageRegion, time_ns: int, reading: TagReading | None
     ) -> TagObservation:
         if reading is None or reading.confidence < CONFIDENT:
             return TagObservation(time_ns, piece, None)

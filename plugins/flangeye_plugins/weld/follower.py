@@ -74,7 +74,7 @@ LATE_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class ResumePoint:
-    """What a stopped weld leaves to who goes on with it.
+    """State of a stopped weld from which it is resumed.
 
     Attributes:
         samples: (K, 5) what was felt; see :meth:`RefinedPath.samples`.
@@ -197,7 +197,7 @@ class Follower:
         return max(min(self.torch, end) - self.lit, 0.0) / (end - self.begins)
 
     def kept(self) -> ResumePoint | None:
-        """Return what is left to who goes on; None before the torch was on the seam."""
+        """Return the state from which to resume; None before the torch was on the seam."""
         if self.lit is None:
             return None
         return ResumePoint(self.refined.samples(), self.torch, self.learned)
@@ -433,7 +433,7 @@ class Follower:
         self.refined.confirm(time - BELIEF)
 
     def _tells(self, s: float, felt: SeamReading, deflection: float) -> bool:
-        """Return whether a wall holds the tip, so that it tells where the seam is."""
+        """Return whether the tip is against a wall, so that it measures the seam."""
         if self.phase == "ending":
             self._notice_loss(s, felt, deflection)
             return not self._release.loose

@@ -58,7 +58,7 @@ class Tool:
         self._angle: float | None = None
 
     def pose(self, base_T_flange: Transform, time: float) -> ToolPose:
-        """Return the tool in the plane; its angle goes on where the last one left off."""
+        """Return the tool in the plane, its angle continuous with the last one."""
         plane = self._plane
         plane_R_base, rotation = plane.rotation.T, base_T_flange.rotation
         tip_in_base = rotation @ self._tip + base_T_flange.translation

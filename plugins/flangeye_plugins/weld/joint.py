@@ -15,7 +15,7 @@ JointKind = Literal["groove", "butt", "fillet", "lap", "corner"]
 
 
 @dataclass(frozen=True)
-class Joint:
+class WeldJoint:
     """Two walls that meet at the seam.
 
     Attributes:
@@ -45,7 +45,7 @@ class Joint:
         return away * math.sin(self.lean), away * math.cos(self.lean)
 
     def seat_slope(self, radius: float) -> float:
-        """Return how far the seat moves aside when one wall leans by more [m/rad]."""
+        """Derivative of the seat's lateral position with respect to a wall's tilt [m/rad]."""
         across, _ = self.seat(radius)
         # Half of the wall's angle turns the bisector, half of it opens the walls.
         turned = radius * math.cos(self.lean) / math.sin(self.half_angle)
@@ -54,7 +54,7 @@ class Joint:
 
 def joint_of(
     kind: JointKind, half_angle: float | None, side: float, radius: float, gap: float
-) -> Joint | None:
+) -> WeldJoint | None:
     """Return the joint that is planned; None where nothing is known of it.
 
     Args:
@@ -65,13 +65,13 @@ def joint_of(
         gap: Between the plates of a square butt joint [m].
     """
     if half_angle is not None:
-        return Joint(half_angle)
+        return WeldJoint(half_angle)
     if kind in ("fillet", "lap"):  # the pressed wall stands upright, the other one lies flat
-        return Joint(math.pi / 4, -side * math.pi / 4)
+        return WeldJoint(math.pi / 4, -side * math.pi / 4)
     if kind == "corner":
-        return Joint(math.pi / 4)
+        return WeldJoint(math.pi / 4)
     if kind == "butt" and 0.0 < gap < 2.0 * radius:
-        return Joint(edges_half_angle(gap, radius))
+        return WeldJoint(edges_half_angle(gap, radius))
     return None
 
 

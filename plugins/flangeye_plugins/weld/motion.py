@@ -24,7 +24,7 @@ class SeamReading:
 
 
 class Track:
-    """The recent poses, to tell where the tool was when an image was taken."""
+    """The recent poses, to find the tool's pose at the time of an image."""
 
     def __init__(self, seconds: float = 1.0) -> None:
         self._poses: deque[ToolPose] = deque()

@@ -52,7 +52,7 @@ class Traced:
     """
 
     def __init__(self, root: Follower, plan: Path, before: Floats) -> None:
-        """Begin; ``before`` (K, 3) is what an earlier weld has left that is gone on with."""
+        """Begin; ``before`` (K, 3) is what the resumed weld had felt."""
         self._root, self._plan = root, plan
         self.rows: list[tuple[float, ...]] = [tuple(row) for row in before.tolist()]
         self._along, self._sigma = before[:, 0], before[:, 2]
@@ -123,7 +123,7 @@ class Passes:
         self._response.dead_time, self._response.lag = learned.dead_time, learned.lag
 
     def kept(self) -> ResumePoint | None:
-        """Return what is left to who goes on; None before the torch was on the seam."""
+        """Return the state from which to resume; None before the torch was on the seam."""
         root = self.root.kept()
         if root is None:
             return None

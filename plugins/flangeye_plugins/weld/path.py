@@ -33,7 +33,7 @@ class Place(NamedTuple):
 
 
 class Path:
-    """A curve that goes on straight beyond both ends; its start has arc length zero.
+    """A curve that continues straight beyond both ends; its start has arc length zero.
 
     Attributes:
         length: From its first point to its last, in the plane.

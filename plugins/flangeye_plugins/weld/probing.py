@@ -193,7 +193,7 @@ class Probing:
         return since if now - since >= STANDING else math.inf
 
     def _settled(self) -> bool:
-        """Return whether enough was felt where the tip is pressed hardest; later ends say less."""
+        """Return whether enough was felt at the highest pressing force."""
         since, before = self._pressed = self._pressed or (self._time, len(self._felt))
         return len(self._felt) - before >= self._enough or self._time - since > LONGEST
 
@@ -203,7 +203,7 @@ class Probing:
         return (self._noise[0] / TOLD) ** 2
 
     def note(self, time: float, told: float, lateral: float) -> None:
-        """Remember a cycle: what was told [m/s] and where the end point was, to the left [m]."""
+        """Record a cycle: the commanded speed [m/s] and the end point's offset to the left [m]."""
         self._cycles.append((time, told, lateral))
 
     def feel(self, time: float, across: float, height: float, along: float) -> None:

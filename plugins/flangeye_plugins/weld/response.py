@@ -69,7 +69,7 @@ class Response:
         self._commands.append(_Told(time, np.array([*command.velocity, command.turn]), way))
 
     def ahead(self, pose: ToolPose) -> ToolPose:
-        """Return where the tool will be when all it was told is carried out."""
+        """Return where the tool will be once every command has taken effect."""
         if not self._commands:
             return pose
         sent = pose.time - self.dead_time  # what is carried out now

@@ -16,7 +16,7 @@ import numpy as np
 
 from flangeye.devices import WeldProfile
 from flangeye.errors import StageError
-from flangeye.log.read import Note, read_notes
+from flangeye.log.read import JournalEntry, read_notes
 from flangeye.motion.seam_following import Command, Controller, FollowingTask, ToolPose, Touch
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
@@ -97,7 +97,7 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
 
 
 def kept_value(kept: ResumePoint) -> dict[str, Any]:
-    """Return what a stopped weld has left as plain values, for the log of the one that goes on."""
+    """Return the state of a stopped weld as plain values, for the resuming run's log."""
     return {**asdict(kept), "samples": kept.samples.tolist(), "traced": kept.traced.tolist()}
 
 
@@ -148,7 +148,7 @@ class LoggedWeld:
         self.newest, self.cycles = -1, 0
         self._looks = LoggedLooks()
 
-    def take(self, note: Note) -> None:
+    def take(self, note: JournalEntry) -> None:
         """Take in the next line of the log."""
         if note.name == "sight":
             self.see(note.value)

@@ -28,7 +28,7 @@ from flangeye_plugins.weld.bound import check_bound
 from flangeye_plugins.weld.bounds import Bounds
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
-from flangeye_plugins.weld.execution import Cell, follow
+from flangeye_plugins.weld.execution import WeldCell, follow
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.follower import ResumePoint
 from flangeye_plugins.weld.frame import Tool, WorkPlane
@@ -102,7 +102,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
             controller = controller_of(plan, belief, params, params.mode, kept)
         weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated, params.log_images))
         weld_log.note("start", start_of(points, plane, finger, belief, params, kept))
-        cell = Cell(
+        cell = WeldCell(
             Executor(robot, model, allowed, eyes.tell), eyes, tool, Bounds(finger, plan, params),
             None if params.look is None else follower_of(controller),
             None if params.arc is None else times.gas_after,

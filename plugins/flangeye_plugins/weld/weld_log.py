@@ -89,7 +89,7 @@ class WeldLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Write what is left."""
+        """Write the remaining rows."""
         self._put_block()
         if self._thread:
             self._queue.put(None)
@@ -128,7 +128,7 @@ class WeldLog:
         self.note("look", {"cycle": len(self.cycles), **asdict(profile)})
 
     def turned(self, cycle: Cycle) -> None:
-        """Take in a cycle."""
+        """Record one control cycle."""
         self.cycles.append(cycle)
         self._block.append(cycle)
         if len(self._block) >= BLOCK:

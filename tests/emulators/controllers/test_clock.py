@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye_emulators.controllers.clock import Clock
+from flangeye_emulators.controllers.clock import ControllerClock
 from flangeye_emulators.controllers.network import DelayLine
 from flangeye_emulators.controllers.server import _precise_loop
 
@@ -17,7 +17,7 @@ def run(coroutine):
 
 def clocked(step, seconds, cycle=0.002):
     async def count():
-        clock = Clock(cycle, step)
+        clock = ControllerClock(cycle, step)
         clock.start()
         await asyncio.sleep(seconds)
         return clock
@@ -47,7 +47,7 @@ def test_a_short_delay_is_made_up_and_a_long_one_is_a_gap() -> None:
 
 
 def test_a_clock_that_never_ticked_has_no_figures() -> None:
-    assert Clock(0.002, lambda: None).figures() == {"ticks": 0}
+    assert ControllerClock(0.002, lambda: None).figures() == {"ticks": 0}
 
 
 @pytest.mark.parametrize("delays", [[0.0] * 5, [0.03, 0.02, 0.01, 0.0, 0.02]])

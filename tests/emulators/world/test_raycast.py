@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flangeye.models.loading import load_model
-from flangeye_emulators.world.cell import Cell
+from flangeye_emulators.world.cell import SimulatedCell
 from flangeye_emulators.world.raycast import Pixels, Scene, _rays, pixels_of
 from tests.emulators.world.bench import SCANNER, facing, flange, flange_scene, plate, zoomed
 
@@ -84,7 +84,7 @@ def test_a_plane_is_flat_to_single_precision() -> None:
 
 def test_the_cell_has_a_second_disc_of_a_similar_size() -> None:
     robot_flange = flange()
-    cell = Cell(
+    cell = SimulatedCell(
         load_model("robots", "ur5"),
         robot_flange,
         np.array([0.6, 0, 0.3]),
@@ -101,5 +101,5 @@ def test_the_cell_has_a_second_disc_of_a_similar_size() -> None:
 
 def test_an_arm_without_volumes_is_a_flange_in_the_air() -> None:
     robot = load_model("robots", "ur5").model_copy(update={"volumes": ()})
-    cell = Cell(robot, flange(), np.array([0.6, 0, 0.3]), np.array([0.3, 0.3, 0.2]))
+    cell = SimulatedCell(robot, flange(), np.array([0.6, 0, 0.3]), np.array([0.3, 0.3, 0.2]))
     assert len(cell.arm(np.tile(np.eye(4), (7, 1, 1)), np.eye(4))) == 2

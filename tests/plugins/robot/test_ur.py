@@ -280,7 +280,7 @@ def test_ctrl_c_does_not_reach_the_client_process(controller: Any) -> None:
 
 
 def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotten() -> None:
-    clock = worker.Clock()
+    clock = worker.SampleClock()
     ahead = 1000.0
     dates = [clock.sampled(0.002 * i, ahead + 0.002 * i + 0.003 * (i % 5)) for i in range(500)]
     np.testing.assert_allclose(dates, ahead + 0.002 * np.arange(500), atol=3e-4)

@@ -7,17 +7,17 @@ import pytest
 
 from flangeye.maths.planes import Plane
 from flangeye_plugins.segment import parts as room
-from flangeye_plugins.segment.parts import Patch, Piece, _flattest, _principal, flat_parts
+from flangeye_plugins.segment.parts import Patch, SurfacePiece, _flattest, _principal, flat_parts
 
 PITCH = 2e-3
 SCATTER = 3e-4
 
 
-def piece(height, rows=60, columns=60, first=0) -> Piece:
+def piece(height, rows=60, columns=60, first=0) -> SurfacePiece:
     """Return a piece whose height over a plane 0.7 m away is a function of place."""
     y, x = (PITCH * a.ravel() for a in np.indices((rows, columns)))
     points = np.stack([x, y, 0.7 - height(x, y)], axis=1).astype(np.float32)
-    return Piece(points, first + np.arange(rows * columns), columns, 10)
+    return SurfacePiece(points, first + np.arange(rows * columns), columns, 10)
 
 
 def flat(x, y):

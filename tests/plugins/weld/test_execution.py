@@ -10,7 +10,7 @@ import pytest
 
 from flangeye.devices import DeviceError, WeldProfile
 from flangeye.motion.seam_following import Command, Controller, ToolPose
-from flangeye_plugins.weld.execution import Clock, _undisturbed, follow
+from flangeye_plugins.weld.execution import WeldClock, _undisturbed, follow
 from flangeye_plugins.weld.tactile import _longest
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -22,7 +22,7 @@ def busy(seconds):
 
 
 def test_a_clock_counts_what_a_cycle_computes_and_nothing_else() -> None:
-    clock = Clock()
+    clock = WeldClock()
     busy(5e-3)
     clock.start()
     assert clock.period >= 5e-3

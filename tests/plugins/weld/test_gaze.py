@@ -8,7 +8,12 @@ import pytest
 from flangeye.devices import DeviceError, SensorFrame
 from flangeye.types import Image, Seed
 from flangeye_plugins.weld.finger_camera import CameraJob, Reader, SteppedReader
-from flangeye_plugins.weld.touch.region_of_interest import MARGIN, Piece, RegionOfInterest, cut
+from flangeye_plugins.weld.touch.region_of_interest import (
+    MARGIN,
+    ImageRegion,
+    RegionOfInterest,
+    cut,
+)
 from tests.plugins.weld.test_camera_process import Camera, state
 from tests.plugins.weld.test_look import Looker, nobody
 from tests.plugins.weld.test_touch import FINGER, Eye, displacements
@@ -29,7 +34,7 @@ def test_the_first_look_is_at_the_whole_image() -> None:
 
 def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone() -> None:
     gaze = RegionOfInterest()
-    gaze.follow(Piece(blank(), (0, 0)), CORNERS)
+    gaze.follow(ImageRegion(blank(), (0, 0)), CORNERS)
     near, whole = gaze.pieces(blank())
     assert near.corner == (100 - MARGIN, 60 - MARGIN)
     assert near.image.pixels.shape == (140 + MARGIN - near.corner[1], 181 + MARGIN - near.corner[0])
@@ -43,10 +48,10 @@ def test_then_around_the_tag_and_at_the_whole_only_if_it_is_gone() -> None:
 
 def test_a_tag_at_the_edge_is_cut_there() -> None:
     gaze = RegionOfInterest()
-    gaze.follow(Piece(blank(), (0, 0)), CORNERS - [95.0, 55.0])
+    gaze.follow(ImageRegion(blank(), (0, 0)), CORNERS - [95.0, 55.0])
     near, _ = gaze.pieces(blank())
     assert near.corner == (0, 0)
-    gaze.follow(Piece(blank(), (0, 0)), CORNERS + [130.0, 90.0])
+    gaze.follow(ImageRegion(blank(), (0, 0)), CORNERS + [130.0, 90.0])
     near, _ = gaze.pieces(blank())
     assert near.image.pixels.shape[1] == 320 - near.corner[0]
     assert near.image.pixels.shape[0] == 240 - near.corner[1]

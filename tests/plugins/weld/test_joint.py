@@ -14,7 +14,7 @@ from flangeye_emulators.weld_world.groove import Contact, Groove, Section, Tip
 from flangeye_plugins.weld.belief import belief_of
 from flangeye_plugins.weld.body import body_from, body_of, leaning
 from flangeye_plugins.weld.checks import check_body, check_seat
-from flangeye_plugins.weld.joint import Joint, edges_half_angle, joint_of
+from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld import cell
@@ -37,7 +37,7 @@ def believed(**given):
 @pytest.mark.parametrize("half_angle", [30.0, 45.0, 60.0])
 @pytest.mark.parametrize("lean", [-45.0, 0.0, 20.0])
 def test_a_seated_ball_is_one_radius_away_from_both_walls(half_angle: float, lean: float) -> None:
-    joint = Joint(*np.radians([half_angle, lean]))
+    joint = WeldJoint(*np.radians([half_angle, lean]))
     across, up = joint.seat(RADIUS)
     left = -np.cos(joint.left) * across + np.sin(joint.left) * up
     right = np.cos(joint.right) * across + np.sin(joint.right) * up
@@ -48,13 +48,13 @@ def test_the_seat_moves_with_a_wall_as_its_slope_says() -> None:
     fillet = joint_of("fillet", None, 1.0, RADIUS, 0.0)
     assert fillet is not None
     np.testing.assert_allclose([fillet.left, fillet.right], [0.0, np.pi / 2], atol=1e-12)
-    wider = Joint(fillet.half_angle + 5e-4, fillet.lean + 5e-4)  # the left wall by 1 mrad
+    wider = WeldJoint(fillet.half_angle + 5e-4, fillet.lean + 5e-4)  # the left wall by 1 mrad
     moved = wider.seat(RADIUS)[0] - fillet.seat(RADIUS)[0]
     assert abs(moved) == pytest.approx(1e-3 * fillet.seat_slope(RADIUS), rel=0.01)
 
 
 def test_the_plan_knows_better_than_the_kind_of_joint() -> None:
-    assert joint_of("fillet", 0.7, 1.0, RADIUS, 0.0) == Joint(0.7)
+    assert joint_of("fillet", 0.7, 1.0, RADIUS, 0.0) == WeldJoint(0.7)
     assert joint_of("groove", None, 1.0, RADIUS, 0.0) is None
     assert edges_half_angle(np.sqrt(2) * RADIUS, RADIUS) == pytest.approx(np.pi / 4)
 

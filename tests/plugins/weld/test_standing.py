@@ -19,7 +19,7 @@ from flangeye_plugins.weld.belief import Belief
 from flangeye_plugins.weld.body import body_of
 from flangeye_plugins.weld.corners import corners_of, leg_of
 from flangeye_plugins.weld.follower import Follower, ResumePoint
-from flangeye_plugins.weld.joint import Joint, JointKind, edges_half_angle, joint_of
+from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
 from flangeye_plugins.weld.motion import Track
 from flangeye_plugins.weld.passes import Passes
 from flangeye_plugins.weld.path import Path
@@ -144,7 +144,7 @@ def test_the_walls_of_a_joint_follow_from_its_kind(side: float, upright: str) ->
     for gap, known in ((0.0, False), (0.1e-3, True), (1.99e-3, True), (2e-3, False), (3e-3, False)):
         assert (joint_of("butt", None, side, 1e-3, gap) is not None) == known
     assert joint_of("groove", None, side, 1e-3, 1e-3) is None
-    assert Joint(0.6).lean == 0.0
+    assert WeldJoint(0.6).lean == 0.0
 
 
 @pytest.mark.parametrize("gap", [0.5e-3, 1.5e-3])
@@ -163,10 +163,10 @@ def test_a_ball_on_two_edges_climbs_as_steeply_as_in_its_groove(gap: float) -> N
 def test_a_seat_moves_with_either_wall_by_no_more_than_is_stated(
     half_angle: float, lean: float
 ) -> None:
-    joint, step, radius = Joint(half_angle, lean), 1e-7, 2e-3
+    joint, step, radius = WeldJoint(half_angle, lean), 1e-7, 2e-3
     here = joint.seat(radius)[0]
-    left = Joint(half_angle + step / 2, lean + step / 2).seat(radius)[0] - here
-    right = Joint(half_angle + step / 2, lean - step / 2).seat(radius)[0] - here
+    left = WeldJoint(half_angle + step / 2, lean + step / 2).seat(radius)[0] - here
+    right = WeldJoint(half_angle + step / 2, lean - step / 2).seat(radius)[0] - here
     most = max(abs(left), abs(right)) / step
     assert joint.seat_slope(radius) == pytest.approx(most, rel=1e-4)
 

@@ -1,4 +1,4 @@
-"""Run the recordings that are there as one batch, and hold each against its manifest."""
+"""Run the recordings that exist as one batch, and compare each with its manifest."""
 
 from __future__ import annotations
 

@@ -198,7 +198,7 @@ def only_user(path: Path) -> Iterator[None]:
 
 
 def prints_of(seen: Sequence[t.Observation]) -> set[bytes]:
-    """Return what tells scans from others: no two give the same centre to the last bit."""
+    """Return a key that is unique to each scan: no two give the same centre to the last bit."""
     return {each.feature.centre.tobytes() for each in seen}
 
 

@@ -49,7 +49,7 @@ class StoredCalibration:
 
     @property
     def key(self) -> str:
-        """What tells this calibration from others."""
+        """Key that is unique to this calibration."""
         return np.array2string(
             self.estimate.transform.matrix.ravel(), precision=9, max_line_width=999
         )
@@ -99,12 +99,12 @@ class StoredCalibration:
 
     @cached_property
     def prior(self) -> Prior:
-        """What this calibration tells of later sightings; its own are held against it as well."""
+        """Prior of later sightings, from the calibration's own sightings."""
         variances = np.concatenate([FREE, self.pose_error.variances])
         return prior_of(self.sightings(self.used, _one_check(self.used)), variances)
 
     def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> Sightings:
-        """Return sightings of the flange, held against this calibration.
+        """Return sightings of the flange with their deviation from this calibration.
 
         Args:
             seen: The N sightings.

@@ -67,7 +67,7 @@ def _without_misfits(
 
 
 def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Information:
-    """Return what the calibration and the last checks tell."""
+    """Return the information in the calibration and the earlier checks."""
     known = stored.prior.told.loosened(test.seasonal)
     if not history.checks:
         return known

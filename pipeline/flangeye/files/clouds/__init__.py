@@ -107,7 +107,7 @@ def read_cloud(
 
 
 def check_cloud_file(path: Path) -> int:
-    """Return how many points a file holds, its header held against its size; decodes nothing.
+    """Return the number of points in a file, after checking its header against its size.
 
     Raises:
         StageError: As :func:`read_cloud`; only damage inside the data is left to be found there.

@@ -127,7 +127,7 @@ class NpyTable:
     fields: tuple[str, ...] = ()
 
     def check(self) -> None:
-        """Its size was held against the header when it was opened."""
+        """Its size was checked against the header when it was opened."""
 
     def decode(self) -> Points:
         """Load the array."""

@@ -1,4 +1,4 @@
-"""Tables of points inside files: held against the file's size first, decoded afterwards."""
+"""Tables of points inside files: checked against the file's size, then decoded."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class CompressedTable:
     viewpoint: Any = None
 
     def check(self) -> None:
-        """Hold the two stated sizes against the header and the file."""
+        """Check the two stated sizes against the header and the file."""
         whole = math.prod(self.shape) * self.record.itemsize
         found = self.path.stat().st_size - self.offset - 8
         compressed, decompressed = self._sizes()

@@ -346,7 +346,7 @@ def _neither(arm: PoseColumns, robot: RobotModel | None) -> str:
 def _writings(
     pose: PoseColumns, numbers: Floats, questions: Questions, prefix: str, robot: RobotModel | None
 ) -> list[Writing]:
-    """Return what a pose's numbers may mean, the likelier first."""
+    """Return the possible conventions of a pose's numbers, the most likely first."""
     given = questions.given.get(f"{prefix}rotation")
     joints = _as_angles(pose, numbers, robot) if given in (None, JOINTS[0]) else []
     if pose.rotations == JOINTS:

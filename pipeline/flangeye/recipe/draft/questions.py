@@ -1,4 +1,4 @@
-"""What a folder does not show: answered by a flag, by a person, or by a default that is told."""
+"""Questions a folder leaves open: answered by an option, a person, or a stated default."""
 
 from __future__ import annotations
 

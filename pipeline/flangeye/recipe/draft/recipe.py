@@ -52,7 +52,7 @@ CONVERTED = {
 
 @dataclass(frozen=True)
 class Draft:
-    """A recipe, and what to tell of it.
+    """A drafted recipe, and the notes about it.
 
     Attributes:
         text: YAML.
@@ -251,7 +251,7 @@ def _length_of_files(questions: Questions) -> str:
 
 
 def _camera(archive: Archive, target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
-    """Return the file of the camera, or the board that tells it, where the archive does not."""
+    """Return the camera's file, or the board to calibrate it by, if the archive has neither."""
     ((kind, params),) = target.items()
     if any(r.camera for r in archive.recordings):
         return {}

@@ -1,4 +1,4 @@
-"""What tells one arm of Universal Robots from another, kinematics aside."""
+"""Differences between the arms of Universal Robots, other than kinematics."""
 
 from __future__ import annotations
 

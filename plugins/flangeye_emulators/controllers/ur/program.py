@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 
 from flangeye_emulators.controllers.arm import BRAKES, SimulatedArm
-from flangeye_emulators.controllers.motion import Motion, stop
+from flangeye_emulators.controllers.motion import ControllerMotion, stop
 
 Thread = Generator[None, None, None]
 """Runs until its next yield in every cycle; ``yield`` is URScript's ``sync()``."""
@@ -38,7 +38,7 @@ class Program:
         raise NotImplementedError
 
     def cycle(self) -> bool:
-        """Run every thread to its next yield; return whether the program goes on.
+        """Run every thread to its next yield; return whether the program continues.
 
         Raises:
             ProgramError: A thread did what a program must not do.
@@ -72,7 +72,7 @@ class Program:
         """Return whether a thread of this name runs."""
         return name in self._threads
 
-    def drive(self, motion: Motion) -> None:
+    def drive(self, motion: ControllerMotion) -> None:
         """Let a motion move the arm in this cycle.
 
         Raises:
@@ -83,13 +83,13 @@ class Program:
         self._driver = self._running
         self.arm.drive(motion)
 
-    def complete(self, plan: Callable[[], Motion]) -> Thread:
+    def complete(self, plan: Callable[[], ControllerMotion]) -> Thread:
         """Bring the arm to rest, then go through the motion that ``plan`` makes there."""
         if not self.arm.standing:
             yield from self.stop_joints(BRAKES)
         yield from self.follow(plan())
 
-    def follow(self, motion: Motion) -> Thread:
+    def follow(self, motion: ControllerMotion) -> Thread:
         """Go through a motion from where the arm is and as fast as it is."""
         while not motion.done:
             self.drive(motion)

@@ -12,7 +12,7 @@ from flangeye_emulators.controllers.ur.faults import URFaultInjector
 
 
 def serve(options: EmulatorOptions) -> None:
-    """Run a controller until the process is told to end.
+    """Run a controller until the process is asked to end.
 
     Raises:
         StageError: A port is taken, or an option is wrong.

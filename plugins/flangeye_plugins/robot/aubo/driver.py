@@ -217,7 +217,7 @@ class AuboRobot(Device):
         self._velocity_until = time.monotonic() + GRACE
 
     def wait_cycle(self) -> None:
-        """Wait for as long as a cycle of the controller lasts; it does not tell of its own."""
+        """Wait for one controller cycle; the controller sends no events of its own."""
         time.sleep(self.period - time.monotonic() % self.period)
 
     def stop(self) -> None:
@@ -318,7 +318,7 @@ class AuboRobot(Device):
 
 
 def _in_joints(goal: Floats) -> Callable[[RobotState], tuple[Floats, float]]:
-    """Return what tells the way (n,) that is left to joint angles, and its length [rad]."""
+    """Return a function from joint angles to the remaining path (n,), and its length [rad]."""
 
     def rest(state: RobotState) -> tuple[Floats, float]:
         way = goal - state.joints

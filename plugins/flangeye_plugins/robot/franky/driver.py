@@ -209,7 +209,7 @@ class FrankyRobot(Device):
         self._ask(lambda: self._robot.move(motion, asynchronous=True))
 
     def _motion(self) -> tuple[bool, str]:
-        """Return whether a motion goes on, and what ended the last one if it went wrong."""
+        """Return whether a motion is in progress, and why the last one failed, if it did."""
         try:
             return bool(self._robot.poll_motion()), ""
         except self._sdk.ControlException as error:

@@ -56,7 +56,7 @@ class FreedriveParams(ListenParams):
 
 @part("robot.ros2")
 def robot_ros2(model: RobotModel, params: Ros2Params, reads_only: bool = False) -> Robot:
-    """Any arm with a ROS 2 driver: joint states tell where it is, a joint trajectory moves it.
+    """Any arm with a ROS 2 driver: joint states report it, a joint trajectory moves it.
 
     Motions are published in pieces that lead a third of a second ahead and end by themselves, so an
     arm that nobody leads any more stands within half a second. The controller must replace the
@@ -240,7 +240,7 @@ class FreedriveArm(Listener):
         super().__init__("robot.ros2_freedrive", model, params, bridge)
 
     def move_joints(self, joints: Floats, speed: float, acceleration: float) -> None:
-        """Wait until the arm was moved on and stands still; say where a scan would tell most."""
+        """Wait until the arm was moved on and stands still; suggest the most informative pose."""
         del speed, acceleration
         pose = self.arm.flange(joints)
         lean = np.degrees(np.arccos(np.clip(pose[:3, 2] @ self._facing(), -1.0, 1.0)))

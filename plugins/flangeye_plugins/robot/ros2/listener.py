@@ -1,4 +1,4 @@
-"""Where an arm is, as ROS 2 tells: joint states, and a pose by its model or from tf."""
+"""Pose of an arm from ROS 2: joint states with its model, or tf."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class TfParams(Params):
 
 
 class ListenParams(Params):
-    """What tells where the arm is."""
+    """Source of the arm's pose."""
 
     joints: tuple[str, ...] = Field(
         min_length=1,

@@ -132,7 +132,7 @@ class UrRobot(Device):
         self._command("move_linear", pose=pose, speed=speed, acceleration=acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
-        """Go on at a twist (6,) of the flange; the controller is told the tool's."""
+        """Command a twist (6,) of the flange, converted to the tool's for the controller."""
         base_T_tool = self._base_T_tool(self._require_able())
         at_tool = twist_at_tool(twist, base_T_tool @ self._tool_T_flange, base_T_tool)
         self._command("move_velocity", twist=at_tool, acceleration=acceleration)

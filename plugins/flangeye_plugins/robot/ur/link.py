@@ -168,7 +168,7 @@ class Link:
         return said["given"]
 
     def _loss(self) -> str:
-        """Return what became of the process; the library may abort it when a connection breaks."""
+        """Return how the process ended; the library may abort it when a connection breaks."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LEAVING)
         code = self._process.returncode

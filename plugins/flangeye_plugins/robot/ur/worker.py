@@ -78,7 +78,7 @@ class Refused(Exception):
     """The library or the controller did not do what it was asked."""
 
 
-class Clock:
+class SampleClock:
     """Tells when the controller took a sample, by this computer's clock.
 
     The earliest arrival, seen over time, has the least delay in it; delays only ever add.
@@ -104,7 +104,7 @@ class Publisher(threading.Thread):
         super().__init__(daemon=True)
         self._receive, self._commander = receive, commander
         self._memory, self._period = memory, period
-        self._clock, self._count, self._last = Clock(), 0, -1.0
+        self._clock, self._count, self._last = SampleClock(), 0, -1.0
         self._owner = os.getppid()
 
     def run(self) -> None:

@@ -13,7 +13,7 @@ MARGIN = 16
 """Around the tag [px]: its white border, and how far it moves from image to image."""
 
 
-class Piece(NamedTuple):
+class ImageRegion(NamedTuple):
     """A part of an image.
 
     Attributes:
@@ -31,23 +31,23 @@ class RegionOfInterest:
     def __init__(self) -> None:
         self._corners: Floats | None = None
 
-    def pieces(self, image: Image) -> Iterator[Piece]:
+    def pieces(self, image: Image) -> Iterator[ImageRegion]:
         """Yield where to look, one after the other until the tag is found."""
         if self._corners is not None:
             low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - MARGIN, 0)
             high = np.ceil(self._corners.max(axis=0)).astype(int) + MARGIN
             yield cut(image, (int(low[0]), int(low[1])), (int(high[0]), int(high[1])))
-        yield Piece(image, (0, 0))
+        yield ImageRegion(image, (0, 0))
 
-    def follow(self, piece: Piece, corners: Floats | None) -> None:
+    def follow(self, piece: ImageRegion, corners: Floats | None) -> None:
         """Look here next: at corners (4, 2) in a piece [px], or everywhere."""
         self._corners = None if corners is None else corners + np.array(piece.corner)
 
 
-def cut(image: Image, start: tuple[int, int], end: tuple[int, int]) -> Piece:
+def cut(image: Image, start: tuple[int, int], end: tuple[int, int]) -> ImageRegion:
     """Return the piece of an image from one (column, row) to before another."""
     pixels = np.ascontiguousarray(image.pixels[start[1] : end[1], start[0] : end[0]])
-    return Piece(Image(pixels, shifted(image.camera_matrix, start), image.distortion), start)
+    return ImageRegion(Image(pixels, shifted(image.camera_matrix, start), image.distortion), start)
 
 
 def shifted(matrix: Floats, corner: tuple[int, int]) -> Floats:

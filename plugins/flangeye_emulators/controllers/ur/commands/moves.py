@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import BRAKES, SimulatedArm
 from flangeye_emulators.controllers.chain import UnreachableError
-from flangeye_emulators.controllers.motion import Motion, Travel, joint_move, linear_move
+from flangeye_emulators.controllers.motion import ControllerMotion, Travel, joint_move, linear_move
 from flangeye_emulators.controllers.poses import pose_matrix
 from flangeye_emulators.controllers.route import JOINTS, POSES, Waypoint
 from flangeye_emulators.controllers.ur.program import ProgramError, Thread
@@ -58,7 +58,7 @@ def to_pose(arm: SimulatedArm, pose: Floats, speed: float, acceleration: float) 
     return linear_move(arm.stance.base_T_tcp, pose, speed, acceleration)
 
 
-def _move(script: ControlScript, plan: Callable[[float, float], Motion]) -> Thread | None:
+def _move(script: ControlScript, plan: Callable[[float, float], ControllerMotion]) -> Thread | None:
     """Do a move with the speed and acceleration in registers 6 and 7, waiting for it or not."""
     speed, acceleration = script.number(6), script.number(7)
     return _do(script, script.complete(lambda: plan(speed, acceleration)))
