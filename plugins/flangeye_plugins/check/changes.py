@@ -108,7 +108,7 @@ def _require_known_place(session: RecordedSession) -> None:
     if session.carried == "camera":
         raise NotApplicable("a constant offset of what carries the camera is part of the answer")
     if not np.isfinite(session.places).all():
-        raise NotApplicable("the target's place on the arm is not known, an offset is part of it")
+        raise NotApplicable("the target's pose on the arm is unknown and absorbs any offset")
 
 
 def _known(found: VariantFits, offset: Floats) -> bool:

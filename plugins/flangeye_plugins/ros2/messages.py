@@ -171,7 +171,7 @@ def pixels_of(message: Any) -> Any:
     if pixels.ndim == 3:
         pixels = pixels[:, :, :3]
     if pixels.dtype.kind == "f":
-        raise StageError(f"an image of encoding '{message.encoding}' is of depths, not of light")
+        raise StageError(f"an image of encoding '{message.encoding}' holds depths, not an image")
     if pixels.dtype.itemsize == 2:
         pixels = (pixels / max(int(pixels.max()), 1) * 255).astype(np.uint8)
     return pixels[..., ::-1] if message.encoding.startswith("rgb") else pixels
