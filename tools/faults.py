@@ -21,11 +21,12 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flangeye.files.children import python_command
 from tests.live.cell import Cell
-from tools.strokes import HELD, OF_A_CLIENT, SHIFTS, STROKES, environment
+from tests.plugins.ros2.cell import Ros2Cell
+from tools.strokes import HELD, OF_A_BRIDGE, OF_A_CLIENT, SHIFTS, STROKES, environment
 
 AUBO_FAULTS = ("protective-stop", "emergency-stop", "drop", "die", "freeze", "latency=300 ms")
 FAULTS = (
@@ -37,8 +38,10 @@ KINDS = {
     "calibration": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
     "leading": (*FAULTS, *ANYWHERE, *OF_A_CLIENT),
     "aubo": (*AUBO_FAULTS, *ANYWHERE),
+    "ros2": (*Ros2Cell.faults, *STROKES, *OF_A_BRIDGE),
 }
-"""What may befall each kind of program; ``aubo`` is a calibration with that arm."""
+"""What may befall each kind of program; ``aubo`` is a calibration with that arm, ``ros2`` one under
+ROS 2, whose own processes must be installed: ``make test`` does."""
 
 RESTS, ENDS, PATIENCE = 0.5, 3.0, 30.0
 """After a fault: longest time until the arm rests, by its clock, and until the program ends; a
@@ -96,8 +99,7 @@ class Trial:
     def once(self) -> None:
         """Start a controller and a program, cause the fault, and look."""
         self._times += 1
-        model = "aubo-i5" if self._kind == "aubo" else "ur5e"
-        with tempfile.TemporaryDirectory() as folder, Cell(Path(folder), model=model) as cell:
+        with tempfile.TemporaryDirectory() as folder, self._cell(Path(folder)) as cell:
             program = self._start(cell)
             try:
                 self.wrong += self._faults(cell, program)
@@ -106,6 +108,11 @@ class Trial:
             finally:
                 program.kill()
                 program.communicate()
+
+    def _cell(self, folder: Path) -> Any:
+        if self._kind == "ros2":
+            return Ros2Cell(folder)
+        return Cell(folder, model="aubo-i5" if self._kind == "aubo" else "ur5e")
 
     def row(self) -> str:
         """Return the line of the table, with the longest times."""
@@ -116,8 +123,10 @@ class Trial:
             f"{exits:9.2f} {queued:12.2f} {len(self.wrong):6}"
         )
 
-    def _start(self, cell: Cell) -> subprocess.Popen[str]:
+    def _start(self, cell: Any) -> subprocess.Popen[str]:
         env = environment(cell.folder)
+        if self._kind == "ros2":
+            return cell.start("run", cell.recipe(), "--move", "--out", "run")
         if self._calibrates:
             return cell.start(cell.recipe(), "--move", "--out", "run", env=env)
         return subprocess.Popen(
@@ -131,21 +140,24 @@ class Trial:
     def _calibrates(self) -> bool:
         return self._kind != "leading"
 
-    def _cause(self, cell: Cell, program: subprocess.Popen[str]) -> None:
+    def _cause(self, cell: Any, program: subprocess.Popen[str]) -> None:
         """Let the fault happen."""
-        if strike := {**STROKES, **OF_A_CLIENT}.get(self._fault):
+        if strike := {**STROKES, **OF_A_CLIENT, **OF_A_BRIDGE}.get(self._fault):
             strike(program.pid)
         elif shift := SHIFTS.get(self._fault):
             (cell.folder / "shift").write_text(shift, "ascii")
         else:
             cell.control.fault(self._fault)
 
-    def _faults(self, cell: Cell, program: subprocess.Popen[str]) -> Iterator[str]:
+    def _faults(self, cell: Any, program: subprocess.Popen[str]) -> Iterator[str]:
         """Cause the fault while the arm moves, and yield what is wrong afterwards."""
         for _ in range(self._chance.randrange(4) if self._calibrates else 0):
             cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
             cell.wait_until(lambda: _speed(cell) < STANDS or _over(program), STARTING)
         cell.wait_until(lambda: _speed(cell) > MOVES or _over(program), STARTING)
+        if _over(program):
+            yield f"it ended before: {program.communicate()[1].splitlines()[-1]}"
+            return
         time.sleep(self._chance.uniform(0, 0.3))
         before, began = set(cell.finished()), cell.control.truth().time
         self._cause(cell, program)
@@ -171,7 +183,7 @@ class Trial:
             yield "the arm rests, and the program goes on"
 
 
-def _speed(cell: Cell) -> float:
+def _speed(cell: Any) -> float:
     return cell.control.truth().speed
 
 
@@ -179,7 +191,7 @@ def _over(program: subprocess.Popen[str]) -> bool:
     return program.poll() is not None
 
 
-def _watched(cell: Cell, program: subprocess.Popen[str], began: float) -> End:
+def _watched(cell: Any, program: subprocess.Popen[str], began: float) -> End:
     """Look at an arm and its program until both have come to an end, or go on in spite of all."""
     moved = now = 0.0
     ended, waited, before = None, 0.0, _queued(program.pid)

@@ -111,5 +111,13 @@ OF_A_CLIENT: dict[str, Callable[[int], None]] = {
 }
 """Those of a driver whose client library has a process of its own."""
 
+OF_A_BRIDGE: dict[str, Callable[[int], None]] = {
+    "arm's bridge killed": lambda run: _killed(_child(guard_of(run), "ros2/bridge")),
+    "arm's bridge held": lambda run: _held(_child(guard_of(run), "ros2/bridge")),
+    "camera's bridge killed": lambda run: _killed(_child(run, "ros2/bridge")),
+    "camera's bridge held": lambda run: _held(_child(run, "ros2/bridge")),
+}
+"""Those of the processes that hold rclpy."""
+
 SHIFTS = {"clock + 1 h": "3600", "clock - 1 h": "-3600"}
 """The wall clock is set: nothing stops."""

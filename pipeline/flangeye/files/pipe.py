@@ -77,8 +77,15 @@ class Pipe:
             self._rest, missing = self._rest[missing:], missing - len(self._rest)
         return b"".join(parts)
 
-    def close(self) -> None:
-        """End the process; safe to call twice."""
+    def close(self, patience: float = 0.0) -> None:
+        """End the process; safe to call twice.
+
+        Args:
+            patience: How long it may take to end by itself when its input has ended [s].
+        """
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            self._in.close()
+            self._process.wait(patience)
         self._process.kill()
         self._process.wait()
         for reader in self._readers:

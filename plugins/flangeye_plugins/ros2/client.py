@@ -32,11 +32,16 @@ PROGRAM = "ros2"
 STARTING = 10.0
 """Longest time until the process has a node: a cold disk reads rclpy's hundred libraries [s]."""
 
-ANSWERING = 1.5
-"""Longest time for an answer; finding a service takes the most, a second [s]."""
+ANSWERING = 2.5
+"""Longest time for an answer; finding a service takes the most, a second, and on a busy machine
+listing the topics [s]."""
 
-DISCOVERY = 3.0
-"""After its start a node knows what runs: DDS repeats what it says that often [s]."""
+DISCOVERY = 2.5
+"""After its start a node knows what runs; on an idle machine it does after half a second [s]."""
+
+LEAVING = 0.5
+"""How long a node may take to say that it leaves: one that is killed is sent messages for 20 s,
+which costs those that are sent to others [s]."""
 
 MATCHING = 0.5
 """Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
@@ -244,7 +249,7 @@ class Bridge(Device):
     def close(self) -> None:
         """End the process; safe to call twice."""
         self._gone = self._gone or "is closed"
-        self._pipe.close()
+        self._pipe.close(LEAVING)
 
     # --- the wire
 

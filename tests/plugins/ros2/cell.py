@@ -1,34 +1,25 @@
 """A cell under ROS 2: an arm behind a controller and a camera, each a node in its own process."""
 
-import itertools
 import json
-import os
 import queue
 import subprocess
 import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid, rotation_from_quaternion
-from tests.plugins.ros2.installed import environment
-
-__all__ = ["environment"]
+from tests.plugins.ros2.installed import environment, free_domain
 
 FACING = [180.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 """Joint angles at which the UR5e holds its flange below the camera [deg]."""
 
 TOWARDS = [16.0, -119.0, -112.0, -39.0, -86.0, 164.0]
 """Those at which the flange faces the camera, 0.6 m before it [deg]."""
-
-_domains = itertools.count()
-
-
-def free_domain():
-    """A ROS domain that no other test, worker or test run uses now; DDS has ports for some 200."""
-    return 1 + (os.getpid() * 7 + next(_domains)) % 100  # each test has its own
 
 
 class Peer:
@@ -130,13 +121,13 @@ class Terminal:
     """A terminal in which ROS 2 is sourced, in a folder of its own."""
 
     def __init__(self, folder, env):
-        self.folder, self._env = folder, env
+        self.folder, self.env = folder, env
 
     def start(self, *words):
         return subprocess.Popen(
             [sys.executable, "-m", "flangeye.cli", *map(str, words)], cwd=self.folder,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL,
-            env=self._env,
+            env=self.env,
         )  # fmt: skip
 
     def run(self, *words, expect=0, patience=240):
@@ -148,6 +139,57 @@ class Terminal:
 
     def result(self, run="run"):
         return json.loads((self.folder / run / "result.json").read_text())
+
+
+class Truth(NamedTuple):
+    """How fast the flange really goes [m/s], and when [s]."""
+
+    time: float
+    speed: float
+
+
+class Ros2Cell(Terminal):
+    """A cell that runs under ROS 2, as ``tools.faults`` has one on loopback."""
+
+    faults: ClassVar[dict[str, dict[str, Any]]] = {
+        "controller rejects": {"rejects": True}, "joint states silent": {"silent": 3.0},
+        "silent for 0.5 s": {"silent": 0.5}, "stamps jump back": {"jump": -5.0},
+        "stamps jump ahead": {"jump": 5.0},
+    }  # fmt: skip
+
+    def __init__(self, folder):
+        super().__init__(folder, environment(free_domain()))
+        self.arm = Controller(self.env, seed=1, joints=TOWARDS)
+        self.eye = Camera(self.env, "zivid")
+        self.control = self
+
+    def recipe(self):
+        self.run("init", "--ros2", "--scanner", "phoxi-m", "--yes", "--trigger", "/camera/capture")
+        return self.folder / "recipe.yaml"
+
+    def truth(self):
+        return Truth(**self.arm.ask(truth=True))
+
+    def fault(self, name):
+        self.arm.tell(**self.faults[name])
+
+    def finished(self):
+        """Return the captures that have gone through so far."""
+        log = self.folder / "run" / "run.mcap"
+        return read_run(log).finished if log.exists() else []
+
+    def wait_until(self, condition, patience):
+        until = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < until, "it did not come so far"
+            time.sleep(0.02)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.arm.kill()
+        self.eye.kill()
 
 
 @contextmanager

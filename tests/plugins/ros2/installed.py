@@ -1,5 +1,6 @@
 """The real rclpy, in an environment of its own: `make test` puts it beside the tests' Python."""
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -63,3 +64,11 @@ def environment(domain):
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[3]), str(folder() / "tf2")]),
     }
+
+
+_domains = itertools.count()
+
+
+def free_domain() -> int:
+    """A ROS domain that no other test, worker or test run uses now; DDS has ports for some 200."""
+    return 1 + (os.getpid() * 7 + next(_domains)) % 100  # each test has its own

@@ -15,8 +15,7 @@ from flangeye_plugins.robot.ros2.driver import (
 )
 from flangeye_plugins.scanner.ros2 import Ros2Params as Topics
 from flangeye_plugins.scanner.ros2 import scanner_ros2
-from tests.plugins.ros2 import installed
-from tests.plugins.ros2.cell import Camera, Controller, environment, free_domain, peers
+from tests.plugins.ros2.cell import Camera, Controller, peers
 
 pytestmark = [pytest.mark.realtime, pytest.mark.ros2]
 
@@ -24,15 +23,6 @@ NO_SERVICE = "/camera/capture did not answer|nobody offers the service /camera/c
 """DDS notices a killed node by its silence, up to 20 s later: until then it is one that is slow."""
 
 ARM, EYE = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
-
-
-@pytest.fixture
-def env(monkeypatch):
-    installed.require()
-    given = environment(free_domain())
-    for name, value in given.items():
-        monkeypatch.setenv(name, value)
-    return given
 
 
 def opened(controller, **params):

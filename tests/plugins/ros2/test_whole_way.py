@@ -16,8 +16,6 @@ from tests.plugins.ros2.cell import (
     Controller,
     Frames,
     Terminal,
-    environment,
-    free_domain,
     peers,
 )
 
@@ -31,7 +29,7 @@ LINK = [0.01, 0.02, -0.03, -0.5, 0.5, -0.5, 0.5]
 @pytest.fixture
 def terminal(tmp_path):
     installed.require()
-    return Terminal(tmp_path, environment(free_domain()))
+    return Terminal(tmp_path, installed.environment(installed.free_domain()))
 
 
 def found(terminal, run="run"):
@@ -48,7 +46,7 @@ def require_near(matrix, truth):
 @pytest.mark.parametrize("layout", ["realsense", "zivid"])
 def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(terminal, layout):
     installed.tf2_msgs()
-    env = terminal._env
+    env = terminal.env
     own = [["camera_link", "optical_frame", LINK]] if layout == "realsense" else []
     arm = Controller(env, seed=1, joints=TOWARDS)
     eye = Camera(env, layout, resolution=0.3 if own else 0.4)
@@ -71,7 +69,7 @@ def test_two_commands_lead_to_a_verified_matrix_and_a_third_to_the_graph(termina
 
 
 def test_an_arm_without_a_controller_is_calibrated_without_permission_to_move(terminal):
-    env = terminal._env
+    env = terminal.env
     poses = leaning()
     with peers(
         Controller(env, controller=None, joints=TOWARDS, prefix="left_", namespace="/cell"),

@@ -153,8 +153,9 @@ class Ros2Arm(Listener):
     def close(self) -> None:
         """Stop, and let go of ROS 2."""
         try:
-            if not self._bridge.closed:
+            if not self._bridge.closed and self._motion is not None:
                 self.stop()
+                self._bridge.listeners(self._topic)  # answered when the hold has left
         except DeviceError:
             pass  # the bridge is gone: the piece under way ends by itself
         finally:

@@ -19,8 +19,8 @@ from flangeye.maths.geometry import rotation_exp, rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats
 
-AHEAD = 0.15
-"""How far a piece leads along the motion before it brakes [s]: five renewals may be late."""
+AHEAD = 0.1
+"""How far a piece leads along the motion before it brakes [s]: three renewals may be late."""
 
 STOPPING = 0.2
 """Longest time in which a piece comes to rest after that [s]. With :data:`AHEAD`, and a tenth of a

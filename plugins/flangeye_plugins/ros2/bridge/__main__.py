@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 SERVICE = 1.0
@@ -188,7 +188,7 @@ def serve(bridge: Bridge, output: Output) -> None:
             bridge.publish(request["topic"], body)
         else:
             output.say(answer(bridge, request))
-    os._exit(0)
+    rclpy.try_shutdown()
 
 
 def answer(bridge: Bridge, request: Request) -> Request:
@@ -224,7 +224,9 @@ def main() -> None:
     threading.Thread(target=serve, args=(Bridge(node, output), output), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    executor.spin()
+    with contextlib.suppress(ExternalShutdownException):
+        executor.spin()
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -193,7 +193,7 @@ class Camera:
 def main():
     options = json.loads(sys.argv[1])
     with suppress(OSError):  # a real camera has a computer of its own
-        os.nice(-15)
+        os.nice(-20)
     rclpy.init()
     node = rclpy.create_node("camera", namespace=options["namespace"] or "/")
     serve(node, Camera(node, options).obey)

@@ -24,6 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
+from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye_emulators.controllers.start import joint_zeros
 from tests.plugins.ros2.peers.node import LATCHED, rclpy, say, serve
@@ -40,6 +41,7 @@ class Controller:
         self.names = names_of(model, options["prefix"])
         self.joints = self.command = np.radians(options["joints"])
         self.speeds = np.zeros(len(self.joints))
+        self.arm = Arm(model)
         self.zeros = joint_zeros(model, options["seed"])
         self.trajectory, self.queue = [], deque()
         self.silent_until, self.rejects, self.jump, self.dead = 0.0, False, 0.0, False
@@ -71,6 +73,9 @@ class Controller:
                 goal = np.array(words["hand"])
                 self.trajectory = self.cubics([(goal, np.zeros_like(goal), words["seconds"])])
             self.rejects = words.get("rejects", self.rejects)
+            if "truth" in words:
+                twist = self.arm.jacobian(self.joints) @ self.speeds
+                say(time=self.now, speed=float(np.linalg.norm(twist[3:])))
             if "history" in words:
                 say(history=list(self.history), taken=self.taken, joints=self.joints.tolist())
 

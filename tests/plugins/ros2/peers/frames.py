@@ -2,8 +2,10 @@
 """The tf tree: what a camera's driver and robot_state_publisher tell, and what is heard of it."""
 
 import json
+import os
 import sys
 import time
+from contextlib import suppress
 
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
@@ -52,6 +54,8 @@ def _transform(given):
 
 def main():
     options = json.loads(sys.argv[1])
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     rclpy.init()
     node = rclpy.create_node("frames")
     serve(node, Frames(node, options).obey)
