@@ -7,22 +7,17 @@ import csv
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
-import numpy as np
 from nicegui import ui
 
-from flangeye import types as t
 from flangeye.errors import FlangeyeError
-from flangeye.log.read import RunLog
 from flangeye.report.units import millimetres
 from flangeye.result import Result
 from flangeye_ui.charts import FAINT, USED
 from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
-from flangeye_ui.scan_page import FLANGE, SCAN
-from flangeye_ui.scene import draw_cloud, new_scene
+from flangeye_ui.scan_view import ScanView
 
 COLUMNS = [
     {"name": key, "label": label, "field": key, "align": "left", "sortable": True}
@@ -31,7 +26,11 @@ COLUMNS = [
         ("predicted", "Predicted rms, mm"), ("note", "Note"),
     )
 ]  # fmt: skip
-POINTS = 5_000
+OPENS = """<q-td :props="props">
+  <a class="nicegui-link" :href="'result?run=' + encodeURIComponent(props.value)">
+    {{ props.value }}</a>
+</q-td>"""
+"""A run's name, which leads to its result."""
 ROWS = 5_000
 """Of a batch's table that are sent to the page."""
 
@@ -48,16 +47,11 @@ def add(project: Project) -> None:
                 return
             table = ui.table(columns=COLUMNS, rows=rows, row_key="run")
             table.classes("w-full").props("dense wrap-cells")
-            table.on(
-                "rowClick",
-                lambda e: ui.navigate.to(f"/result?run={quote(e.args['run'])}"),
-                js_handler="(_, row) => emit(row)",
-            )
+            table.add_slot("body-cell-run", OPENS)
             if len(rows) > 1:
                 ui.echart(comparison(rows)).classes("w-full h-48").props('aria-label="Errors"')
             _reports(project)
             Scrubber(project)
-            _watch(project)
             for path in sorted(project.folder.glob("batches/*/sessions.csv")):
                 _batch(path)
             command_line(project.command("show", f"runs/{rows[0]['run']}/run.mcap"))
@@ -107,19 +101,6 @@ def comparison(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _watch(project: Project) -> None:
-    """Show the charts of ``flangeye monitor``, and how to keep watch."""
-    ui.label("Keeping watch").classes("text-h6")
-    charts = sorted(project.folder.glob("runs/*/monitor.html"))
-    for path in charts:
-        link(project, path)
-    if not charts:
-        ui.label("No calibration of this folder is watched yet.")
-    names = [run.name for run in project.runs() if (run / "calibration.yaml").exists()]
-    chosen = charts[-1].parent.name if charts else names[0] if names else "RUN"
-    command_line(project.command("monitor", f"runs/{chosen}", "--archive", "NEW"))
-
-
 def _batch(path: Path) -> None:
     """Show a batch's table, its numbers in SI units."""
     ui.label(f"Batch {path.parent.name}").classes("text-h6")
@@ -155,10 +136,8 @@ class Scrubber:
 
     def __init__(self, project: Project) -> None:
         self._project = project
-        self._log: RunLog | None = None
-        self._captures: list[str] = []
         runs = [r.name for r in project.runs()]
-        ui.label("Look at a log").classes("text-h6")
+        ui.label("Look into the scans").classes("part").props('role="heading" aria-level="2"')
         ui.select(
             runs, value=runs[0], label="Run", on_change=lambda e: self._open(e.value)
         ).classes("w-full")
@@ -166,57 +145,26 @@ class Scrubber:
             min=0, max=1, step=1, value=0, on_change=lambda e: self._at(e.value)
         )
         self._slider.props('aria-label="Capture" label')
-        self._told = ui.label().props('role="status"')
-        self._scene = new_scene(600, 360)
+        self._scan = ScanView()
+        self._captures: list[str] = []
         ui.timer(0.05, lambda: self._open(runs[0]), once=True)
 
     async def _open(self, run: str) -> None:
-        self._log, self._told.text = None, "reading …"
+        self._captures = []
+        self._scan.say("reading …")
         try:
             facts = await asyncio.to_thread(self._project.read, self._project.folder / "runs" / run)
-            self._log = facts.log
         except FlangeyeError as error:
-            self._told.text = str(error)
+            self._scan.say(str(error))
             return
-        self._captures = [*self._log.poses] or [o.id for o in self._log.observations()]
+        self._scan.log = facts.log
+        self._captures = [*facts.log.poses] or [o.id for o in facts.log.observations()]
         self._slider.props(f"max={max(len(self._captures) - 1, 0)}")
         self._slider.value = 0
         self._at(0)
 
     def _at(self, index: int) -> None:
-        """Show one capture: its flange and its outcome."""
-        if self._log is None:
-            return
-        if not self._captures:
-            self._told.text = "this log has no captures"
-            return
-        capture = self._captures[int(index)]
-        self._told.text = f"capture {capture}: {fate_of(self._log, capture)}"
-        self._scene.clear()
-        self._scene.set_visibility(bool(self._log.of_kind("segment")))
-        for entry in self._log.of_kind("segment"):
-            if entry.capture == capture and isinstance(entry.value, t.FlangeCloud):
-                self._cloud(entry.value)
-
-    def _cloud(self, flange: t.FlangeCloud) -> None:
-        xyz = flange.cloud.points()
-        thin = xyz[:: max(1, len(xyz) // POINTS)].astype(np.float64)
-        draw_cloud(self._scene, thin, FLANGE)
-        at = np.asarray(flange.centre)
-        draw_cloud(self._scene, at[None], SCAN)
-        self._scene.move_camera(*(at - 0.15 * at / np.linalg.norm(at)).tolist(), *at.tolist())
-
-
-def fate_of(log: RunLog, capture: str) -> str:
-    """Return the outcome of a capture in words."""
-    for rejection in log.rejections:
-        if rejection.id == capture:
-            return f"set aside by {rejection.stage}: {rejection.reason}"
-    calibration = log.calibration()
-    for pair in calibration.pairs if calibration else ():
-        if pair.observation.id == capture:
-            residual = f"residual {millimetres(float(np.linalg.norm(pair.residual)))} mm"
-            return f"{'used' if pair.used else 'not used'}, {pair.reason or residual}"
-    if log.poses.get(capture, {}).get("role") == "verification":
-        return "kept for verification"
-    return "not solved"
+        if self._captures:
+            self._scan.show(self._captures[int(index)])
+        elif self._scan.log is not None:
+            self._scan.say("this log has no captures")

@@ -4,26 +4,39 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, get_args
 
 import yaml
 from nicegui import ui
 
 from flangeye.files.bundled import bundled
+from flangeye.files.yaml_lines import read_yaml
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.recipe.find import find_recipe, recipe_names
-from flangeye_ui.layout import command_line, mistake, next_step, page
+from flangeye_ui.drawing import drawing_of
+from flangeye_ui.layout import Bar, command_line, mistake, page, svg
 from flangeye_ui.project import Mistake, Project, at
 
 WORDS = {
     "acquire.simulated": "Take simulated scans", "acquire.live": "Move the arm and scan",
     "acquire.archive": "Read recorded scans", "acquire.samples": "Read recorded samples",
     "segment.flange": "Find the flange", "fit.rim": "Measure its rim",
-    "solve.robust": "Find the scanner's place", "verify.holdout": "Check on poses held out",
+    "solve.robust": "Find where the scanner stands", "verify.holdout": "Check on poses held out",
 }  # fmt: skip
-"""What people say for the steps that most recipes have."""
-CONFIGURATIONS = ["eye-on-base", "eye-in-hand", "eye-on-arm", "two-arms"]
+"""What people say for the steps that most recipes have; others show their summary."""
+CONFIGURATIONS = {
+    "eye-on-base": "beside the arm", "eye-in-hand": "on the arm's flange",
+    "eye-on-arm": "on another link of the arm", "two-arms": "on a second arm",
+}  # fmt: skip
+OPTION = """
+<q-item v-bind="props.itemProps">
+  <q-item-section avatar><img :src="'shapes/{kind}/' + props.opt.label.split(' · ')[0] + '.svg'"
+    width="72" height="54" loading="lazy" alt=""></q-item-section>
+  <q-item-section>{{{{ props.opt.label }}}}</q-item-section>
+</q-item>"""
+"""One line of a list of arms or scanners, with its picture."""
 
 
 def add(project: Project) -> None:
@@ -31,112 +44,155 @@ def add(project: Project) -> None:
 
     @ui.page("/")
     def cell() -> None:
-        with page(project, "Cell"), ui.row().classes("w-full gap-6 items-start"):
-            Form(project)
+        with page(project, "Cell") as bar, ui.row().classes("w-full gap-6 items-start"):
+            Form(project, bar)
 
 
 class Form:
     """The form and the recipe: two views of one file."""
 
-    def __init__(self, project: Project) -> None:
-        self._project = project
+    def __init__(self, project: Project, bar: Bar) -> None:
+        self._project, self._bar, self._wanted = project, bar, ""
+        self._choices: dict[tuple[str, str], ui.select] = {}
+        self._agreeing = False
+        self._next = bar.lead("Poses", "Next: check the poses")
         with ui.column().classes("col-12 col-md-5 gap-2"):
-            self._start_from()
-            self.fields()
-            Import(project, self, "robot", ARM)
-            Import(project, self, "scanner", SCANNER)
-        with ui.column().classes("col-12 col-md gap-2 md:sticky md:top-16"):
-            ui.label("Recipe").classes("text-h6")
-            self._yaml = ui.textarea(value=project.text, on_change=self._typed)
-            self._yaml.classes("w-full").props(
-                'outlined autogrow input-class="font-mono" aria-label="Recipe in YAML"'
-            )
+            self._header()
+            with ui.expansion("Not in the lists?").classes("w-full"):
+                Import(project, self, "robot", ARM)
+                Import(project, self, "scanner", SCANNER)
+            self._advanced()
+        with ui.column().classes("col-12 col-md gap-2"):
+            self.picture()
             self.verdict()
-            command_line(project.command("check", project.recipe_path.name))
+            with ui.expansion("Recipe: cell.yaml", value=True).classes("w-full"):
+                self._yaml = ui.textarea(value=project.text, on_change=self._typed)
+                self._yaml.classes("w-full").props(
+                    'outlined autogrow input-class="font-mono" aria-label="Recipe in YAML"'
+                )
+                command_line(project.command("check", project.recipe_path.name))
+
+    @ui.refreshable_method
+    def picture(self) -> None:
+        """Draw the cell as the recipe has it."""
+        drawing = drawing_of(self._project)
+        if drawing:
+            svg(drawing).classes("picture")
 
     @ui.refreshable_method
     def verdict(self) -> None:
         """Say whether the recipe can run, and everything that is wrong with it."""
         _, mistakes = self._project.check()
-        if not mistakes:
-            ui.label("The recipe is valid.").classes("text-positive").props('role="status"')
-            next_step("Poses", "Next: poses")
+        count = f"{len(mistakes)} thing{'s' * (len(mistakes) > 1)} to mend in the recipe."
+        self._bar.say(count if mistakes else "The recipe is valid.")
+        self._next.set_enabled(not mistakes)
         for each in mistakes:
             mistake(f"line {each.line}: {each.path}: {each.text}" if each.line else each.text)
 
+    def _advanced(self) -> None:
+        with ui.expansion("Advanced: every step and its settings") as self._box:
+            search = ui.input("Search the settings", on_change=lambda e: self._search(e.value))
+            search.classes("w-full").props("outlined dense clearable debounce=300")
+            self.steps()
+        self._box.classes("w-full")
+
+    def _search(self, words: str | None) -> None:
+        self._wanted = (words or "").lower()
+        self.steps.refresh()
+
     @ui.refreshable_method
-    def fields(self) -> None:
-        """Show the header and every step, with what is wrong at each field."""
+    def steps(self) -> None:
+        """Show every step that has what was searched for, with what is wrong at each field."""
         data, (_, mistakes) = self._project.data(), self._project.check()
-        self._header(data, mistakes)
-        wrong = any(m.path.startswith("steps") for m in mistakes)
-        with ui.expansion("Advanced: every step and its fields", value=wrong).classes("w-full"):
-            for index, entry in enumerate(data.get("steps") or []):
-                self._step(index, entry, mistakes)
-            stages = sorted(self._project.registry.stages)
-            add = ui.select(stages, label="Add a step", with_input=True, on_change=self._add)
-            add.classes("w-full")
+        if any(m.path.startswith("steps") for m in mistakes):
+            self._box.value = True
+        for index, entry in enumerate(data.get("steps") or []):
+            self._step(index, entry, mistakes)
+        stages = sorted(self._project.registry.stages)
+        add = ui.select(stages, label="Add a step", with_input=True, on_change=self._add)
+        add.classes("w-full")
+        title = ui.input("Title of the cell", value=str(data.get("title", "")))
+        title.on("change", lambda e: self._set(["title"], e.args)).classes("w-full")
 
-    def _start_from(self) -> None:
-        def take(event: Any) -> None:
-            self._write(yaml.safe_load(find_recipe(event.value).read_text(encoding="utf-8")))
-
-        names = list(recipe_names())
-        ui.select(names, label="Start from a recipe", with_input=True, on_change=take).classes(
-            "w-full"
-        )
-
-    def _header(self, data: dict[str, Any], mistakes: list[Mistake]) -> None:
-        ui.input(
-            "Title", value=str(data.get("title", "")),
-        ).on("change", lambda e: self._set(["title"], e.args)).classes("w-full")  # fmt: skip
+    def _header(self) -> None:
+        """Show the few fields that matter."""
+        examples = ui.select(list(recipe_names()), label="Start from an example", with_input=True)
+        examples.on_value_change(self._start_from).classes("w-full")
         for section, label in (("robot", "Arm"), ("scanner", "Scanner")):
-            chosen = (data.get(section) or {}).get("model")
-            known = sorted(p.stem for p in (bundled("data") / f"{section}s").glob("*.yaml"))
-            self._choice(label, [section, "model"], chosen, known)
-            self._mistakes(mistakes, section)
-        standard = (data.get("feature") or {}).get("standard")
-        self._choice("Flange", ["feature", "standard"], standard, _standards())
-        self._mistakes(mistakes, "feature")
-        name = (data.get("configuration") or {}).get("name", CONFIGURATIONS[0])
-        self._choice("Configuration", ["configuration", "name"], name, CONFIGURATIONS)
-        self._mistakes(mistakes, "configuration")
+            choice = self._choice(label, (section, "model"), _models(f"{section}s"))
+            choice.add_slot("option", OPTION.format(kind=f"{section}s"))
+        plates = {each: each for each in _standards()}
+        self._choice("Flange (the arm's own if empty)", ("feature", "standard"), plates)
+        self._choice("The scanner stands", ("configuration", "name"), CONFIGURATIONS)
+        self._agree()
 
-    def _choice(self, label: str, path: list[str], chosen: Any, known: list[str]) -> None:
-        options = known if chosen in (None, *known) else [chosen, *known]
-        ui.select(
-            options,
-            label=label,
-            value=chosen,
-            with_input=True,
-            on_change=lambda e: self._set(path, e.value),
-        ).classes("w-full")
+    def _start_from(self, event: Any) -> None:
+        self._write(yaml.safe_load(find_recipe(event.value).read_text(encoding="utf-8")))
+
+    def _choice(self, label: str, path: tuple[str, str], known: dict[str, str]) -> ui.select:
+        def take(event: Any) -> None:
+            if not self._agreeing:
+                self._set(list(path), event.value)
+
+        choice = ui.select(dict(known), label=label, with_input=True, on_change=take)
+        self._choices[path] = choice
+        return choice.classes("w-full")
+
+    def _agree(self) -> None:
+        """Let the fields show what the recipe says, and what is wrong with it at each."""
+        data, (_, mistakes) = self._project.data(), self._project.check()
+        self._agreeing = True
+        for (section, key), choice in self._choices.items():
+            given = data.get(section)
+            value = given.get(key) if isinstance(given, dict) else None
+            value = value or {"configuration": "eye-on-base"}.get(section)
+            if value is not None and value not in choice.options:
+                choice.set_options({value: str(value), **dict(choice.options)})
+            choice.value = value
+            wrong = "; ".join(at(mistakes, section))
+            choice.props["error"], choice.props["error-message"] = bool(wrong), wrong
+        self._agreeing = False
 
     def _step(self, index: int, entry: Any, mistakes: list[Mistake]) -> None:
         name = next(iter(entry)) if isinstance(entry, dict) else str(entry)
         given = (entry[name] if isinstance(entry, dict) else None) or {}
         stage = self._project.registry.stages.get(name)
         wrong = [m for m in mistakes if f"{m.path}.".startswith(f"steps.{index}.")]
-        with (
-            ui.expansion(f"{index + 1}. {WORDS.get(name, name)}", value=bool(wrong))
-            .classes("w-full")
-            .props("dense")
-        ):
+        fields = self._fields(name, stage)
+        if self._wanted and not fields:
+            return
+        words = WORDS.get(name) or (stage.summary if stage else name)
+        with ui.expansion(f"{index + 1}. {words}", value=bool(wrong or self._wanted)) as box:
+            ui.label(f"{name}: {stage.summary}" if stage else name).classes("note")
             if stage:
-                ui.label(f"{name}: {stage.summary}").classes("text-caption")
-                self._parameters(index, name, stage, given, wrong)
-            ui.button("Remove", on_click=lambda: self._remove(index)).props("flat dense")
-        fields = (stage.params.model_fields if stage and stage.params else {}).keys()
+                self._parameters(index, name, stage, fields, given, wrong)
+            ui.button("Remove this step", on_click=lambda: self._remove(index)).props(
+                "flat dense no-caps"
+            )
+        box.classes("w-full").props("dense")
         for each in wrong:
             if not any(_within(each, index, name, field) for field in fields):
                 mistake(each.text)
 
+    def _fields(self, name: str, stage: Stage | None) -> list[str]:
+        """Return the parameters of a step that have what was searched for."""
+        known = stage.params.model_fields if stage and stage.params else {}
+        return [
+            field
+            for field, info in known.items()
+            if self._wanted in f"{name} {field.replace('_', ' ')} {info.description}".lower()
+        ]
+
     def _parameters(
-        self, index: int, name: str, stage: Stage, given: Any, wrong: list[Mistake]
-    ) -> None:
+        self, index: int, name: str, stage: Stage, fields: list[str], given: Any,
+        wrong: list[Mistake],
+    ) -> None:  # fmt: skip
         """Show a field for each parameter, as the recipe's schema has it, with what is wrong."""
-        schema = stage.params.model_json_schema()["properties"] if stage.params else {}
-        for field, info in (stage.params.model_fields if stage.params else {}).items():
+        if stage.params is None:
+            return
+        schema = stage.params.model_json_schema()["properties"]
+        for field in fields:
+            info = stage.params.model_fields[field]
             text = "; ".join(m.text for m in wrong if _within(m, index, name, field))
             value = given.get(field) if isinstance(given, dict) else None
             box = _field(field, schema[field], value, info.is_required())
@@ -147,10 +203,6 @@ class Form:
 
     def _setter(self, path: list[Any], box: Any) -> Any:
         return lambda: self._set(path, "" if box.value is None else str(box.value))
-
-    def _mistakes(self, mistakes: list[Mistake], *paths: str) -> None:
-        for text in at(mistakes, *paths):
-            mistake(text)
 
     def _set(self, path: list[Any], value: Any) -> None:
         data = self._project.data()
@@ -181,12 +233,18 @@ class Form:
     def _write(self, data: dict[str, Any]) -> None:
         self._project.edit(data)
         self._yaml.value = self._project.text
-        self.fields.refresh()
 
     def _typed(self, event: Any) -> None:
         self._project.text = event.value
-        self.verdict.refresh()
-        self.fields.refresh()
+        self._agree()
+        for each in (self.steps, self.verdict, self.picture):
+            each.refresh()
+
+
+@cache
+def _standards() -> list[str]:
+    table = yaml.safe_load((bundled("data") / "standards" / "iso9409-1.yaml").read_text("utf-8"))
+    return [plate["designation"] for plate in table["plates"]]
 
 
 class Import:
@@ -301,6 +359,10 @@ def _plain(text: str) -> Any:
         return text
 
 
-def _standards() -> list[str]:
-    table = yaml.safe_load((bundled("data") / "standards" / "iso9409-1.yaml").read_text("utf-8"))
-    return [plate["designation"] for plate in table["plates"]]
+@cache
+def _models(kind: str) -> dict[str, str]:
+    """Return the bundled arms or scanners: by name, the name and who makes it."""
+    return {
+        path.stem: f"{path.stem} · {read_yaml(path).data.get('maker', '')}"
+        for path in sorted((bundled("data") / kind).glob("*.yaml"))
+    }

@@ -8,19 +8,24 @@ from typing import Any
 import numpy as np
 
 from flangeye.models.coverage import ENOUGH, Coverage
-from flangeye.run.outlook import Outlook
+from flangeye.report.look import LIGHT
 
-USED, ASIDE, FAINT = "#1a7f45", "#c02626", "#8a93a3"
+USED, ASIDE, FAINT = LIGHT["verified"], LIGHT["refused"], LIGHT["axis"]
 LAYERS = ("low", "middle", "high")
 
 
-def residual_chart(found: Outlook | None) -> dict[str, Any]:
-    """Return a bar for the residual of each pose; those set aside are named at their place."""
-    sizes = dict(found.residuals) if found else {}
-    aside = list(found.set_aside) if found else []
-    names = sorted([*sizes, *aside])
+def residual_chart(
+    sizes: Mapping[str, float], aside: Mapping[str, str], limit: float | None = None
+) -> dict[str, Any]:
+    """Return a bar for the error of each pose [m] and the limit; those set aside are marked."""
+    names = sorted({*sizes, *aside})
     bars = [round(1e3 * sizes[n], 4) if n in sizes else None for n in names]
-    crosses = [[n, 0] for n in aside]
+    series: dict[str, Any] = {"type": "bar", "name": "mm", "data": bars, "color": USED}
+    if limit is not None:
+        line = {"yAxis": 1e3 * limit, "lineStyle": {"color": ASIDE}}
+        label = {"formatter": "limit", "color": FAINT, "position": "insideEndTop"}
+        series["markLine"] = {"symbol": "none", "data": [line], "label": label}
+    crosses = [[n, 0] for n in sorted(aside)]
     return {
         "animation": False,
         "grid": {"left": 45, "right": 10, "top": 25, "bottom": 25},
@@ -29,9 +34,10 @@ def residual_chart(found: Outlook | None) -> dict[str, Any]:
         "yAxis": {
             "type": "value", "name": "mm", "nameTextStyle": {"color": FAINT},
             "axisLabel": {"color": FAINT}, "splitLine": {"lineStyle": {"opacity": 0.3}},
+            **({"max": float(f"{1.1e3 * max(limit, *sizes.values()):.2g}")} if limit else {}),
         },
         "series": [
-            {"type": "bar", "name": "residual, mm", "data": bars, "color": USED},
+            series,
             {
                 "type": "scatter", "name": "set aside", "data": crosses, "color": ASIDE,
                 "symbol": "diamond", "symbolSize": 12,

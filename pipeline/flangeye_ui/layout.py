@@ -2,88 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from flangeye.report.look import LIGHT
+from flangeye.report.look import LIGHT, LOGO, css
 
 if TYPE_CHECKING:
     from flangeye_ui.project import Project
 
 STEPS = {
-    "Cell": ("/", "Choose the arm, the scanner and its place. The recipe grows from it."),
-    "Poses": ("/poses", "Check that the arm reaches every pose and that the scanner sees it."),
-    "Scan": ("/scan", "Take the scans. Stop at any time with the button or the space bar."),
+    "Cell": ("/", "Choose the arm, the scanner and how they stand."),
+    "Poses": ("/poses", "Check that the arm reaches every pose and the scanner sees it."),
+    "Scan": ("/scan", "Let the scanner look at the flange from every pose."),
     "Result": ("/result", "See whether the calibration can be trusted, and what would mend it."),
-    "Use": ("/use", "Take the calibration to your system: a file, a copy or a certificate."),
+    "Use": ("/use", "Take the calibration to your system."),
 }
 """The way from an empty folder to an exported file: address, and what to do there."""
 BESIDE = {
+    "Watch": ("/watch", "See whether stored calibrations still hold."),
     "Archive": ("/archive", "Compare the sessions of this folder and look into their scans."),
 }
-SIMULATED = "Simulated: no real arm or scanner. Figures are those of the simulation."
-STYLE = """
-.steps {display: flex; flex-wrap: wrap; gap: .25rem 1.1rem; align-items: center}
-.steps a {color: inherit; text-decoration: none; padding: .35rem .15rem}
-.steps a[aria-current] {font-weight: 700; border-bottom: 3px solid currentColor}
-.brand {font-weight: 700; letter-spacing: -.01em; margin-right: .75rem}
-.number {font-variant-numeric: tabular-nums; font-size: 2.4rem; line-height: 1.1; font-weight: 650}
-.banner {border-left: .4rem solid #a86200; padding: .4rem .75rem; width: 100%}
-body:not(.body--dark) .text-warning {color: #8a5000 !important}
-body.body--dark .text-positive {color: #4cc07f !important}
-body.body--dark .text-negative {color: #ff7b72 !important}
-body.body--dark .text-warning {color: #e3a33c !important}
-body.body--dark .nicegui-link {color: #7db4ee}
-"""
-"""The report's colours where Quasar's lack contrast."""
+SIMULATED = "SIMULATED: no real arm or scanner; the figures are the simulation's."
+STYLE = css() + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+
+
+class Bar:
+    """The bar below a page: how things stand, and the one button that leads on."""
+
+    def __init__(self) -> None:
+        with (
+            ui.footer().classes("bar") as self._footer,
+            ui.row().classes("items-center gap-3 no-wrap w-full"),
+        ):
+            self._said = ui.label().classes("grow").props('role="status"')
+            self._buttons = ui.row().classes("items-center gap-2 justify-end")
+
+        self._footer.set_visibility(False)
+
+    def say(self, text: str) -> None:
+        """Say how things stand, in one line."""
+        self._footer.set_visibility(True)
+        self._said.text = text
+
+    def offer(self, label: str, go: Callable[[], Any], *, second: bool = False) -> ui.button:
+        """Return a button in the bar; of the primary ones a page shows one at a time."""
+        self._footer.set_visibility(True)
+        with self._buttons:
+            button = ui.button(label, on_click=go).props("no-caps")
+        return button.props("outline" if second else "unelevated").classes("act")
+
+    def lead(self, title: str, label: str) -> ui.button:
+        """Return a button that leads to a step."""
+        return self.offer(label, lambda: ui.navigate.to(STEPS[title][0]))
 
 
 @contextmanager
-def page(project: Project, title: str) -> Iterator[None]:
-    """Lay out one page around what is made inside; the next step is offered when one is done."""
+def page(project: Project, title: str) -> Iterator[Bar]:
+    """Lay out one page around what is made inside; yield the bar with its primary button."""
     ui.add_css(STYLE)
+    ui.add_head_html("<script>document.documentElement.lang = 'en'</script>")
     ui.colors(
         primary=LIGHT["link"], positive=LIGHT["verified"], negative=LIGHT["refused"],
         warning=LIGHT["unverified"],
     )  # fmt: skip
     ui.page_title(f"{title} · flangeye")
+    _header(project, title)
+    bar = Bar()
+    with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 page"):
+        with ui.column().classes("gap-0"):
+            ui.label(title).classes("title").props('role="heading" aria-level="1"')
+            ui.label({**STEPS, **BESIDE}[title][1]).classes("what")
+        yield bar
+
+
+def _header(project: Project, title: str) -> None:
     done = project.done()
-    with ui.header().classes("q-py-xs"), ui.element("nav").classes("steps") as nav:
-        nav.props('aria-label="Steps"')
-        ui.label("flangeye").classes("brand")
-        for number, name in enumerate(STEPS, 1):
-            _step(name, f"{number}", name == title, name in done)
-        for name in BESIDE:
-            _step(name, "", name == title, False)
-    with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 q-pa-sm").props('role="main"'):
-        ui.label(title).classes("text-h5").props('role="heading" aria-level="1"')
-        ui.label({**STEPS, **BESIDE}[title][1]).classes("text-body1")
+    with ui.header().classes("head"):
+        with ui.element("nav").props('aria-label="Steps"').classes("ways"):
+            ui.html(f"{LOGO}<span>flangeye</span>", sanitize=False).classes("brand")
+            with ui.element("ol").classes("steps"):
+                for number, name in enumerate(STEPS, 1):
+                    with ui.element("li"):
+                        _way(name, name == title, f"{number}", name in done)
+            with ui.element("ul").classes("beside"):
+                for name in BESIDE:
+                    with ui.element("li"):
+                        _way(name, name == title)
         if project.simulated:
-            ui.label(SIMULATED).classes("banner").props('role="note"')
-        yield
+            ui.label(SIMULATED).classes("simulated").props('role="note"')
 
 
-def _step(name: str, number: str, here: bool, done: bool) -> None:
-    with ui.element("div").classes("row items-center no-wrap gap-1"):
+def _way(name: str, here: bool, number: str = "", done: bool = False) -> None:
+    link = ui.link(target={**STEPS, **BESIDE}[name][0]).classes("done" if done else "")
+    with link:
         if number:
-            ui.label("✓" if done else number).props(f'aria-hidden="{str(not done).lower()}"')
-        link = ui.link(name, {**STEPS, **BESIDE}[name][0])
-        if here:
-            link.props('aria-current="page"')
-
-
-def next_step(title: str, label: str) -> ui.button:
-    """Offer the step that follows, as the page's one primary button."""
-    path = STEPS[title][0]
-    return ui.button(label, on_click=lambda: ui.navigate.to(path)).props("no-caps unelevated")
+            ui.label("✓" if done else number).classes("mark").props('aria-hidden="true"')
+        ui.label(name)
+    if done:
+        link.props('aria-description="done"')
+    if here:
+        link.props('aria-current="page"')
 
 
 def command_line(text: str) -> ui.label:
     """Show a command that does the same, with a button that copies it."""
-    with ui.row().classes("items-center gap-2 no-wrap w-full"):
+    with ui.row().classes("items-center gap-1 no-wrap w-full command"):
         shown = code(text)
         copy = ui.button(icon="content_copy", on_click=lambda: ui.clipboard.write(shown.text))
         copy.props('flat dense size=sm aria-label="Copy the command"')
@@ -103,17 +130,22 @@ def mistake(text: str) -> ui.label:
 async def code_from_terminal() -> str:
     """Ask for the code that the terminal shows; return it, empty where nobody gave one."""
     with ui.dialog() as dialog, ui.card():
-        ui.label("The arm will move. Is its workspace clear of people?")
+        ui.label("The arm will move. Is its workspace clear of people?").classes("title")
         ui.label("The terminal of 'flangeye ui' shows a code for this move.")
-        box = ui.input("Code from the terminal").props("autofocus inputmode=numeric")
-        box.on("keydown.enter", lambda: dialog.submit(box.value))
+        box = ui.input("Code from the terminal").props("autofocus inputmode=numeric outlined")
+        box.on("keydown.enter", lambda: dialog.submit(box.value)).classes("w-full")
         with ui.row():
-            ui.button("Move the arm", on_click=lambda: dialog.submit(box.value), color="negative")
-            ui.button("No", on_click=lambda: dialog.submit("")).props("outline")
+            move = ui.button("Move the arm", on_click=lambda: dialog.submit(box.value))
+            move.props("no-caps unelevated color=negative")
+            ui.button("No", on_click=lambda: dialog.submit("")).props("no-caps outline")
     return str(await dialog or "")
 
 
 def code(text: str) -> ui.label:
     """Show text as it is written: never as markup, whatever is in it."""
-    shown = ui.label(text).classes("font-mono whitespace-pre w-full overflow-x-auto text-caption")
-    return shown.props("tabindex=0")
+    return ui.label(text).classes("code").props('tabindex=0 role="group" aria-label="Text"')
+
+
+def svg(text: str) -> ui.html:
+    """Show a drawing that this program made; its words were escaped when it was made."""
+    return ui.html(text, sanitize=False)

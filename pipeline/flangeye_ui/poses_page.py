@@ -6,20 +6,16 @@ import asyncio
 import json
 from typing import Any, cast
 
-import numpy as np
 from nicegui import events, ui
 
-from flangeye.errors import StageError
-from flangeye.maths.kinematics import Arm
+from flangeye.errors import FlangeyeError
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.recipe.load import Recipe
-from flangeye_ui.layout import code, command_line, mistake, next_step, page
+from flangeye_ui.drawing import base_T_camera_of, box_of
+from flangeye_ui.layout import Bar, code, command_line, mistake, page
 from flangeye_ui.project import Project
-from flangeye_ui.scene import draw_arm, draw_box, draw_frustum, new_scene
-
-HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""How an arm of six joints is drawn that has not said where it stands."""
+from flangeye_ui.scene import Scene3D
 
 
 def add(project: Project) -> None:
@@ -27,62 +23,64 @@ def add(project: Project) -> None:
 
     @ui.page("/poses")
     def poses() -> None:
-        with page(project, "Poses"):
-            ui.label("Nothing moves on this page.")
+        with page(project, "Poses") as bar:
             recipe, mistakes = project.check()
             if recipe is None:
                 mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
+                bar.lead("Cell", "Go to step 1: cell")
                 return
-            Planner(project, recipe)
+            Planner(project, recipe, bar)
 
 
 class Planner:
     """The drawing and the plan beside it."""
 
-    def __init__(self, project: Project, recipe: Recipe) -> None:
-        self._project, self._recipe = project, recipe
+    def __init__(self, project: Project, recipe: Recipe, bar: Bar) -> None:
+        self._project, self._recipe, self._bar = project, recipe, bar
+        self._rows: list[dict[str, Any]] = []
         self._words = ("run", project.recipe_path.name, "--json")
         with ui.row().classes("w-full gap-4"):
-            with ui.column().classes("col-12 col-md-7"):
-                self._scene = new_scene(640, 460)
+            with ui.column().classes("col-12 col-md-7 gap-1"):
+                self._scene = Scene3D(460, hovered=self._hovered)
                 self._draw()
             with ui.column().classes("col-12 col-md gap-2"):
                 self._guess()
+                self._checked = ui.column().classes("w-full gap-2")
                 if recipe.plans:
-                    ui.button("Check poses", on_click=self._plan).props("no-caps unelevated")
-                else:
-                    ui.label("Its poses come from recordings: there is nothing to check.")
-                    next_step("Scan", "Next: scan")
-        self._checked = ui.column().classes("w-full")
-        if recipe.plans:
-            command_line(project.command(*self._words))
+                    command_line(project.command(*self._words))
+        self._check = bar.offer("Check poses", self._plan)
+        self._next = bar.lead("Scan", "Next: scan")
+        self._settle()
+
+    def _settle(self) -> None:
+        """Say how things stand, and show the button that leads on from there."""
+        checked = self._project.planned == self._project.text
+        if not self._recipe.plans:
+            self._bar.say("Its poses come from recordings: there is nothing to check.")
+        elif checked:
+            self._show_poses(self._project.plan)
+        else:
+            self._bar.say("Nothing moves while poses are checked.")
+        self._check.set_visibility(self._recipe.plans and not checked)
+        done = checked or not self._recipe.plans or "Poses" in self._project.done()
+        self._next.set_visibility(done)
 
     def _draw(self) -> None:
         robot, scanner = (self._recipe.context.get(m) for m in (RobotModel, ScannerModel))
         if robot is not None:
-            joints = HOME if Arm(robot).n == 6 else np.zeros(Arm(robot).n)
-            draw_arm(self._scene, robot, joints)
-        limits = self._recipe.header.robot and self._recipe.header.robot.limits
-        if limits:
-            draw_box(self._scene, np.array(limits.box.centre), np.array(limits.box.size), "#d68910")
-        if scanner is not None and robot is not None:
-            try:
-                self._scanner(robot, scanner)
-            except StageError as error:
-                mistake(str(error))
-        self._scene.move_camera(1.35, -1.15, 1.0, 0.3, 0, 0.5)
-
-    def _scanner(self, robot: RobotModel, scanner: ScannerModel) -> None:
-        """Draw what the scanner sees from where it is guessed to stand, or simulated."""
-        view = self._view()
-        if view is None and self._simulated is None:
+            self._scene.arm(robot)
+        if (box := box_of(self._recipe)) is not None:
+            self._scene.box_of(*box)
+        if scanner is None:
             return
-        base_T_camera = view(Arm(robot), scanner) if view else self._simulated.base_T_camera
-        draw_frustum(self._scene, scanner, base_T_camera)
-        with self._scene:
-            ball = self._scene.sphere(0.05).move(*base_T_camera[:3, 3].tolist())
-            ball.material("#3a7ebf").draggable()
-        self._scene.on_drag_end(lambda e: self._dragged(e))
+        try:
+            at = base_T_camera_of(self._recipe)
+        except FlangeyeError as error:
+            mistake(str(error))
+            return
+        if at is not None:
+            self._scene.sees(scanner, at).draggable()
+            self._scene.on_drag_end(self._dragged)
 
     def _view(self) -> Any:
         return getattr(self._recipe.steps[0].params, "view", None)
@@ -151,48 +149,48 @@ class Planner:
 
     async def _plan(self) -> None:
         """Ask the command line for the plan: without --move it shows it and nothing moves."""
-        self._checked.clear()
-        with self._checked:
-            ui.spinner()
+        self._check.disable()
+        self._bar.say("Checking every pose and every path …")
         text = await asyncio.to_thread(self._project.run_command, self._words)
+        self._check.enable()
+        plan = plan_in(text)
         self._checked.clear()
         with self._checked:
-            self._show(text)
+            for line in plan["text"].splitlines():
+                if line.startswith("error: "):
+                    mistake(line.removeprefix("error: "))
+            with ui.expansion("The plan in words").classes("w-full"):
+                code(plan["text"])
+        if plan.get("rows"):
+            self._project.planned, self._project.plan = self._project.text, plan["rows"]
+        self._settle()
+        if not plan.get("rows"):
+            self._bar.say("There is no plan yet: see what is wrong above.")
 
-    def _show(self, text: str) -> None:
-        plan = plan_in(text)
-        for line in plan["text"].splitlines():
-            if line.startswith("error: "):
-                mistake(line.removeprefix("error: "))
-        rows = plan.get("rows", [])
-        if rows:
-            stops = sum(row["id"] is not None for row in rows)
-            motion = f", {plan['seconds']:.0f} s of motion" if plan["seconds"] else ""
-            label = ui.label(f"{stops} poses{motion}")
-            label.classes("text-subtitle1").props('role="status"')
-        code(plan["text"])
-        for row in rows:
-            with self._scene:
-                colour = "#d64545" if row["why_not"] else "#2e9e5b"
-                self._scene.sphere(0.012).move(*row["place"]).material(colour)
-        if rows:
-            self._project.planned = self._project.text
-            next_step("Scan", "Next: scan")
-        barred = [row for row in rows if row["why_not"]]
-        if barred:
-            ui.label(f"{len(barred)} poses are left out (red). Choose one: the picture says why.")
+    def _show_poses(self, rows: list[dict[str, Any]]) -> None:
+        """Draw every pose; say which are left out, and why when one is pointed at or chosen."""
+        self._rows = rows
+        for number, row in enumerate(rows):
+            self._scene.pose(row["place"], not row["why_not"], f"pose {number}")
+        barred = {n: row["why_not"] for n, row in enumerate(rows) if row["why_not"]}
+        taken = len(rows) - len(barred)
+        left = f"; {len(barred)} poses are left out (red)" if barred else ""
+        self._bar.say(f"{taken} poses are taken (green){left}.")
+        if not barred:
+            return
+        with self._checked:
+            ui.label("Point at a red pose, or choose it: the picture says why it is left out.")
             ui.select(
-                {n: row["why_not"] for n, row in enumerate(barred)}, label="Poses left out",
-                on_change=lambda e: self._say(barred[e.value]),
+                {n: f"{n}: {why}" for n, why in barred.items()}, label="Poses left out",
+                on_change=lambda e: self._hovered(f"pose {e.value}"),
             ).classes("w-full")  # fmt: skip
 
-    def _say(self, row: dict[str, Any]) -> None:
+    def _hovered(self, name: str) -> None:
         """Write in the picture why a pose is left out."""
-        self._scene.delete_objects(lambda each: each.name == "reason")
-        with self._scene:
-            x, y, z = row["place"]
-            text = self._scene.text(row["why_not"], "background: #fff; color: #c02626")
-            text.with_name("reason").move(x, y, z + 0.03)
+        number = name.removeprefix("pose ")
+        row = self._rows[int(number)] if number.isdigit() else None
+        why = row["why_not"] if row else ""
+        self._scene.say(why, row["place"] if row else (0.0, 0.0, 0.0))
 
 
 def plan_in(printed: str) -> dict[str, Any]:

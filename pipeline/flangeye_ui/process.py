@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,6 +29,10 @@ from flangeye.types import Floats
 
 POINTS = 20_000
 """Of a scan that are sent to the page."""
+SHOT = (160, 120)
+"""Width and height of a scan's small picture [pixels]."""
+FLANGE = (239, 155, 60)
+"""Colour of the flange in it: blue, green, red."""
 DIE_WITH_PARENT = 1
 """``PR_SET_PDEATHSIG`` of Linux: a run does not outlive its page's server."""
 
@@ -42,7 +47,9 @@ class RunProcess:
         log: The same as values, clouds of whole scans aside.
         outlook: What its poses so far are worth; None before the first was judged.
         cloud: (N, 3) the newest scan, thinned, in the camera [m]; and the flange in it.
-        places: (3,) of the flange in the base [m], by capture; those set aside are named.
+        places: (3,) of the flange in the base [m], by capture.
+        shots: A small picture of each scan with its flange, by capture, as a data URL.
+        began: When it was started, by time.monotonic [s].
         stopped: Why it was stopped from here; empty where it was not.
     """
 
@@ -56,7 +63,8 @@ class RunProcess:
         self.flange: Floats = np.zeros((0, 3))
         self.arrived = 0
         self.places: dict[str, list[float]] = {}
-        self.set_aside: set[str] = set()
+        self.shots: dict[str, str] = {}
+        self.began, self._capture = time.monotonic(), ""
         out = str(self.path.relative_to(folder))
         self.words = ["run", *words, "--out", out, *(["--move"] if move else [])]
         self._process = subprocess.Popen(
@@ -73,6 +81,20 @@ class RunProcess:
     def code(self) -> int | None:
         """The exit code; None while it goes."""
         return self._process.poll()
+
+    @property
+    def set_aside(self) -> dict[str, str]:
+        """Why captures were set aside, by a stage or by the solver, by capture."""
+        by_stages = {each.id: f"{each.stage}: {each.reason}" for each in self.log.rejections}
+        return {**(self.outlook.set_aside if self.outlook else {}), **by_stages}
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that it takes at most, by the pace so far; None where nobody can say."""
+        seen, total = self.view.captures, self.view.total
+        if not seen or not total or self.code is not None:
+            return None
+        return (time.monotonic() - self.began) / seen * max(total - seen, 0)
 
     def stop(self, why: str) -> None:
         """Stop it as Ctrl-C does: the arm's guard hears it at once."""
@@ -108,11 +130,11 @@ class RunProcess:
         time.sleep(0.05)
 
     def _mark(self, message: Message) -> None:
-        """Keep where the flange has been, and what was set aside."""
-        if message.channel.topic == "/capture" and self.view.arm:
-            self.places[json.loads(message.data)["id"]] = self.view.arm[0]
-        elif message.channel.topic == "/rejection":
-            self.set_aside.add(json.loads(message.data)["id"])
+        """Keep where the flange has been, and hear of what was fitted."""
+        if message.channel.topic == "/capture":
+            self._capture = json.loads(message.data)["id"]
+            if self.view.arm:
+                self.places[self._capture] = self.view.arm[0]
         elif message.channel.topic.partition(".")[2].startswith("fit."):
             self._fitted.set()
 
@@ -145,6 +167,7 @@ class RunProcess:
             self.cloud, self.flange = thin, np.zeros((0, 3))
         elif ".segment." in topic:
             self.flange = thin
+        self.shots[self._capture] = picture_of(self.cloud, self.flange)
         self.arrived += 1
 
 
@@ -157,6 +180,26 @@ def thinned(data: bytes) -> Floats:
     some = xyz[:: max(1, len(xyz) // (20 * POINTS))]
     cloud = t.PointCloud(t.CAMERA, some).points()
     return cloud[:: max(1, len(cloud) // POINTS)].astype(np.float64)
+
+
+def picture_of(cloud: Floats, flange: Floats) -> str:
+    """Return a scan as its camera sees it, near light and far dark, its flange blue: a data URL."""
+    import cv2
+
+    image = np.zeros((SHOT[1], SHOT[0], 3), dtype=np.uint8)
+    if len(cloud):
+        rays = cloud[:, :2] / cloud[:, 2:]
+        low, high = rays.min(axis=0), rays.max(axis=0)
+        scale = (np.array(SHOT) - 2) / max(float((high - low).max() / (SHOT[0] / SHOT[1])), 1e-9)
+        depth = np.argsort(-cloud[:, 2])
+        shade = np.interp(cloud[:, 2], np.quantile(cloud[:, 2], [0.02, 0.98]), [235, 70])
+        for points, colour in ((cloud[depth], shade[depth, None]), (flange, FLANGE)):
+            at = ((points[:, :2] / points[:, 2:] - low) * scale.min()).astype(int)
+            inside = ((at >= 0) & (at < np.array(SHOT) - 1)).all(axis=1)
+            values = np.broadcast_to(colour, (len(points), 3))[inside]
+            for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                image[at[inside, 1] + y, at[inside, 0] + x] = values
+    return "data:image/png;base64," + b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
 
 
 class _EndedError(Exception):

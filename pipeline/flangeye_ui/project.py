@@ -60,14 +60,15 @@ class Project:
         codes: What the terminal shows and a move asks for.
         run: The run that was started here last, if any.
         owner: The page that started it.
-        planned: The recipe whose poses were checked last.
+        ran: The recipe that it was started with.
+        planned: The recipe whose poses were checked last, and its poses.
     """
 
     def __init__(self, folder: Path, registry: Registry, codes: MoveCodes) -> None:
         self.folder, self.registry, self.codes = folder, registry, codes
         self.run: RunProcess | None = None
-        self.owner = ""
-        self.planned = ""
+        self.owner, self.ran = "", ""
+        self.planned, self.plan = "", list[dict[str, Any]]()
         if not self.recipe_path.exists():
             self.recipe_path.write_text(NEW, encoding="utf-8")
 
@@ -207,7 +208,7 @@ class Project:
         if code is not None:
             self.codes.spend(code, words, owner)
         self.run = RunProcess(self.folder, words, code is not None, self.registry)
-        self.owner = owner
+        self.owner, self.ran = owner, self.text
 
     def page_gone(self, page: str, why: str = "the page was closed") -> None:
         """Stop an arm that moves for a page that is not there any more."""

@@ -9,22 +9,38 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+import yaml
 from nicegui import ui
 
 from flangeye.doctor import examine, open_session
 from flangeye.doctor.diagnosis import Finding
 from flangeye.errors import FlangeyeError
+from flangeye.models.robots import RobotModel
 from flangeye.report.account import set_aside_of
 from flangeye.report.facts import Facts
-from flangeye.report.summary import banner_of, tiles_of, transform_text
-from flangeye.report.units import millimetres
+from flangeye.report.look import SERIES
+from flangeye.report.still import scene_of
+from flangeye.report.summary import banner_of, transform_text
+from flangeye.report.units import rounded_mm
 from flangeye.result import expected_error
 from flangeye.run.outlook import Outlook, outlook_of_log
-from flangeye_ui.charts import coverage_drawing
-from flangeye_ui.layout import code, command_line, mistake, next_step, page, warning
+from flangeye_ui.charts import coverage_drawing, residual_chart
+from flangeye_ui.layout import Bar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
+from flangeye_ui.scan_view import ScanView
+from flangeye_ui.scene import RIM, Scene3D, outline_of
 
-TONES = {"verified": "text-positive", "unverified": "text-warning"}
+LIGHTS = {
+    "verified": ("good", "✓", "Can be used"),
+    "unverified": ("fair", "!", "Check it before use"),
+    "incomplete": ("fair", "…", "Not finished"),
+}
+"""By verdict: tone, sign and words of the light; anything else is red."""
+RED = ("poor", "✕", "Do not use")
+ARROW = 0.3
+"""The longest residual is drawn at most so long [m]."""
+Show = Callable[[Project, Path, Facts, Bar], None]
 
 
 def add(project: Project) -> None:
@@ -32,90 +48,221 @@ def add(project: Project) -> None:
 
     @ui.page("/result")
     def result(run: str = "") -> None:
-        with page(project, "Result"):
-            chosen_run(project, run, "/result", _show)
+        with page(project, "Result") as bar:
+            chosen_run(project, run, "/result", bar, _show)
 
 
-Show = Callable[[Project, Path, Facts], None]
-
-
-def chosen_run(project: Project, run: str, address: str, show: Show) -> None:
+def chosen_run(project: Project, run: str, address: str, bar: Bar, show: Show) -> None:
     """Let a run be chosen, the newest at first, and show it."""
     runs = project.runs()
     chosen = next((r for r in runs if r.name == run), runs[0] if runs else None)
     if chosen is None:
-        ui.label("There is no run yet.")
-        next_step("Scan", "Go to step 3: scan")
+        bar.say("There is no run yet.")
+        bar.lead("Scan", "Go to step 3: scan")
         return
+    place = ui.column().classes("w-full gap-3")
     ui.select(
-        [r.name for r in runs], value=chosen.name, label="Run", with_input=True,
+        [r.name for r in runs], value=chosen.name, label="Another run", with_input=True,
         on_change=lambda e: ui.navigate.to(f"{address}?run={quote(e.value)}"),
     ).classes("w-full")  # fmt: skip
-    place = ui.column().classes("w-full gap-3")
-    ui.timer(0.05, lambda: _load(project, chosen, place, show), once=True)
+    ui.timer(0.05, lambda: _load(project, chosen, place, bar, show), once=True)
 
 
-async def _load(project: Project, run: Path, place: ui.column, show: Show) -> None:
+async def _load(project: Project, run: Path, place: ui.column, bar: Bar, show: Show) -> None:
     """Read the log aside, so that the page answers meanwhile, and show it."""
     with place:
         spinner = ui.spinner()
         try:
             facts = await asyncio.to_thread(project.read, run)
-            show(project, run, facts)
+            show(project, run, facts, bar)
         except FlangeyeError as error:
             mistake(str(error))
         spinner.delete()
 
 
-def _show(project: Project, run: Path, facts: Facts) -> None:
+def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
+    with ui.row().classes("w-full gap-6 items-start"):
+        with ui.column().classes("col-12 col-md-5 gap-3"):
+            _light(facts)
+            _warnings(project, facts)
+        with ui.column().classes("col-12 col-md gap-1"):
+            _by_pose(facts)
+    with ui.expansion("The matrix", value=True).classes("w-full"):
+        _matrix(facts)
+    if notes := facts.result.provenance.notes:
+        with ui.expansion("What the solver noted").classes("w-full"):
+            for note in notes:
+                ui.label(note).classes("note")
+    with ui.expansion("In 3D: fitted rims and residuals").classes("w-full") as in_3d:
+        in_3d.on_value_change(lambda e: _in_3d(project, in_3d, facts) if e.value else None)
+    with ui.expansion("What would make it better", value=True).classes("w-full"):
+        Better(project, run, facts)
+    with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:
+        Doctor(project, run, box)
+    bar.say(f"{run.name}: {LIGHTS.get(banner_of(facts).kind, RED)[2].lower()}.")
+    if facts.result.transforms and not facts.result.refused:
+        bar.lead("Use", "Next: use it")
+    else:
+        bar.lead("Scan", "Scan again")
+
+
+def _light(facts: Facts) -> None:
+    """Show one light and one number: what it means, its 95 %, and the limit."""
     found = banner_of(facts)
-    tone = TONES.get(found.kind, "text-negative")
-    ui.label(f"{found.label}: {found.sentence}").classes(f"text-h6 {tone}").props('role="status"')
-    for line in warnings_of(facts):
-        warning(line)
-    expected = expected_error(facts.result)
-    if expected is not None:
-        ui.label(f"{millimetres(expected[0])} mm").classes("number")
-        ui.label("expected error at the work, rms")
-    if facts.result.transforms:
-        next_step("Use", "Next: use it")
-    with ui.tabs().props("dense align=left no-caps").classes("w-full") as tabs:
-        for name in ("Result", "Doctor"):
-            ui.tab(name)
-    with ui.tab_panels(tabs, value="Result").classes("w-full").props("keep-alive"):
-        with ui.tab_panel("Result").classes("q-px-none gap-3"):
-            _matrix(facts)
-            Better(project, run, facts)
-        with ui.tab_panel("Doctor").classes("q-px-none gap-3"):
-            Doctor(project, run)
+    tone, sign, words = LIGHTS.get(found.kind, RED)
+    with ui.element("div").classes(f"card w-full {tone}"):
+        with ui.row().classes("items-center gap-5 no-wrap"):
+            ui.label(sign).classes("light").props('aria-hidden="true"')
+            with ui.column().classes("gap-0"):
+                ui.label(words).classes("title said")
+                _number(facts)
+        ui.label(f"{found.label}: {found.sentence}").classes("q-mt-sm").props('role="status"')
+
+
+def _number(facts: Facts) -> None:
+    expected, limit = expected_error(facts.result), limit_of(facts)
+    if expected is None:
+        ui.label("No error could be estimated.")
+        return
+    rms, p95 = expected
+    ui.label(f"{rounded_mm(rms)} mm").classes("number")
+    ui.label("error to expect at the work, rms")
+    if p95 is not None:
+        ui.label(f"95 % of errors are below {rounded_mm(p95)} mm")
+    if limit is not None:
+        ui.label(f"limit of the recipe: {rounded_mm(limit)} mm, rms on poses held out")
+
+
+def limit_of(facts: Facts) -> float | None:
+    """Return the largest error on poses held out that the recipe lets pass [m], if it has one."""
+    held = facts.result.holdout
+    return held.figures.get("limit") if held else None
+
+
+def _by_pose(facts: Facts) -> None:
+    """Show the error of each pose; a click on one opens its scan."""
+    found = next((v.errors for v in facts.result.verifications.values() if v.errors), None)
+    what = "Error of each pose, held out" if found else "Residual of each pose"
+    ui.label(what).classes("part").props('role="heading" aria-level="2"')
+    aside = {each.id: each.reason or "not used" for each in facts.set_aside}
+    chart = residual_chart(found or facts.residuals, aside, limit_of(facts))
+    names = chart["xAxis"]["data"]
+    if not names:
+        ui.label("No pose was measured.")
+        return
+    bars = ui.echart(chart, on_point_click=lambda e: opened.set_value(e.name))
+    bars.classes("w-full h-56").props('role="img"').props["aria-label"] = what
+    opened: ui.select = ui.select(names, label="Open the scan of a pose", with_input=True).classes(
+        "w-full"
+    )
+    place = ui.column().classes("w-full gap-1")
+
+    def look(pose: str | None) -> None:
+        place.clear()
+        if pose is not None:
+            with place:
+                ScanView(facts.log).show(pose)
+
+    opened.on_value_change(lambda e: look(e.value))
+
+
+def _warnings(project: Project, facts: Facts) -> None:
+    """Show what whoever uses the matrix has to know, and the button that mends it."""
+    for each in facts.result.warnings:
+        warning(each.text)
+        code(each.fix)
+        if line := _line_of(project, each.fix):
+            ui.button("Write it into the recipe", on_click=partial(_apply, project, line)).props(
+                "no-caps outline"
+            )
+    for text in warnings_of(facts):
+        warning(text)
+
+
+def _line_of(project: Project, fix: str) -> dict[str, Any] | None:
+    """Return a warning's cure as a line of the recipe, where it is one."""
+    try:
+        found = yaml.safe_load(fix)
+    except yaml.YAMLError:
+        return None
+    line = found[0] if isinstance(found, list) and len(found) == 1 else found
+    known = {*project.registry.stages, *project.data()}
+    if not isinstance(line, dict) or not all(isinstance(v, dict) for v in line.values()):
+        return None
+    return line if set(line) <= known else None
+
+
+def _apply(project: Project, line: dict[str, Any]) -> None:
+    for name, params in line.items():
+        project.write_line(name, params)
+    ui.notify("Written into the recipe. Scan again to see what it does.")
 
 
 def warnings_of(facts: Facts) -> list[str]:
-    """Return what whoever uses the matrix has to know first."""
+    """Return what a log says of itself and of its captures."""
     aside = [f"{count} set aside: {why}" for count, _, why in set_aside_of(facts).counts]
     return [*facts.log.notes, *aside]
 
 
 def _matrix(facts: Facts) -> None:
-    with ui.row().classes("gap-6"):
-        for figure in tiles_of(facts):
-            with ui.column().classes("gap-0"):
-                ui.label(figure.name).classes("text-caption")
-                ui.label(f"{figure.value} {figure.unit}").classes("text-h6")
-                ui.label(figure.note).classes("text-caption")
     for name, estimate in facts.result.transforms.items():
         text = transform_text(name, estimate)
-        ui.label(f"{text.name} {text.meaning}")
+        ui.label(f"{text.name} {text.meaning}.")
+        with ui.row().classes("gap-x-6 gap-y-1"):
+            ui.label(f"x, y, z: {', '.join(text.translation)} mm")
+            ui.label(f"roll, pitch, yaw: {', '.join(text.rotation)}°")
         code(text.matrix)
-    for note in facts.result.provenance.notes:
-        ui.label(note).classes("text-caption")
+        copy = partial(ui.clipboard.write, text.matrix)
+        ui.button("Copy the matrix", icon="content_copy", on_click=copy).props("flat no-caps")
+    if not facts.result.transforms:
+        ui.label("There is none.")
+
+
+def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
+    """Draw the fitted rims where the calibration puts them, and what is left at each, enlarged."""
+    pose = facts.base_T_camera
+    box.clear()
+    with box:
+        if pose is None:
+            ui.label("There is no scanner that stands in the base to draw.")
+            return
+        scene = Scene3D(420)
+        _cell(project, scene, facts)
+        for entry in facts.log.of_kind("fit"):
+            scene.cloud(outline_of(entry.value) @ pose[:3, :3].T + pose[:3, 3], RIM, 0.004)
+        times = _residuals(scene, facts)
+        ui.label(
+            f"Fitted rims red, in the base; residuals as arrows, {times:.0f} times their length: "
+            "blue of poses that were used, orange of others."
+        ).classes("note")
+
+
+def _cell(project: Project, scene: Scene3D, facts: Facts) -> None:
+    """Draw scanner and arm; the arm where it is the recipe's, whose shape is served."""
+    found, (recipe, _) = scene_of(facts), project.check()
+    if found is None:
+        return
+    if found.scanner is not None and found.base_T_camera is not None:
+        scene.sees(found.scanner, found.base_T_camera)
+    if recipe and found.robot is not None and recipe.context.get(RobotModel) == found.robot:
+        scene.arm(found.robot, found.joints)
+
+
+def _residuals(scene: Scene3D, facts: Facts) -> float:
+    """Draw what is left at each pose as an arrow; return how many times its length it has."""
+    left = [(o.tcp_in_base, o.residual_in_base, o.used) for o in facts.measured]
+    arrows = [(np.array(p), np.array(r), used) for p, r, used in left if p and r]
+    longest = max((float(np.linalg.norm(r)) for _, r, used in arrows if used), default=0.0)
+    times = float(10.0 ** np.floor(np.log10(ARROW / longest))) if longest else 1.0
+    for place, residual, used in arrows:
+        scene.arrow(place, times * residual, SERIES["used" if used else "unused"])
+    return times
 
 
 class Better:
     """What would make the calibration better: the motion that is missing."""
 
     def __init__(self, project: Project, run: Path, facts: Facts) -> None:
-        ui.label("What would make it better").classes("text-h6")
         self._place = ui.column().classes("w-full gap-1")
         command_line(project.command("show", "--outlook", str(run.relative_to(project.folder))))
         self._log, self._registry = facts.log, project.registry
@@ -132,20 +279,23 @@ class Better:
             if not found.missing and not found.better:
                 ui.label("The poses reach every side of the work, turned both ways.")
             if found.coverage:
-                ui.html(coverage_drawing(found.coverage), sanitize=False).classes("w-full")
+                svg(coverage_drawing(found.coverage)).classes("w-full")
 
 
 class Doctor:
     """The doctor's findings, each with a button that writes the line it gives into the recipe."""
 
-    def __init__(self, project: Project, run: Path) -> None:
-        self._project, self._run = project, run
-        ui.button("Ask the doctor", on_click=self._ask).props("outline")
+    def __init__(self, project: Project, run: Path, box: ui.expansion) -> None:
+        self._project, self._run, self._asked = project, run, False
+        box.on_value_change(self._ask)
         self._told = ui.column().classes("w-full gap-1")
         command_line(project.command("doctor", str(run.relative_to(project.folder))))
 
     async def _ask(self) -> None:
-        self._told.clear()
+        """Ask once, when the box is opened."""
+        if self._asked:
+            return
+        self._asked = True
         with self._told:
             ui.spinner()
         try:
@@ -174,9 +324,4 @@ class Doctor:
             for number, line in enumerate(found.lines, 1):
                 which = f" (choice {number})" if len(found.lines) > 1 else ""
                 label = f"Write {next(iter(line))} into the recipe{which}"
-                ui.button(label, on_click=partial(self._apply, line)).props("no-caps")
-
-    def _apply(self, line: dict[str, Any]) -> None:
-        for name, params in line.items():
-            self._project.write_line(name, params)
-        ui.notify("written into the recipe; look at step 1, Cell, then scan again")
+                ui.button(label, on_click=partial(_apply, self._project, line)).props("no-caps")

@@ -12,21 +12,22 @@ from nicegui import Client, ui
 
 from flangeye.errors import StageError
 from flangeye_ui.charts import coverage_drawing, place_chart, residual_chart
-from flangeye_ui.layout import code_from_terminal, command_line, mistake, next_step, page
+from flangeye_ui.drawing import drawing_of
+from flangeye_ui.layout import Bar, code_from_terminal, command_line, mistake, page, svg
 from flangeye_ui.process import RunProcess
 from flangeye_ui.project import Project
-from flangeye_ui.scene import draw_cloud, new_scene, outline_of
+from flangeye_ui.scene import EARLIER, FLANGE, RIM, SCAN, SCANNED, Scene3D, outline_of
 
 EVERY = 0.25
 """Between two looks at the run [s]."""
 SILENCE = 5.0
 """A page that is not heard of for so long is taken for dead, and its arm is stopped [s]."""
-SCAN, FLANGE, RIM, EARLIER = (
-    (0.12, 0.14, 0.18),
-    (0.02, 0.20, 0.75),
-    (0.85, 0.1, 0.1),
-    (0.5, 0.6, 0.5),
-)
+BEFORE = {
+    True: "The arm moves its flange from pose to pose before the scanner. Keep people out of its "
+    "workspace. Starting asks for a code that the terminal shows.",
+    False: "No arm moves. Each scan is shown when it arrives, with what became of it.",
+}
+"""What is about to happen, by whether an arm moves."""
 BEAT = "setInterval(() => emitEvent('beat'), 500)"
 
 
@@ -35,63 +36,73 @@ def add(project: Project) -> None:
 
     @ui.page("/scan")
     def scan(client: Client) -> None:
-        with page(project, "Scan"):
-            Panel(project, client)
+        with page(project, "Scan") as bar:
+            Panel(project, client, bar)
 
 
 class Panel:
     """What is seen of the run, and the buttons that start and stop it."""
 
-    def __init__(self, project: Project, client: Client) -> None:
-        self._project, self._me, self._heard, self._shown = project, client.id, time.monotonic(), -1
-        recipe, mistakes = project.check()
-        self._said: list[Any] = []
-        self._recipe = recipe
-        self._live = bool(recipe) and recipe.steps[0].stage.name == "acquire.live"  # type: ignore[union-attr]
+    def __init__(self, project: Project, client: Client, bar: Bar) -> None:
+        self._project, self._me, self._bar = project, client.id, bar
+        self._heard, self._shown, self._said = time.monotonic(), tuple[Any, ...](), list[Any]()
+        self._shown_run: RunProcess | None = None
+        self._cards: dict[str, tuple[ui.element, Any]] = {}
+        self._recipe, mistakes = project.check()
+        first = self._recipe.steps[0].stage.name if self._recipe else ""
+        self._live = first == "acquire.live"
         if mistakes:
             mistake(f"The recipe has {len(mistakes)} errors; see step 1, Cell.")
         self._buttons(sound=not mistakes)
-        self._state = ui.label().props('role="status"').classes("text-subtitle1")
-        with ui.row().classes("w-full gap-4 items-start"):
-            with ui.column().classes("col-12 col-md-5 gap-1"):
-                self._worth = ui.column().classes("gap-1 w-full")
-                self._rows = ui.column().classes("gap-1 w-full")
-            with ui.column().classes("col-12 col-md gap-1"):
-                self._pictures()
-        command_line(project.command("run", *self._words()))
-        self._pose = OnePose(self)
+        self._before = ui.row().classes("w-full gap-4 items-center")
+        with self._before:
+            svg(drawing_of(project)).classes("picture col-12 col-md-6")
+            ui.label(BEFORE[self._live]).classes("col-12 col-md what")
+        self._during = ui.column().classes("w-full gap-3")
+        with self._during:
+            self._views()
+        words = [project.recipe_path.name, *(["--move"] if self._live else [])]
+        self._line = command_line(project.command("run", *words))
         self._watch(client)
 
     def _buttons(self, sound: bool) -> None:
-        with ui.row().classes("items-center gap-3"):
-            self._start = ui.button(
-                "Start: the arm moves" if self._live else "Start scanning", on_click=self._begin
-            ).props("no-caps unelevated")
-            self._start.set_enabled(sound)
-            self._halt = ui.button("Stop (space bar)", on_click=self._stop, color="negative")
-            self._halt.props('aria-keyshortcuts="Space" no-caps').classes("text-h6")
-            self._on = next_step("Result", "See the result")
-            self._resume_button = ui.button("Resume", on_click=self._resume).props("outline")
+        offer = self._bar.offer
+        self._resume_button = offer("Resume", self._resume, second=True)
+        self._take = offer("Take over", self._take_over, second=True)
+        label = "Start: the arm moves" if self._live else "Start scanning"
+        self._start = offer(label, self._begin)
+        self._start.set_enabled(sound)
+        self._start_again = offer("Scan again", self._begin, second=True)
+        self._on = self._bar.lead("Result", "See the result")
+        self._halt = offer("Stop (space bar)", self._stop)
+        self._halt.props('aria-keyshortcuts="Space"')
         ui.keyboard(on_key=self._key)
 
-    def _pictures(self) -> None:
-        self._scene = new_scene(600, 330, fps=5)
-        self._scene.move_camera(0.0, -0.15, 0.25, 0, 0, 0.8, 0, -1, 0)
-        with ui.column().classes("w-full gap-1") as self._of_poses:
-            ui.label("Residual of each pose so far").classes("text-caption")
-            self._bars = ui.echart(residual_chart(None)).classes("w-full h-40")
-            ui.label("Where the flange has been, from above (base, mm)").classes("text-caption")
+    def _views(self) -> None:
+        self._progress = ui.linear_progress(0.0, show_value=False, size="10px")
+        self._progress.props('aria-label="Captures"')
+        self._left = ui.label().props("aria-live=polite")
+        with ui.row().classes("w-full gap-4 items-start"):
+            with ui.column().classes("col-12 col-md-6 gap-1"):
+                self._scene = Scene3D(330, SCANNED)
+                ui.label("The newest scan: flange blue, its rim as fitted red.").classes("note")
+            with ui.column().classes("col-12 col-md gap-1"):
+                self._worth = ui.column().classes("gap-1 w-full")
+        ui.label("Scans").classes("part").props('role="heading" aria-level="2"')
+        self._shots = ui.element("div").classes("shots")
+        with ui.expansion("Residuals, places and what was logged").classes("w-full"):
+            ui.label("Residual of each pose so far").classes("note")
+            self._bars = ui.echart(residual_chart({}, {})).classes("w-full h-40")
+            ui.label("Where the flange has been, from above (base, mm)").classes("note")
             self._map = ui.echart(place_chart({}, set())).classes("w-full h-48")
-        self._of_poses.set_visibility(False)
-
-    def _words(self) -> list[str]:
-        return [self._project.recipe_path.name, *(["--move"] if self._live else [])]
+            self._rows = ui.column().classes("gap-1 w-full")
 
     def _watch(self, client: Client) -> None:
         """Look at the run, and at whether this page still lives."""
         ui.on("beat", self._beat)
         client.on_disconnect(lambda: self._project.page_gone(self._me))
         ui.timer(0.1, lambda: ui.run_javascript(BEAT), once=True)
+        self._look()
         ui.timer(EVERY, self._look)
 
     def _beat(self, _: Any) -> None:
@@ -105,6 +116,9 @@ class Panel:
         if self._project.run:
             self._project.run.stop("stopped on this page")
 
+    def _take_over(self) -> None:
+        self._project.owner = self._me
+
     async def _begin(self) -> None:
         await self.begin([self._project.recipe_path.name], self._live)
 
@@ -117,6 +131,7 @@ class Panel:
         if self._running or self._project.elsewhere():
             ui.notify("a run is under way; stop it first", type="warning")
             return
+        self._line.text = self._project.command("run", *words, *["--move"] * moves)
         code = None
         if moves:
             self._project.codes.ask(words, self._me)
@@ -127,52 +142,55 @@ class Panel:
             self._project.begin(words, self._me, code)
         except StageError as error:
             ui.notify(str(error), type="negative")
-        self._shown = -1
-
-    @property
-    def project(self) -> Project:
-        """What the page is about."""
-        return self._project
-
-    @property
-    def live(self) -> bool:
-        """Whether the recipe drives an arm."""
-        return self._live
-
-    @property
-    def solver(self) -> str:
-        """Name of the recipe's solve step."""
-        steps = self._recipe.steps if self._recipe else ()
-        return next((s.stage.name for s in steps if s.stage.kind == "solve"), "solve.robust")
 
     @property
     def _running(self) -> bool:
         return bool(self._project.run) and self._project.run.code is None  # type: ignore[union-attr]
 
     def _look(self) -> None:
-        run = self._project.run
-        if self._running and time.monotonic() - self._heard > SILENCE:
+        run, running = self._project.run, self._running
+        if running and time.monotonic() - self._heard > SILENCE:
             self._project.page_gone(self._me, f"the page was silent for {SILENCE:g} s")
-        self._halt.set_visibility(self._running)
-        self._on.set_visibility(run is not None and run.code in (0, 1))
-        left = self._project.unfinished()
+        left, other = self._project.unfinished(), self._project.elsewhere()
+        shown = run is not None and not (other and run.code is not None)
+        ended = shown and run is not None and run.code in (0, 1)
+        ended = ended and self._project.ran == self._project.text
+        self._halt.set_visibility(running)
+        _enlarge(self._halt, running and run is not None and run.moves)
+        self._take.set_visibility(running and self._project.owner != self._me)
+        self._start.set_visibility(not running and not ended)
+        self._start_again.set_visibility(bool(ended))
+        self._on.set_visibility(bool(ended))
         self._resume_button.set_visibility(left is not None)
-        other = self._project.elsewhere()
-        if run is None or (other and run.code is not None):
-            self._state.text = _nothing(left, other)
+        self._before.set_visibility(not shown)
+        if shown and not self._during.visible:
+            ui.timer(0.1, self._scene.fit, once=True)
+        self._during.set_visibility(shown)
+        if run is None or not shown:
+            self._bar.say(_nothing(left, other))
             return
-        self._state.text = status_line(run, self._project.owner == self._me)
+        self._bar.say(status_line(run, self._project.owner == self._me))
         self._show(run)
 
     def _show(self, run: RunProcess) -> None:
-        said = [*run.view.rows(), *run.view.events, run.code, run.outlook]
+        seconds, view = run.left, run.view
+        self._progress.value = view.captures / view.total if view.total else 0.0
+        if run.code is not None:
+            self._progress.value = 1.0
+        rest = "" if seconds is None else f", {_time(seconds)} left at most"
+        self._left.text = f"{view.captures} of at most {view.total or '?'} scans{rest}"
+        if not view.captures and run.code is None:
+            self._left.text = "Getting ready …"
+        said = [*view.rows(), *view.events, run.code, run.outlook]
         if said != self._said:
             self._said = said
             self._tell(run)
             self._judge(run)
-        if run.arrived != self._shown:
-            self._shown = run.arrived
+        if (run.path, run.arrived, run.code) != self._shown:
+            self._shown = (run.path, run.arrived, run.code)
             self._draw(run)
+        for capture, picture in {**dict.fromkeys(run.set_aside, ""), **run.shots}.items():
+            self._shot(run, capture, picture)
 
     def _tell(self, run: RunProcess) -> None:
         self._rows.clear()
@@ -181,80 +199,106 @@ class Panel:
                 if label != "error so far" or run.view.progress or not run.outlook:
                     ui.label(f"{label}: {text}")
             for line in run.view.events:
-                ui.label(line).classes("text-caption")
-            if run.code:
-                for line in [x for x in run.said if x.startswith("error: ")]:
-                    mistake(line.removeprefix("error: "))
+                ui.label(line).classes("note")
 
     def _judge(self, run: RunProcess) -> None:
-        """Show what the poses so far are worth."""
+        """Show what the poses so far are worth, and each scan with its verdict."""
         found = run.outlook
-        self._bars.options.update(residual_chart(found))
+        self._bars.options.update(residual_chart(found.residuals if found else {}, run.set_aside))
         self._bars.update()
         self._worth.clear()
-        if found is None:
-            return
         with self._worth:
+            for line in [x for x in run.said if run.code and x.startswith("error: ")]:
+                mistake(line.removeprefix("error: "))
+            if run.view.next and run.code is None:
+                ui.label("Next pose: " + ": ".join(filter(None, run.view.next)))
+            if found is None:
+                return
             for line in found.lines()[len(found.residuals) + len(found.set_aside) :]:
                 ui.label(line).classes("text-warning" if line.startswith("missing") else "")
             if found.coverage:
-                ui.html(coverage_drawing(found.coverage), sanitize=False).classes("w-full")
+                svg(coverage_drawing(found.coverage)).classes("w-full")
             command_line(self._project.command("show", "--outlook", f"runs/{run.path.name}"))
-        self._pose.offer([*found.residuals, *found.set_aside, *sorted(run.set_aside)])
 
     def _draw(self, run: RunProcess) -> None:
-        self._of_poses.set_visibility(True)
-        self._map.options.update(place_chart(run.places, run.set_aside))
+        self._map.options.update(place_chart(run.places, set(run.set_aside)))
         self._map.update()
-        self._scene.clear()
-        draw_cloud(self._scene, run.cloud[::4], SCAN, 0.006)
-        draw_cloud(self._scene, run.flange, FLANGE, 0.004)
+        self._scene.wipe()
+        self._scene.cloud(run.cloud[::4], SCAN, 0.006)
+        self._scene.cloud(run.flange, FLANGE, 0.004)
         rims = [outline_of(entry.value) for entry in run.log.of_kind("fit")]
         if rims:
-            draw_cloud(self._scene, rims[-1], RIM, 0.006)
-            draw_cloud(self._scene, np.vstack([np.zeros((0, 3)), *rims[:-1]]), EARLIER, 0.003)
+            self._scene.cloud(rims[-1], RIM, 0.006)
+            self._scene.cloud(np.vstack([np.zeros((0, 3)), *rims[:-1]]), EARLIER, 0.003)
+        if run is not self._shown_run:
+            self._shown_run = run
+            self._shots.clear()
+            self._cards.clear()
 
-
-class OnePose:
-    """A pose of the run that ended: take it again, or do without it, by a command that is shown."""
-
-    def __init__(self, panel: Panel) -> None:
-        self._panel = panel
-        self._box = ui.column().classes("w-full gap-1")
-        with self._box:
-            ui.label("Mend a pose").classes("text-h6")
-            self._which = ui.select([], label="Pose", on_change=self._chosen).classes("w-40")
-            self._does = ui.column().classes("w-full gap-1")
-        self._box.set_visibility(False)
-
-    def offer(self, poses: list[str]) -> None:
-        """Let one of these be chosen, once the run has ended."""
-        run = self._panel.project.run
-        ended = run is not None and run.code is not None
-        self._box.set_visibility(ended and bool(poses))
-        if sorted(poses) != self._which.options:
-            self._which.set_options(sorted(poses), value=None)
-
-    def _chosen(self) -> None:
-        self._does.clear()
-        run, pose = self._panel.project.run, self._which.value
-        if run is None or pose is None:
+    def _shot(self, run: RunProcess, capture: str, picture: str) -> None:
+        """Show one scan with its verdict; when the run has ended, what can be done about it."""
+        tone, verdict = verdict_on(run, capture)
+        state = (tone, verdict, picture, run.code)
+        card, before = self._cards.get(capture, (None, None))
+        if state == before:
             return
-        where = f"runs/{run.path.name}"
-        recipe = self._panel.project.recipe_path.name
-        without = [recipe, "--from", f"{where}/run.mcap", "--at", self._panel.solver]
-        with self._does:
-            self._offer("Do without it", [*without, "--leave-out", pose], False)
-            if self._panel.live:
-                self._offer("Take it again", ["--resume", where, "--retake", pose], True)
+        if card is None:
+            with self._shots:
+                card = ui.element("div")
+        self._cards[capture] = card, state
+        card.classes(replace=f"shot {tone}").clear()
+        with card:
+            if picture:
+                ui.element("img").props('alt=""').props["src"] = picture
+            ui.label(f"{capture}: {verdict}")
+            if run.code is not None:
+                self._offers(run, capture)
 
-    def _offer(self, label: str, words: list[str], moves: bool) -> None:
+    def _offers(self, run: RunProcess, capture: str) -> None:
+        where, recipe = f"runs/{run.path.name}", self._project.recipe_path.name
+        without = [recipe, "--from", f"{where}/run.mcap", "--at", self._solver]
+        if capture not in run.set_aside:
+            self._mend("Leave out", capture, [*without, "--leave-out", capture], moves=False)
+        if self._live:
+            again = ["--resume", where, "--retake", capture]
+            self._mend("Take again", capture, again, moves=True)
+
+    def _mend(self, label: str, capture: str, words: list[str], moves: bool) -> None:
         async def go() -> None:
-            await self._panel.begin(words, moves)
+            await self.begin(words, moves)
 
-        with ui.row().classes("items-center w-full gap-2"):
-            ui.button(label, on_click=go).props("outline")
-            command_line(self._panel.project.command("run", *words, *["--move"] * moves))
+        button = ui.button(label, on_click=go).props("flat dense no-caps")
+        button.props(f'aria-label="{label} {capture}"')
+
+    @property
+    def _solver(self) -> str:
+        """Name of the recipe's solve step."""
+        steps = self._recipe.steps if self._recipe else ()
+        return next((s.stage.name for s in steps if s.stage.kind == "solve"), "solve.robust")
+
+
+def _enlarge(halt: ui.button, moving: bool) -> None:
+    """Make the stop button large and red, only while something can move."""
+    large, small = "unelevated color=negative", "outline color=primary"
+    halt.props(large if moving else small, remove="outline" if moving else "unelevated")
+    halt.classes(**({"add": "halt"} if moving else {"remove": "halt"}))
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def verdict_on(run: RunProcess, capture: str) -> tuple[str, str]:
+    """Return tone and words of what became of a capture so far."""
+    if capture in run.set_aside:
+        return "poor", f"set aside: {run.set_aside[capture]}"
+    residuals = run.outlook.residuals if run.outlook else {}
+    if capture in residuals:
+        return "good", f"used, residual {1e3 * residuals[capture]:.2f} mm"
+    if run.log.poses.get(capture, {}).get("role") == "verification":
+        return "good", "kept for verification"
+    fitted = any(entry.capture == capture for entry in run.log.of_kind("fit"))
+    return "good", "fitted" if fitted else "…"
 
 
 def _nothing(left: Path | None, other: Path | None) -> str:
@@ -271,5 +315,7 @@ def status_line(run: RunProcess, mine: bool) -> str:
     if run.code is None:
         where = "" if mine else "; another page started it"
         return f"{run.path.name} runs{where}."
-    ended = {0: "done", 1: "the calibration was refused"}.get(run.code, "ended early")
-    return f"{run.path.name}: {run.stopped or ended} (exit code {run.code})."
+    ended = {0: "Done", 1: "The calibration was refused; the result says why"}
+    why = f": {run.stopped}" if run.stopped else ""
+    early = f"{run.path.name} ended early{why} (exit code {run.code})"
+    return ended.get(run.code, early) + "."

@@ -1,77 +1,164 @@
-"""The cell in 3D: arm, box, scanner and what it saw, drawn from the recipe and the log."""
+"""The cell in 3D: floor, axes, arm, box, scanner, poses and what was seen of the flange."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from nicegui import ui
+from nicegui import events, ui
 
 from flangeye.maths.geometry import basis_of_plane
-from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
+from flangeye.report.look import LIGHT, SERIES
+from flangeye.report.still import frustum, ready
 from flangeye.types import CircleFeature, Feature, Floats
+from flangeye_ui.shapes import address_of_arm
 
-BALLS = 5
-"""A capsule is drawn as so many balls."""
 ROUND = 90
 """Points that a circle is drawn with."""
-
+FLOOR, SQUARES = 4, 16
+"""Edge of the floor [m], and squares along it."""
+AXES = 0.25
+"""Length of the base's axes [m]."""
+Point = tuple[float, float, float]
+View = tuple[Point, Point, Point]
+"""Where the camera stands, where it looks [m], and the direction that is up."""
+CELL: dict[str, View] = {
+    name: (eye, (0.35, 0.0, 0.4), (0.0, 0.0, 1.0))
+    for name, eye in {
+        "Overview": (1.2, -1.1, 0.95), "Front": (1.9, 0.0, 0.5), "Side": (0.35, -1.6, 0.5),
+        "Top": (0.35, -0.01, 1.9),
+    }.items()
+}  # fmt: skip
+"""Views of a cell in its base."""
+SCANNED: dict[str, View] = {
+    "From the scanner": ((0.0, -0.02, 0.2), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
+    "From the side": ((0.7, -0.1, 0.8), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
+}
+"""Views of a scan in its camera, whose y points down."""
+SCAN, FLANGE, RIM = (0.12, 0.14, 0.18), (0.02, 0.20, 0.75), (0.85, 0.1, 0.1)
+EARLIER = (0.5, 0.6, 0.5)
+"""Colours of clouds: red, green, blue; the rims of earlier scans are pale."""
 DARK = "body.body--dark .scene canvas {filter: invert(0.88) hue-rotate(180deg)}"
 """At night what is light is dark and colours keep their hue: a scene has one background only."""
 
 
-def new_scene(width: int, height: int, fps: int = 20) -> ui.scene:
-    """Return an empty scene as wide as its column, which follows the page into the dark."""
-    ui.add_css(DARK)
-    scene = ui.scene(width=width, height=height, fps=fps, background_color="#eef1f5")
-    return scene.classes("w-full scene")
+class Scene3D(ui.scene):
+    """A scene with axes and views to choose from; of a cell also with a floor in squares."""
 
+    def __init__(
+        self,
+        height: int,
+        views: Mapping[str, View] = CELL,
+        hovered: Callable[[str], None] | None = None,
+    ) -> None:
+        """Make one as wide as its column; ``hovered`` hears which named thing is pointed at."""
+        ui.add_css(DARK)
+        self._hovered, self._last, self._of = hovered, "", views
+        super().__init__(
+            width=640, height=height, fps=20, background_color=LIGHT["panel"],
+            grid=(FLOOR, SQUARES) if views is CELL else False, on_click=self._pointed,
+            click_events=["click", "mousemove"] if hovered else ["click"],
+        )  # fmt: skip
+        self.classes("w-full scene").style(f"height: {height}px")
+        self.props('role="img" aria-label="The cell in 3D"')
+        with self:
+            for axis, name in enumerate("xyz"):
+                tip = np.eye(3)[axis] * AXES
+                self.line([0, 0, 0], tip.tolist()).material(SERIES[name])
+                self.text(name, f"color: {SERIES[name]}").move(*(1.12 * tip).tolist())
+        self._stays = set(self.objects)
+        self._views()
+        self.look(next(iter(views)))
 
-def draw_arm(scene: ui.scene, robot: RobotModel, joints: Floats) -> None:
-    """Draw the arm's capsules; where the model has none, its links as lines."""
-    frames, robot = Arm(robot).frames(joints), robot.filled()
-    with scene:
-        for volume in robot.volumes:
-            frame = frames[volume.link]
-            along = np.linspace(np.array(volume.start), np.array(volume.end), BALLS)
-            places = frame[:3, :3] @ along.T + frame[:3, 3:]
-            for place in places.T.tolist():
-                scene.sphere(volume.radius).move(*place).material("#9aa4b4")
-        if not robot.volumes:
-            draw_lines(scene, frames[:, :3, 3], "#9aa4b4")
+    def _views(self) -> None:
+        scale = f"floor: squares of {1e3 * FLOOR / SQUARES:.0f} mm; " if self._of is CELL else ""
+        with ui.row().classes("items-center gap-1 w-full"):
+            for name in self._of:
+                button = ui.button(name, on_click=lambda name=name: self.look(name))
+                button.props("flat dense no-caps")
+            ui.label(f"{scale}axes: {1e3 * AXES:.0f} mm; drag to turn").classes("note")
 
+    def wipe(self) -> None:
+        """Take everything away but the axes."""
+        self.delete_objects(lambda each: each.id not in self._stays)
 
-def draw_box(scene: ui.scene, centre: Floats, size: Floats, colour: str) -> None:
-    """Draw the edges of a box."""
-    width, depth, height = np.asarray(size).tolist()
-    with scene:
-        box = scene.box(width, depth, height, wireframe=True)
-        box.move(*np.asarray(centre).tolist()).material(colour)
+    def fit(self) -> None:
+        """Take the size of the column, after it was hidden."""
+        self.run_method("resize")
 
+    def look(self, view: str) -> None:
+        """Look from one of the views."""
+        eye, middle, up = self._of[view]
+        self.move_camera(*eye, *middle, *up, 0.0)
 
-def draw_frustum(scene: ui.scene, scanner: ScannerModel, base_T_camera: Floats) -> None:
-    """Draw what the scanner can see."""
-    half = np.tan(np.array(scanner.field_of_view) / 2)
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    rims = [
-        np.column_stack([signs * half * depth, np.full(5, depth)])
-        for depth in (scanner.near, scanner.far)
-    ]
-    placed = [rim @ base_T_camera[:3, :3].T + base_T_camera[:3, 3] for rim in rims]
-    for rim in placed:
-        draw_lines(scene, rim, "#3a7ebf")
-    for near, far in zip(*placed, strict=True):
-        draw_lines(scene, np.stack([near, far]), "#3a7ebf")
+    def _pointed(self, event: events.SceneClickEventArguments) -> None:
+        name = next((hit.object_name for hit in event.hits if hit.object_name), "")
+        if self._hovered and name != self._last:
+            self._last = name
+            self._hovered(name)
 
+    def arm(self, robot: RobotModel, joints: Floats | None = None) -> None:
+        """Draw the arm, with these joint values or ready to be scanned."""
+        with self:
+            body = self.stl(address_of_arm(ready(robot) if joints is None else joints))
+            body.material("#aab4c3")
 
-def draw_lines(scene: ui.scene, points: Floats, colour: str) -> None:
-    """Draw lines from point to point."""
-    with scene:
-        for start, end in pairwise(np.asarray(points).tolist()):
-            scene.line(start, end).material(colour)
+    def box_of(self, centre: Floats, size: Floats) -> None:
+        """Draw the edges of the box that the arm keeps to [m]."""
+        width, depth, height = np.asarray(size).tolist()
+        with self:
+            box = self.box(width, depth, height, wireframe=True)
+            box.move(*np.asarray(centre).tolist()).material(SERIES["unused"])
+
+    def sees(self, scanner: ScannerModel, base_T_camera: Floats) -> Any:
+        """Draw what the scanner can see, and return the ball that stands for it."""
+        near, far = frustum(scanner, base_T_camera)
+        rays = [np.stack([base_T_camera[:3, 3], corner]) for corner in far[:4]]
+        for line in (near, far, *rays):
+            self.lines(line, SERIES["used"])
+        with self:
+            ball = self.sphere(0.05).move(*base_T_camera[:3, 3].tolist())
+        return ball.material(SERIES["used"])
+
+    def lines(self, points: Floats, colour: str) -> None:
+        """Draw lines from point to point."""
+        with self:
+            for start, end in pairwise(np.asarray(points).tolist()):
+                self.line(start, end).material(colour)
+
+    def arrow(self, place: Floats, along: Floats, colour: str) -> None:
+        """Draw an arrow from a place [m]."""
+        self.lines(np.stack([place, place + along]), colour)
+        across, other, tip = basis_of_plane(along)
+        if np.isfinite(tip).all():
+            with self:
+                cone = self.cylinder(0.0, 0.006, 0.018).move(*(place + along).tolist())
+                cone.rotate_R(np.column_stack([across, tip, -other]).tolist()).material(colour)
+
+    def pose(self, place: Sequence[float], taken: bool, name: str) -> None:
+        """Draw a pose of the flange, green where it is taken and red where it is left out."""
+        with self:
+            ball = self.sphere(0.014).move(*place).with_name(name)
+            ball.material("#2e9e5b" if taken else "#d64545")
+
+    def say(self, text: str, place: Sequence[float]) -> None:
+        """Write in the picture, in place of what was written last."""
+        self.delete_objects(lambda each: each.name == "said")
+        if text:
+            with self:
+                shown = self.text(text, f"background: #fff; color: {LIGHT['refused']}")
+                x, y, z = place
+                shown.with_name("said").move(x, y, z + 0.05)
+
+    def cloud(self, points: Floats, colour: tuple[float, ...], size: float = 0.002) -> None:
+        """Draw a cloud in one colour, its points of a size [m]."""
+        with self:
+            colours = np.tile(colour, (len(points), 1))
+            self.point_cloud(points.tolist(), colours.tolist(), point_size=size)
 
 
 def outline_of(feature: Feature) -> Floats:
@@ -82,12 +169,3 @@ def outline_of(feature: Feature) -> Floats:
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     radius = max(feature.radii.values())
     return np.asarray(feature.centre + radius * ring @ basis_of_plane(feature.normal)[:2])
-
-
-def draw_cloud(
-    scene: ui.scene, points: Floats, colour: tuple[float, float, float], size: float = 0.002
-) -> Any:
-    """Draw a cloud in one colour, its points of a size [m], and return it."""
-    with scene:
-        colours = np.tile(colour, (len(points), 1))
-        return scene.point_cloud(points.tolist(), colours.tolist(), point_size=size)

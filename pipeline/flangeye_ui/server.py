@@ -22,12 +22,17 @@ from flangeye_ui import (
     poses_page,
     result_page,
     scan_page,
+    shapes,
     use_page,
-)  # fmt: skip
+    watch_page,
+)
 from flangeye_ui.gate import Gate, Keys
 from flangeye_ui.permission import MoveCodes
 from flangeye_ui.project import Project
 
+PAGES = (
+    cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, shapes,
+)  # fmt: skip
 OPENS = "<!doctype html><meta http-equiv=refresh content='0;url={}'><title>flangeye</title>"
 
 
@@ -50,7 +55,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
     at = f"http://{f'[{host}]' if ':' in host else host}:{port}/?token="
     keys = Keys(lambda token: say(f"for another browser, once: {at}{token}"))
     project = Project(folder.resolve(), registry, MoveCodes(say))
-    for each in (cell_page, poses_page, scan_page, result_page, use_page, archive_page):
+    for each in PAGES:
         each.add(project)
     foreign.add(project.folder)
     app.add_middleware(Gate, keys=keys, host=host, port=port)

@@ -9,11 +9,13 @@ from nicegui import ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.written import write_whole
+from flangeye.report.certificate.budget import Conditions
+from flangeye.report.certificate.page import render
 from flangeye.report.exports import exported
 from flangeye.report.facts import Facts
 from flangeye.types import ExportedFile
 from flangeye_ui.foreign import address_of
-from flangeye_ui.layout import code, command_line, mistake, next_step, page
+from flangeye_ui.layout import Bar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
 
@@ -23,42 +25,50 @@ def add(project: Project) -> None:
 
     @ui.page("/use")
     def use(run: str = "") -> None:
-        with page(project, "Use"):
-            chosen_run(project, run, "/use", _show)
+        with page(project, "Use") as bar:
+            chosen_run(project, run, "/use", bar, _show)
 
 
-def _show(project: Project, run: Path, facts: Facts) -> None:
+def _show(project: Project, run: Path, facts: Facts, bar: Bar) -> None:
     formats = project.registry.exports()
     files = exported(facts.result, formats)
     if not files:
         mistake("This run has no calibration to use: see step 4, Result.")
-        next_step("Result", "Go to the result")
+        bar.lead("Result", "Go to the result")
         return
     told = {stage.name.partition(".")[2]: stage.summary for stage in formats}
-    Systems(project, run, {name: (told[name], file) for name, file in files.items()})
-    with ui.expansion("Certificate").classes("w-full"):
-        _certificate(project, run)
+    Systems(project, run, {name: (told[name], file) for name, file in files.items()}, bar)
+    with ui.expansion("Certificate: who, where and how warm, and what it says").classes(
+        "w-full"
+    ) as x:
+        Certificate(project, run, facts, x)
 
 
 class Systems:
     """The systems that take the calibration: searched, looked at, copied, downloaded."""
 
     def __init__(
-        self, project: Project, run: Path, files: dict[str, tuple[str, ExportedFile]]
+        self, project: Project, run: Path, files: dict[str, tuple[str, ExportedFile]], bar: Bar
     ) -> None:
-        self._project, self._run, self._files = project, run, files
+        self._project, self._run, self._files, self._bar = project, run, files, bar
+        self._file: ExportedFile | None = None
         with ui.row().classes("w-full gap-4 items-start"):
             with ui.column().classes("col-12 col-md-5 gap-1"):
                 box = ui.input("Search your system", on_change=lambda e: self._search(e.value))
                 box.classes("w-full").props("outlined dense clearable autofocus")
                 box.on("keydown.enter", self._first)
                 self._none = ui.label("No system has these words.").props('role="status"')
-                with ui.list().props("bordered separator").classes("w-full systems"):
+                with ui.list().props(LIST).classes("w-full systems"):
                     self._items = {name: self._item(name) for name in files}
             self._preview = ui.column().classes("col-12 col-md gap-2")
+        self._copy = bar.offer("Copy", self._to_clipboard, second=True)
+        self._download = bar.offer("Download", self._save)
+        for each in (self._copy, self._download):
+            each.disable()
+        bar.say("Choose your system.")
         self._search("")
         with self._preview:
-            ui.label("Choose your system: what it takes is shown here.")
+            ui.label("Choose your system: the file that it takes is shown here.")
 
     def _item(self, name: str) -> ui.item:
         with ui.item(on_click=lambda: self._choose(name)) as item, ui.item_section():
@@ -85,61 +95,87 @@ class Systems:
             item.props(
                 add="active" if each == name else "", remove="" if each == name else "active"
             )
-        file = self._files[name][1]
+        self._file = file = self._files[name][1]
         words = ["export", str(self._run.relative_to(self._project.folder)), "--to", name]
+        self._bar.say(f"{file.name} for {name.replace('_', ' ')}")
+        for button in (self._copy, self._download):
+            button.enable()
         self._preview.clear()
         with self._preview:
-            ui.label(file.name).classes("text-h6")
+            ui.label(file.name).classes("part").props('role="heading" aria-level="2"')
             ui.label(file.use)
-            with ui.row().classes("gap-2"):
-                ui.button("Download", icon="download", on_click=lambda: self._save(file)).props(
-                    "no-caps unelevated"
-                )
-                ui.button(
-                    "Copy", icon="content_copy", on_click=lambda: ui.clipboard.write(file.text)
-                ).props("no-caps outline")
             code(file.text)
             command_line(self._project.command(*words))
 
-    def _save(self, file: ExportedFile) -> None:
+    def _to_clipboard(self) -> None:
+        if self._file:
+            ui.clipboard.write(self._file.text)
+            ui.notify("Copied.")
+
+    def _save(self) -> None:
         """Write the file where the command would, and hand it to the browser."""
-        path = self._run / "exports" / file.name
+        if self._file is None:
+            return
+        path = self._run / "exports" / self._file.name
         try:
-            write_whole(path, file.text)
+            write_whole(path, self._file.text)
         except FlangeyeError as error:
             ui.notify(str(error), type="negative")
             return
-        ui.download.content(file.text, file.name)
-        ui.notify(f"Written: {path.relative_to(self._project.folder)}", type="positive")
+        ui.download.content(self._file.text, self._file.name)
+        self._bar.say(f"Written: {path.relative_to(self._project.folder)}")
 
 
-def _certificate(project: Project, run: Path) -> None:
-    """Let the certificate be written, with what only a person knows of the place."""
-    where = run.relative_to(project.folder)
-    asked = {
-        "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
-        "place": "Where it was done", "operator": "Who did it",
-    }  # fmt: skip
-    boxes: dict[str, ui.input] = {}
+LIST = 'bordered separator role="group" aria-label="Systems"'
+ASKED = {
+    "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
+    "place": "Where it was done", "operator": "Who did it",
+}  # fmt: skip
+"""What only a person knows of the place: option of the command, and what it is called."""
 
-    def words() -> list[str]:
-        given = {key: box.value for key, box in boxes.items() if box.value}
-        options = [f"--{key}={value}" for key, value in given.items()]
-        return ["certificate", str(where), *options]
 
-    async def write() -> None:
-        said = await asyncio.to_thread(project.run_command, [*words(), "--no-pdf"])
-        if said.startswith("error: "):
-            mistake(said.removeprefix("error: "))
+class Certificate:
+    """The certificate: what a person adds, what it will say, and the file."""
+
+    def __init__(self, project: Project, run: Path, facts: Facts, box: ui.expansion) -> None:
+        self._project, self._run, self._facts = project, run, facts
+        with ui.row().classes("w-full gap-4"):
+            self._boxes = {key: ui.input(label).classes("w-64") for key, label in ASKED.items()}
+        for each in self._boxes.values():
+            each.on("change", self._preview)
+        with ui.row().classes("items-center gap-4"):
+            ui.button("Write the certificate", on_click=self._write).props("no-caps outline")
+            there = address_of(project.folder, run / "certificate.html")
+            self._link = ui.link("Open the certificate", there, new_tab=True)
+        self._link.set_visibility((run / "certificate.html").exists())
+        self._line = command_line(project.command(*self._words()))
+        self._frame = ui.element("iframe").classes("preview")
+        self._frame.props('sandbox="" title="The certificate"')
+        box.on_value_change(self._preview)
+
+    def _words(self) -> list[str]:
+        given = {key: box.value for key, box in self._boxes.items() if box.value}
+        where = str(self._run.relative_to(self._project.folder))
+        return ["certificate", where, *(f"--{key}={value}" for key, value in given.items())]
+
+    async def _preview(self) -> None:
+        """Show what it will say: without scripts, in an origin of its own."""
+        self._line.text = self._project.command(*self._words())
+        given = {key: box.value or "" for key, box in self._boxes.items()}
+        try:
+            warm, spread = (
+                float(given[k]) if given[k] else None for k in ("temperature", "spread")
+            )
+            conditions = Conditions(warm, spread, given["place"], given["operator"])
+            page = await asyncio.to_thread(render, self._facts, conditions)
+        except (ValueError, FlangeyeError) as error:
+            ui.notify(str(error), type="negative")
             return
-        line.text = project.command(*words())
-        link.set_visibility(True)
+        self._frame.props["srcdoc"] = page
 
-    with ui.row().classes("w-full gap-4"):
-        for key, label in asked.items():
-            boxes[key] = ui.input(label).classes("w-64")
-    ui.button("Write the certificate", on_click=write)
-    there = address_of(project.folder, run / "certificate.html")
-    link = ui.link("Open the certificate", there, new_tab=True)
-    link.set_visibility((run / "certificate.html").exists())
-    line = command_line(project.command(*words()))
+    async def _write(self) -> None:
+        said = await asyncio.to_thread(self._project.run_command, [*self._words(), "--no-pdf"])
+        if said.startswith("error: "):
+            ui.notify(said, type="negative")
+            return
+        self._link.set_visibility(True)

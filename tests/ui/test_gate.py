@@ -225,17 +225,17 @@ def entered(browser: Any, served: Served) -> Any:
 
 def test_a_hostile_run_reaches_nothing_from_the_archive(browser: Any, hostile: Served) -> None:
     page = entered(browser, hostile)
-    page.get_by_role("link", name="Archive", exact=True).click()
-    page.get_by_role("heading", name="Archive", exact=True).wait_for()
-    page.wait_for_timeout(3000)
-    assert page.title() == "Archive · flangeye"
-    assert page.locator("iframe, img[src=x]").count() == 0
-    for name in ("report", "monitor"):
+    for room, name in (("Archive", "report"), ("Watch", "monitor")):
+        page.get_by_role("link", name=room, exact=True).click()
+        page.get_by_role("heading", name=room, exact=True).wait_for()
+        page.wait_for_timeout(3000)
+        assert page.title() == f"{room} · flangeye"
+        assert page.locator("iframe, img[src=x]").count() == 0
         with page.context.expect_page() as opened:
             page.get_by_role("link", name=f"runs/evil/{name}.html").click()
         opened.value.wait_for_timeout(6000)
         assert opened.value.title().strip() == "got:", name  # its script ran, and reached nothing
-    assert page.title() == "Archive · flangeye"
+        assert page.title() == f"{room} · flangeye"
     assert not [line for line in hostile.said if line.startswith("code ")]
 
 

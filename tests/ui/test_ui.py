@@ -1,6 +1,7 @@
 """The page in a real browser: from an empty folder to an exported file, and its bad days.
 
-With FLANGEYE_PICTURES=1 the pictures in docs/images are made again.
+With FLANGEYE_PICTURES=1 the pictures that docs/how-to/page.md shows are made again; with a folder,
+those of every step, in it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from tests.doctor.sessions import clean
 from tests.doctor.test_cures import write
 from tests.ui.conftest import Served, ended, serve
 
-PICTURES = Path(__file__).parents[2] / "docs" / "images"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "how-to" / "page.md"
+PICTURES = DOCUMENT.parents[1] / "images"
 SMALL = """title: A small cell
 robot: {model: ur5}
 scanner: {model: phoxi-m}
@@ -60,6 +62,7 @@ steps:
 SHOWN = """180 deg, -90 deg, 90 deg, -90 deg, -90 deg, 0 deg
 185 deg, -90 deg, 95 deg, -95 deg, -90 deg, 0 deg
 175 deg, -80 deg, 90 deg, -100 deg, -90 deg, 0 deg"""
+START = re.compile("^(Start|Scan again)")
 URDF = """<robot name="kr6"> <link name="base_link"/> <link name="l1"/> <link name="tool0"/>
 <joint name="a1" type="revolute"> <parent link="base_link"/> <child link="l1"/>
 <origin xyz="0 0 0.4"/> <axis xyz="0 0 -1"/> <limit lower="-2" upper="2"/> </joint>
@@ -68,10 +71,12 @@ URDF = """<robot name="kr6"> <link name="base_link"/> <link name="l1"/> <link na
 
 
 def shot(page: Any, name: str) -> None:
-    if os.environ.get("FLANGEYE_PICTURES"):
-        PICTURES.mkdir(exist_ok=True)
+    """Make the picture again, where the page in the documents shows one of this name."""
+    asked = os.environ.get("FLANGEYE_PICTURES", "")
+    if asked and (asked != "1" or f"ui_{name}.png" in DOCUMENT.read_text("utf-8")):
         page.wait_for_timeout(1500)
-        page.screenshot(path=PICTURES / f"ui_{name}.png")
+        folder = PICTURES if asked == "1" else Path(asked)
+        page.screenshot(path=folder / f"ui_{name}.png")
 
 
 def opened(browser: Any, served: Served, **options: Any) -> Any:
@@ -131,24 +136,23 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     page.evaluate("window.scrollTo(0, 0)")
     write_recipe(page, SMALL)
     page.get_by_text("The recipe is valid.").wait_for()
-    shot(page, "cell")
     go(page, "Scan")
-    page.get_by_role("button", name=re.compile("^Start")).click()
+    page.get_by_role("button", name=START).click()
     page.get_by_text("runs.").wait_for()
-    page.get_by_text("expected error at the work").wait_for(timeout=120_000)
-    assert slowest_answer(served) < 0.1
+    page.get_by_text("expected error at the work").first.wait_for(timeout=120_000)
+    page.get_by_text(re.compile("of at most 8 scans, .* left at most")).wait_for()
+    assert slowest_answer(served) < 0.1 * crowd()
     page.get_by_text("error to expect: 95 % below").wait_for(timeout=120_000)
-    page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
-    page.get_by_text("fitted 0007").wait_for()
+    page.get_by_text("Done.", exact=True).wait_for(timeout=180_000)
+    page.get_by_text(re.compile("^0007: used, residual ")).wait_for()
+    assert page.locator(".shot img").count() == 8
     page.get_by_role("img").get_by_text("turned about, ±30°").wait_for()
-    shot(page, "scan")
     go(page, "Result")
     page.get_by_text("Verified: ").wait_for()
     page.get_by_text("What would make it better").wait_for()
     page.get_by_text("cells of the work; turned").wait_for(state="attached")
-    shot(page, "result")
     go(page, "Use")
-    page.get_by_text("Certificate", exact=True).click()
+    page.get_by_text("Certificate: who").click()
     page.get_by_label("Who did it").fill("a person")
     page.get_by_role("button", name="Write the certificate").click()
     page.get_by_role("link", name="Open the certificate").wait_for()
@@ -157,7 +161,6 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     page.get_by_role("button", name="ur", exact=True).click()
     page.get_by_text("--to ur", exact=False).wait_for()
     page.evaluate("window.scrollTo(0, 0)")
-    shot(page, "use")
     with page.expect_download() as download:
         page.get_by_role("button", name="Download").click()
     assert "p[" in Path(download.value.path()).read_text()
@@ -173,15 +176,13 @@ def test_a_pose_is_left_out_by_the_command_that_is_shown(browser: Any, served: S
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Scan")
     page.get_by_role("status").filter(has_text=re.compile(r"\S")).wait_for()
-    if not page.get_by_text("done (exit code 0)").count():
-        page.get_by_role("button", name=re.compile("^Start")).click()
-        page.get_by_text("done (exit code 0)").wait_for(timeout=180_000)
-    page.get_by_label("Pose", exact=True).click()
-    page.get_by_role("option", name="0004").click()
-    page.get_by_text("--at solve.robust --leave-out").wait_for()
-    page.get_by_role("button", name="Do without it").click()
-    page.get_by_text("set aside 0004: acquire: left out by --leave-out").wait_for()
-    page.get_by_text("done (exit code 0)").wait_for()
+    if not page.get_by_text("Done.", exact=True).count():
+        page.get_by_role("button", name=START).click()
+        page.get_by_text("Done.", exact=True).wait_for(timeout=180_000)
+    page.get_by_role("button", name="Leave out 0004").click()
+    page.get_by_text("--at solve.robust --leave-out 0004").wait_for()
+    page.get_by_text("0004: set aside: acquire: left out by --leave-out").wait_for()
+    page.get_by_text("Done.", exact=True).wait_for()
     newest = max(served.folder.glob("runs/*/result.json"), key=lambda p: p.stat().st_mtime)
     aside = [o["id"] for o in json.loads(newest.read_text())["observations"] if not o["used"]]
     assert "0004" in aside
@@ -195,22 +196,21 @@ def test_the_doctors_button_mends_the_recipe(browser: Any, served: Served) -> No
     write_recipe(page, SAMPLES)
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Scan")
-    page.get_by_role("button", name=re.compile("^Start")).click()
-    page.get_by_text("refused (exit code 1)").wait_for()
+    page.get_by_role("button", name=START).click()
+    page.get_by_text("The calibration was refused").wait_for()
     go(page, "Result")
-    page.get_by_role("tab", name="Doctor").click()
-    page.get_by_role("button", name="Ask the doctor").click()
+    page.get_by_text("Ask the doctor what is wrong").click()
     page.get_by_text("pose direction").wait_for()
     shot(page, "doctor")
     page.get_by_role("button", name="Write configuration into the recipe (choice 1)").wait_for()
     page.get_by_role("button", name="Write acquire.samples into the recipe (choice 2)").click()
-    page.get_by_text("written into the recipe").wait_for()
+    page.get_by_text("Written into the recipe").wait_for()
     step = yaml.safe_load((served.folder / "cell.yaml").read_text())["steps"][0]["acquire.samples"]
     assert Path(step["path"]).name == "samples"
     assert step["reader"] != "moveit" or set(step) > {"path", "reader", "position_noise"}
     go(page, "Scan")
-    page.get_by_role("button", name=re.compile("^Start")).click()
-    page.get_by_text("done (exit code 0)").wait_for()
+    page.get_by_role("button", name=START).click()
+    page.get_by_text("Done.", exact=True).wait_for()
 
 
 @pytest.mark.slow
@@ -224,7 +224,6 @@ def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
     place.press("Tab")
     page.wait_for_load_state()
     page.get_by_role("heading", name="Poses").wait_for()
-    shot(page, "poses")
     assert "600 mm" in (served.folder / "cell.yaml").read_text()
     page.get_by_text("Or show three poses").click()
     page.get_by_label("Joint angles of three poses").fill(SHOWN)
@@ -256,12 +255,22 @@ def test_poses_that_cannot_be_reached_are_red(browser: Any, served: Served) -> N
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Poses")
     page.wait_for_timeout(1000)
-    assert not red_pixels(page)
+    before = red_pixels(page)  # the base's x axis
     page.get_by_role("button", name="Check poses").click()
-    page.get_by_text(re.compile("poses are left out")).wait_for()
+    page.get_by_text(re.compile("poses are left out")).first.wait_for()
     page.wait_for_timeout(1000)
-    assert red_pixels(page)
+    assert red_pixels(page) > before + 50
     shot(page, "poses_barred")
+
+
+def test_a_recipe_that_is_wrong_opens_with_its_mistakes(browser: Any, served: Served) -> None:
+    (served.folder / "cell.yaml").write_text(SMALL.replace("0.25", "quarter"))
+    page = opened(browser, served)
+    page.get_by_text("to mend in the recipe.").wait_for()
+    page.locator(".q-field--error", has_text="resolution").get_by_text("quarter").wait_for()
+    assert page.get_by_role("button", name="Next: check the poses").is_disabled()
+    page.get_by_label("Search the settings").fill("noise")
+    page.locator(".q-field--error", has_text="resolution").wait_for(state="hidden")
 
 
 def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
@@ -269,6 +278,7 @@ def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     write_recipe(page, SMALL)
     page.get_by_text("The recipe is valid.").wait_for()
+    page.get_by_text("Not in the lists?").click()
     page.get_by_text("Import an arm").click()
     page.get_by_label("Name of the arm").fill("kr6")
     page.get_by_label("Its URDF file, in this folder").fill("nowhere.urdf")
@@ -286,6 +296,7 @@ def test_an_arm_is_imported_from_its_urdf(browser: Any, served: Served) -> None:
 def test_a_scanner_is_imported(browser: Any, served: Served) -> None:
     page = opened(browser, served)
     write_recipe(page, SMALL)
+    page.get_by_text("Not in the lists?").click()
     page.get_by_text("Import a scanner").click()
     page.get_by_label("Name of the scanner").fill("eye7")
     for label, value in (
@@ -321,20 +332,28 @@ def test_the_archive_compares_runs_batches_and_checks(
     go(page, "Archive")
     page.get_by_role("cell", name=finished.name).wait_for()
     page.get_by_role("cell", name="monday").wait_for()
-    page.get_by_role("link", name=f"runs/{finished.name}/monitor.html").wait_for()
-    page.get_by_text(f"flangeye monitor runs/{finished.name} --archive NEW").wait_for()
     page.get_by_label("Run", exact=True).click()
     page.get_by_role("option", name=finished.name).click()
     page.get_by_text(re.compile(r"^capture 0000: ")).wait_for()
     page.locator(".q-slider__track-container").press("ArrowRight")
     page.get_by_text(re.compile(r"^capture 0001: used, residual ")).wait_for()
     shot(page, "archive")
+    page.get_by_role("link", name=finished.name, exact=True).click()
+    page.get_by_role("heading", name="Result", exact=True).wait_for()
+    go(page, "Watch")
+    page.get_by_role("link", name=f"runs/{finished.name}/monitor.html").wait_for()
+    page.get_by_text("flangeye monitor runs/").first.wait_for()
     assert page.problems == []
 
 
+def crowd() -> float:
+    """Return how many programs compete for a core, at least 1: a bound by the clock grows so."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 def slowest_answer(served: Served) -> float:
-    """Return the longest of ten answers while scans are being processed [s], the best of three."""
-    return min(max(_answer(served) for _ in range(10)) for _ in range(3))
+    """Return the longest of five answers while scans are being processed [s], the best of nine."""
+    return min(max(_answer(served) for _ in range(5)) for _ in range(9))
 
 
 def _answer(served: Served) -> float:
@@ -354,7 +373,6 @@ def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None
         go(page, name)
         page.wait_for_timeout(500)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, name
-        shot(page, f"narrow_dark_{name.lower()}")
     assert page.evaluate("document.body.classList.contains('body--dark')")
     filtered = "getComputedStyle(document.querySelector('.scene canvas')).filter"
     assert "invert" in page.evaluate(filtered)
@@ -362,19 +380,22 @@ def test_narrow_dark_and_by_keyboard_alone(browser: Any, served: Served) -> None
     for _ in range(12):
         page.keyboard.press("Tab")
         reached.add(page.evaluate("document.activeElement.innerText"))
-    assert {"Cell", "Poses", "Scan", "Result", "Use", "Archive"} <= reached
-    assert any("START" in str(text).upper() for text in reached)
+    reached = {str(text).split("\n")[-1] for text in reached}
+    assert {"Cell", "Poses", "Scan", "Result", "Use", "Watch", "Archive"} <= reached
+    press_until(page, "Start scanning", "Scan again")
 
 
-def press_until(page: Any, name: str, key: str = "Tab") -> None:
-    """Press a key until what is focused has this text or label; in a row of tabs, ArrowRight."""
+def press_until(page: Any, *names: str) -> None:
+    """Press Tab until what is focused has one of these texts or labels."""
     focused = "[document.activeElement.innerText, document.activeElement.ariaLabel]"
     for _ in range(120):
-        page.keyboard.press(key)
+        page.keyboard.press("Tab")
         texts = [str(text).strip().upper().split("\n")[-1] for text in page.evaluate(focused)]
-        if name.upper() in texts:  # an icon's name stands before its button's
+        if {name.upper() for name in names} & set(
+            texts
+        ):  # an icon's name stands before its button's
             return
-    raise AssertionError(f"no {key} leads to {name}")
+    raise AssertionError(f"no Tab leads to {names}")
 
 
 @pytest.mark.slow
@@ -387,9 +408,10 @@ def test_a_calibration_by_keyboard_alone(browser: Any, served: Served) -> None:
     press_until(page, "Scan")
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="Scan", exact=True).wait_for()
-    press_until(page, "Start scanning")
+    press_until(page, "Start scanning", "Scan again")
     page.keyboard.press("Enter")
-    page.get_by_text("done (exit code 0)").wait_for(timeout=300_000)
+    page.get_by_text("_ui runs.").wait_for()
+    page.get_by_text("Done.", exact=True).wait_for(timeout=300_000)
     press_until(page, "Use")
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="Use", exact=True).wait_for()
@@ -411,7 +433,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     write_recipe(page, SMALL.replace("0.25", "1.0"))
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Scan")
-    page.get_by_role("button", name=re.compile("^Start")).click()
+    page.get_by_role("button", name=START).click()
     page.get_by_text("runs.").wait_for()
     second = page.context.new_page()
     second.goto(page.url)
@@ -419,7 +441,7 @@ def test_the_space_bar_stops_a_run_and_a_second_page_sees_it(browser: Any, serve
     page.reload()  # the run is found again, and nothing was started by it
     page.get_by_text("another page started it").wait_for()
     page.locator("body").press(" ")
-    page.get_by_text("stopped on this page").wait_for()
+    page.get_by_text("stopped on this page").first.wait_for()
     assert len(list(served.folder.glob("runs/*"))) <= before + 1
 
 
@@ -495,7 +517,7 @@ def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> No
     assert project.run is not None
     project.run._process.kill()
     project.run._process.wait(10)
-    assert scan_page.status_line(project.run, True).endswith("_ui: ended early (exit code -9).")
+    assert scan_page.status_line(project.run, True).endswith("_ui ended early (exit code -9).")
 
 
 def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
@@ -556,7 +578,7 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
         try:
             page = opened(browser, served)
             go(page, "Scan")
-            page.get_by_role("button", name=re.compile("^Start")).click()
+            page.get_by_role("button", name=START).click()
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
             move(page, served)
@@ -575,6 +597,6 @@ def test_the_pages_death_stops_the_arm_and_a_new_page_goes_on(browser: Any, tmp_
             assert cell.standing()
             move(page, served)
             cell.wait_until(cell.moving, patience=60)
-            page.get_by_text("done (exit code 0)").wait_for(timeout=120_000)
+            page.get_by_text("Done.", exact=True).wait_for(timeout=120_000)
         finally:
             ended(served)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from pydantic import Field, PrivateAttr, field_validator
@@ -111,6 +111,10 @@ class Bodies(Protocol):
         """
         ...
 
+    def meshes(self) -> Iterator[tuple[int, Any]]:
+        """Yield what is seen of each link as a trimesh in its moving frame, and its number."""
+        ...
+
 
 class RobotModel(Model):
     """An arm: its kinematics, its flange, and roughly the space it fills."""
@@ -153,6 +157,16 @@ class RobotModel(Model):
         arm = self.model_copy()
         arm._bodies, arm._notes = bodies, notes
         return arm
+
+    def meshes(self) -> list[tuple[int, Any]]:
+        """Return what is seen of the arm, a trimesh [m] and the number of the frame it moves with.
+
+        Nothing of an arm that is not given by a URDF, or whose meshes are not there.
+        """
+        try:
+            return list(self._bodies.meshes()) if self._bodies else []
+        except RecipeError:
+            return []
 
     def filled(self) -> RobotModel:
         """Return the arm with the space it fills, as its URDF's bodies have it."""

@@ -24,7 +24,7 @@ from flangeye.maths.geometry import (
     rpy_from_rotation,
 )
 from flangeye.models.robots import FlangeDetails, Joint, Placement, RobotModel, Volume
-from flangeye.models.urdf_meshes import capsule_of
+from flangeye.models.urdf_meshes import capsule_of, mesh_of
 from flangeye.models.urdf_numbers import numbers_of
 from flangeye.types import Floats, Note, Warn
 from flangeye.units import SI
@@ -199,6 +199,20 @@ class UrdfBodies:
         if not volumes:
             raise RecipeError(f"{self.urdf.path}: no link of the arm has a collision body")
         return volumes
+
+    def meshes(self) -> Iterator[tuple[int, Any]]:
+        """Yield what is seen of each link as a trimesh in its moving frame, and the frame's number.
+
+        Raises:
+            RecipeError: A mesh is missing or wrong.
+        """
+        for link, index, pose in self.links():
+            of = self.urdf.links[link]
+            for body in of.findall("visual") or of.findall("collision"):
+                geometry = body.find("geometry")
+                if geometry is not None and len(geometry):
+                    mesh = mesh_of(geometry[0], self.urdf.path, self.packages)
+                    yield index, mesh.apply_transform(pose @ origin_of(self.urdf.path, body))
 
     def without(self) -> list[str]:
         """Return the moved links that have no body, nor has any link fixed to them."""

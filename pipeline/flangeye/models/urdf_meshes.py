@@ -48,6 +48,22 @@ def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Ca
     return capsule
 
 
+def mesh_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Any:
+    """Return the surface of a geometry's body as a trimesh, in its own frame [m]; to draw.
+
+    Raises:
+        RecipeError: It is not there, or cannot be read.
+    """
+    import trimesh
+
+    if body.tag == "mesh":
+        scale = np.array(numbers_of(urdf, body, "scale", "1 1 1"))
+        return _loaded(_find(body.get("filename", ""), urdf, packages)).apply_scale(scale)
+    if body.tag == "sphere":
+        return trimesh.creation.icosphere(radius=_number(body, "radius", urdf))
+    return trimesh.convex.convex_hull(_points(body, urdf, packages))
+
+
 def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Floats:
     if body.tag == "box":
         half = np.array(numbers_of(urdf, body, "size", "")) / 2
@@ -103,6 +119,10 @@ def vertices(path: Path) -> Floats:
     Raises:
         RecipeError: It is no regular file of a known kind, is too large, or is damaged.
     """
+    return np.asarray(_loaded(path).vertices, dtype=np.float64).reshape(-1, 3)
+
+
+def _loaded(path: Path) -> Any:
     import trimesh
 
     kind = path.suffix.lower()
@@ -118,4 +138,4 @@ def vertices(path: Path) -> Floats:
         raise RecipeError(f"{path}: is no mesh that can be read: {reason_of(error)}") from None
     if not len(points) or not np.isfinite(points).all():
         raise RecipeError(f"{path}: has no vertices, or some that are not finite")
-    return points
+    return mesh

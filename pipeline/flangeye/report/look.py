@@ -8,12 +8,14 @@ from __future__ import annotations
 LIGHT = {
     "paper": "#ffffff", "panel": "#f6f7f9", "ink": "#1c2230", "muted": "#5b6474", "rule": "#dfe3e9",
     "link": "#1f5fa8", "bar": "#3a7ebf", "axis": "#7b8494", "grid": "#dfe3e9",
-    "verified": "#1a7f45", "unverified": "#a86200", "refused": "#c02626", "incomplete": "#66707f",
+    "verified": "#1a7f45", "unverified": "#8a5000", "refused": "#c02626", "incomplete": "#5b6474",
+    "arm": "#b9c1cd",
 }  # fmt: skip
 DARK = {
     "paper": "#14171d", "panel": "#1c2028", "ink": "#e6e9ef", "muted": "#9aa4b4", "rule": "#2f3641",
     "link": "#7db4ee", "bar": "#4f93d2", "axis": "#7b8494", "grid": "#2f3641",
     "verified": "#4cc07f", "unverified": "#e3a33c", "refused": "#ff7b72", "incomplete": "#9aa4b4",
+    "arm": "#5b6474",
 }  # fmt: skip
 SERIES = {
     "used": "#3a7ebf", "unused": "#d98a00", "held_out": "#8a8f98", "truth": "#c0559a",

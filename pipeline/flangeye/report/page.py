@@ -21,6 +21,7 @@ from flangeye.report.plotly_js import packed_plotly, plotly_js
 from flangeye.report.residuals import errors_of, residual_figure
 from flangeye.report.seam import seam_view
 from flangeye.report.space import workspace_drawing
+from flangeye.report.still import scene_of, still
 from flangeye.report.summary import (
     TransformText,
     banner_of,
@@ -65,6 +66,12 @@ def render(log: RunLog, library: str | None = None) -> str:
     return _environment().get_template("report.html.j2").render(content)
 
 
+def _still(facts: Facts) -> str:
+    """Return a picture of the cell, which needs no script; empty where it is not known."""
+    scene = scene_of(facts)
+    return still(scene, "The cell: arm, scanner and poses") if scene else ""
+
+
 def _corrected(facts: Facts) -> list[TransformText]:
     """Return the poses for the corrected arm, where an error of it was found."""
     answers = facts.result.answers
@@ -92,6 +99,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "panels": cloud_panels(facts),
         "image": image_view(facts),
         "missed": missed_view(facts),
+        "still": _still(facts),
         "cell": graph_drawing(facts) if facts.of_cell else cell_drawing(facts),
         "drawings": drawings_of(facts),
         "seam": seam_view(facts),
