@@ -186,8 +186,8 @@ class Panel:
             self._said = said
             self._tell(run)
             self._judge(run)
-        if (run.path, run.arrived, run.code) != self._shown:
-            self._shown = (run.path, run.arrived, run.code)
+        if (run.path, run.arrived) != self._shown:
+            self._shown = (run.path, run.arrived)
             self._draw(run)
         for capture, picture in {**dict.fromkeys(run.set_aside, ""), **run.shots}.items():
             self._shot(run, capture, picture)
