@@ -164,10 +164,12 @@ def _workpiece(draw: _Draw) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def judged(seed: int) -> WorldScore:
-    """Weld in a random world and compare the stated bound with the truth."""
+def judged(seed: int, **settings: Any) -> WorldScore:
+    """Weld in a random world, with its settings and these; compare the bound with the truth."""
+    condition = drawn(seed)
+    condition = condition._replace(settings={**condition.settings, **settings})
     try:
-        trial = try_condition(drawn(seed), seed, LENGTH, PERIOD)
+        trial = try_condition(condition, seed, LENGTH, PERIOD)
     except StageError as refusal:
         return WorldScore(seed, "refused", str(refusal))
     errors = trial.errors

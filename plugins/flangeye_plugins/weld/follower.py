@@ -68,6 +68,9 @@ SWERVE_AHEAD = 10e-3
 SHARE = 2e-3
 """A control cycle finds one piece of the felt seam again for so much of its period [s]."""
 
+PATIENT = 4.0
+"""Before the arc burns a tag is waited for so many times longer: the arm stands."""
+
 LATE_SHARE = 0.05
 """Weight of one image in the mean of their delays."""
 
@@ -539,8 +542,9 @@ class Follower:
         """Stop where going on would be blind."""
         if self.phase in ("done", "stopped"):
             return
-        if self._touching and self.phase != "ending" and pose.time - self._seen > settings.blind:
-            self._stop(f"no tag was seen for {settings.blind * 1e3:.0f} ms")
+        patience = settings.blind if self.lit is not None else PATIENT * settings.blind
+        if self._touching and self.phase != "ending" and pose.time - self._seen > patience:
+            self._stop(f"no tag was seen for {patience * 1e3:.0f} ms")
         elif self.phase == "bridging" and self.tip - self._bridge > settings.longest_gap:
             self._stop(f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam")
         elif self.phase in ("following", "bridging") and self._aside(pose) > CENTRE:

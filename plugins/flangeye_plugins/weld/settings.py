@@ -166,7 +166,10 @@ class Following(Params):
         description="The torch's end may be higher or lower than the seam by at most this.",
     )  # fmt: skip
     blind: Duration = param(
-        "500 ms", gt=0, description="Without a tag for longer, the weld is stopped."
+        "500 ms",
+        gt=0,
+        description="Without a tag for longer while the arc burns, or for four times as "
+        "long before, the weld is stopped.",
     )
 
     @property

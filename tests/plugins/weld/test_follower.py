@@ -568,8 +568,10 @@ def refused(found: Any, at: Any = None, **state: Any) -> str:
 
 
 def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
-    assert refused(make(), _seen=0.501) == refused(make(), _seen=0.5) == ""
-    assert refused(make(), _seen=0.499) == "no tag was seen for 500 ms"
+    assert refused(make(), _seen=0.501, lit=0.0) == refused(make(), _seen=0.5, lit=0.0) == ""
+    assert refused(make(), _seen=0.499, lit=0.0) == "no tag was seen for 500 ms"
+    assert refused(make(), _seen=-0.99) == ""  # no arc burns: the arm stands and waits
+    assert refused(make(), _seen=-1.01) == "no tag was seen for 2000 ms"
     assert refused(make("ending"), _seen=0.0) == ""
     assert refused(make(touch=False), _seen=0.0) == ""
     assert refused(make("bridging"), _seen=1.0, _bridge=0.02, tip=0.0599) == ""
