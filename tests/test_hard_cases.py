@@ -614,7 +614,7 @@ def test_numbers_of_400_digits_in_a_pose_file(tmp_path: Path, flangeye: Callable
         f"- effector_wrt_world: [{row}]\n  object_wrt_sensor: [{', '.join('1000010000100001')}]\n"
     )
     (tmp_path / "r.yaml").write_text(
-        "title: t\nsteps:\n  - acquire.samples: {path: a.yaml}\n  - solve.maximum_likelihood\n"
+        "title: t\nsteps:\n  - acquire.samples: {path: a.yaml}\n  - solve.robust\n"
     )
     said = flangeye("run", "r.yaml", "--out", "o")
     assert said[0] == 2

@@ -137,7 +137,7 @@ def test_every_configuration_runs_to_a_verified_calibration(name: Any, tmp_path:
     layout = checked.context.get(Cell) or checked.context[Configuration]
     assert set(result.transforms) == set(layout.unknowns)
     assert sum(o.used for o in result.observations) >= 0.8 * len(result.observations)
-    assert result.truth.rms_over_workspace < 6 * result.workspace.predicted_rms
+    assert result.truth.rms_over_workspace < 6 * result.expected_error.rms
     (limit,) = [s.params.max_rms for s in checked.steps if s.stage.name == "verify.holdout"]
     assert result.truth.rms_over_workspace < limit
     assert read_run(folder.log).calibration().transforms.keys() == result.transforms.keys()
@@ -178,7 +178,7 @@ def test_the_published_aubo_clouds_reach_the_target_with_the_poses_that_agree(
     assert rms([pose["residual"] for pose in poses if pose["used"]]) <= 0.42e-3
     assert median(pose["residual"] for pose in poses) <= 0.24e-3
     assert result["holdout"]["rms"] <= 0.44e-3
-    assert result["holdout"]["figures"]["corrected_rms_inliers"] <= 0.25e-3
+    assert result["holdout"]["figures"]["corrected_rms"] <= 0.25e-3
 
 
 @pytest.fixture(scope="module")

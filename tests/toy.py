@@ -17,6 +17,7 @@ from flangeye.types import (
     Capture,
     Captures,
     CircleFeature,
+    ExpectedError,
     FlangeCloud,
     HandEye,
     Look,
@@ -136,7 +137,7 @@ def solve(observations: Observations, params: SolveParams) -> HandEye:
     residuals = transform.apply(camera) - base
     pairs = tuple(Pair(o, r) for o, r in zip(pulled, residuals, strict=True))
     estimate = TransformEstimate(transform, 1e-8 * np.eye(6), base.mean(axis=0))
-    return HandEye(estimate, pairs, "solve.toy")
+    return HandEye(estimate, pairs, "solve.toy", expected=ExpectedError(1e-4, 2e-4))
 
 
 @stage("refine.toy")

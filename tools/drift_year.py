@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.handeye.blame import blame, suspects
-from flangeye.handeye.drift import (
+from flangeye.estimation.watch.blame import blame, suspects
+from flangeye.estimation.watch.drift import (
     DriftTest,
     Information,
     Prior,

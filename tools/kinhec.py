@@ -24,9 +24,10 @@ import numpy as np
 import typer
 
 from flangeye import FlangeyeError
+from flangeye.models.cell import cell_of
 from flangeye.models.configuration import Configuration
 from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Observation, PoseFeature, Transform
-from flangeye_plugins.solve.robust import RobustParams, solve_poses
+from flangeye_plugins.solve.robust import RobustParams, solve_cell
 
 ANGLE_NOISE, POSITION_NOISE = np.radians(0.2), 0.5e-3
 """The defaults of acquire.samples [rad, m]."""
@@ -62,7 +63,7 @@ def error(sequence):
     size = "known" if sequence.scale == 1.0 else "unknown"
     try:
         params = RobustParams(target_size=size)
-        found = solve_poses(observations(sequence), params, None, cell)
+        found = solve_cell(observations(sequence), cell_of(cell, None), params)
     except FlangeyeError as refused:
         return str(refused)
     place = found.transforms[name].transform.translation

@@ -35,7 +35,7 @@ from tools.covering import FAST
 ROOT = Path(__file__).parents[1]
 ROOMS: dict[str, tuple[str, ...]] = {
     "motion": ("pipeline/flangeye/motion", "tests/motion"),
-    "estimator": ("pipeline/flangeye/handeye", "tests/handeye"),
+    "estimator": ("pipeline/flangeye/estimation", "tests/estimation"),
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),

@@ -16,14 +16,14 @@ from flangeye.run.folder import RunFolder
 from flangeye.run.session import Start, record_run
 
 OUTCOMES = Path(__file__).parents[1] / "recipes" / "configurations" / "outcomes.csv"
-FIELDS = ("recipe", "captures", "used", "held_out_mm", "predicted_mm", "true_mm")
+FIELDS = ("recipe", "captures", "used", "held_out_mm", "expected_mm", "true_mm")
 
 
 def outcome(name, result):
-    """Return a recipe's row: what was held out, what was predicted and what is true, rms."""
+    """Return a recipe's row: what was held out, what is expected and what is true, rms."""
     figures = (
         result.holdout.rms,
-        result.workspace.predicted_rms,
+        result.expected_error and result.expected_error.rms,
         result.truth.rms_over_workspace,
     )
     counts = len(result.observations), sum(o.used for o in result.observations)

@@ -1,6 +1,6 @@
 """How many sightings each plan needs for the same uncertainty of a cell: python -m tools.study_cells
 
-The cells of recipes/configurations, on simulated marker poses. The level is what ``solve.cell``
+The cells of recipes/configurations, on simulated marker poses. The level is what the planner
 states after so many sightings of a grid of joints, three values each, dealt in turn to who sees
 whom: nothing that is to be found is off by more at its work, with 95 % probability. Beside it, how
 many sightings drawn at random, and how many chosen by the whole graph's covariance, come as low.
@@ -11,9 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from flangeye.handeye.cell import solve_so_far
-from flangeye.handeye.cell_plan import errors_at_work, work_of_frames
-from flangeye.handeye.graph import LIMITS
+from flangeye.estimation.plan import errors_at_work, so_far, work_of_frames
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import recipe_names
@@ -48,7 +46,7 @@ def levels(cell, plan, seed, every=1):
     for sighting in sightings:
         seen.append(sighting)
         if len(seen) % every == 0:
-            found = solve_so_far(seen, model, LIMITS, found)
+            found = so_far(seen, model)
         if found is not None and len(seen) % every == 0:
             stated = max(errors_at_work(found, model, seen).values())
             yield len(seen), stated, max(true_errors(found, model, seen, truth))

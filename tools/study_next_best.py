@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.maths.statistics import corners_of, largest_error_quantile
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import DEFAULT
 from flangeye.models.loading import load_model
 from flangeye.models.scanners import middle_of_view
 from flangeye.motion.planning import Site
@@ -22,7 +24,7 @@ from flangeye_emulators.world.arm import ImperfectArm
 from flangeye_emulators.world.scanner import CameraPose
 from flangeye_plugins.plan.grid import GridParams, grid
 from flangeye_plugins.plan.next_best import NextBestParams, next_best
-from flangeye_plugins.solve.robust import FEWEST_ONLINE, RobustParams, solve_poses
+from flangeye_plugins.solve.robust import FEWEST_ONLINE, RobustParams, solve_cell
 
 ROBOT, SCANNER = load_model("robots", "ur5e"), load_model("scanners", "phoxi-m")
 BASE_T_CAMERA = CameraPose().base_T_camera
@@ -69,9 +71,9 @@ def levels(plan, params, seed, poses):
 
 
 def level(seen, centre):
-    found = solve_poses(seen, RobustParams(), ROBOT)
-    known, scatter = found.base_T_camera, found.scatter_covariance
-    stated = largest_error_quantile(scatter, known.about, corners_of(centre, WORK))
+    found = solve_cell(seen, cell_of(DEFAULT, ROBOT), RobustParams())
+    known = found.base_T_camera
+    stated = largest_error_quantile(known.covariance, known.about, corners_of(centre, WORK))
     off = known.transform.matrix @ np.linalg.inv(BASE_T_CAMERA)
     work = Box(centre, WORK).grid()
     errors = work @ off[:3, :3].T + off[:3, 3] - work

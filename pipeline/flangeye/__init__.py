@@ -1,7 +1,7 @@
 """flangeye: hand-eye calibration from the robot's own flange.
 
-The names every plugin needs are here. Public are also the rooms ``types``, ``units``,
-``devices``, ``errors``, ``maths``, ``handeye``, ``models``, ``files``, ``motion``, ``plugin`` and
+The names every plugin needs are here. Public are also the rooms ``types``, ``units``, ``devices``,
+``errors``, ``maths``, ``estimation``, ``models``, ``files``, ``motion``, ``plugin`` and
 ``testing``, the modules ``log.read``, ``recipe.header`` and ``result``, and those that hold
 contracts of parts; the rest may change without notice. The last contract in pyproject.toml holds
 plugins to it.

@@ -66,14 +66,14 @@ def row_of(run: Path) -> dict[str, Any]:
         result = Result.model_validate_json(path.read_bytes())
     except (OSError, ValueError) as error:
         return {"run": run.name, "status": "unreadable", "note": str(error).splitlines()[0]}
-    held, box = result.holdout, result.workspace
+    held = result.holdout
     used = sum(o.used for o in result.observations)
     return {
         "run": run.name,
         "status": result.status,
         "used": f"{used} of {len(result.observations)}",
         "held": millimetres(held.rms) if held else "",
-        "predicted": millimetres(box.predicted_rms) if box else "",
+        "predicted": millimetres(result.expected_error.rms) if result.expected_error else "",
         "note": result.refused or "",
     }
 

@@ -46,12 +46,9 @@ STAGES = {
     "segment.sphere": "flangeye_plugins.segment.sphere:segment_sphere",
     "fit.sphere": "flangeye_plugins.fit.sphere:fit_sphere",
     "fit.sphere_profile": "flangeye_plugins.fit.sphere_profile:fit_sphere_profile",
-    "solve.cell": "flangeye_plugins.solve.cell:solve_cell",
     "solve.robust": "flangeye_plugins.solve.robust:solve_robust",
     "solve.svd": "flangeye_plugins.solve.svd:solve_svd",
     "solve.iterative": "flangeye_plugins.solve.iterative:solve_iterative",
-    "solve.maximum_likelihood": "flangeye_plugins.solve.maximum_likelihood:"
-    "solve_maximum_likelihood",
     "solve.tsai_lenz": "flangeye_plugins.solve.named:CLOSED_FORMS",
     "solve.park_martin": "flangeye_plugins.solve.named:CLOSED_FORMS",
     "solve.horaud_dornaika": "flangeye_plugins.solve.named:CLOSED_FORMS",

@@ -102,14 +102,14 @@ def test_columns(entries: Any) -> None:
     assert tuple(columns(entries)) == (
         "session", "recipe", "archive", "steps.0.noise", "steps.0.count", "seed", "status",
         "reason", "used", "captures", "holdout_rms_m", "holdout_median_m", "holdout_p95_m",
-        "predicted_rms_m", "predicted_p95_m", "true_rms_m", "true_centre_m", "true_rotation_rad",
+        "expected_rms_m", "expected_p95_m", "true_rms_m", "true_centre_m", "true_rotation_rad",
         "seconds", "report",
     )  # fmt: skip
 
 
 def test_quantities_stand_on_an_axis_by_their_number(entries: Any) -> None:
     drawn = dict(drawings(entries))
-    assert set(drawn) == {"Held-out error, rms", "Predicted error, 95 %", "Time"}
+    assert set(drawn) == {"Held-out error, rms", "Expected error, 95 %", "Time"}
     figure = drawn["Held-out error, rms"]
     assert figure["layout"]["xaxis"]["title"]["text"] == "step 0.noise [mm]"
     dots = [dict(zip(t["x"], t["y"], strict=True)) for t in figure["data"]]

@@ -68,7 +68,7 @@ def test_a_session_leaves_what_run_leaves(work: Any) -> None:
     assert (outcome.used, outcome.captures, outcome.reason) == (6, 6, None)
     assert 0 < outcome.holdout_rms_m < 1e-3
     assert 0 < outcome.true_rms_m < 1e-3
-    assert outcome.predicted_p95_m > outcome.predicted_rms_m > 0
+    assert outcome.expected_p95_m > outcome.expected_rms_m > 0
     assert outcome.seconds > 0
     assert outcome.report == f"{work.session.id}/report.html"
     assert names(work.folder) == [

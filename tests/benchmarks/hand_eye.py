@@ -18,21 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.handeye.closed import daniilidis, robot_world, separable
-from flangeye.handeye.closed.comanipulation import alternate, random_rotations
-from flangeye.handeye.closed.motions import motions_of
-from flangeye.handeye.components import Noise as Extra
-from flangeye.handeye.likelihood import weigh
-from flangeye.handeye.loop import ArmNoise, LoopProblem
-from flangeye.handeye.measurements import loop_of, measurements_of
-from flangeye.handeye.unknowns import Unknowns
+from flangeye.estimation.closed import daniilidis, robot_world, separable
+from flangeye.estimation.closed.comanipulation import alternate, random_rotations
+from flangeye.estimation.closed.motions import motions_of
+from flangeye.estimation.sightings import problem_of
 from flangeye.maths.geometry import rotation_log
-from flangeye.models.configuration import Configuration
+from flangeye.models.cell import cell_of
 from flangeye_plugins.solve.robust import (
     RobustParams,
     solve_robust,
 )
-from tests.handeye.cells import CONFIGURATIONS, session
+from tests.estimation.cells import CONFIGURATIONS, session
 
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
 CASES = {"n=15, 17 deg": (15, np.radians(17)), "n=8, 30 deg": (8, np.radians(30))}
@@ -44,7 +40,6 @@ BY_MOTIONS = {
     "daniilidis": daniilidis.daniilidis,
 }
 BY_BOTH = {"shah": robot_world.shah, "li": robot_world.li}
-STATED = RobustParams(robot_noise={"rotation": "0.2 mrad", "position": "0.05 mm"})
 
 
 def sessions(case: str, count: int) -> list:
@@ -69,8 +64,8 @@ def closed(name: str, made) -> np.ndarray:
 
 
 def most_likely(made) -> np.ndarray:
-    """Return X (4, 4) by maximum likelihood, the noise being stated."""
-    found = solve_robust(made.stream(), STATED, configuration=made.configuration)
+    """Return X (4, 4) by solve.robust."""
+    found = solve_robust(made.stream(), RobustParams(), configuration=made.configuration)
     return found.camera.transform.matrix
 
 
@@ -84,16 +79,18 @@ def rms(found: list, made: list) -> tuple[float, float]:
 
 
 def bound(made: list) -> tuple[float, float]:
-    """Return the Cramer-Rao bound of the same two figures."""
+    """Return the Cramer-Rao bound of the same two figures, the arm's noise being known."""
     traces = []
     for m in made:
-        problem = LoopProblem(
-            measurements=measurements_of(m.observations, MARKER, None),
-            loop=loop_of(Configuration("eye-in-hand", "flange", "base")),
-            arms=ArmNoise(2e-4, 5e-5),
+        problem = problem_of(m.observations, cell_of(MARKER, None))
+        linear = problem.linearised(
+            {"camera": m.truth["flange_T_camera"], "target": m.truth["base_T_target"]}
         )
-        at = Unknowns.of_loop(m.truth["flange_T_camera"], np.eye(4), m.truth["base_T_target"])
-        known = weigh(problem, at, Extra(0.0, 0.0), np.ones(len(m.observations))).covariance
+        rows = np.concatenate([linear.blocks[name] for name in problem.unknown], axis=2)
+        arm = np.diag(np.repeat(np.square((2e-4, 5e-5)), 3))
+        of_arm = linear.blocks["flange"]
+        noise = problem.seen.covariances + of_arm @ arm @ np.swapaxes(of_arm, 1, 2)
+        known = np.linalg.inv(np.einsum("nai,nab,nbj->ij", rows, np.linalg.inv(noise), rows))
         traces.append([np.trace(known[:3, :3]), np.trace(known[3:6, 3:6])])
     turn, shift = np.sqrt(np.mean(traces, axis=0))
     return float(np.degrees(turn)), float(shift * 1e3)
@@ -136,7 +133,7 @@ def main(words: list[str]) -> None:
             )
         print(
             "  {:20} {:.4f} deg {:.3f} mm".format(
-                "maximum_likelihood", *rms([most_likely(m) for m in made], made)
+                "robust", *rms([most_likely(m) for m in made], made)
             )
         )
         print("  {:20} {:.4f} deg {:.3f} mm".format("Cramer-Rao bound", *bound(made)))

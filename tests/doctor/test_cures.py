@@ -29,7 +29,7 @@ RECIPE: dict[str, Any] = {
     "configuration": {"name": "eye-on-base", "place": "unknown"},
     "steps": [
         {"acquire.samples": {"reader": "moveit", "position_noise": "0.3 mm"}},
-        "solve.maximum_likelihood",
+        "solve.robust",
     ],
 }
 

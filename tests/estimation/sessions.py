@@ -10,10 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
-from flangeye.estimation.effects.arm import arm_effects
-from flangeye.estimation.effects.target import target_effects
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
+from flangeye.estimation.session import Asked, effects_of
 from flangeye.maths.frame_graph import Frame
 from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.maths.kinematics import Arm
@@ -80,7 +79,7 @@ def estimated(s: foreign.Session, kind: str) -> Estimate:
     problem = problem_of(s, kind, s.reported, s.joints, s.seen)
     truth = {"camera": s.camera, "target": s.target}
     start = problem.moved(truth, np.full(6 * len(problem.unknown), 0.01))
-    effects = [*arm_effects(problem, "flange"), *target_effects(problem)]
+    effects = effects_of(problem, None, Asked())
     return estimate(problem, start, effects, np.ones(len(s.seen), dtype=bool))
 
 
@@ -101,7 +100,7 @@ def score(kind: str, arm: dict, s: float, poses: int, seed: int) -> Scores:
         _scored(found, functional(found, np.zeros_like(a)), session.camera, points),
         _scored(found, functional(found, a), truth, points),
         _of_svd(session, truth, points) if kind in ("flange", "centres") else np.nan,
-        expected_error(found, work, a).rms,
+        expected_error(found, work, functional(found, a).mean).rms,
         int((~found.inliers).sum()),
     )
 

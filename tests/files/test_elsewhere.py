@@ -164,7 +164,7 @@ def test_a_run_from_a_bucket_into_a_bucket_has_the_result_of_one_on_disk(
     ):
         done = CliRunner().invoke(app, [*words, archive, "--out", out])
         assert done.exit_code == 0, done.output
-    assert "s3://cell/out/: report.html  calibration.yaml  result.json  run.mcap" in done.output
+    assert "flangeye show s3://cell/out" in done.output
     here = json.loads((tmp_path / "run" / "result.json").read_text())
     there = json.loads(bucket.cat("cell/out/result.json"))
     assert here["transforms"] == there["transforms"]

@@ -1,4 +1,4 @@
-"""A field of displacements: smooth, without a rigid part, and its covariance that of its weights."""
+"""A field of displacements: smooth, and without a rigid part."""
 
 from dataclasses import replace
 
@@ -8,7 +8,6 @@ from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.geometry import hat, kabsch, rigid
 from flangeye.maths.smooth_field import (
     displacement,
-    displacement_covariance,
     effects,
     field_over,
 )
@@ -21,9 +20,7 @@ PLACES = np.array([0.4, -0.5, 0.2]) + RNG.uniform(-0.15, 0.15, (40, 3))
 def weighted(seed: int):
     bare = field_over(PLACES)
     rng = np.random.default_rng(seed)
-    spread = 1e-4 * rng.standard_normal((len(bare.weights), len(bare.weights)))
-    weights = 1e-3 * rng.standard_normal(len(bare.weights))
-    return replace(bare, weights=weights, covariance=spread @ spread.T, size=1e-3)
+    return replace(bare, weights=1e-3 * rng.standard_normal(len(bare.weights)))
 
 
 def test_a_field_moves_no_camera() -> None:
@@ -42,17 +39,6 @@ def test_a_quadratic_error_is_followed() -> None:
     rows, wanted = rows.reshape(120, -1), wanted.ravel()
     left = wanted - rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0]
     assert np.abs(left).max() < 0.15 * np.abs(wanted).max()
-
-
-def test_covariances_are_those_of_the_weights() -> None:
-    field, place = weighted(1), PLACES[:1] + 0.05
-    rng = np.random.default_rng(2)
-    drawn = rng.multivariate_normal(field.weights, field.covariance, 20000)
-    found = np.cov((drawn @ effects(field, place)[0].T).T)
-    known = displacement_covariance(field, place, corrected=True)[0]
-    np.testing.assert_allclose(found, known, atol=0.05 * np.abs(known).max())
-    wide = displacement_covariance(field, place, corrected=False)[0]
-    np.testing.assert_allclose(wide, 1e-6 * effects(field, place)[0] @ effects(field, place)[0].T)
 
 
 def test_a_correction_moves_the_reported_flange_by_the_field() -> None:

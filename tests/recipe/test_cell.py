@@ -16,7 +16,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.types import Observation, Transform
 
-STEPS = "steps: [acquire.simulated_cell, solve.cell, verify.holdout]\n"
+STEPS = "steps: [acquire.simulated_cell, solve.robust, verify.holdout]\n"
 TWO = "cell: {arms: {arm: ur5}, cameras: {left: base, right: base}, targets: {marker: arm}}\n"
 
 
@@ -167,7 +167,6 @@ def test_steps_for_one_camera_are_refused_in_a_cell() -> None:
         "r.yaml:3: steps.0.acquire.simulated_marker: acquire.simulated_marker serves no cell; use "
         "acquire.samples, acquire.centres or acquire.archive with reader: cell, or "
         "acquire.simulated_cell",
-        "r.yaml:3: steps.1.solve.robust: solve.robust serves no cell; use solve.cell",
         "r.yaml:3: steps.3.export.matrix: export.matrix serves no cell; leave it out: "
         "calibration.yaml carries every transform of the cell, and after the run flangeye export RUN "
         "--to NAME --camera CAMERA writes one",

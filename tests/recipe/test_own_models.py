@@ -23,7 +23,7 @@ from tests.models.test_factory import CONF
 
 HEADER = "title: T\n"
 STEPS = "steps: [acquire.simulated, segment.flange, fit.rim, solve.robust]\n"
-CELL = "steps: [acquire.simulated_cell, solve.cell]\n"
+CELL = "steps: [acquire.simulated_cell, solve.robust]\n"
 
 
 @pytest.fixture

@@ -296,7 +296,7 @@ steps:
   - acquire.archive
   - segment.flange
   - fit.rim
-  - solve.robust: {joint_offsets: auto}
+  - solve.robust
 """
 
 
@@ -307,15 +307,13 @@ def test_what_is_demanded_is_what_is_used() -> None:
         *(f"r.yaml:{line}: steps.{line - 3}.{name}: needs the plate to look for: write feature: "
           "{standard: ISO 9409-1-50-4-M6} ('flangeye standards' lists them), or a robot's model"
           for line, name in ((4, "segment.flange"), (5, "fit.rim"))),
-        "r.yaml:6: steps.3.solve.robust: needs the arm's kinematics, to correct its joints: write "
-        "robot: ur10e ('flangeye robots' lists them), or robot: {urdf: arm.urdf}",
     ]  # fmt: skip
-    plain = "robot: {flange: ISO 9409-1-50-4-M6}\n" + ARCHIVE.replace(": {joint_offsets: auto}", "")
+    plain = "robot: {flange: ISO 9409-1-50-4-M6}\n" + ARCHIVE
     parse_recipe(plain, "r.yaml", registry)
     marker = "  - acquire.images: {focal_length: [900, 900], principal_point: [640, 480]}\n"
     board = "  - fit.checkerboard: {columns: 8, rows: 5, square: 30 mm}\n"
     seen = "configuration: {name: eye-in-hand, place: unknown}\ntitle: T\nsteps:\n"
-    parse_recipe(seen + marker + board + "  - solve.maximum_likelihood\n", "r.yaml", registry)
+    parse_recipe(seen + marker + board + "  - solve.robust\n", "r.yaml", registry)
 
 
 def test_live_and_simulated_runs_say_what_kinematics_are_for() -> None:
@@ -323,7 +321,7 @@ def test_live_and_simulated_runs_say_what_kinematics_are_for() -> None:
     live = "robot: {flange: ISO 9409-1-50-4-M6}\nscanner: {name: ACME}\n" + ARCHIVE.replace(
         "acquire.archive", "acquire.simulated"
     )
-    told = mistakes(live.replace(": {joint_offsets: auto}", ""), registry)
+    told = mistakes(live, registry)
     assert told == [
         "r.yaml:5: steps.0.acquire.simulated: needs the arm's kinematics, to simulate it: write "
         "robot: ur10e ('flangeye robots' lists them), or robot: {urdf: arm.urdf}",

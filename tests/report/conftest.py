@@ -208,7 +208,7 @@ def _result(
         method=calibration.method if calibration else None,
         transforms=r.transforms_result(calibration),
         observations=r.observations_result(pairs, rejections),
-        workspace=r.workspace_result(calibration.camera, WORKSPACE) if calibration else None,
+        workspace=r.workspace_result(WORKSPACE) if calibration else None,
         holdout=r.holdout_result(verifications),
         verifications={
             k: r.VerificationResult(

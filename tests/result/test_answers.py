@@ -17,6 +17,7 @@ from flangeye.types import (
     ArmCorrection,
     CircleFeature,
     CorrectedArm,
+    ExpectedError,
     HandEye,
     Observation,
     Pair,
@@ -45,8 +46,9 @@ def calibration(**changes):
 
 
 def corrected():
-    found = CorrectedArm(estimate(3e-3), ArmCorrection(np.zeros(3), OFFSETS, np.ones(6)))
-    return calibration(corrected=found)
+    correction = ArmCorrection(np.zeros(3), OFFSETS, np.ones(6))
+    found = CorrectedArm(estimate(3e-3), correction, expected=ExpectedError(0.2e-3, 0.4e-3))
+    return calibration(corrected=found, expected=ExpectedError(0.361e-3, 0.6e-3))
 
 
 def document(calibration, figures=None):
@@ -94,9 +96,8 @@ def test_where_on_the_flange_the_circle_is_belongs_to_both() -> None:
 
 def test_both_stand_side_by_side_with_the_error_to_expect() -> None:
     answers = document(corrected(), FIGURES).answers
-    noise = 3 * SIGMA**2
-    assert answers.as_reported.expected_rms == pytest.approx(np.sqrt(0.4e-3**2 - noise))
-    assert answers.corrected.expected_rms == pytest.approx(np.sqrt(0.3e-3**2 - noise))
+    assert answers.as_reported.expected_rms == pytest.approx(0.361e-3)
+    assert answers.corrected.expected_rms == pytest.approx(0.2e-3)
     assert answers.as_reported.correction is None
     assert answers.corrected.correction.joint_offsets == pytest.approx(OFFSETS)
     poses = [
@@ -104,19 +105,6 @@ def test_both_stand_side_by_side_with_the_error_to_expect() -> None:
         for a in (answers.as_reported, answers.corrected)
     ]
     assert poses[1][1, 3] - poses[0][1, 3] == pytest.approx(3e-3)
-
-
-def test_noise_that_explains_everything_leaves_what_the_pose_is_known_to() -> None:
-    answers = document(calibration(), {**FIGURES, "rms_inliers": SIGMA}).answers
-    of_pose = answers.as_reported.transforms["base_T_camera"].covariance
-    least = np.sqrt(np.trace(np.array(of_pose)[3:, 3:]))
-    assert answers.as_reported.expected_rms == pytest.approx(least, rel=1e-6)
-
-
-def test_without_poses_held_out_nobody_says_what_to_expect() -> None:
-    answers = document(corrected()).answers
-    assert answers.as_reported.expected_rms is None
-    assert document(calibration(), FIGURES).answers.corrected is None
 
 
 def test_the_console_gives_both() -> None:

@@ -116,12 +116,14 @@ def test_every_form_of_a_pose_is_the_same_pose(result: Result) -> None:
 def test_an_error_to_expect_is_told_where_it_is_known(result: Result) -> None:
     assert result.answers is not None
     known = result.answers.as_reported.model_copy(update={"expected_rms": 4e-4})
+    nobody = result.answers.as_reported.model_copy(update={"expected_rms": None})
 
     def told(answers):
         return yaml.safe_load(calibration_yaml(result.model_copy(update={"answers": answers})))
 
-    assert told(result.answers.model_copy(update={"as_reported": known}))[
-        "expected_rms_at_the_work_m"
-    ] == pytest.approx(4e-4)
-    for unknown in (result.answers, None):
+    def with_reported(answer):
+        return result.answers.model_copy(update={"as_reported": answer, "corrected": None})
+
+    assert told(with_reported(known))["expected_rms_at_the_work_m"] == pytest.approx(4e-4)
+    for unknown in (with_reported(nobody), None):
         assert {"expected_rms_at_the_work_m", "corrected_arm"}.isdisjoint(told(unknown))

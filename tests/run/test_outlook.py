@@ -11,9 +11,7 @@ import pytest
 from flangeye import types as t
 from flangeye.log.read import read_run
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.coverage import coverage_of
-from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import load_registry
 from flangeye.recipe.load import parse_recipe
 from flangeye.run.folder import RunFolder
@@ -48,17 +46,11 @@ def test_it_says_of_every_pose_what_the_solver_would(run: Path) -> None:
         assert found.residuals[name] == pytest.approx(np.linalg.norm(pair.residual), rel=1e-6)
 
 
-def test_the_error_is_that_of_the_worst_corner_of_the_work(run: Path) -> None:
+def test_the_error_is_that_to_expect_at_the_work(run: Path) -> None:
     log = read_run(run)
     found, calibration = outlook_of_log(log, load_registry()), log.calibration()
-    assert calibration is not None and log.source is not None
-    camera, box = calibration.camera, work_of(calibration, log.source, None)
-    assert box is not None and found.error is not None
-    corners = corners_of(box.centre, box.size)
-    assert found.error == pytest.approx(
-        largest_error_quantile(camera.covariance, camera.about, corners), rel=1e-6
-    )
-    assert found.error > largest_error_quantile(camera.covariance, camera.about, camera.about[None])
+    assert calibration is not None and calibration.expected is not None
+    assert found.error == pytest.approx(calibration.expected.p95, rel=1e-6)
 
 
 def test_a_pose_that_the_solver_sets_aside_is_told_with_its_reason(run: Path) -> None:
@@ -117,7 +109,7 @@ def test_an_outlook_is_told_in_millimetres() -> None:
     assert told == [
         "01  1.200 mm",
         "02  set aside: too far",
-        "error to expect: 95 % below 0.500 mm anywhere at the work",
+        "error to expect: 95 % below 0.500 mm at the work",
     ]
     assert Outlook(missing="move the arm").lines() == [
         "error to expect: not known yet", "missing: move the arm",

@@ -75,7 +75,7 @@ def test_steps_that_work_on_scans_are_known_by_their_kind() -> None:
     steps = [
         "segment.flange",
         {"fit.rim": {"inlier": "1 mm"}},
-        "solve.cell",
+        "solve.robust",
         {"verify.holdout": {}},
     ]
     assert [_works_on_scans(step) for step in steps] == [True, True, False, False]
@@ -86,12 +86,12 @@ def test_steps_that_work_on_scans_go_where_there_are_none(scans: dict[str, str])
     text = """
 description: of a run
 robot: ur5e
-steps: [acquire.live, segment.flange, fit.rim, solve.cell]
+steps: [acquire.live, segment.flange, fit.rim, solve.robust]
 """
     cell: Any = SimpleNamespace(movers={"arm": object()})
     recipe = yaml.safe_load(_recipe(text, cell, [circle(1, [1e-8] * 3)], scans))
     acquire, *steps = recipe["steps"]
-    assert steps == (["segment.flange", "fit.rim", "solve.cell"] if scans else ["solve.cell"])
+    assert steps == (["segment.flange", "fit.rim", "solve.robust"] if scans else ["solve.robust"])
     assert list(acquire) == ["acquire.archive" if scans else "acquire.centres"]
     assert list(recipe) == ["robot", "steps"]
 
@@ -114,7 +114,7 @@ def of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 UNUSED: Any = None
-TEXT = "title: a cell\nsteps: [acquire.simulated_cell, segment.flange, fit.rim, solve.cell]\n"
+TEXT = "title: a cell\nsteps: [acquire.simulated_cell, segment.flange, fit.rim, solve.robust]\n"
 
 
 @pytest.mark.usefixtures("of_a_cell")
@@ -133,11 +133,11 @@ def test_a_table_of_the_arm_one_of_what_was_seen_and_a_recipe(tmp_path: Path, cl
             ["2", "clouds/2-camera-target.pcd"],
         ]
         assert all((tmp_path / row[1]).stat().st_size > 0 for row in rows[1:])
-        assert steps[1:] == ["segment.flange", "fit.rim", "solve.cell"]
+        assert steps[1:] == ["segment.flange", "fit.rim", "solve.robust"]
     else:
         assert rows[1:] == [["10", "10", "0.1", "0.2"], ["2", "2", "0.1", "0.2"]]
         assert not (tmp_path / "clouds").exists()
-        assert steps[1:] == ["solve.cell"]
+        assert steps[1:] == ["solve.robust"]
     assert next(iter(steps[0])) == ("acquire.archive" if clouds else "acquire.centres")
 
 

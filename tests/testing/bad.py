@@ -10,6 +10,7 @@ import numpy as np
 from flangeye import Params, StageError, part, stage
 from flangeye import types as t
 from flangeye.devices import (
+    Arc,
     DeviceError,
     Profiler,
     Robot,
@@ -32,6 +33,7 @@ from flangeye.motion.seam_following import Command, Controller, FollowingTask
 from flangeye.run.replay import ReplayedStep
 from flangeye.testing.solving import reference_solution
 from flangeye.types import FLANGE
+from flangeye_emulators.arc.simulated import SimulatedArc, SimulatedArcParams
 from flangeye_emulators.robot.simulated import SimulatedParams, SimulatedRobot
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.fit.rim_params import RimParams
@@ -324,6 +326,22 @@ def robot(**methods):
         return made(model, SimulatedParams())
 
     return robot_bad
+
+
+def arc(**methods):
+    """A power source some of whose methods are replaced."""
+    made = type("Bad", (SimulatedArc,), methods)
+
+    @part("arc.bad")
+    def arc_bad(params: SimulatedArcParams) -> Arc:
+        """Switch badly."""
+        return made()
+
+    return arc_bad
+
+
+def late(self, on):
+    time.sleep(0.5)
 
 
 def twice_as_fast(self, joints, speed, acceleration):

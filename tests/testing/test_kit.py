@@ -604,6 +604,20 @@ CASES = [
         "was said",
         {},
     ),
+    (
+        "arc",
+        "test_it_switches_gas_and_arc_without_waiting",
+        bad.arc(gas=bad.late),
+        "switching took",
+        {},
+    ),
+    (
+        "arc",
+        "test_it_says_whether_it_burns_or_that_it_does_not_know",
+        bad.arc(burning=lambda self: "yes"),
+        r"burning\(\) returned 'yes'",
+        {},
+    ),
     ("robot", "test_it_stops_at_once", bad.robot(stop=lambda self: None), "went on to", {}),
     (
         "robot",

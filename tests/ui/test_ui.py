@@ -57,7 +57,7 @@ robot: {model: ur5e}
 configuration: {name: eye-on-base, place: unknown}
 steps:
   - acquire.samples: {path: samples, reader: moveit, position_noise: 0.3 mm}
-  - solve.maximum_likelihood
+  - solve.robust
 """
 SHOWN = """180 deg, -90 deg, 90 deg, -90 deg, -90 deg, 0 deg
 185 deg, -90 deg, 95 deg, -95 deg, -90 deg, 0 deg

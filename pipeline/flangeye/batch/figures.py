@@ -45,7 +45,7 @@ class Figure:
 
 FIGURES = (
     Figure("holdout_rms_m", "Held-out error, rms", "mm", 1e3),
-    Figure("predicted_p95_m", "Predicted error, 95 %", "mm", 1e3),
+    Figure("expected_p95_m", "Expected error, 95 %", "mm", 1e3),
     Figure("true_rms_m", "True error, rms", "mm", 1e3),
     Figure("seconds", "Time", "s", 1.0),
 )

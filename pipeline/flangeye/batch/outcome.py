@@ -31,8 +31,8 @@ class SessionOutcome:
         holdout_rms_m: Error on poses that took no part in the estimate.
         holdout_median_m: The same, its median.
         holdout_p95_m: The same, 95 % are below.
-        predicted_rms_m: Error to expect over the workspace.
-        predicted_p95_m: The same, 95 % are below.
+        expected_rms_m: Error to expect at the work.
+        expected_p95_m: The same, 95 % are below.
         true_rms_m: True error over the workspace, in simulation.
         true_centre_m: True error at its centre.
         true_rotation_rad: True error of the rotation.
@@ -47,8 +47,8 @@ class SessionOutcome:
     holdout_rms_m: float | None = None
     holdout_median_m: float | None = None
     holdout_p95_m: float | None = None
-    predicted_rms_m: float | None = None
-    predicted_p95_m: float | None = None
+    expected_rms_m: float | None = None
+    expected_p95_m: float | None = None
     true_rms_m: float | None = None
     true_centre_m: float | None = None
     true_rotation_rad: float | None = None
@@ -58,7 +58,7 @@ class SessionOutcome:
 
 def outcome_of(result: Result) -> SessionOutcome:
     """Return the headline figures of a result."""
-    holdout, workspace, truth = result.holdout, result.workspace, result.truth
+    holdout, expected, truth = result.holdout, result.expected_error, result.truth
     return SessionOutcome(
         status=result.status,  # type: ignore[arg-type]
         reason=result.refused,
@@ -67,8 +67,8 @@ def outcome_of(result: Result) -> SessionOutcome:
         holdout_rms_m=holdout.rms if holdout else None,
         holdout_median_m=holdout.median if holdout else None,
         holdout_p95_m=holdout.p95 if holdout else None,
-        predicted_rms_m=workspace.predicted_rms if workspace else None,
-        predicted_p95_m=workspace.predicted_p95 if workspace else None,
+        expected_rms_m=expected.rms if expected else None,
+        expected_p95_m=expected.p95 if expected else None,
         true_rms_m=truth.rms_over_workspace if truth else None,
         true_centre_m=truth.error_at_centroid if truth else None,
         true_rotation_rad=truth.rotation_error if truth else None,

@@ -18,7 +18,7 @@ from flangeye.files.elsewhere import is_url
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FIGURES = ("holdout_rms_m", "predicted_p95_m", "true_rms_m")
+FIGURES = ("holdout_rms_m", "expected_p95_m", "true_rms_m")
 """Of which medians are told."""
 
 MOST = 1000

@@ -73,19 +73,12 @@ def _motion(direction: Vector) -> str:
 def _errors(result: Result) -> list[str]:
     lines = []
     if found := expected_error(result):
-        rms, bound = found
-        below = "" if bound is None else f", 95 % below {_mm(bound)}"
-        lines.append(f"  expected error     {_mm(rms)} rms at the work{below}")
+        rms, p95 = found
+        lines.append(f"  expected error     {_mm(rms)} rms at the work, 95 % below {_mm(p95)}")
     if h := result.holdout:
         lines.append(
             f"  held-out error     {_mm(h.rms)} rms, {_mm(h.median)} median, "
             f"95 % below {_mm(h.p95)} ({_over(h)})"
-        )
-    if w := result.workspace:
-        size = " x ".join(f"{x * 1e3:.0f}" for x in w.size)
-        lines.append(
-            f"  of the pose alone  {_mm(w.predicted_rms)} rms, 95 % below {_mm(w.predicted_p95)} "
-            f"over the workspace ({size} mm)"
         )
     return lines + (_truth(result.truth) if result.truth else [])
 

@@ -114,7 +114,7 @@ def init(  # noqa: PLR0913  one for each option
     yes: Yes = False,
     out: Out = Path("recipe.yaml"),
 ) -> None:
-    """Write a recipe for a folder of recordings, or with --ros2 for what runs.
+    """Write a recipe for recordings, or for ROS 2 (--ros2).
 
     Inspects the folder or the running graph and asks for what it does not show.
     """

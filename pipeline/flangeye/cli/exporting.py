@@ -89,7 +89,7 @@ def publish(
     camera: Camera = None,
     anyway: Anyway = False,
 ) -> None:
-    """Keep the calibration on the ROS 2 graph as static transforms, until Ctrl-C.
+    """Keep a calibration on the ROS 2 graph (tf_static).
 
     The recipe names the frames in its export.ros2_launch step; without one they are ours.
     """

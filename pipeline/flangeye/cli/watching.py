@@ -82,7 +82,7 @@ def monitor(  # noqa: PLR0913  one argument an option
     )
     from flangeye.doctor.monitor.opcua import write_state
     from flangeye.errors import StageError
-    from flangeye.handeye.drift import DriftTest
+    from flangeye.estimation.watch.drift import DriftTest
     from flangeye.units import parse_quantity
 
     archive = [*(archive or ()), *(more or ())]

@@ -17,9 +17,8 @@ import numpy as np
 from flangeye.doctor.diagnosis import Change, Finding, Misfit, RecordedSession
 from flangeye.doctor.examine import Diagnosis, require_enough
 from flangeye.errors import FlangeyeError
-from flangeye.handeye.candidates import held_out
-from flangeye.handeye.cell import solve_cell
-from flangeye.handeye.graph import LIMITS
+from flangeye.estimation.rough import rough
+from flangeye.estimation.sightings import problem_of
 from flangeye.maths.geometry import invert, rigid
 from flangeye.models.cell import Cell, Link
 from flangeye.types import (
@@ -242,10 +241,10 @@ def _links_beside(stands: str, observations: Sequence[Observation], cell: Cell) 
 def _mispaired(observations: Sequence[Observation], cell: Cell) -> list[Finding]:
     """Return the sightings that do not belong to the poses beside them, if others agree."""
     try:
-        found = solve_cell(observations, cell, LIMITS).found
+        found = rough(problem_of(observations, cell), cell.freedoms)
     except (FlangeyeError, np.linalg.LinAlgError):
         return []
-    errors = np.linalg.norm(held_out(found)[0], axis=1)
+    errors = np.linalg.norm(found.errors[:, 3:], axis=1)
     ordinary = GROSS * np.sqrt((errors[found.inliers] ** 2).mean())
     wrong = ~found.inliers & (errors > ordinary)
     far = [o.id for o, gone in zip(observations, wrong, strict=True) if gone]
@@ -289,11 +288,10 @@ class Foretold:
 def foretold(observations: Sequence[Observation], cell: Cell) -> Foretold:
     """Return the error with which the others predict each sighting; infinite without a solution."""
     try:
-        found = solve_cell(observations, cell, LIMITS).found
+        found = rough(problem_of(observations, cell), cell.freedoms)
     except (FlangeyeError, np.linalg.LinAlgError):
         return Foretold(Misfit(np.inf), np.inf)
-    places = np.linalg.norm(held_out(found)[0], axis=1)
-    turns = np.linalg.norm(found.linear.residuals[:, :3], axis=1)
+    turns, places = (np.linalg.norm(found.errors[:, at], axis=1) for at in (slice(3), slice(3, 6)))
     centres = np.array([o.feature.centre for o in observations])
     of_pairs = []
     for of in _by_pair(observations).values():

@@ -20,8 +20,10 @@ from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Carrier, Linear, Problem
 from flangeye.maths.frame_graph import chain, composed
 from flangeye.maths.geometry import hat, invert
-from flangeye.types import Floats
+from flangeye.types import ExpectedError, Floats
 
+DRAWS = 8
+"""Of an error at each pose and each draw of the sizes, for its quantiles."""
 LEVER = 0.1
 """Turns of a target count like what they do so far from it [m]: the size of tools and markers."""
 
@@ -38,6 +40,11 @@ class Answer:
     mean: Floats
     covariance: Floats
 
+    def at(self, mean: Floats) -> Answer:
+        """Return other moves (P,), with the covariance about them."""
+        off = mean - self.mean
+        return Answer(mean, self.covariance + np.outer(off, off))
+
 
 def functional(found: Estimate, a: Floats) -> Answer:
     """Return the answer p + A delta of a (P, K) matrix, over the mixture."""
@@ -48,45 +55,55 @@ def functional(found: Estimate, a: Floats) -> Answer:
     return Answer(mean, 0.5 * (covariance + covariance.T))
 
 
-def as_reported(found: Estimate, work: Problem) -> Floats:
+def as_reported(found: Estimate, work: Problem, without: frozenset[str] = frozenset()) -> Floats:
     """Return (P, K): what the effects' numbers add to the places for the arms as reported.
 
     Args:
         found: The posterior.
         work: Sightings as they would be over the workspace.
+        without: Kinds of the arms' errors that are corrected, and so are no part of what they
+            report.
     """
     linear = work.linearised(found.places)
     columns = [
-        e.block(work, linear) if e.of_arm else np.zeros((len(work.seen), 6, n))
+        e.block(work, linear)
+        if e.of_arm and e.kind not in without
+        else np.zeros((len(work.seen), 6, n))
         for e, n in zip(found.effects, found.counts, strict=True)
     ]
     of_arm = np.concatenate([np.zeros((len(work.seen), 6, 0)), *columns], axis=2)
-    world = _world(found, work)
+    world = _world(found, work, without)
     out = []
     for name in found.problem.unknown:
         if any(c.frame in chain(work.frames, name) for c in work.carriers):
             out.append(_carried(work, linear, name, (of_arm, world), found))
         else:
-            out.append(_fixed(found, work, name, world))
+            out.append(_fixed(found, work, name, world, without))
     return np.concatenate([np.zeros((0, of_arm.shape[2])), *out])
 
 
-def _columns_of_arm(found: Estimate, work: Problem, carrier: Carrier) -> Floats:
+def _columns_of_arm(
+    found: Estimate, work: Problem, carrier: Carrier, without: frozenset[str]
+) -> Floats:
     """Return (T, 6, K) twists of what one carrier moves, by every effect's numbers."""
     still = np.zeros((len(work.seen), 6, 6))
     blocks = {c.frame: still + np.eye(6) if c is carrier else still for c in work.carriers}
     one = Linear(np.zeros(0), np.zeros(0), blocks)
     columns = [
-        e.block(work, one) if e.of_arm else np.zeros((len(work.seen), 6, n))
+        e.block(work, one)
+        if e.of_arm and e.kind not in without
+        else np.zeros((len(work.seen), 6, n))
         for e, n in zip(found.effects, found.counts, strict=True)
     ]
     return np.concatenate([np.zeros((len(work.seen), 6, 0)), *columns], axis=2)
 
 
-def _rigid_part(found: Estimate, work: Problem, carrier: Carrier) -> Floats:
+def _rigid_part(
+    found: Estimate, work: Problem, carrier: Carrier, without: frozenset[str]
+) -> Floats:
     """Return (6, K) the rigid motion, about the arm base's origin, of its displacements."""
     places = np.asarray(work.frames[carrier.frame].place)[work.seen.times, :3, 3]
-    moved = _columns_of_arm(found, work, carrier)[:, 3:]
+    moved = _columns_of_arm(found, work, carrier, without)[:, 3:]
     motions = np.concatenate(
         [-hat(places), np.broadcast_to(np.eye(3), (len(places), 3, 3))], axis=2
     )
@@ -94,7 +111,7 @@ def _rigid_part(found: Estimate, work: Problem, carrier: Carrier) -> Floats:
                       @ moved.reshape(-1, moved.shape[2]))  # fmt: skip
 
 
-def _world(found: Estimate, work: Problem) -> Floats:
+def _world(found: Estimate, work: Problem, without: frozenset[str]) -> Floats:
     """Return (6, K) by how much reported coordinates of the root are turned and shifted."""
     parts = []
     for carrier in work.carriers:
@@ -104,12 +121,14 @@ def _world(found: Estimate, work: Problem) -> Floats:
             base = np.eye(4)
             for place in places:
                 base = base @ place
-            parts.append(adjoint(base) @ _rigid_part(found, work, carrier))
+            parts.append(adjoint(base) @ _rigid_part(found, work, carrier, without))
     count = len(found.posterior.model.sizes.effect)
     return np.asarray(sum(parts) / len(parts)) if parts else np.zeros((6, count))
 
 
-def _fixed(found: Estimate, work: Problem, name: str, world: Floats) -> Floats:
+def _fixed(
+    found: Estimate, work: Problem, name: str, world: Floats, without: frozenset[str]
+) -> Floats:
     """Return (6, K) of a place that no arm moves: the rigid part, seen from its own origin."""
     frames = {n: replace(f, place=found.places.get(n, f.place)) for n, f in work.frames.items()}
     parent = np.eye(4)
@@ -120,7 +139,7 @@ def _fixed(found: Estimate, work: Problem, name: str, world: Floats) -> Floats:
     bases = [c for c in work.carriers if work.frames[c.frame].parent == name and c.link is None]
     place = parent @ found.places[name]
     for carrier in bases:
-        gauge = gauge + adjoint(place) @ _rigid_part(found, work, carrier)
+        gauge = gauge + adjoint(place) @ _rigid_part(found, work, carrier, without)
     turned = adjoint(invert(parent)) @ gauge
     shift = np.eye(6)
     shift[3:, :3] = -hat(found.places[name][:3, 3])
@@ -178,44 +197,40 @@ def adjoint(pose: Floats) -> Floats:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """The expected error at the work: where a camera's point is commanded, and where it is.
-
-    Attributes:
-        rms: [m]
-        p95: 95 % of the errors are below [m].
-    """
-
-    rms: float
-    p95: float
-
-
-def expected_error(found: Estimate, work: Problem, a: Floats) -> Expected:
-    """Return the predictive spread of the as-reported answer at new poses of the work.
+def expected_error(
+    found: Estimate, work: Problem, answer: Floats, corrected: bool = False
+) -> ExpectedError:
+    """Return the predictive spread of an answer at new poses of the work.
 
     Of the pose's own error, of what the arm does beyond the rigid part, and of the noise of a
     sighting: what errors of poses held out consist of.
+
+    Args:
+        found: The posterior.
+        work: Sightings as they would be over the workspace.
+        answer: (P,) moves of the places.
+        corrected: Whether the arms' errors are corrected by their posterior mean.
     """
-    known = found.posterior
-    model = model_at(work, found.places, found.effects, np.ones(len(work.seen)))
-    p, rng = model.p, np.random.default_rng(0)
+    known, rng = found.posterior, np.random.default_rng(0)
+    model = model_at(work, found.places, found.effects, np.ones(len(work.seen)), of_session=False)
+    p = model.p
     of_places, of_effects = model.places[:, 3:], model.effects[:, 3:]
-    answer = np.concatenate([np.eye(p), a], axis=1) @ known.mean
+    put_right = np.repeat([corrected and e.of_arm for e in found.effects], found.counts)
+    expected = of_places @ answer + of_effects @ (put_right * known.mean[p:])
     rows = np.concatenate([of_places, of_effects], axis=2)
     squares, chances = [], []
     for chance, each in zip(known.chances, known.fits, strict=True):
-        bias = rows @ each.mean - of_places @ answer
+        bias = rows @ each.mean - expected
         noise = model.noise(each.sizes)[:, 3:, 3:]
         covariance = rows @ each.covariance @ np.swapaxes(rows, 1, 2) + noise
         root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
-        drawn = bias + (root @ rng.standard_normal((8, len(bias), 3, 1)))[..., 0]
-        squares.append((drawn**2).sum(axis=2).ravel())
-        chances.append(np.full(squares[-1].size, chance))
-        exact = (bias**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2)
-        squares[-1] *= exact.mean() / squares[-1].mean()
+        drawn = bias + (root @ rng.standard_normal((DRAWS, len(bias), 3, 1)))[..., 0]
+        exact = float(((bias**2).sum(axis=1) + np.trace(covariance, axis1=1, axis2=2)).mean())
+        square = (drawn**2).sum(axis=2).ravel()
+        squares.append(square * exact / square.mean())
+        chances.append(np.full(square.size, chance))
     values, weights = np.concatenate(squares), np.concatenate(chances)
     order = np.argsort(values)
     share = np.cumsum(weights[order]) / weights.sum()
     p95 = float(np.sqrt(values[order][np.searchsorted(share, 0.95)]))
-    return Expected(float(np.sqrt(np.average(values, weights=weights))), p95)
+    return ExpectedError(float(np.sqrt(np.average(values, weights=weights))), p95)

@@ -64,6 +64,26 @@ class Estimate:
     inliers: Mask
     squares: Floats
 
+    def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
+        """Return the effects of a kind, each with the mean and covariance of its numbers."""
+        out, at = [], self.posterior.model.p
+        for effect, count in zip(self.effects, self.counts, strict=True):
+            rows = slice(at, at + count)
+            if effect.kind == kind:
+                known = self.posterior
+                out.append((effect, known.mean[rows], known.covariance[rows, rows]))
+            at += count
+        return out
+
+    def outgrown(self, kind: str) -> bool:
+        """Whether an effect is larger than its prior leaves likely: two deviations or more."""
+        sizes = self.posterior.mode.sizes
+        return any(
+            np.log(sizes[k] / effect.size) > 2 * np.log(effect.factor)
+            for k, effect in enumerate(self.effects)
+            if effect.kind == kind
+        )
+
     @property
     def counts(self) -> list[int]:
         """How many numbers each effect has."""
@@ -85,10 +105,26 @@ def prior_of(effects: Sequence[Effect], counts: Sequence[int]) -> Sizes:
     return Sizes(centre, mix, np.repeat(np.arange(count), counts))
 
 
-def model_at(problem: Problem, places: Places, effects: Sequence[Effect], shares: Floats) -> Model:
-    """Return the linear model near some places."""
+def model_at(
+    problem: Problem,
+    places: Places,
+    effects: Sequence[Effect],
+    shares: Floats,
+    of_session: bool = True,
+) -> Model:
+    """Return the linear model near some places.
+
+    Args:
+        problem: What is given.
+        places: (4, 4) of each unknown.
+        effects: What may be wrong.
+        shares: (N,) weights of the sightings.
+        of_session: Whether the sightings are those of the session, and not new ones.
+    """
     linear, s = problem.linearised(places), problem.seen
     blocks = [effect.block(problem, linear) for effect in effects]
+    if not of_session:
+        blocks = [b if e.lasting else 0 * b for b, e in zip(blocks, effects, strict=True)]
     still = np.zeros((len(s), 6, 0))
     return Model(
         (s.projectors @ linear.residuals[..., None])[..., 0],
@@ -116,7 +152,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
     for _ in range(ROUNDS):
         model = model_at(problem, places, effects, inliers.astype(float))
         z = mode_of(model, z)
-        found = fit(model, model.sizes.at(z))
+        found = fit(model, model.sizes.at(z), with_gradient=False)
         places, step = _moved(problem, places, found)
         squares, good = judged(model, found)
         key = good.tobytes()
@@ -141,7 +177,7 @@ def judged(model: Model, found: Fit) -> tuple[Floats, Mask]:
     noise = model.noise(found.sizes)
     q = model.projectors
     left, spread = left_out(everyone, found)
-    covariance = q @ (noise + spread) @ q + np.eye(6) - q
+    covariance = q @ (noise + spread) @ q + (np.eye(6) - q)
     squares = np.einsum("na,nab,nb->n", left, np.linalg.inv(covariance), left)
     ranks = np.trace(q, axis1=1, axis2=2).round()
     limits = np.array([chi2_quantile(OUTLIER, int(k)) if k else np.inf for k in range(7)])

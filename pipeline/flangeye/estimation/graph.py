@@ -89,6 +89,9 @@ class Carrier:
         joints: (T, n) at each time [rad]; None where nothing is known of them.
         accuracy: Median of the deviation of a joint's zero, by the robot's file [rad].
         link: Which link it is; None for the flange.
+        rates: (T, 6) its twists per second at each time, in its base at its origin; None where
+            nobody recorded how it passed.
+        axis: Whether it is a rail or a positioner.
     """
 
     frame: str
@@ -97,6 +100,8 @@ class Carrier:
     joints: Floats | None = None
     accuracy: float = 0.0
     link: int | None = None
+    rates: Floats | None = None
+    axis: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +134,31 @@ class Problem:
         """Return the problem of some of the sightings."""
         return replace(self, seen=self.seen.where(chosen))
 
+    def of_pair(self, k: int) -> Problem:
+        """Return the problem of the sightings of one camera and one target."""
+        return self.where(self.seen.pairs == k)
+
+    def without_normals(self, which: Mask) -> Problem:
+        """Return the problem with only the centres of some circles."""
+        projectors = self.seen.projectors.copy()
+        projectors[which, :3, :3] = 0.0
+        return replace(self, seen=replace(self.seen, projectors=projectors))
+
+    def placed(self, places: Places) -> Problem:
+        """Return the problem with some of its unknown places known."""
+        frames = {n: replace(f, place=places.get(n, f.place)) for n, f in self.frames.items()}
+        return replace(self, frames=frames)
+
+    def residuals(self, places: Places) -> Floats:
+        """Return (N, 6) measured minus predicted, across what was measured [rad, m]."""
+        s, out = self.seen, np.zeros((len(self.seen), 6))
+        for k, ends in enumerate(self.ends):
+            rows = s.pairs == k
+            if rows.any():
+                frames = self._at(places, s.times[rows])
+                out[rows] = _residuals(frames, ends, s.where(rows))[0]
+        return np.asarray((s.projectors @ out[..., None])[..., 0])
+
     def moved(self, places: Places, step: Floats) -> Places:
         """Return the places moved by (6 K,), in the order of ``unknown``."""
         out = {}
@@ -138,6 +168,15 @@ class Problem:
             place[:3, 3] += shift
             out[name] = place
         return out
+
+    def moves(self, places: Places, there: Places) -> Floats:
+        """Return the (6 K,) that move places to others: the inverse of :meth:`moved`."""
+        each = []
+        for name in self.unknown:
+            before, after = np.asarray(places[name]), np.asarray(there[name])
+            turn = rotation_log(after[:3, :3] @ before[:3, :3].T)
+            each += [turn, after[:3, 3] - before[:3, 3]]
+        return np.concatenate([np.zeros(0), *each])
 
     def linearised(self, places: Places) -> Linear:
         """Return what is predicted at some places, and how each frame moves it."""

@@ -27,11 +27,15 @@ from scipy.stats import qmc
 from flangeye.types import Floats, Mask
 
 FREE = 1e-10
-"""Information per unknown place before anything is seen, in units of the scaled design: none, but
-what keeps the factorisation positive where the sightings show nothing."""
+"""Information of each unknown before anything is seen, as a share of what is most: none, but what
+keeps the factorisation positive where the sightings show nothing."""
+EXACT = 1e-6, 1e-7
+"""Noise of the exactest sightings [rad, m]: a thousandth of what any camera has."""
 SAMPLES = 32
 """Draws of the sizes about their mode (half of them mirrored). Twice as many change the stated
 error of 16 poses by less than 1 %."""
+TELLING = 150
+"""Sightings that sizes are found from: more change them by less than their priors' spread."""
 WIDER = 1.3
 """Factor on the Laplace approximation's deviations that the draws come from: importance sampling
 needs a proposal wider than the posterior."""
@@ -94,10 +98,19 @@ class Model:
 
     def noise(self, sizes: Floats) -> Floats:
         """Return (N, 6, 6) covariances of the noise; the identity across what was not measured."""
-        scale, further = np.repeat(sizes[-4:-2], 3), np.repeat(sizes[-2:] ** 2, 3)
+        scale, further = np.repeat(sizes[-4:-2], 3), sizes[-2:] ** 2 + np.square(EXACT)
         q = self.projectors
-        inside = self.covariances * np.outer(scale, scale) + np.diag(further)
-        return np.asarray(q @ inside @ q + np.eye(6) - q)
+        inside = self.covariances * np.outer(scale, scale) + np.diag(np.repeat(further, 3))
+        return np.asarray(q @ inside @ q + (np.eye(6) - q))
+
+    def telling(self) -> Model:
+        """Return the model of some sightings that take part, evenly over all."""
+        kept = np.flatnonzero(self.shares)
+        if len(kept) <= TELLING:
+            return self
+        rows = kept[np.linspace(0, len(kept) - 1, TELLING).round().astype(int)]
+        each = ("residuals", "places", "effects", "covariances", "projectors", "shares")
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
     def weighted(self, shares: Floats) -> Model:
         """Return the model with other weights of its sightings."""
@@ -129,8 +142,10 @@ class Fit:
     right: Floats
 
 
-def fit(model: Model, sizes: Floats) -> Fit:
+def fit(model: Model, sizes: Floats, with_gradient: bool = True) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
+
+    Without the gradient (zeros) it takes half the time.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
@@ -139,16 +154,14 @@ def fit(model: Model, sizes: Floats) -> Fit:
     noise = model.noise(sizes)
     q, share = model.projectors, model.shares
     bare = np.asarray(np.linalg.inv(noise), dtype=np.float64)
-    weights = q @ bare @ q * share[:, None, None]
+    weights = q @ (bare + np.swapaxes(bare, 1, 2)) @ q * share[:, None, None] / 2
     count = h.shape[2]
     weighted = weights @ h
     flat, flat_weighted = h.reshape(-1, count), weighted.reshape(-1, count)
     right = flat_weighted.T @ r.ravel()
     prior = np.concatenate([np.full(model.p, 0.0), sizes[model.sizes.effect] ** -2.0])
     information = flat.T @ flat_weighted + np.diag(prior)
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information / np.outer(scale, scale)
-    scaled[np.diag_indices(model.p)] += FREE
+    scaled, scale = _scaled(information)
     root = cholesky(scaled, lower=True)
     covariance = cho_solve((root, True), np.eye(count)) / np.outer(scale, scale)
     mean = covariance @ right
@@ -161,9 +174,19 @@ def fit(model: Model, sizes: Floats) -> Fit:
         + np.einsum("na,nab,nb->", left, weights, left)
         + prior @ mean**2
     )
-    gradient = _gradient(model, sizes, Fit(sizes, mean, covariance, weights, cost, sizes,
-                                           information, right), (h, left, bare, prior))  # fmt: skip
-    return Fit(sizes, mean, covariance, weights, cost, gradient, information, right)
+    found = Fit(sizes, mean, covariance, weights, cost, np.zeros(len(sizes)), information, right)
+    if not with_gradient:
+        return found
+    return replace(found, gradient=_gradient(model, sizes, found, (h, left, bare, prior)))
+
+
+def _scaled(information: Floats) -> tuple[Floats, Floats]:
+    """Return an information with a diagonal of ones, a little more, and what it is divided by."""
+    scale = np.sqrt(np.maximum(np.diag(information), 0.0))
+    scale = np.where(scale > 1e-7 * scale.max(), scale, scale.max())
+    scaled = information / np.outer(scale, scale)
+    scaled[np.diag_indices(len(scaled))] += FREE
+    return scaled, scale
 
 
 def _gradient(
@@ -228,7 +251,7 @@ class Posterior:
 
 def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
     """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
-    prior = model.sizes
+    prior, model = model.sizes, model.telling()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
 
     def cost(z: Floats) -> tuple[float, Floats]:
@@ -244,17 +267,16 @@ def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Float
 
 def posterior(model: Model, mode: Floats | None = None) -> Posterior:
     """Return the joint posterior, the sizes integrated over."""
-    z = mode_of(model) if mode is None else mode
-    spread = _laplace(model, z)
-    draws = _draws(len(z))
+    z, some = mode_of(model) if mode is None else mode, model.telling()
+    spread = _laplace(some, z)
+    draws = _draws(len(z), SAMPLES if some is model else SAMPLES // 4)
     norms = (draws**2).sum(axis=1)
-    fits, logs = [fit(model, model.sizes.at(z))], [-0.5 * (float(z @ z))]
-    logs[0] -= 0.5 * fits[0].cost
-    for draw in draws:
-        at = z + WIDER * spread @ draw
-        found = fit(model, model.sizes.at(at))
+    fits, logs = [], []
+    for at in [z, *(z + WIDER * spread @ draw for draw in draws)]:
+        found = fit(model, model.sizes.at(at), with_gradient=False)
+        told = found if some is model else fit(some, model.sizes.at(at), with_gradient=False)
         fits.append(found)
-        logs.append(-0.5 * (found.cost + float(at @ at)))
+        logs.append(-0.5 * (told.cost + float(at @ at)))
     # Density of the proposal, a multivariate t; the mode is its first draw.
     of_proposal = -0.5 * (TAIL + len(z)) * np.log1p(np.concatenate([[0.0], norms]) / TAIL)
     weights = np.array(logs) - of_proposal
@@ -276,11 +298,11 @@ def _laplace(model: Model, z: Floats) -> Floats:
     return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
 
 
-def _draws(count: int) -> Floats:
-    """Return (SAMPLES, count) multivariate t numbers, low in discrepancy, in mirrored pairs."""
+def _draws(count: int, samples: int) -> Floats:
+    """Return (samples, count) multivariate t numbers, low in discrepancy, in mirrored pairs."""
     from scipy.special import gammaincinv, ndtri
 
-    points = qmc.Sobol(count + 1, scramble=True, seed=0).random(SAMPLES // 2)
+    points = qmc.Sobol(count + 1, scramble=True, seed=0).random(samples // 2)
     normal = ndtri(np.clip(points[:, :-1], 1e-6, 1 - 1e-6))
     chi2 = 2 * gammaincinv(TAIL / 2, np.clip(points[:, -1], 1e-6, 1 - 1e-6))
     half = normal / np.sqrt(chi2 / TAIL)[:, None]
@@ -309,7 +331,5 @@ def without(found: Fit, model: Model, fold: Mask) -> Floats:
     weighted = (w @ h).reshape(-1, count)
     information = found.information - h.reshape(-1, count).T @ weighted
     right = found.right - weighted.T @ r.ravel()
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information / np.outer(scale, scale)
-    scaled[np.diag_indices(model.p)] += FREE
+    scaled, scale = _scaled(information)
     return np.asarray(np.linalg.solve(scaled, right / scale) / scale)

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.smooth_field import displacement
-from flangeye.types import FLANGE, ArmCorrection, Floats, Observation, VerificationView
+from flangeye.types import FLANGE, ArmCorrection, Floats, Mask, Observation, VerificationView
 
 REACHED = 1e-9
 """Joint angles belong to a pose when they reach it this closely [rad, m]."""
@@ -141,15 +141,27 @@ def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
     Raises:
         ValueError: It does not get to every pose.
     """
+    joints, reached = reached_from(arm, base_T_flange, near)
+    if not reached.all():
+        raise ValueError("no joint angles near the given ones reach the pose")
+    return joints
+
+
+def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats, Mask]:
+    """Return joint angles (..., n) near others (..., n), and which (...) poses they reach.
+
+    See :func:`follow`.
+    """
     joints = np.broadcast_to(near, (*base_T_flange.shape[:-2], arm.n)).astype(np.float64)
     for _ in range(STEPS):
         twist = _twist(base_T_flange, arm.flange(joints))
         if np.abs(twist).max() < REACHED:
-            return joints
+            break
         step = (np.linalg.pinv(arm.jacobian(joints), rcond=1e-6) @ twist[..., None])[..., 0]
         longest = np.abs(step).max(axis=-1, keepdims=True)
         joints = joints + step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-12))
-    raise ValueError("no joint angles near the given ones reach the pose")
+    left = np.abs(_twist(base_T_flange, arm.flange(joints))).max(axis=-1)
+    return joints, np.asarray(left < REACHED)
 
 
 def _twist(wanted: Floats, reached: Floats) -> Floats:

@@ -35,9 +35,7 @@ def field_over(places: Floats) -> SmoothField:
     about = places.mean(axis=0)
     radius = float(np.linalg.norm(places - about, axis=1).max())
     k = 3 * len(POWERS)
-    bare = SmoothField(
-        about, RADII * max(radius, 1e-3), np.zeros((6, k)), np.zeros(k), np.zeros((k, k)), 0.0
-    )
+    bare = SmoothField(about, RADII * max(radius, 1e-3), np.zeros((6, k)), np.zeros(k))
     motions, moved = _motions(bare, places).reshape(-1, 6), effects(bare, places)
     nearest = np.linalg.pinv(motions, rcond=1e-9) @ moved.reshape(-1, k)
     return replace(bare, rigid=nearest)
@@ -63,20 +61,6 @@ def features(scaled: Floats, powers: Sequence[tuple[int, ...]]) -> Floats:
 def displacement(field: SmoothField, places: Floats) -> Floats:
     """Return (..., 3) by how much a flange reported at (..., 3) places is elsewhere [m]."""
     return np.asarray(effects(field, places) @ field.weights)
-
-
-def displacement_covariance(field: SmoothField, places: Floats, corrected: bool) -> Floats:
-    """Return (..., 3, 3) covariances of what the field leaves at (..., 3) places [m^2].
-
-    Args:
-        field: The field.
-        places: In ``base`` [m].
-        corrected: Whether poses are those of the arm corrected by the field, not as reported.
-    """
-    moved = effects(field, places)
-    if corrected:
-        return np.asarray(moved @ field.covariance @ np.swapaxes(moved, -1, -2))
-    return np.asarray(field.size**2 * moved @ np.swapaxes(moved, -1, -2))
 
 
 def _motions(field: SmoothField, places: Floats) -> Floats:

@@ -103,7 +103,8 @@ def excess_variance(errors: Floats, covariances: Floats) -> float:
         covariances: (N, 3, 3) what is known of each [m^2].
     """
     variances, axes = np.linalg.eigh(covariances)
-    squares = np.einsum("nji,nj->ni", axes, errors) ** 2
+    with np.errstate(over="ignore"):  # what a file says may be beyond all numbers
+        squares = np.einsum("nji,nj->ni", axes, errors) ** 2
     median = chi2_quantile(0.5, 3)
 
     def too_small(excess: float) -> bool:

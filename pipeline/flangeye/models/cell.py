@@ -17,9 +17,23 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.models.configuration import Ends
+from flangeye.models.configuration import LINK, Configuration, Ends
 from flangeye.models.robots import RobotModel
-from flangeye.types import Array, Floats, HandEye, Mask, Motion, Observation, Transform
+from flangeye.types import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    Array,
+    Floats,
+    HandEye,
+    Mask,
+    Motion,
+    Observation,
+    Transform,
+)
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -77,7 +91,7 @@ class Cell:
 
     Attributes:
         frames: By name. The place of what moves is None here: observations have it.
-        movers: What moves which frame.
+        movers: What moves which frame; None for an arm of which no model is known.
         cameras: Frames of cameras, in the recipe's order.
         targets: Frames of targets.
         links: By frame, the links that carry something. Their places are None, too: they follow
@@ -85,7 +99,7 @@ class Cell:
     """
 
     frames: Mapping[str, Frame]
-    movers: Mapping[str, RobotModel | Axis]
+    movers: Mapping[str, RobotModel | Axis | None]
     cameras: tuple[str, ...]
     targets: tuple[str, ...]
     links: Mapping[str, Link] = field(default_factory=dict)
@@ -114,6 +128,7 @@ class Cell:
         able = {
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
+            if mover is not None
         }
         links = {name: _freedoms_of_link(link, self.arms) for name, link in self.links.items()}
         return able | links
@@ -121,7 +136,7 @@ class Cell:
     @property
     def arms(self) -> dict[str, RobotModel]:
         """The models of the arms."""
-        return {n: mover for n, mover in self.movers.items() if not isinstance(mover, Axis)}
+        return {n: mover for n, mover in self.movers.items() if isinstance(mover, RobotModel)}
 
     def passing(self, motion: Motion) -> Motion:
         """Return how everything passed: rails, positioners and links where recorded values say."""
@@ -136,12 +151,13 @@ class Cell:
             for name, link in self.links.items()
             if link.arm in motion.joints
         }
-        return replace(motion, others={**motion.others, **placed})
+        own = {FLANGE: motion.poses} if FLANGE in self.movers else {}
+        return replace(motion, others={**own, **motion.others, **placed})
 
     def joints(self, observations: Sequence[Observation]) -> dict[str, Floats]:
         """Return (N, n) of the arms that reported them at all N observations [rad]."""
-        told = [n for n in self.arms if all(n in o.arm_joints for o in observations)]
-        return {name: np.array([o.arm_joints[name] for o in observations]) for name in told}
+        each = {name: [joints_of(o, name) for o in observations] for name in self.arms}
+        return {n: np.array(q) for n, q in each.items() if all(x is not None for x in q)}
 
     def link_poses(self, name: str, joints: Floats) -> Floats:
         """Return (N, 4, 4) of a link in its arm's base at (N, n) joints, by the arm's model."""
@@ -202,11 +218,13 @@ class Cell:
         """Return observations with the flanges where corrected arms have them; see ``Layout``."""
         from flangeye.maths.arm_correction import corrected_observation
         from flangeye.maths.kinematics import Arm
+        from flangeye.maths.shared_errors import without_shared
 
-        moved = list(observations)
-        for name, correction in calibration.arms.items():
+        alone = {FLANGE: calibration.correction} if calibration.correction else {}
+        moved = [without_shared(o, calibration.shared) for o in observations]
+        for name, correction in {**alone, **calibration.arms}.items():
             mover = self.movers[name]
-            model = None if isinstance(mover, Axis) else Arm(mover)
+            model = Arm(mover) if isinstance(mover, RobotModel) else None
             moved = [corrected_observation(o, correction, model, name) for o in moved]
         return moved
 
@@ -266,13 +284,44 @@ def _measured(name: str, observations: Sequence[Observation]) -> Floats:
 
 
 def _joints(name: str, link: Link, observations: Sequence[Observation]) -> Floats:
-    for observation in observations:
-        if link.arm not in observation.arm_joints:
+    joints = [joints_of(o, link.arm) for o in observations]
+    for observation, each in zip(observations, joints, strict=True):
+        if each is None:
             raise StageError(
                 f"where {name} was at observation {observation.id} follows from the joint angles "
                 f"of '{link.arm}', and there are none: record them"
             )
-    return np.array([o.arm_joints[link.arm] for o in observations])
+    return np.array(joints)
+
+
+def joints_of(observation: Observation, arm: str) -> Array | None:
+    """Return the (n,) joint angles of an arm at an observation [rad]; None if not recorded."""
+    own = observation.joints if arm == FLANGE else None
+    return observation.arm_joints.get(arm, own)
+
+
+def cell_of(
+    configuration: Configuration, robot: RobotModel | None, second: RobotModel | None = None
+) -> Cell:
+    """Return the cell of one camera and one target that a configuration names.
+
+    Args:
+        configuration: Who carries camera and target.
+        robot: The arm's model, where it is known.
+        second: That of the arm that carries the target before another's camera.
+    """
+    frames = {FLANGE: Frame(BASE), CAMERA: Frame(configuration.camera)}
+    movers: dict[str, RobotModel | Axis | None] = {FLANGE: robot}
+    links: dict[str, Link] = {}
+    if configuration.other_base:
+        frames |= {BASE2: Frame(BASE), FLANGE2: Frame(BASE2)}
+        movers[FLANGE2] = second
+    frames[TARGET] = Frame(configuration.target, configuration.place)
+    if configuration.camera.startswith(LINK):
+        frames[configuration.camera] = Frame(BASE)
+        number = int(configuration.camera.removeprefix(LINK))
+        links[configuration.camera] = Link(FLANGE, number)
+    return Cell(frames, movers, (CAMERA,), (TARGET,), links)
 
 
 def _of_each(frames: Mapping[str, Frame], names: Sequence[str]) -> Floats:

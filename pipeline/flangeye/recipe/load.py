@@ -234,7 +234,7 @@ class _Checker:
                     ("steps", step.index, step.stage.name, "arm"),
                     f"the corrected arm is asked for, and {last[0].stage.name} gives the pose for "
                     "the arm as its controller reports it alone; write arm: as-reported, or let "
-                    "solve.robust: {joint_offsets: auto} find the arm's error, with no refine "
+                    "solve.robust find the arm's error, with no refine "
                     "step after it that changes the pose",
                 )
 

@@ -234,7 +234,7 @@ def bare(need: Any) -> Any:
 
 
 def _instead(kind: str) -> str:
-    known = {"solve": "use solve.maximum_likelihood", "verify": "use verify.holdout"}
+    known = {"solve": "use solve.robust", "verify": "use verify.holdout"}
     return known.get(kind, "leave it out")
 
 

@@ -122,9 +122,6 @@ def evidence_of(facts: Facts) -> list[KeyFigure]:
             found.append(KeyFigure("Held-out", value, "mm", f"without {outliers:.0f} outliers"))
         found.append(KeyFigure("Held-out", millimetres(held.median), "mm", "median"))
         found.append(KeyFigure("Held-out", millimetres(held.p95), "mm", "95 % below"))
-    if box := result.workspace:
-        note = "95 % of the errors over the workspace below; the covariance of the pose alone"
-        found.append(KeyFigure("Pose alone", millimetres(box.predicted_p95), "mm", note))
     if truth := result.truth:
         over = "rms over the workspace, known in simulation"
         found.append(KeyFigure("True error", millimetres(truth.rms_over_workspace), "mm", over))

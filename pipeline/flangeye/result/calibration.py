@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.maths.geometry import covariance_at, rotation_log
+from flangeye.maths.geometry import rotation_log
 from flangeye.maths.kinematics import Arm
 from flangeye.models.configuration import (
     DEFAULT,
@@ -19,6 +19,7 @@ from flangeye.result.contract import (
     AnswerResult,
     AnswersResult,
     CorrectionResult,
+    ExpectedErrorResult,
     FieldResult,
     HoldoutResult,
     ObservationResult,
@@ -103,10 +104,21 @@ def standing_warnings(result: Result) -> list[WarningResult]:
     return [WarningResult(text=text, fix=fix) for text, fix in found]
 
 
-def expected_error(result: Result) -> tuple[float, float | None] | None:
+def expected_error(result: Result) -> tuple[float, float] | None:
     """Return the error to expect at the work, rms and 95 % bound [m]; None where not estimated."""
-    answer = result.answers and result.answers.as_reported
-    return None if not answer or answer.expected_rms is None else (answer.expected_rms, None)
+    found = result.expected_error
+    return None if found is None else (found.rms, found.p95)
+
+
+def expected_error_result(calibration: t.HandEye | None) -> ExpectedErrorResult | None:
+    """Return the section ``expected_error``."""
+    found = calibration and calibration.expected
+    return ExpectedErrorResult(rms=found.rms, p95=found.p95) if found else None
+
+
+def true_result(calibration: t.HandEye | None) -> dict[str, TransformResult]:
+    """Return the section ``true``."""
+    return {x.transform.name: _transform(x) for x in (calibration.true if calibration else ())}
 
 
 def answers_result(
@@ -124,39 +136,19 @@ def answers_result(
     figures = holdout.figures if holdout else {}
     found = {"all": holdout.rms, **figures} if holdout else {}
     return AnswersResult(
-        as_reported=_answer(calibration.as_reported(), found.get("all"), found.get("rms_inliers")),
-        corrected=corrected
-        and _answer(corrected, found.get("corrected_rms"), found.get("corrected_rms_inliers")),
+        as_reported=_answer(calibration.as_reported(), found.get("all")),
+        corrected=corrected and _answer(corrected, found.get("corrected_rms")),
     )
 
 
-def _answer(calibration: t.HandEye, of_all: float | None, inliers: float | None) -> AnswerResult:
+def _answer(calibration: t.HandEye, of_all: float | None) -> AnswerResult:
     return AnswerResult(
         transforms=transforms_result(calibration),
         correction=correction_result(calibration.correction),
         arms={name: _correction(found) for name, found in calibration.arms.items()},
-        expected_rms=_expected(calibration, inliers),
+        expected_rms=calibration.expected and calibration.expected.rms,
         holdout_rms=of_all,
     )
-
-
-def _expected(calibration: t.HandEye, inliers: float | None) -> float | None:
-    """Return the error to expect at the work: what poses held out show, less the centres' noise.
-
-    Never less than what the covariance of the pose alone makes of it: where the noise explains all
-    that the poses held out show, the pose is still only known that well.
-    """
-    used = [pair.observation.feature for pair in calibration.pairs if pair.used]
-    if inliers is None or not used:
-        return None
-    noise = float(np.mean([np.trace(feature.centre_covariance) for feature in used]))
-    camera = calibration.camera
-    seen = [p.observation for p in calibration.pairs if p.used]
-    own = [o.feature.centre for o in seen if o.camera == camera.transform.child]
-    places = camera.transform.apply(np.array(own).reshape(-1, 3))
-    of_pose = covariance_at(calibration.scatter_covariance, camera.about, places)
-    least = float(np.trace(of_pose, axis1=1, axis2=2).mean()) if own else 0.0
-    return float(np.sqrt(max(inliers**2 - noise, least)))
 
 
 def observations_result(
@@ -191,23 +183,9 @@ def _observation(pair: t.Pair) -> ObservationResult:
     )
 
 
-def workspace_result(estimate: t.TransformEstimate, box: t.Box) -> WorkspaceResult:
-    """Return the error to expect over ``box``, from the estimate's covariance alone."""
-    covariances = covariance_at(estimate.covariance, estimate.about, box.grid())
-    return WorkspaceResult(
-        centre=box.centre.tolist(),
-        size=box.size.tolist(),
-        predicted_rms=float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean())),
-        predicted_p95=_p95_of_gaussians(covariances),
-    )
-
-
-def _p95_of_gaussians(covariances: t.Array, draws: int = 400) -> float:
-    """Return the 95th percentile of |x| over zero-mean Gaussians (N, 3, 3), by fixed draws."""
-    unit = np.random.default_rng(0).standard_normal((draws, 3))
-    values, vectors = np.linalg.eigh(covariances)
-    roots = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
-    return float(np.quantile(np.linalg.norm(roots @ unit.T, axis=1), 0.95))
+def workspace_result(box: t.Box) -> WorkspaceResult:
+    """Return the section ``workspace``."""
+    return WorkspaceResult(centre=box.centre.tolist(), size=box.size.tolist())
 
 
 def truth_result(

@@ -110,12 +110,17 @@ class VerificationResult(_Part):
 
 
 class WorkspaceResult(_Part):
-    """Where errors are reported, and the error to expect there."""
+    """Where the work is."""
 
     centre: Vector
     size: Vector
-    predicted_rms: float = Field(description="Root mean square over the box, from the covariance.")
-    predicted_p95: float = Field(description="95 % of the errors over the box are below [m].")
+
+
+class ExpectedErrorResult(_Part):
+    """How far off the arm will be when it is sent to a point that the camera saw."""
+
+    rms: float = Field(description="Root mean square over the work [m].")
+    p95: float = Field(description="95 % of the errors are below [m].")
 
 
 class TransformErrorResult(_Part):
@@ -234,8 +239,7 @@ class AnswerResult(_Part):
     )
     expected_rms: float | None = Field(
         None,
-        description="Error to expect at the work, rms: of the pose, of the arm, and of all else "
-        "that poses held out show beyond the noise of a circle's centre [m].",
+        description="Error to expect at the work, rms [m].",
     )
     holdout_rms: float | None = Field(None, description="On poses held out, over all of them [m].")
 
@@ -297,6 +301,16 @@ class Result(_Part):
     )
     answers: AnswersResult | None = Field(
         None, description="The transforms for the arm as it reports, and those for it corrected."
+    )
+    expected_error: ExpectedErrorResult | None = Field(
+        None,
+        description="The error to expect at the work, with the transforms for the arm as its "
+        "controller reports it; null where the solver does not estimate it.",
+    )
+    true: dict[str, TransformResult] = Field(
+        default_factory=dict,
+        description="The transforms in the arm's true base, for metrology: with all that the arm "
+        "may do wrong alike at every pose in their covariances.",
     )
     observations: list[ObservationResult]
     workspace: WorkspaceResult | None = None

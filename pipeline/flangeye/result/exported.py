@@ -79,12 +79,11 @@ def result_of_camera(result: Result, camera: str | None) -> Result:
 def _work_of_camera(
     name: str, found: TransformResult, seen: Sequence[ObservationResult]
 ) -> WorkspaceResult:
-    """Return the error to expect where a camera saw something, in the frame that carries it."""
+    """Return where a camera saw something, in the frame that carries it."""
     pose = t.Transform.named(name, np.array(found.matrix))
-    estimate = t.TransformEstimate(pose, np.array(found.covariance), np.array(found.about))
     points = pose.apply(np.array([o.centre_in_camera for o in seen if o.centre_in_camera]))
     low, high = points.min(axis=0), points.max(axis=0)
-    return workspace_result(estimate, t.Box((low + high) / 2, high - low))
+    return workspace_result(t.Box((low + high) / 2, high - low))
 
 
 def _of_camera(result: Result, camera: str) -> str:

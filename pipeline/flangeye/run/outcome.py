@@ -95,6 +95,8 @@ def result_of(
         transforms=r.transforms_result(calibration),
         correction=r.correction_result(known),
         answers=r.answers_result(calibration, holdout),
+        expected_error=r.expected_error_result(calibration),
+        true=r.true_result(calibration),
         observations=r.observations_result(pairs, outcome.rejections),
         holdout=holdout,
         verifications=r.verifications_result(outcome.verifications),
@@ -110,7 +112,7 @@ def result_of(
     given = recipe.context.get(t.Box)
     if calibration and (box := work_of(calibration, outcome.source, given)):
         result.method = calibration.method
-        result.workspace = r.workspace_result(calibration.camera, box)
+        result.workspace = r.workspace_result(box)
         if truth := truths.cell:
             result.truth = r.truth_result(calibration, truth, box, _robots(recipe))
     result.warnings += r.standing_warnings(result)

@@ -10,9 +10,8 @@ import numpy as np
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.log.read import RunLog
-from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.models.coverage import Coverage, coverage_of
-from flangeye.models.workspace import work_of, workspace_of
+from flangeye.models.workspace import workspace_of
 from flangeye.plugin.registry import Registry
 from flangeye.recipe.load import Recipe
 from flangeye.run.recorded import recipe_of_log
@@ -26,7 +25,7 @@ class Outlook:
     Attributes:
         residuals: By pose, of those that the solver used [m].
         set_aside: Why the solver did not use a pose, by pose.
-        error: No point of the work is off by more, with 95 % probability [m]; None where unknown.
+        error: 95 % of the errors to expect at the work are below [m]; None where unknown.
         missing: What the solver lacks, in its own words: the motion that is missing; else empty.
         coverage: What of the work the poses have been in, where it is known.
     """
@@ -43,7 +42,7 @@ class Outlook:
         poses += [f"{pose}  set aside: {why}" for pose, why in self.set_aside.items()]
         worth = "error to expect: not known yet"
         if self.error is not None:
-            worth = f"error to expect: 95 % below {self.error * 1e3:.3f} mm anywhere at the work"
+            worth = f"error to expect: 95 % below {self.error * 1e3:.3f} mm at the work"
         covered = [f"covered: {self.coverage}"] if self.coverage else []
         missing = [f"missing: {self.missing}"] if self.missing else []
         return [*poses, worth, *covered, *missing, *(f"better: {x}" for x in self.better)]
@@ -79,7 +78,8 @@ def outlook(
         return Outlook(missing=str(error), coverage=_coverage(recipe, seen, source))
     used = {p.observation.id: float(np.linalg.norm(p.residual)) for p in found.pairs if p.used}
     aside = {p.observation.id: p.reason or "not used" for p in found.pairs if not p.used}
-    return Outlook(used, aside, _error(found, recipe, source), "", _coverage(recipe, seen, source))
+    worth = found.expected.p95 if found.expected else None
+    return Outlook(used, aside, worth, "", _coverage(recipe, seen, source))
 
 
 def _of_all(recipe: Recipe) -> Recipe:
@@ -91,13 +91,6 @@ def _of_all(recipe: Recipe) -> Recipe:
         for step in recipe.steps
     ]
     return replace(recipe, steps=tuple(steps))
-
-
-def _error(found: t.HandEye, recipe: Recipe, source: t.Source) -> float:
-    camera = found.camera
-    box = work_of(found, source, recipe.context.get(t.Box))
-    corners = camera.about[None] if box is None else corners_of(box.centre, box.size)
-    return largest_error_quantile(found.scatter_covariance, camera.about, corners)
 
 
 def _coverage(recipe: Recipe, seen: Sequence[t.Observation], source: t.Source) -> Coverage | None:

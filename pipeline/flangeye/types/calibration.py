@@ -48,20 +48,16 @@ class SmoothField:
         length: Correlation length of the field [m].
         rigid: (6, K) rotation and translation about the middle that each feature is less.
         weights: (K,) of the features [m].
-        covariance: (K, K) of the weights [m^2].
-        size: Standard deviation of a weight before anything was seen [m].
     """
 
     about: Array
     length: float
     rigid: Array
     weights: Array
-    covariance: Array
-    size: float
 
     def __post_init__(self) -> None:
         k = len(self.weights)
-        freeze(self, about=(3,), rigid=(6, k), weights=(k,), covariance=(k, k))
+        freeze(self, about=(3,), rigid=(6, k), weights=(k,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +100,7 @@ class CorrectedArm:
         others: As in :class:`HandEye`.
         arms: As in :class:`HandEye`.
         shared: As in :class:`HandEye`.
-        scatter: (6, 6) as the pose of :class:`ScatterNoise`; None where the camera's is no larger.
+        expected: As in :class:`HandEye`, of the corrected arm.
     """
 
     camera: TransformEstimate
@@ -112,37 +108,23 @@ class CorrectedArm:
     others: tuple[TransformEstimate, ...] = ()
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
     shared: Array = field(default_factory=lambda: np.zeros(0))
-    scatter: Array | None = None
+    expected: ExpectedError | None = None
 
     def __post_init__(self) -> None:
         freeze(self, shared=(len(self.shared),))
-        if self.scatter is not None:
-            freeze(self, scatter=(6, 6))
 
 
 @dataclass(frozen=True)
-class ScatterNoise:
-    """What differs from pose to pose, beside what all poses share.
+class ExpectedError:
+    """How far off the arm will be when it is sent to a point that the camera saw.
 
     Attributes:
-        arm: Variance of the flange's place per axis, beyond its smooth error and beyond the
-            features' own noise [m^2].
-        feature_scale: Factor on the features' own covariances, at most 1.
-        widening: Factor on what is stated of a single prediction: for what is unknown of the noise,
-            and for what errors on poses held out show beyond it; at least 1.
-        pose: (6, 6) covariance of the camera's pose as scatter leaves it, like an estimate's: of
-            errors at poses as those it was found from, where the arm errs as it did there. None
-            where the estimate's is no larger.
+        rms: Root mean square over the work [m].
+        p95: 95 % of the errors are below [m].
     """
 
-    arm: float
-    feature_scale: float
-    widening: float = 1.0
-    pose: Array | None = None
-
-    def __post_init__(self) -> None:
-        if self.pose is not None:
-            freeze(self, pose=(6, 6))
+    rms: float
+    p95: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +142,9 @@ class HandEye:
         others: The configuration's other unknowns, such as ``base_T_target``.
         corrected: Where another pose is the best for the corrected arm: that pose, with its
             correction.
-        noise: What differs from pose to pose, as the residuals show it; None where not estimated.
+        expected: The error to expect at the work; None where it was not estimated.
+        true: The unknowns in the arms' true bases, with all that the arms may do wrong alike at
+            every pose in their covariances: for metrology, not for sending the arm anywhere.
         arms: In a cell, what it found wrong with each arm, by its name.
         shared: (k,) how much it found of each error that the features share (such as the camera's,
             :class:`PoseFeature`), in standard deviations; none where it looked for none.
@@ -173,7 +157,8 @@ class HandEye:
     correction: ArmCorrection | None = None
     others: tuple[TransformEstimate, ...] = ()
     corrected: CorrectedArm | None = None
-    noise: ScatterNoise | None = None
+    expected: ExpectedError | None = None
+    true: tuple[TransformEstimate, ...] = ()
     arms: Mapping[str, ArmCorrection] = field(default_factory=dict)
     shared: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -192,18 +177,11 @@ class HandEye:
         if self.corrected is not None:
             found = self.corrected
             answer = replace(self, camera=found.camera, correction=found.correction)
-            noise = self.noise and replace(self.noise, pose=found.scatter)
-            answer = replace(answer, shared=found.shared, noise=noise)
+            answer = replace(answer, shared=found.shared, expected=found.expected)
             others = found.others or self.others
             return replace(answer, others=others, corrected=None, arms=found.arms)
         known = (self.correction, *self.arms.values())
         return self if any(each is not None and each.of_arm for each in known) else None
-
-    @property
-    def scatter_covariance(self) -> Floats:
-        """(6, 6) of the camera's pose for poses like these; see :class:`ScatterNoise`."""
-        own = None if self.noise is None else self.noise.pose
-        return self.camera.covariance if own is None else own
 
     @property
     def base_T_camera(self) -> TransformEstimate:

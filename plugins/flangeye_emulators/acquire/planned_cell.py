@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.handeye.cell import solve_so_far
-from flangeye.handeye.cell_plan import foreseen, foreseen_poses, most_telling
-from flangeye.handeye.graph import LIMITS, Solved
+from flangeye.estimation.plan import foreseen, foreseen_poses, most_telling, so_far
+from flangeye.estimation.rough import Rough
 from flangeye.maths.frame_graph import Frame, chain, composed
 from flangeye.maths.geometry import invert
 from flangeye.models.cell import Axis, Cell
@@ -132,14 +131,14 @@ class NextBest:
         self._planned, self._left = planned, list(planned.scheduled)
         self._rng = np.random.default_rng(len(planned.scheduled))
         self._taken: set[int] = set()
-        self._found: Solved | None = None
+        self._found: Rough | None = None
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
         """Yield what is seen, as many at most as were to be scheduled."""
         moments, cell = self._planned.moments, self._planned.moments.cell
         for _ in self._planned.scheduled:
             before = seen()
-            self._found = solve_so_far(before, cell, LIMITS, self._found)
+            self._found = so_far(before, cell)
             chosen = self._choose(before) or self._left.pop(0)
             self._taken.add(chosen[0])
             if self._planned.view.sees(moments.pose(*chosen)[None])[0]:
@@ -157,7 +156,7 @@ class NextBest:
         best = foreseen[most_telling(foreseen, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
-    def _in_view(self, like: Observation, found: Solved) -> list[Observation]:
+    def _in_view(self, like: Observation, found: Rough) -> list[Observation]:
         """Return moments drawn, at which its camera sees its target by what is known so far."""
         moments = self._planned.moments
         drawn = self._rng.choice(DRAWS, CANDIDATES, replace=False)
@@ -305,7 +304,7 @@ class Drawn(NamedTuple):
 
 
 def _moved(
-    name: str, mover: RobotModel | Axis, params: CellSessionParams, rng: np.random.Generator
+    name: str, mover: RobotModel | Axis | None, params: CellSessionParams, rng: np.random.Generator
 ) -> Drawn:
     """Draw where something that moves is."""
     if isinstance(mover, Axis):
@@ -313,6 +312,8 @@ def _moved(
         shares = (_changes(params.plan, 1, rng)[:, 0] + 1) / 2
         places = np.array([mover.place(low + x * (high - low)) for x in shares])
         return Drawn(places, places)
+    if mover is None:
+        raise StageError(f"a simulated cell: the model of '{name}' is not known")
     home = np.array(params.home.get(name, UPRIGHT))
     joints = home + params.spread * _changes(params.plan, len(home), rng)
     arm = ImperfectArm(mover, 0.0 if params.arm.is_default else 1.0, rng.spawn(1)[0], params.arm)

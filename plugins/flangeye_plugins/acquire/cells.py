@@ -102,7 +102,7 @@ def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> N
 
 def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell: Cell) -> None:
     """Refuse joints of an arm that are not those of its poses, and a link's place without any."""
-    from flangeye.handeye.arm import LARGEST_MODEL_ERROR
+    from flangeye.estimation.sightings import REACHED
     from flangeye.maths.kinematics import Arm
 
     arm, told = Arm(cell.arms[name]), [r for r in recordings if name in r.arm_joints]
@@ -120,7 +120,7 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
                 f"{cell.arms[name].model} has {arm.n} joints"
             )
         away = float(np.linalg.norm((arm.flange(joints) - recording.poses[name])[:3, 3]))
-        if away > LARGEST_MODEL_ERROR:
+        if away > REACHED:
             raise StageError(
                 f"{root}: pose '{recording.id}': the joint angles of '{name}' put the flange of a "
                 f"{cell.arms[name].model} {away * 1e3:.3g} mm from its pose; "
@@ -130,7 +130,7 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
 
 def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
     """Return what would make joints and pose of an arm agree."""
-    from flangeye.handeye.arm import LARGEST_MODEL_ERROR
+    from flangeye.estimation.sightings import REACHED
 
     cures = {
         "write joint_unit: deg": (np.radians(joints), pose),
@@ -140,7 +140,7 @@ def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
         "write length: m": (joints, scaled(pose, 1e3)),
     }
     for cure, (angles, place) in cures.items():
-        if np.linalg.norm((arm.flange(angles) - place)[:3, 3]) < LARGEST_MODEL_ERROR:
+        if np.linalg.norm((arm.flange(angles) - place)[:3, 3]) < REACHED:
             return cure
     return "check their order and the model, or leave out joints"
 

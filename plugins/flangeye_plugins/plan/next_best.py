@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import Field
 
-from flangeye.handeye.observability import in_base
+from flangeye.estimation.observability import in_base
 from flangeye.maths.geometry import angle_between, hat, rigid, rotation_from_rpy
 from flangeye.motion.planning import Plan, PlannedPose, Site
 from flangeye.plugin.stage import Params, part

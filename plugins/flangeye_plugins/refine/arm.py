@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import Params, StageError, stage
-from flangeye.handeye.arm_model import (
+from flangeye.estimation.arm_model import (
     ArmFit,
     ArmSession,
     combinations,

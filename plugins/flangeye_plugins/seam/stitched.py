@@ -145,8 +145,8 @@ class _AsOnePlace:
     answer: HandEye
 
     def __call__(self, points_in_base: Floats) -> Floats:
-        about = self.answer.base_T_camera.about
-        return covariance_at(self.answer.scatter_covariance, about, points_in_base)
+        pose = self.answer.base_T_camera
+        return covariance_at(pose.covariance, pose.about, points_in_base)
 
 
 @dataclass(frozen=True, eq=False)

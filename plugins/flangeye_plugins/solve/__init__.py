@@ -1,1 +1,1 @@
-"""``solve.*``: solvers as stages, a module each; their mathematics is ``flangeye.handeye``."""
+"""``solve.*``: solvers as stages, a module each; their mathematics is ``flangeye.estimation``."""

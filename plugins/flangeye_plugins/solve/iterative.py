@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, stage
-from flangeye.handeye.observability import (
+from flangeye.estimation.observability import (
     FINEST_NOISE,
     require_poses,
     robust_sigma,
@@ -19,6 +19,8 @@ from flangeye.handeye.observability import (
 )
 from flangeye.maths.geometry import kabsch, kabsch_covariance, rigid
 from flangeye.maths.statistics import covariance_inflation
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
 from flangeye.types import (
     BASE,
@@ -35,6 +37,7 @@ from flangeye.units import Length, param
 from flangeye_plugins.solve.observations import (
     centres_of,
     estimate_of,
+    expected_at,
     hand_eye,
     residuals_of,
     tcps_of,
@@ -85,7 +88,12 @@ class Search:
 
 @stage("solve.iterative")
 def solve_iterative(
-    observations: Observations, views: Views | None, flange: Flange | None, params: IterativeParams
+    observations: Observations,
+    views: Views | None,
+    flange: Flange | None,
+    params: IterativeParams,
+    robot: RobotModel | None = None,
+    scanner: ScannerModel | None = None,
 ) -> HandEye:
     """Algorithm 1: keep a pool of poses; each new pose replaces the one whose removal helps most.
 
@@ -119,7 +127,8 @@ def solve_iterative(
     answer, notes = solve_pool(search.pool), [_stopped(search, params)]
     losers = {**search.losers, **{o.id: "kept from the pool to measure on" for o in kept}}
     estimate = _with_covariance(answer, search.pool, observations.seen)
-    return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes)
+    expected = expected_at(estimate, observations.seen, robot, scanner)
+    return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes, expected)
 
 
 def improve_pool(

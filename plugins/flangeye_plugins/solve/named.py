@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from flangeye import StageError, stage
-from flangeye.handeye.closed.comanipulation import (
+from flangeye.estimation.closed.comanipulation import (
     FEWEST_KRONECKER,
     kronecker,
     two_steps,
 )
-from flangeye.handeye.closed.daniilidis import daniilidis
-from flangeye.handeye.closed.robot_world import li, shah
-from flangeye.handeye.closed.separable import (
+from flangeye.estimation.closed.daniilidis import daniilidis
+from flangeye.estimation.closed.robot_world import li, shah
+from flangeye.estimation.closed.separable import (
     andreff,
     horaud_dornaika,
     park_martin,
     tsai_lenz,
 )
-from flangeye.handeye.measurements import Loop, Measurements
-from flangeye.handeye.observed import Cell
-from flangeye.handeye.starts import start_of
+from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
-from flangeye.types import Floats, HandEye, Observations
+from flangeye.types import HandEye, Observations
 from flangeye_plugins.solve.closed_forms import (
     ClosedForm,
     ClosedFormParams,
     by_both,
     by_motions,
     by_three,
+    linear,
     solve_closed,
 )
 
@@ -46,21 +43,14 @@ def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:
         second: SecondRobot | None = None,
     ) -> HandEye:
         seen, other = list(observations), second.model if second else None
-        cell = Cell(seen, configuration or DEFAULT, robot, scanner, second_robot=other)
+        cell = cell_of(configuration or DEFAULT, robot, other)
         try:
-            return solve_closed(name, solver, cell, params)
+            return solve_closed(name, solver, (seen, cell, scanner), params)
         except StageError as error:
             raise StageError(f"{name}: {error}") from None
 
     solve.__doc__ = documentation
     return stage(name, serves=EVERY)(solve)
-
-
-def _linear(measurements: Measurements, loop: Loop) -> tuple[Floats, Floats, Floats]:
-    if measurements.are_poses:
-        raise StageError("takes circles, and there are whole poses: use solve.park_martin")
-    found = start_of(measurements, loop, np.random.default_rng(0))
-    return found.x, found.y, found.z
 
 
 CLOSED_FORMS = (
@@ -111,7 +101,7 @@ CLOSED_FORMS = (
     ),
     _named(
         "solve.linear",
-        _linear,
+        linear,
         "Circles in any configuration, by linear least squares: no noise model, no outliers.",
     ),
 )

@@ -1,100 +1,37 @@
-"""The default solver of every configuration: outliers found, the arm's own error in the model."""
+"""``solve.robust``: every configuration and cell by one linear mixed model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 from pydantic import Field
 
 from flangeye import FlangeyeError, Params, stage
-from flangeye.models.configuration import DEFAULT, EVERY, Configuration
+from flangeye.models.cell import Cell, cell_of
+from flangeye.models.configuration import CELL, DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
-from flangeye.types import (
-    Box,
-    CircleFeature,
-    HandEye,
-    Observation,
-    Observations,
-    Progress,
-    Solver,
-    Source,
-    StageLog,
-)
+from flangeye.types import Box, HandEye, Observation, Observations, Progress, Solver, StageLog
 from flangeye.units import Angle, Length, param
 
 if TYPE_CHECKING:
-    from flangeye.handeye.calibration import Options
-    from flangeye.handeye.observed import Cell
+    from flangeye.estimation.calibrate import Options
 
 FEWEST_ONLINE = 6
 """Poses before an online run may stop: fewer tell too little of the noise."""
 
 
-class RobotNoise(Params):
-    """Noise of the poses an arm reports; of both arms where there are two."""
-
-    rotation: Angle = param("0.01 deg", gt=0, description="Standard deviation about each axis.")
-    position: Length = param("0.05 mm", gt=0, description="Standard deviation along each axis.")
-
-
 class RobustParams(Params):
     """Parameters of ``solve.robust``."""
 
-    robot_noise: RobotNoise | None = Field(
-        None,
-        description="All the noise of the poses the arm reports, where it is known; by default "
-        "what noise the residuals show beyond the features' own, and the arm's smooth error.",
-    )
     normals: Literal["auto", "off"] = Field(
         "auto", description="Use the flange's measured normals where there are any."
-    )
-    normal_bias: Angle = param(
-        "0.05 deg",
-        gt=0,
-        description="Standard deviation of a tilt common to all normals: flatness of the plate, "
-        "zeros of the last joints, scanner.",
-    )
-    pose_noise: Length | None = param(
-        None, gt=0, description="Noise of the arm's position per axis; by default estimated."
     )
     rotation_limit: Angle = param(
         "2 deg",
         gt=0,
         description="Refuse when rotation about some axis has a larger standard deviation.",
-    )
-    tool_offset: Literal["auto", "off"] = Field(
-        "auto",
-        description="Estimate a constant offset of the seen circle in the flange frame, if the "
-        "poses show one and it helps on poses held out.",
-    )
-    joint_offsets: Literal["auto", "off"] = Field(
-        "off",
-        description="Estimate the arm's joint offsets too, if that helps on poses held out: the "
-        "result then has a second pose, for the arm with these offsets corrected.",
-    )
-    joint_zeros: Literal["consider", "ignore"] = Field(
-        "consider",
-        description="Whether the covariance includes what the arm does wrong alike at all poses: "
-        "zeros, encoders, sag, lengths, twists, and what is smooth over the workspace, as large as "
-        "the residuals show them.",
-    )
-    joint_prior: Angle = param(
-        "0.5 deg", gt=0, description="Expected standard deviation of a joint's offset."
-    )
-    smooth_error: Literal["auto", "off"] = Field(
-        "auto",
-        description="Estimate a smooth error of the arm over the workspace, if that helps on poses "
-        "held out. The matrix stays the best for the arm as reported.",
-    )
-    scanner_distortion: Literal["consider", "ignore"] = Field(
-        "consider",
-        description="Whether the scanner's smooth distortion is part of the model, as large as the "
-        "scanner's file has it (calibration_error): found as far as the poses show it, and in the "
-        "covariance. With it, where a circle's place is unknown, how it rounds the edges of a "
-        "tilted face.",
     )
     translation_limit: Length = param(
         "20 mm", gt=0, description="A translation known less well is not observable."
@@ -124,22 +61,17 @@ class RobustParams(Params):
     required: Length | None = param(
         None,
         gt=0,
-        description="Stop acquiring once no point of the workspace is off by more, with 95 % "
-        "probability, but for what the arm does wrong alike at all poses: more poses do not mend "
-        "that. By default every pose is used.",
+        description="Stop acquiring once 95 % of the errors to expect at the work are below. By "
+        "default every pose is used.",
     )
-
-    def requires(self) -> Mapping[type, str]:
-        """Return the arm's kinematics, where its joint offsets are to be found."""
-        return {RobotModel: "to correct its joints"} if self.joint_offsets == "auto" else {}
 
     @property
     def corrects_arm(self) -> bool:
         """Whether the arm's own error may be found; read where a step asks for that answer."""
-        return "auto" in (self.joint_offsets, self.smooth_error)
+        return True
 
 
-@stage("solve.robust", serves=EVERY)
+@stage("solve.robust", serves=(*EVERY, CELL))
 def solve_robust(  # noqa: PLR0913  what it asks the runner for
     observations: Observations,
     params: RobustParams,
@@ -147,122 +79,84 @@ def solve_robust(  # noqa: PLR0913  what it asks the runner for
     robot: RobotModel | None = None,
     stage_log: StageLog | None = None,
     configuration: Configuration | None = None,
+    cell: Cell | None = None,
     scanner: ScannerModel | None = None,
     second: SecondRobot | None = None,
 ) -> HandEye:
-    """Robust maximum likelihood: reject outlier poses and estimate every unknown transform.
+    """Estimate every unknown transform with all that may be wrong with arms, targets and sensors.
 
-    Takes whole poses, centres with normals, or centres alone, each with its covariance. Gross
-    outliers are found by graduated non-convexity on truncated least squares (Yang et al. 2020) and
-    set aside with their residual; noise beyond the features' own is estimated. What is wrong with
-    the arm (tool offset, joints, a smooth error over the workspace) is part of the model where it
-    helps on poses held out. Every unknown gets its covariance, about the place where the camera
-    looks: with what few poses leave unknown of the noise and what the zeros of the arm's joints
-    may be off by, so that its 95 % region holds its share.
+    Takes whole poses, centres with normals, or centres alone, each with its covariance, of any
+    number of cameras and targets. Needs no first guess. Outliers are sightings that all the others,
+    with every effect that may be wrong, do not predict; they are set aside with their residual. The
+    answer is the best for the arms as their controllers report them, with the error to expect at
+    the work; where correcting the arms is worth its while there is a second answer for them.
 
     Raises:
-        StageError: Too few poses, all the same, not in one unit, those of a mirrored camera, or
-            a carrier's pose is missing.
+        StageError: Too few poses, all the same, those of a mirrored camera, or a carrier's pose is
+            missing.
         CalibrationRefused: Fewer than half of the poses agree, the motion leaves something unknown
             (it says which motion is missing), or a marker has another size than its fit was told.
     """
-    from flangeye.handeye.observed import Cell
+    standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
 
     def solve(pulled: Sequence[Observation]) -> HandEye:
-        other = second.model if second else None
-        cell = Cell(pulled, configuration or DEFAULT, robot, scanner, second_robot=other)
-        return solve_cell(cell, params)
+        return solve_cell(pulled, standing, params, scanner, workspace)
 
-    if params.required is None:
+    if params.required is None or observations.whole:
         return solve(list(observations))
-    return solve(pull(observations, solve, params.required, workspace, stage_log))
+    return solve(pull(observations, solve, params.required, stage_log))
+
+
+def solve_cell(
+    pulled: Sequence[Observation],
+    cell: Cell,
+    params: RobustParams,
+    scanner: ScannerModel | None = None,
+    workspace: Box | None = None,
+) -> HandEye:
+    """Solve observations that are all there; see :func:`solve_robust`."""
+    from flangeye.estimation.calibrate import calibrate
+
+    return calibrate(pulled, cell, scanner, _options(params, workspace), "solve.robust")
+
+
+def _options(params: RobustParams, workspace: Box | None) -> Options:
+    from flangeye.estimation.calibrate import Options
+    from flangeye.estimation.session import Asked
+
+    return Options(
+        (params.rotation_limit, params.translation_limit),
+        params.unobservable == "mark",
+        params.certify,
+        workspace,
+        Asked(params.normals == "auto", params.target_size == "unknown", params.size_limit),
+    )
 
 
 def pull(
     observations: Observations,
     solve: Solver,
     required: float,
-    workspace: Box | None,
     stage_log: StageLog | None = None,
 ) -> list[Observation]:
-    """Take observations until no point of the workspace is off by more than ``required`` [m]."""
+    """Take observations until 95 % of the errors to expect at the work are below ``required``."""
     pulled: list[Observation] = []
     for observation in observations:
         pulled.append(observation)
         if len(pulled) < FEWEST_ONLINE:
             continue
-        error = _error_at_work(pulled, solve, workspace, observations.source)
+        error = _expected(pulled, solve)
         if stage_log:
-            told = error if np.isfinite(error) else None
-            stage_log("progress", Progress(len(pulled), told, required))
-        if error <= required:
+            stage_log("progress", Progress(len(pulled), error, required))
+        if error is not None and error <= required:
             break
     return pulled
 
 
-def _error_at_work(
-    pulled: Sequence[Observation], solve: Solver, workspace: Box | None, source: Source
-) -> float:
-    """Return what no point of the workspace is off by more than, with 95 % probability [m]."""
-    from flangeye.maths.statistics import corners_of, largest_error_quantile
-    from flangeye.models.workspace import workspace_of
-
+def _expected(pulled: Sequence[Observation], solve: Solver) -> float | None:
+    """Return what 95 % of the errors at the work are below [m]; None while nothing is known."""
     try:
-        found = solve(pulled)
+        expected = solve(pulled).expected
     except FlangeyeError:
-        return float("inf")
-    box = workspace_of(source, workspace, found.pairs)
-    known = found.camera
-    corners = corners_of(box.centre, box.size) if box else known.about[None]
-    return largest_error_quantile(found.scatter_covariance, known.about, corners)
-
-
-def solve_poses(
-    pulled: Sequence[Observation],
-    params: RobustParams,
-    robot: RobotModel | None = None,
-    configuration: Configuration | None = None,
-    method: str = "solve.robust",
-    scanner: ScannerModel | None = None,
-) -> HandEye:
-    """Solve observations that are all there; see :func:`solve_robust`."""
-    from flangeye.handeye.observed import Cell
-
-    return solve_cell(Cell(pulled, configuration or DEFAULT, robot, scanner), params, method)
-
-
-def solve_cell(cell: Cell, params: RobustParams, method: str = "solve.robust") -> HandEye:
-    """Solve what was observed, where; see :func:`solve_robust`."""
-    from flangeye.handeye.calibration import calibrate
-    from flangeye_plugins.solve.svd import check_poses
-
-    circles = all(isinstance(o.feature, CircleFeature) for o in cell.observations)
-    if cell.configuration.is_default and circles:
-        check_poses(cell.observations)
-    return calibrate(cell, _options(params), method)
-
-
-def _options(params: RobustParams) -> Options:
-    from flangeye.handeye.calibration import Options
-    from flangeye.handeye.loop import ArmNoise
-    from flangeye.handeye.observability import ObservabilityLimits
-
-    noise = params.robot_noise
-    return Options(
-        normals=params.normals == "auto",
-        normal_bias=params.normal_bias,
-        robot_noise=ArmNoise(noise.rotation, noise.position) if noise else None,
-        pose_noise=params.pose_noise,
-        limits=ObservabilityLimits(
-            params.rotation_limit, params.translation_limit, params.unobservable == "mark"
-        ),
-        tool_offset=params.tool_offset == "auto",
-        joint_offsets=params.joint_offsets == "auto",
-        joint_prior=params.joint_prior,
-        joint_zeros=params.joint_zeros == "consider",
-        smooth_error=params.smooth_error == "auto",
-        scanner_distortion=params.scanner_distortion == "consider",
-        size_limit=params.size_limit,
-        finds_size=params.target_size == "unknown",
-        certify=params.certify,
-    )
+        return None
+    return expected.p95 if expected else None

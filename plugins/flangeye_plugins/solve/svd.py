@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flangeye import Params, stage
-from flangeye.handeye.observability import (
+from flangeye.estimation.observability import (
     FINEST_NOISE,
     information_of_centres,
     require_observable,
@@ -19,11 +19,14 @@ from flangeye.handeye.observability import (
 )
 from flangeye.maths.geometry import kabsch, kabsch_covariance
 from flangeye.maths.statistics import covariance_inflation
+from flangeye.models.robots import RobotModel
+from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
 from flangeye.units import Angle, param
 from flangeye_plugins.solve.observations import (
     centres_of,
     estimate_of,
+    expected_at,
     hand_eye,
     residuals_of,
     tcps_of,
@@ -41,7 +44,12 @@ class SvdParams(Params):
 
 
 @stage("solve.svd")
-def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
+def solve_svd(
+    observations: Observations,
+    params: SvdParams,
+    robot: RobotModel | None = None,
+    scanner: ScannerModel | None = None,
+) -> HandEye:
     """Fit the camera's pose to all centres by equally weighted least squares.
 
     Equations (8) to (10) of the paper with scale one. The noise is taken as equal in every
@@ -58,7 +66,8 @@ def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
     residuals = residuals_of(pulled, rotation, translation)
     _require_observable(tcps_of(pulled), residuals, params.rotation_limit)
     estimate = least_squares_estimate(rotation, translation, tcps_of(pulled), residuals)
-    return hand_eye(pulled, estimate, "solve.svd")
+    expected = expected_at(estimate, pulled, robot, scanner)
+    return hand_eye(pulled, estimate, "solve.svd", expected=expected)
 
 
 def check_poses(observations: Sequence[Observation]) -> None:

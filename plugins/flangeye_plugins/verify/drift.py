@@ -7,8 +7,8 @@ from pydantic import Field
 
 from flangeye import Params, stage
 from flangeye.doctor.monitor import stored_calibration
+from flangeye.estimation.watch.drift import DriftTest, information_of, verdict
 from flangeye.files.paths import RecipePath
-from flangeye.handeye.drift import DriftTest, information_of, verdict
 from flangeye.types import HandEye, Verification
 from flangeye.units import Length, param
 

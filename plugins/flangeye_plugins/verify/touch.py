@@ -61,7 +61,7 @@ def verify_touch(
     estimate = calibration.base_T_camera
     predicted = estimate.transform.apply(np.array([t.seen for t in params.touches]))
     errors = predicted - np.array([_touched(t, params.tip) for t in params.touches])
-    known = covariance_at(calibration.scatter_covariance, estimate.about, predicted)
+    known = covariance_at(estimate.covariance, estimate.about, predicted)
     known += params.accuracy**2 * np.eye(3)
     squares = np.einsum("ni,ni->n", errors, np.linalg.solve(known, errors[..., None])[..., 0])
     lengths = np.linalg.norm(errors, axis=1)

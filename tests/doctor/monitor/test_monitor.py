@@ -25,7 +25,7 @@ from flangeye.doctor.monitor.chart import figure
 from flangeye.doctor.monitor.history import Finding
 from flangeye.doctor.monitor.opcua import write_state
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.handeye.drift import DriftTest
+from flangeye.estimation.watch.drift import DriftTest
 from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.doctor.monitor.cell import calibrate, check
 from tests.doctor.sessions import clean

@@ -17,7 +17,7 @@ from flangeye.doctor.monitor import (
     judge,
     stored_calibration,
 )
-from flangeye.handeye.drift import DriftTest
+from flangeye.estimation.watch.drift import DriftTest
 from flangeye.types import Observation
 
 RECIPE = "aubo-i5_phoxi-s_archive"

@@ -23,7 +23,7 @@ from flangeye.run.session import Start, record_run
 from flangeye.run.tables import write_tables
 from flangeye.types import ArchivePath, Source
 from flangeye_plugins.reader.cell import CellParams, cell
-from tests.handeye.cells import ROBOT, moving, swinging
+from tests.estimation.cells import ROBOT, moving, swinging
 
 REGISTRY = load_registry()
 RECIPES = Path(__file__).parents[3] / "recipes" / "configurations"
@@ -354,7 +354,7 @@ steps:
           sightings:
             - {camera: left, target: marker, file: left.csv, time: t, rotation: xyzw, length: m}
           join: {clock_offset: 0 ms}
-  - solve.cell
+  - solve.robust
 """
 
 

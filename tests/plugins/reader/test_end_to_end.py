@@ -89,7 +89,7 @@ def recipe(tmp_path, kind):
     path = tmp_path / "recipe.yaml"
     path.write_text(
         f"{HEADER}  - acquire.samples: {{reader: {{easy_handeye: {{calibration: {kind}}}}}}}\n"
-        "  - solve.maximum_likelihood\n"
+        "  - solve.robust\n"
     )
     return path
 
@@ -139,7 +139,7 @@ def test_a_folder_of_images_with_kuka_poses_is_calibrated(
         "      reader: {table: {rotation: kuka, length: mm, angle: deg, pose: base_T_flange}}\n"
         "      focal_length: [700, 700]\n      principal_point: [320, 240]\n"
         "  - fit.charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}\n"
-        "  - solve.maximum_likelihood\n"
+        "  - solve.robust\n"
     )
     assert flangeye(monkeypatch, "run", path, "--archive", folder, "--out", tmp_path / "o") == 0
     check_result(tmp_path / "o", 0.1, 0.6e-3)
@@ -168,7 +168,7 @@ def test_organised_clouds_with_images_beside_them_need_no_camera_matrix(
         HEADER.replace("configuration", "scanner: {model: phoxi-m}\nconfiguration")
         + "  - acquire.archive\n"
         "  - fit.charuco: {columns: 7, rows: 5, square: 30 mm, marker: 22 mm}\n"
-        "  - solve.maximum_likelihood\n"
+        "  - solve.robust\n"
     )
     assert flangeye(monkeypatch, "run", path, "--archive", folder, "--out", tmp_path / "o") == 0
     check_result(tmp_path / "o", 0.1, 0.6e-3)

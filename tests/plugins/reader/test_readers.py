@@ -272,7 +272,7 @@ robot: {model: ur5e}
 configuration: {name: eye-in-hand, place: unknown}
 steps:
   - acquire.samples: {reader: moveit}
-  - solve.maximum_likelihood
+  - solve.robust
 """
 
 
@@ -311,7 +311,7 @@ def test_images_come_with_the_cameras_matrix(tmp_path: Path) -> None:
         "      reader: {table: {rotation: kuka, length: mm, angle: deg, pose: base_T_flange}}\n"
         "      focal_length: [1000, 1001]\n      principal_point: [2, 3]\n"
         "      distortion: [0.1, 0, 0, 0]\n"
-        "  - fit.aruco: {size: 40 mm}\n  - solve.maximum_likelihood\n"
+        "  - fit.aruco: {size: 40 mm}\n  - solve.robust\n"
     )
     registry = load_registry()
     recipe = load_recipe(path, registry)

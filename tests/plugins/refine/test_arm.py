@@ -10,6 +10,8 @@ from flangeye import StageError
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
+from flangeye.models.cell import cell_of
+from flangeye.models.configuration import DEFAULT
 from flangeye.models.loading import load_model
 from flangeye.models.robots import RobotModel
 from flangeye.types import (
@@ -81,12 +83,11 @@ def refined(spread=0.5, only_places=False, count=40):
 
 def errors_on_others(calibration, observations):
     """Distances [m] on sightings that took no part, of a calibration whose pose and arm agree."""
-    from flangeye.models.configuration import DEFAULT
     from flangeye_plugins.verify.holdout import hold_out
 
     every = [np.arange(len(observations))]
     return np.linalg.norm(
-        hold_out(observations, every, [calibration], (DEFAULT, Arm(UR5))).errors, axis=1
+        hold_out(observations, every, [calibration], cell_of(DEFAULT, UR5)).errors, axis=1
     )
 
 

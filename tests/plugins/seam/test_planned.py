@@ -95,9 +95,9 @@ def checked(tmp_path, solve):
 
 
 def test_a_recipe_that_mixes_the_two_arms_fails_check(tmp_path: Path) -> None:
-    assert checked(tmp_path, "solve.robust: {joint_offsets: auto}")
+    assert checked(tmp_path, "solve.robust")
     with pytest.raises(RecipeError, match=r"r.yaml:15: steps.6.seam.groove.arm: the corrected arm"):
         checked(tmp_path, "solve.svd")
-    mixed = "solve.robust: {joint_offsets: auto}\n  - refine.compensate"
+    mixed = "solve.robust\n  - refine.compensate"
     with pytest.raises(RecipeError, match="refine.compensate gives the pose for the arm as its co"):
         checked(tmp_path, mixed)

@@ -6,17 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from flangeye import StageError
 from flangeye.maths.geometry import rigid, rotation_exp
-from flangeye.models.configuration import DEFAULT
 from flangeye.types import (
     BASE,
     FLANGE,
-    Box,
     CircleFeature,
-    CorrectedArm,
     HandEye,
     Observation,
     Observations,
@@ -29,15 +25,9 @@ from flangeye.types import (
 )
 from flangeye_plugins.solve.svd import SvdParams, solve_svd
 from flangeye_plugins.verify.holdout import (
-    HeldOut,
     HoldoutParams,
-    _beyond_gate,
-    _corrected_figures,
-    _judge,
-    _measure_loop,
     deal,
     deal_moments,
-    hold_out,
     verify_holdout,
 )
 
@@ -140,26 +130,6 @@ def test_angles_that_were_read_wrongly_do_not_pass_though_positions_fit() -> Non
     assert verify_holdout(svd(simulate(30, tilt=np.radians(1))), svd, HoldoutParams()).passed
 
 
-def test_a_loop_measures_a_camera_beside_an_arm_as_that_is_measured() -> None:
-    observations, every = simulate(12, tilt=0.02), np.arange(12)
-    calibration = svd(simulate(12, seed=1))
-    plain = hold_out(observations, [every], [calibration], (DEFAULT, None))
-    loop = HeldOut(np.zeros((12, 3)), np.zeros((12, 3, 3)), np.full(12, np.nan))
-    _measure_loop(calibration, observations, every, (DEFAULT, None), loop)
-    assert loop.errors == pytest.approx(plain.errors, abs=1e-12)
-    assert loop.tilts == pytest.approx(plain.tilts, abs=1e-9)
-    assert loop.tilts == pytest.approx(np.full(12, 0.02), abs=5e-3)
-
-
-def test_a_marker_on_the_flange_is_measured_beside_an_arm() -> None:
-    observations, calibration = simulate(12, tilt=0.02), svd(simulate(12, seed=1))
-    plain = hold_out(observations, [np.arange(12)], [calibration], (DEFAULT, None))
-    markers = [replace(o, feature=marker_of(o.circle)) for o in observations]
-    held = hold_out(markers, [np.arange(12)], [calibration], (DEFAULT, None))
-    assert held.errors == pytest.approx(plain.errors, abs=1e-12)
-    assert held.tilts == pytest.approx(plain.tilts, abs=1e-9)
-
-
 def test_a_calibration_above_the_limit_does_not_pass() -> None:
     result = verify_holdout(
         svd(simulate(20)), svd, HoldoutParams.model_validate({"max_rms": "0.1 mm"})
@@ -196,16 +166,9 @@ def test_an_outlier_the_solver_set_aside_is_counted_and_reported() -> None:
     result = verify_holdout(without_07(observations), without_07, HoldoutParams())
     assert result.passed
     assert result.figures["outliers"] == 1
-    assert result.figures["rms_inliers"] < 0.8 * MM < result.figures["rms"]
+    assert result.figures["rms"] < 0.8 * MM < result.figures["rms_all"]
     assert result.errors["07"] == pytest.approx(0.02, rel=0.05)
-    assert "mm rms over all 20 poses, " in result.reason
-    assert "mm without 1 set aside, within the limit of 1 mm" in result.reason
-
-
-def test_a_good_pose_the_solver_set_aside_still_counts() -> None:
-    result = verify_holdout(without_07(simulate(20)), without_07, HoldoutParams())
-    assert result.figures["outliers"] == 0
-    assert result.figures["poses"] == 20
+    assert result.reason.endswith("mm rms (1 of 20 poses set aside), within the limit of 1 mm")
 
 
 def test_too_many_outliers_do_not_pass() -> None:
@@ -253,82 +216,10 @@ def test_an_unsolvable_fold_is_said_and_not_raised() -> None:
     assert (result.passed, result.reason) == (False, "without one fold of 5 there is no answer: no")
 
 
-@pytest.mark.parametrize("n", [8, 20])
-def test_the_predicted_error_over_the_workspace_holds(n: int) -> None:
-    runs = 80
-    inside = sum(_holds(n, seed) for seed in range(runs)) / runs
-    assert inside >= 0.95 - 0.075  # three standard deviations of 80 runs
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [8, 20, 40])
-def test_the_predicted_error_holds_in_93_to_97_percent(n: int) -> None:
-    inside = sum(_holds(n, seed) for seed in range(1000)) / 1000
-    assert 0.93 <= inside <= 0.97
-
-
-def _holds(n: int, seed: int) -> bool:
-    """Whether the true error in every corner of the workspace is below the prediction."""
-    box = Box(np.array([0.4, -0.5, 0.2]), np.array([0.4, 0.4, 0.3]))
-    calibration = svd(simulate(n, seed=1000 * n + seed))
-    predicted = verify_holdout(calibration, svd, HoldoutParams(folds=2), box).figures[
-        "predicted_worst_p95"
-    ]
-    corners = box.grid(2)
-    wrong = calibration.base_T_camera.transform.apply((corners - TRUTH[1]) @ TRUTH[0]) - corners
-    return bool(np.linalg.norm(wrong, axis=1).max() <= predicted)
-
-
-@pytest.mark.parametrize("probability", [0.95, 0.99])
-def test_a_pose_is_an_outlier_beyond_the_quantile_of_three_degrees_of_freedom(
-    probability: float,
-) -> None:
-    gate = np.sqrt(chi2.ppf(probability, 3)) * MM
-    errors = np.zeros((9, 3))
-    errors[:2, 0] = gate * 0.999, gate * 1.001  # the others lie where they should: nothing is added
-    held = HeldOut(errors, np.tile(np.eye(3) * MM**2, (9, 1, 1)), np.full(9, np.nan))
-    assert _beyond_gate(held, probability).tolist() == [False, True] + [False] * 7
-
-
-def test_errors_larger_than_stated_are_scatter_not_outliers_but_for_the_one_far_off() -> None:
-    errors = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
-    errors[7] = [0.0, 0.03, 0.0]
-    held = HeldOut(errors, np.tile(1e-12 * np.eye(3), (40, 1, 1)), np.full(40, np.nan))
-    assert np.flatnonzero(_beyond_gate(held, 0.999)).tolist() == [7]
-
-
 def test_two_folds_are_enough_and_one_is_not() -> None:
     assert HoldoutParams(folds=2).folds == 2
     with pytest.raises(ValueError, match="greater than or equal to 2"):
         HoldoutParams(folds=1)
-
-
-def test_the_verdict_tells_the_error_over_all_poses_and_without_those_set_aside() -> None:
-    figures = {"poses": 20.0, "outliers": 0.0, "rms": 0.4e-3, "rms_inliers": 0.4e-3}
-    params = HoldoutParams.model_validate({"max_rms": "0.5 mm", "max_outliers": 0.1})
-    assert _judge(figures, params) == (
-        True, "held-out error 0.400 mm rms, within the limit of 0.5 mm",
-    )  # fmt: skip
-    some = figures | {"outliers": 2.0, "rms": 3e-3, "rms_inliers": 0.6e-3}
-    assert _judge(some, params) == (
-        False, "held-out error 3.000 mm rms over all 20 poses, 0.600 mm without 2 set aside, above "
-        "the limit of 0.5 mm",
-    )  # fmt: skip
-    assert _judge(some | {"outliers": 3.0}, params)[1].startswith("3 of 20 poses are outliers, ")
-
-
-def test_figures_of_a_corrected_arm_are_those_of_the_errors_lengths() -> None:
-    errors = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 12.0, 0.0]])
-    held = HeldOut(errors, np.zeros((3, 3, 3)), np.zeros(3))
-    figures = _corrected_figures(held, np.array([False, False, True]))
-    assert figures == pytest.approx(
-        {
-            "corrected_rms": np.sqrt((25 + 1 + 144) / 3),
-            "corrected_median": 5.0,
-            "corrected_p95": 11.3,
-            "corrected_rms_inliers": np.sqrt(13.0),
-        }
-    )
 
 
 def test_what_cameras_saw_of_one_pose_is_held_out_together() -> None:
@@ -339,24 +230,3 @@ def test_what_cameras_saw_of_one_pose_is_held_out_together() -> None:
     for fold in folds:
         assert len(fold) == 4
         assert {i ^ 1 for i in fold} == set(fold.tolist())
-
-
-def test_outliers_are_told_by_the_arm_as_it_is_corrected() -> None:
-    """As reported all poses are 30 mm off, and the one that is off by 20 mm more is like them."""
-    observations = simulate(20)
-    observations[7] = displaced(observations[7], [0.02, 0, 0])
-
-    def both(some: Sequence[Observation]) -> HandEye:
-        sound = without_07(some)
-        pose = sound.camera.transform
-        off = rigid(pose.rotation, pose.translation + [0.03, 0, 0])
-        reported = replace(sound.camera, transform=replace(pose, matrix=off))
-        return replace(sound, camera=reported, corrected=CorrectedArm(sound.camera, None))
-
-    figures = verify_holdout(both(observations), both, HoldoutParams()).figures
-    assert figures["outliers"] == 1
-    assert figures["corrected_rms_inliers"] < 0.8 * MM
-    assert figures["rms_inliers"] == pytest.approx(0.03, rel=0.05)
-    plain = verify_holdout(without_07(observations), without_07, HoldoutParams()).figures
-    assert figures["corrected_rms"] == pytest.approx(plain["rms"])
-    assert figures["corrected_p95"] == pytest.approx(plain["p95"])

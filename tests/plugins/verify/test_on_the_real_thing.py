@@ -278,8 +278,6 @@ def test_pairs_of_poses_are_counted_once_if_they_are_far_enough_apart() -> None:
         (HoldoutParams, {}, "max_rms", "0 mm", "1 um"),
         (HoldoutParams, {}, "max_outliers", -0.1, 0),
         (HoldoutParams, {}, "max_outliers", 1, 0.99),
-        (HoldoutParams, {}, "gate", 0.5, 0.51),
-        (HoldoutParams, {}, "gate", 1, 0.9999),
         (DriftParams, {"reference": "a.mcap"}, "limit", "0 mm", "1 um"),
         (DriftParams, {"reference": "a.mcap"}, "false_alarms", 0, 1e-9),
         (DriftParams, {"reference": "a.mcap"}, "false_alarms", 0.1, 0.09),

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from flangeye.doctor.monitor.history import Finding, History
+from flangeye.estimation.watch.drift import DriftTest
 from flangeye.files.written import write_whole
-from flangeye.handeye.drift import DriftTest
 from flangeye.report.look import LIGHT, SERIES, css
 
 COLOURS = {"OK": LIGHT["verified"], "DEGRADED": LIGHT["unverified"], "MOVED": LIGHT["refused"]}

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import StageError
+from flangeye.estimation.watch.drift import Prior, Sightings, prior_of, sightings_of
+from flangeye.estimation.watch.pose_error import FREE, PoseError, pose_error_of
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.handeye.drift import Prior, Sightings, prior_of, sightings_of
-from flangeye.handeye.pose_error import FREE, PoseError, pose_error_of
 from flangeye.log.read import RunLog, read_run
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm

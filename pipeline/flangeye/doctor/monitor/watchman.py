@@ -9,8 +9,8 @@ import numpy as np
 from flangeye.doctor.monitor.history import Check, Finding, History
 from flangeye.doctor.monitor.stored import StoredCalibration
 from flangeye.errors import StageError
-from flangeye.handeye.blame import blame, explained, suspects
-from flangeye.handeye.drift import (
+from flangeye.estimation.watch.blame import blame, explained, suspects
+from flangeye.estimation.watch.drift import (
     DriftTest,
     Information,
     Sightings,

@@ -31,8 +31,11 @@ KINDS = {
 """Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
-FIELD = 0.1
-"""Likewise what no kind explains, smooth over the workspace [m]."""
+FIELD, FIELD_TIMES = 0.1, 4.0
+"""Likewise what no kind explains, smooth over the workspace [m], and by how many times it may be
+more or less, one sigma: of it nothing is known beforehand."""
+ACCURACY = 0.3e-3
+"""Typical deviation of a joint's zero where no file says it [rad]: that of the catalogue's arms."""
 QUALITY = 4.0
 """By how many times an arm may be better or worse than its file says, one sigma: joint accuracy is
 on no data sheet, and arms of one maker differ tenfold."""
@@ -45,18 +48,20 @@ DELTA = 1e-6
 
 
 def arm_effects(problem: Problem, arm: str) -> list[Effect]:
-    """Return what may be wrong with one arm, all of it of one quality."""
+    """Return what may be wrong with one arm, or rail, all of it of one quality."""
     carriers = [c for c in problem.carriers if c.arm == arm]
-    accuracy = carriers[0].accuracy
+    accuracy = carriers[0].accuracy or ACCURACY
     effects = []
     if all(c.joints is not None and c.kinematics is not None for c in carriers):
         for kind, (name, ratio) in KINDS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
-    flange = carriers[0].frame
-    field = field_over(np.asarray(problem.frames[flange].place)[:, :3, 3])
+    field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
     block = _by_place(arm, field)
-    return [*effects, Effect("smooth error", block, FIELD * accuracy, EACH, arm, True, "field")]
+    return [
+        *effects,
+        Effect("smooth error", block, FIELD * accuracy, FIELD_TIMES, arm, True, "field"),
+    ]
 
 
 def _of_carriers(arm: str, kind: str) -> Block:

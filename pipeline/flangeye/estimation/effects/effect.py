@@ -23,6 +23,7 @@ class Effect:
         factor: By how many times that size is uncertain, one sigma (log-normal).
         cause: Effects of one cause (an arm) have a common quality as well; empty for none.
         of_arm: Whether it displaces an arm against what its controller reports.
+        lasting: Whether it is at new poses as it was at those of the session.
         kind: Which part of a correction its numbers are (``zeros``, ``lengths``, ``field``...).
     """
 
@@ -33,3 +34,4 @@ class Effect:
     cause: str = ""
     of_arm: bool = False
     kind: str = ""
+    lasting: bool = True

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from flangeye.estimation.effects.effect import Block, Effect
@@ -11,10 +14,13 @@ from flangeye.types import Floats
 TILT = 0.5e-3
 """Typical tilt of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the rim
 and what the last joint's bearing adds."""
-OFFSET = 0.02e-3
+OFFSET = 0.03e-3
 """Typical distance of the seen circle's centre from the controller's flange origin [m]."""
 TIMES = 2.0
 """By how many times both may be larger or smaller, one sigma."""
+
+WRONG, WRONG_TIMES = 2e-3, 3.0
+"""The same of a circle that is mounted elsewhere than was said, or of a tool frame that is set."""
 
 
 def target_effects(problem: Problem) -> list[Effect]:
@@ -27,10 +33,21 @@ def target_effects(problem: Problem) -> list[Effect]:
     ranks = s.ranks[np.isin(s.pairs, circles) & s.by_depth]
     effects = []
     if (ranks == 5).any():
-        effects.append(Effect("tilt of the face", _tilt(circles), TILT, TIMES))
+        effects.append(Effect("tilt of the face", _tilt(circles), TILT, TIMES, kind="tilt"))
     if (ranks > 0).any():
-        effects.append(Effect("offset of the circle", _offset(circles), OFFSET, TIMES))
+        effects.append(
+            Effect("offset of the circle", _offset(circles), OFFSET, TIMES, kind="offset")
+        )
     return effects
+
+
+def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | None:
+    """Return the effects with an offset of millimetres instead; None where there is no circle."""
+    if not any(effect.kind == "offset" for effect in effects):
+        return None
+    return [
+        replace(e, size=WRONG, factor=WRONG_TIMES) if e.kind == "offset" else e for e in effects
+    ]
 
 
 def _tilt(circles: list[int]) -> Block:

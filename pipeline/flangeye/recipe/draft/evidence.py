@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.handeye.closed.motions import motions_of, place_of, translation_of
-from flangeye.handeye.closed.separable import park_martin
+from flangeye.estimation.closed.motions import motions_of, place_of, translation_of
+from flangeye.estimation.closed.separable import park_martin
 from flangeye.maths.geometry import rigid
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted

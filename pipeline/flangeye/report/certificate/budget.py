@@ -304,8 +304,12 @@ def _of_one_pose(result: Result) -> list[Contribution]:
     if held is None or box is None:
         return []
     poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
+    _, estimate = _estimate_of(result)
+    corners = corners_of(np.array(box.centre), np.array(box.size))
+    motions = _motions(corners, np.array(estimate.about))
+    own = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions).mean()
     hidden = _standard_error(held.rms**2, int(3 * poses))
-    beyond = held.rms**2 - box.predicted_rms**2
+    beyond = held.rms**2 - float(own)
     standard = np.sqrt(max(beyond, hidden) / 3)
     evidence = f"held-out error {held.rms * 1e3:.3f} mm rms beyond the calibration's own"
     rows = _each_axis("Arm and scan at one pose", "A", standard, evidence, 3 * poses)

@@ -1,0 +1,360 @@
+"""The calibration of a cell: from what was observed to the transforms that people get."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flangeye.estimation.answers import Answer, as_reported, expected_error, functional
+from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
+from flangeye.estimation.corrections import CORRECTED, corrections_of
+from flangeye.estimation.estimate import Estimate, estimate
+from flangeye.estimation.flange_roll import roll_note
+from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.mixed import fit
+from flangeye.estimation.observability import LEAST, meaningless, unobservable
+from flangeye.estimation.session import Asked, Session, session_of
+from flangeye.estimation.threads import on_one_thread
+from flangeye.estimation.work import work_of
+from flangeye.maths.geometry import adjoint_shift
+from flangeye.models.cell import Cell
+from flangeye.models.configuration import mapped_and_expected
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import (
+    BASE,
+    FLANGE,
+    ArmCorrection,
+    Box,
+    CircleFeature,
+    CorrectedArm,
+    ExpectedError,
+    Floats,
+    HandEye,
+    Note,
+    Observation,
+    Pair,
+    Transform,
+    TransformEstimate,
+)
+
+BETTER = 0.9
+"""The answer for corrected arms is given where it expects this share of the error or less."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a calibration is judged; see the parameters of ``solve.robust``.
+
+    Attributes:
+        limits: Largest standard deviations of a rotation [rad] and of a translation [m].
+        mark: Whether translations that the motion cannot show are marked instead of refused.
+        certify: Whether to say if the answer is the best of all.
+        work: Where the error to expect is taken; None for where the session was.
+        asked: What is to be found.
+    """
+
+    limits: tuple[float, float] = (float(np.radians(2)), 20e-3)
+    mark: bool = False
+    certify: bool = False
+    work: Box | None = None
+    asked: Asked = field(default_factory=Asked)
+
+
+@on_one_thread
+def calibrate(
+    observations: Sequence[Observation],
+    cell: Cell,
+    scanner: ScannerModel | None,
+    options: Options,
+    method: str,
+) -> HandEye:
+    """Return every unknown of a cell with its covariance, and the error to expect at the work.
+
+    Args:
+        observations: What was seen.
+        cell: What stands on what; ``cell_of`` makes it of a configuration.
+        scanner: The scanner's model, where it is known.
+        options: How it is judged.
+        method: Name of the stage.
+
+    Raises:
+        StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
+            something that moves is missing.
+        CalibrationRefused: Fewer than half of the sightings agree, the motion leaves something
+            unknown (it says which motion is missing), or a marker has another size than was said.
+    """
+    session = session_of(observations, cell, scanner, options.asked)
+    session = _at_best(session) if options.certify else session
+    weak = _weak(session, options)
+    work = _work(session, options)
+    reported = _reported(session, work, weak)
+    corrected = _corrected(session, work, weak, reported.expected)
+    return replace(
+        reported,
+        method=method,
+        corrected=corrected,
+        true=tuple(_estimates(session, _true(session.found), weak)),
+        notes=(*session.notes, *_notes(session, weak, options)),
+    )
+
+
+@on_one_thread
+def calibrate_at(
+    places: Places,
+    observations: Sequence[Observation],
+    cell: Cell,
+    scanner: ScannerModel | None,
+    options: Options,
+    method: str,
+) -> HandEye:
+    """Return the calibration whose places another method found, with what the model says of them.
+
+    Every observation took part. Its covariance is about these places: it holds what the likeliest
+    ones are away from them.
+
+    Args:
+        places: (4, 4) of each unknown.
+        observations: As of :func:`calibrate`, and so the rest.
+        cell: What stands on what.
+        scanner: The scanner's model, where it is known.
+        options: How it is judged.
+        method: Name of the stage.
+
+    Raises:
+        StageError: As of :func:`calibrate`.
+        CalibrationRefused: As of :func:`calibrate`.
+    """
+    session = session_of(observations, cell, scanner, options.asked)
+    weak = _weak(session, options)
+    work = _work(session, options)
+    answer = _reported(session, work, weak, places)
+    pairs = tuple(replace(pair, used=True, reason=None) for pair in answer.pairs)
+    true = _true(session.found).at(session.found.problem.moves(session.found.places, places))
+    return replace(
+        answer,
+        pairs=pairs,
+        method=method,
+        true=tuple(_estimates(session, true, weak)),
+        notes=session.notes,
+    )
+
+
+def _at_best(session: Session) -> Session:
+    """Return the session where the certificate leads, if that fits better, and say so."""
+    found = session.found
+    start = verdict_of(answer_of(found)).better
+    if start is None:
+        return session
+    there = estimate(found.problem, start, found.effects, found.inliers)
+    if there.posterior.mode.cost >= found.posterior.mode.cost:
+        return session
+    return replace(session, found=there).noted(moved_note())
+
+
+def _weak(session: Session, options: Options) -> Floats:
+    """Return (P, k) moves of the places that the sightings tell nothing of; see ``unobservable``.
+
+    With as much noise as the sightings show, and no less than a camera and an arm have.
+    """
+    found = session.found
+    model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()
+    sizes[-2:] = np.maximum(sizes[-2:], LEAST)
+    covariance = fit(model, sizes, with_gradient=False).covariance[: model.p, : model.p]
+    information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    agreeing = found.problem.where(found.inliers)
+    return unobservable(
+        agreeing, found.places, information, options.limits, options.mark, session.cell.freedoms
+    )
+
+
+def _work(session: Session, options: Options) -> Problem:
+    found = session.found
+    return work_of(found.problem.where(found.inliers), found.places, options.work)
+
+
+def _true(found: Estimate) -> Answer:
+    return functional(found, np.zeros((found.posterior.model.p, sum(found.counts))))
+
+
+def _reported(
+    session: Session, work: Problem, weak: Floats, given: Places | None = None
+) -> HandEye:
+    """Return the answer for the arms as their controllers report them: the likeliest, or given."""
+    found = session.found
+    answered = functional(found, as_reported(found, work))
+    if given is not None:
+        answered = answered.at(found.problem.moves(found.places, given))
+    camera, *others = _estimates(session, answered, weak)
+    tool = ArmCorrection(session.tool_offset) if session.tool_offset.any() else None
+    answer = HandEye(
+        camera,
+        (),
+        "",
+        correction=tool,
+        others=tuple(others),
+        expected=expected_error(found, work, answered.mean),
+        shared=_shared(found),
+    )
+    return replace(answer, pairs=_pairs(session, answer))
+
+
+def _corrected(
+    session: Session, work: Problem, weak: Floats, reported: ExpectedError | None
+) -> CorrectedArm | None:
+    """Return the answer for the arms with their errors corrected, where that is worth its while."""
+    found = session.found
+    corrections = corrections_of(found, session.tool_offset)
+    if not corrections or reported is None:
+        return None
+    answered = functional(found, as_reported(found, work, without=CORRECTED))
+    likeliest = found.posterior.mean[: found.posterior.model.p]
+    expected = expected_error(found, work, likeliest, corrected=True)
+    if expected.rms > BETTER * reported.rms:
+        return None
+    camera, *others = _estimates(session, answered, weak)
+    alone = list(corrections) == [FLANGE]
+    return CorrectedArm(
+        camera,
+        corrections[FLANGE] if alone else None,
+        tuple(others),
+        {} if alone else corrections,
+        _shared(found),
+        expected,
+    )
+
+
+def _estimates(session: Session, answer: Answer, weak: Floats) -> list[TransformEstimate]:
+    """Return the unknowns, the cameras' first, each with its covariance where it matters.
+
+    A camera's about the middle of what it saw; another's about its own origin.
+    """
+    problem, found = session.found.problem, session.found
+    moved = _without(problem, problem.moved(found.places, answer.mean), weak)
+    nothing = np.hstack([weak, meaningless(problem)])
+    out = {}
+    for i, name in enumerate(problem.unknown):
+        rows = slice(6 * i, 6 * i + 6)
+        transform = Transform.named(session.cell.name_of(name), moved[name])
+        free = nothing[rows].copy()
+        own = meaningless(problem)[rows]
+        if own.any():  # a turn of a round target, about its own axis
+            free = np.hstack([weak[rows], _in_parent(moved[name], own)])
+        out[name] = _estimate(
+            transform, answer.covariance[rows, rows], _about(session, transform), free
+        )
+    order = [n for n in session.cell.unknown_frames if n in out]
+    return [out[name] for name in order]
+
+
+def _in_parent(place: Floats, moves: Floats) -> Floats:
+    out = moves.copy()
+    out[:3] = place[:3, :3] @ moves[:3]
+    return out
+
+
+def _without(problem: Problem, places: Places, weak: Floats) -> Places:
+    """Return the places moved to where the camera has no part along unobservable moves."""
+    if not weak.shape[1]:
+        return places
+    i = problem.unknown.index(problem.ends[0][0])
+    along = weak[6 * i + 3 : 6 * i + 6]
+    at = places[problem.ends[0][0]][:3, 3]
+    steps = np.linalg.lstsq(along.T @ along, -along.T @ at, rcond=None)[0]
+    return problem.moved(places, weak @ steps)
+
+
+def _about(session: Session, transform: Transform) -> Floats:
+    seen = [o.feature.centre for o, kept in zip(session.observations, session.found.inliers,
+            strict=True) if kept and o.camera == transform.child]  # fmt: skip
+    return transform.apply(np.mean(seen, axis=0)) if seen else transform.translation
+
+
+def _estimate(
+    transform: Transform, covariance: Floats, about: Floats, free: Floats
+) -> TransformEstimate:
+    """Return an estimate, its covariance taken about a point instead of the child's origin.
+
+    Args:
+        transform: The value.
+        covariance: (6, 6), rotation and translation, this at the child's origin.
+        about: (3,) in the parent [m].
+        free: (6, k) moves that nothing tells of, taken like the covariance.
+    """
+    shift = adjoint_shift(about - transform.translation)
+    moved = shift @ covariance @ shift.T
+    sizes = np.linalg.norm(free, axis=0)
+    kept = (shift @ free)[:, sizes > 1e-6]  # others move other places alone
+    directions = np.linalg.qr(kept)[0].T if kept.shape[1] else np.zeros((0, 6))
+    across = np.eye(6) - directions.T @ directions
+    moved = across @ moved @ across
+    return TransformEstimate(transform, 0.5 * (moved + moved.T), about, directions)
+
+
+def _shared(found: Estimate) -> Floats:
+    """Return how much there is of each error that the features share [standard deviations]."""
+    means = [mean for _, mean, _ in found.numbers("shared")]
+    return np.concatenate(means) if means else np.zeros(0)
+
+
+def _pairs(session: Session, answer: HandEye) -> tuple[Pair, ...]:
+    """Return every observation with its residual in ``base``, and why it was not used."""
+    found, observations = session.found, session.observations
+    transforms = {name: x.transform for name, x in answer.transforms.items()}
+    moved = session.cell.corrected(observations, answer)
+    mapped, expected = mapped_and_expected(session.cell.ends(transforms, moved), moved)
+    residuals = found.problem.residuals(found.places)
+    pairs = []
+    for i, (o, used) in enumerate(zip(observations, found.inliers, strict=True)):
+        turn, shift = np.linalg.norm(residuals[i].reshape(2, 3), axis=1)
+        turned = f" and {np.degrees(turn):.1f} deg" if found.problem.seen.ranks[i] == 6 else ""
+        sigma = np.sqrt(found.squares[i])
+        reason = None if used else f"residual {shift * 1e3:.1f} mm{turned}, {sigma:.0f} sigma"
+        pairs.append(Pair(o, mapped[i] - expected[i], bool(used), reason))
+    return tuple(pairs)
+
+
+def _noise_beyond(found: Estimate) -> tuple[float, float]:
+    """Return the noise per axis beyond what the features' fits state: [rad] and [m]."""
+    model, q = found.posterior.model, found.posterior.model.projectors
+    every = model.noise(found.posterior.mode.sizes) - (np.eye(6) - q) - model.covariances
+    squares = np.diagonal(q @ every @ q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
+    freedoms = np.diagonal(q, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=(0, 2))
+    turn, shift = np.sqrt(np.maximum(squares / np.maximum(freedoms, 1.0), 0.0))
+    return float(turn), float(shift)
+
+
+def _sees_flange(cell: Cell) -> bool:
+    """Whether one camera stands on the root and sees the flange's own circle."""
+    camera, target = cell.frames[cell.cameras[0]], cell.frames[cell.targets[0]]
+    at_origin = target.place is not None and not np.abs(target.place - np.eye(4)).any()
+    return camera.parent == BASE and target.parent == FLANGE and at_origin
+
+
+def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
+    """Return what is for the record."""
+    found, cell = session.found, session.cell
+    turn, shift = _noise_beyond(found)
+    notes: list[Note] = [
+        f"noise beyond the features' own: {shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg "
+        "per axis"
+    ]
+    if len(found.problem.ends) > 1:
+        who = Counter((o.camera, o.target) for o in session.observations)
+        seen = ", ".join(f"{c} saw {t} {n} times" for (c, t), n in who.items())
+        notes.append(f"solved at once: {seen}")
+    agreeing = [o for o, kept in zip(session.observations, found.inliers, strict=True) if kept]
+    plates = [
+        o for o in agreeing if isinstance(o.feature, CircleFeature) and o.feature.normal is not None
+    ]
+    if _sees_flange(cell) and plates and found.problem.seen.ranks.max() == 5:
+        camera = found.places[found.problem.ends[0][0]]
+        notes.append(roll_note(agreeing, camera[:3, :3], found.posterior.covariance[:3, :3]))
+    if weak.shape[1]:
+        notes.append(
+            f"not observable from these poses, and set to zero: {weak.shape[1]} translation"
+            f"{'s' if weak.shape[1] > 1 else ''} along which the arm's axes do not tilt"
+        )
+    return [*notes, *(certificate_notes(answer_of(found)) if options.certify else ())]

@@ -1,0 +1,241 @@
+r"""Whether an answer is the best of all, not only of its neighbourhood. Arrays only.
+
+Squared errors are a quadratic ``r' Q r`` of features of the unknown places
+(:mod:`flangeye.estimation.lifted`).
+Many other quadratics are naught for all places, since rotations
+are rotations and products are products. Where one of them, C, leaves
+
+    L = Q - C - f E,   positive semidefinite,
+
+no place costs less than ``f``, for E picks the one: Lagrangian duality, as used for many cameras
+and targets in arXiv 2507.23045. All rotations' features have one length: if L is semidefinite with
+``e`` more on their diagonal, nothing better than ``f`` by more than ``e`` times its square exists.
+Translations have any length, and get no more. That it is semidefinite, a Cholesky decomposition
+shows, to what it rounds.
+
+What is naught for all products of two places' features is what products of two bases do not span,
+one of either place: all C are one projection by small matrices. C is sought by quasi-Newton steps
+that bring L to the matrices that are semidefinite and leave the answer as it is: no solver of
+semidefinite programs. Where there is none, the part of L that is negative is like the features of
+better places: where it leads to such, they are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from flangeye.estimation.lifted import Family, Sightings, Squares, squares_of
+from flangeye.maths.geometry import nearest_rotation, rotation_exp
+from flangeye.types import Floats, Indices
+
+TRIES, TRIES_ELSEWHERE = 150, 50
+"""To find a certificate, most take twenty; and, where there is none, a better place."""
+GAP, ROUNDING = 1e-3, 1e-12
+"""Share of the cost that may be missing; and of the size of ``Q``, where the cost is none."""
+SHARES = np.geomspace(GAP, 1.0, 31)
+"""Of the cost that may be missing, as they are tried."""
+WAYS = 3
+"""Directions in which a better place is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What could be shown.
+
+    Attributes:
+        places: (K, 4, 4) at the bottom of the valley.
+        cost: What their squared errors come to.
+        missing: By how much another answer may be better, at most.
+        optimal: Whether that is next to nothing.
+        better: (K, 4, 4) that cost less than ``places``, if such were found.
+    """
+
+    places: Floats
+    cost: float
+    missing: float
+    optimal: bool
+    better: Floats | None = None
+
+
+def certify(sightings: Sightings, places: Floats) -> Certificate:
+    """Return what can be shown of the valley in which the unknowns (K, 4, 4) lie."""
+    squares = squares_of(sightings, places)
+    found = squares.descend(np.tile(np.eye(4), (len(places), 1, 1)))
+    cost = squares.cost(found)
+    size = max(cost, ROUNDING / GAP * float(np.trace(squares.quadratic)))
+    bare = squares.quadratic / size
+    bare[0, 0] -= cost / size
+    dual = _Dual.of(bare, squares.families)
+    sought = dual.sought(_across(squares.alike(found)), TRIES)
+    share = dual.missing(sought)
+    if share <= GAP:
+        return Certificate(places @ found, cost, share * size, True)
+    elsewhere = _elsewhere(squares, dual.lacks(sought), len(places))
+    lower = squares.cost(elsewhere) < cost - GAP * size
+    better = places @ elsewhere if lower else None
+    return Certificate(places @ found, cost, share * size, False, better)
+
+
+def _across(features: Floats) -> Floats:
+    """Return the (n, n) projector onto what is across (m, n) features."""
+    _, sizes, ways = np.linalg.svd(features, full_matrices=False)
+    along = ways[sizes > 1e-6 * sizes[0]]
+    return np.asarray(np.eye(features.shape[1]) - along.T @ along)
+
+
+def _elsewhere(squares: Squares, lack: Floats, count: int) -> Floats:
+    """Return the best places to which what is lacking leads: a sum of squares of features."""
+    tried = []
+    for way in np.linalg.eigh(lack)[1][:, -WAYS:].T:
+        start = np.tile(np.eye(4), (count, 1, 1))
+        features = way * np.copysign(1.0, way[0])
+        for family in squares.families:
+            start[family.first, :3, :3] = _rotation(features[family.at[1:, 0]])
+            for other in family.after:
+                start[other, :3, :3] = _rotation(features[family.of(other)[0, :9]])
+        tried.append(squares.descend(start))
+    return min(tried, key=squares.cost)
+
+
+def _rotation(entries: Floats) -> Floats:
+    return nearest_rotation(entries.reshape(3, 3))
+
+
+# --- multipliers ---------------------------------------------------------------------------------
+
+
+class _Block(NamedTuple):
+    """Where a family's features stand, and what their products span, as products of either's."""
+
+    at: Indices
+    first: Floats
+    others: Floats
+
+    def naught(self, matrix: Floats) -> Floats:
+        """Return the part of a matrix, of the family's features, that is naught for all places."""
+        size = len(matrix) // 10
+        pairs = matrix.reshape(10, size, 10, size).swapaxes(1, 2).reshape(100, -1)
+        told = self.first @ (self.first.T @ pairs @ self.others) @ self.others.T
+        return matrix - told.reshape(10, 10, size, size).swapaxes(1, 2).reshape(matrix.shape)
+
+
+class _Dual(NamedTuple):
+    """The matrices L that have a quadratic's values for all places.
+
+    Attributes:
+        bare: (n, n) one of them.
+        blocks: In which they differ.
+        bounded: (n,) of features of rotations alone: one by the square of their length.
+    """
+
+    bare: Floats
+    blocks: Sequence[_Block]
+    bounded: Floats
+
+    @classmethod
+    def of(cls, bare: Floats, families: Sequence[Family]) -> _Dual:
+        """Return those of a quadratic, of the features of some families."""
+        bounded = np.ones(len(bare))
+        for family in families:
+            for other in family.after:
+                bounded[family.of(other)[:, 9:]] = 0.0
+        length = 1 + sum(4 * (1 + 3 * len(family.after)) - 1 for family in families)
+        blocks = [_Block(f.at.ravel(), _of_first(), _of_others(len(f.after))) for f in families]
+        return cls(bare, blocks, bounded / length)
+
+    def at(self, multipliers: Floats) -> Floats:
+        """Return one of the matrices."""
+        out, start = self.bare.copy(), 0
+        for block in self.blocks:
+            end = start + len(block.at) ** 2
+            matrix = multipliers[start:end].reshape(len(block.at), -1)
+            out[np.ix_(block.at, block.at)] += block.naught(matrix)
+            start = end
+        return out
+
+    def parts(self, matrix: Floats) -> Floats:
+        """Return by how much multipliers move along a matrix."""
+        parts = (block.naught(matrix[np.ix_(block.at, block.at)]) for block in self.blocks)
+        return np.concatenate([part.ravel() for part in parts])
+
+    def sought(self, still: Floats, tries: int, start: Floats | None = None) -> Floats:
+        """Return multipliers whose matrix is semidefinite, or as near to it as could be found.
+
+        Args:
+            still: (n, n) projector across what the matrix has to leave as naught.
+            tries: Steps at most.
+            start: Multipliers to begin with; without them none.
+        """
+
+        def apart(multipliers: Floats) -> tuple[float, Floats]:
+            matrix = self.at(multipliers)
+            off = matrix - _nearest(still @ matrix @ still)
+            return 0.5 * float((off**2).sum()), self.parts(off)
+
+        def ended(multipliers: Floats) -> None:
+            if self.shows(multipliers, GAP):
+                raise StopIteration
+
+        none = np.zeros(sum(len(block.at) ** 2 for block in self.blocks))
+        begin = none if start is None else start
+        options = {"maxiter": tries, "ftol": 0.0, "gtol": 0.0}
+        found = minimize(apart, begin, jac=True, method="L-BFGS-B", callback=ended, options=options)
+        return np.asarray(found.x)
+
+    def shows(self, multipliers: Floats, share: float) -> bool:
+        """Whether they show that no more than a share of the unit is missing."""
+        try:
+            np.linalg.cholesky(self.at(multipliers) + share * np.diag(self.bounded))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def missing(self, multipliers: Floats) -> float:
+        """Return the least share that they show to be all that is missing: no cost is negative."""
+        return next((float(each) for each in SHARES if self.shows(multipliers, each)), 1.0)
+
+    def lacks(self, multipliers: Floats) -> Floats:
+        """Return what every matrix lacks of being semidefinite (n, n), as near as it comes."""
+        matrix = self.at(self.sought(np.eye(len(self.bare)), TRIES_ELSEWHERE, multipliers))
+        return np.asarray(_nearest(matrix) - matrix)
+
+
+def _nearest(matrix: Floats) -> Floats:
+    """Return the nearest matrix that is positive semidefinite."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+@cache
+def _of_first() -> Floats:
+    """Return (100, 35) what products of a one and a rotation's entries span."""
+    return _spanned(_any_places(1, 100)[:, :10])
+
+
+@cache
+def _of_others(count: int) -> Floats:
+    """Return ((1 + 12 C)^2, m) what products of a one and the entries of C places span."""
+    spanned = 1 + 70 * count + 144 * (count * (count - 1) // 2)
+    return _spanned(_any_places(count, 2 * spanned))
+
+
+def _any_places(count: int, draws: int) -> Floats:
+    """Return (draws, 1 + 12 C) of a one and the entries of C places each."""
+    rng = np.random.default_rng(0)
+    places = rng.standard_normal((draws, count, 12))
+    turns = rotation_exp(rng.uniform(-np.pi, np.pi, (draws * count, 3)))
+    places[:, :, :9] = turns.reshape(draws, count, 9)
+    return np.concatenate([np.ones((draws, 1)), places.reshape(draws, -1)], axis=1)
+
+
+def _spanned(features: Floats) -> Floats:
+    """Return an orthonormal basis of the products of any two of (N, f) features."""
+    products = np.einsum("ni,nj->nij", features, features).reshape(len(features), -1)
+    _, sizes, basis = np.linalg.svd(products, full_matrices=False)
+    return np.asarray(basis[sizes > 1e-9 * sizes[0]].T)

@@ -1,0 +1,275 @@
+"""What is said of an answer of which somebody asks if it is the best: for any graph of frames.
+
+Between a camera and what it saw the graph has known places and unknown ones. From any of its frames
+on one may look at it: places that then lead the other way go over as their inverses. Where two at
+most are unknown on either way, from where both part, ``C M = T`` can be written as certificates
+take it (:mod:`flangeye.estimation.certificate`). It is looked at from where that takes least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.estimation.certificate import Certificate, certify
+from flangeye.estimation.estimate import Estimate
+from flangeye.estimation.lifted import Side, Sightings, families_of
+from flangeye.maths.frame_graph import Frame, chain
+from flangeye.maths.geometry import invert, rotation_exp, rotation_log
+from flangeye.types import Floats, Indices
+
+NEAR, ROUNDING = 5.0, 1e-9
+"""Standard deviations by which what weights that stay as they are change may move an answer, and
+rounding [rad]."""
+OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"
+NOT_CERTIFIED = "not certified as globally optimal"
+
+
+class Verdict(NamedTuple):
+    """What is said of an answer.
+
+    Attributes:
+        note: In words.
+        better: (4, 4) of the unknown frames that fit better, as far as such were found.
+    """
+
+    note: str
+    better: Mapping[str, Floats] | None = None
+
+
+class Step(NamedTuple):
+    """One frame on a way, or back from it to what it stands on."""
+
+    name: str
+    back: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The answer for N sightings that agree.
+
+    Attributes:
+        frames: By name; those to be found have no place, what moves has one at each time.
+        ends: (N,) each one's camera and target.
+        times: (N,) index of the places of what moves.
+        places: (4, 4) of the K unknown frames.
+        covariances: (6, 6) of them.
+        errors: (N, 6) what takes predicted targets to measured ones, in ``camera``.
+        weights: (N, 6, 6) inverse covariances of them.
+        freedoms: (N,) how many numbers were measured: 6, 5 with a normal, 3.
+    """
+
+    frames: Mapping[str, Frame]
+    ends: Sequence[tuple[str, str]]
+    times: Indices
+    places: Mapping[str, Floats]
+    covariances: Mapping[str, Floats]
+    errors: Floats
+    weights: Floats
+    freedoms: Floats
+
+    def of_pair(self, ends: tuple[str, str]) -> Indices:
+        """Return (M,) the sightings of one target by one camera."""
+        return np.flatnonzero([each == ends for each in self.ends])
+
+    def ways(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
+        """Return the frames that lead to a camera and to a target, from where both ways part.
+
+        Args:
+            ends: The camera and the target.
+            root: From where on one looks at the graph; by default from its own root.
+        """
+        first, second = (self._way(root, end) for end in ends)
+        shared = sum(1 for a, b in zip(first, second, strict=False) if a == b)
+        return first[shared:], second[shared:]
+
+    def _way(self, root: str, end: str) -> list[Step]:
+        up, down = chain(self.frames, root), chain(self.frames, end)
+        shared = sum(1 for a, b in zip(up, down, strict=False) if a == b)
+        back = [Step(name, True) for name in reversed(up[shared:])]
+        return [*back, *(Step(name, False) for name in down[shared:])]
+
+    def unknown(self, ends: tuple[str, str], root: str = "") -> tuple[list[Step], list[Step]]:
+        """Return the unknown ones of those."""
+        first, second = ([s for s in w if s.name in self.places] for w in self.ways(ends, root))
+        return first, second
+
+    def place(self, step: Step, times: Indices) -> Floats:
+        """Return the (M, 4, 4) places of a step whose frame's is known."""
+        place = np.asarray(self.frames[step.name].place)
+        every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
+        return invert(every) if step.back else every
+
+
+def answer_of(found: Estimate) -> Answer:
+    """Return the answer for the sightings that agree; what may be wrong stays as it was found."""
+    problem, model, kept = found.problem, found.posterior.model, found.inliers
+    s = problem.seen.where(kept)
+    frames, ends = dict(problem.frames), list(problem.ends)
+    if problem.seen.offsets.any():  # what was seen stands beside the target's origin
+        points = np.tile(np.eye(4), (len(problem.seen), 1, 1))
+        points[problem.seen.times, :3, 3] = problem.seen.offsets
+        frames |= {f"{target}_point": Frame(target, points) for _, target in problem.ends}
+        ends = [(camera, f"{target}_point") for camera, target in problem.ends]
+    mode = found.posterior.mode
+    left = model.residuals - (model.effects @ mode.mean[model.p :])
+    return Answer(
+        frames,
+        [ends[k] for k in s.pairs],
+        s.times,
+        dict(found.places),
+        {
+            name: mode.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+            for i, name in enumerate(problem.unknown)
+        },
+        left[kept],
+        mode.weights[kept],
+        s.ranks.astype(np.float64),
+    )
+
+
+def verdict_of(answer: Answer) -> Verdict:
+    """Return whether the sightings that agree have no better answer than the one found."""
+    root = _seen_from(answer)
+    if root is None:
+        return Verdict(_not_certifiable(answer))
+    shown = certify(_sightings(answer, root), _array(_turned(answer.places, root, answer)))
+    if not shown.optimal:
+        share = min(shown.missing / max(shown.cost, 1e-300), 1)
+        note = (
+            f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may leave squared errors less by "
+            "so much"
+        )
+        return Verdict(note, _named(shown.better, root, answer))
+    away = _far_away(shown, root, answer)
+    return Verdict(away, _named(shown.places, root, answer)) if away else Verdict(OPTIMAL)
+
+
+def certificate_notes(answer: Answer) -> tuple[str, ...]:
+    """Return in words whether there is a better answer."""
+    return (verdict_of(answer).note,)
+
+
+def moved_note() -> str:
+    """Return what is said where the certificate led to a better answer."""
+    return "what the search had found was not the best: the certificate led to a likelier answer"
+
+
+def _named(places: Floats | None, root: str, answer: Answer) -> dict[str, Floats] | None:
+    if places is None:
+        return None
+    return _turned(dict(zip(answer.places, places, strict=True)), root, answer)
+
+
+def _far_away(shown: Certificate, root: str, answer: Answer) -> str | None:
+    """Return what is said where the bottom of the valley is not the answer."""
+    places = _array(_turned(answer.places, root, answer))
+    turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
+    away = np.linalg.norm(rotation_log(turns), axis=1)
+    known = [np.linalg.eigvalsh(each[:3, :3])[-1] for each in answer.covariances.values()]
+    beyond = away > NEAR * np.sqrt(known) + ROUNDING
+    if not beyond.any():
+        return None
+    far = np.degrees(away[beyond].max())
+    return f"{NOT_CERTIFIED}: with its weights the best answer is {far:.2g} deg from it"
+
+
+def _not_certifiable(answer: Answer) -> str:
+    def between(ends: tuple[str, str]) -> list[str]:
+        return [step.name for way in answer.unknown(ends) for step in way]
+
+    camera, target = most = max(dict.fromkeys(answer.ends), key=lambda ends: len(between(ends)))
+    return (
+        f"not certifiable: where {camera} saw {target}, too many unknown places lie between them: "
+        f"{', '.join(between(most))}"
+    )
+
+
+# --- from where the graph is looked at -----------------------------------------------------------
+
+
+def _seen_from(answer: Answer) -> str | None:
+    """Return the frame from which errors are a quadratic of fewest features; None if there is none.
+
+    The root is an empty name.
+    """
+    sizes = {root: _size(answer, root) for root in ("", *answer.places)}
+    possible = {root: size for root, size in sizes.items() if size}
+    return min(possible, key=possible.__getitem__) if possible else None
+
+
+def _size(answer: Answer, root: str) -> int:
+    """Return how many features errors are a quadratic of; none where they are not."""
+    ways = [way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends, root)]
+    index = {name: i for i, name in enumerate(answer.places)}
+    pairs = {(index[way[0].name], index[way[1].name]) for way in ways if len(way) == 2}
+    nested = {u for u, _ in pairs} & {v for _, v in pairs}
+    if nested or any(len(way) > 2 for way in ways):
+        return 0
+    return families_of(pairs, len(index))[1]
+
+
+def _turned(places: Mapping[str, Floats], root: str, answer: Answer) -> dict[str, Floats]:
+    """Return places, those that lead the other way from a root as their inverses."""
+    back = chain(answer.frames, root)
+    return {name: invert(place) if name in back else place for name, place in places.items()}
+
+
+def _array(places: Mapping[str, Floats]) -> Floats:
+    return np.array(list(places.values()))
+
+
+# --- the sightings -------------------------------------------------------------------------------
+
+
+def _sightings(answer: Answer, root: str) -> Sightings:
+    pairs = [_of_pair(answer, ends, root) for ends in dict.fromkeys(answer.ends)]
+    return Sightings(
+        _joined([p.camera for p in pairs]),
+        _joined([p.target for p in pairs]),
+        np.concatenate([p.weights for p in pairs]),
+        np.concatenate([p.freedoms for p in pairs]),
+    )
+
+
+def _joined(sides: Sequence[Side]) -> Side:
+    return Side(*(np.concatenate([getattr(s, f.name) for s in sides]) for f in fields(Side)))
+
+
+def _of_pair(answer: Answer, ends: tuple[str, str], root: str) -> Sightings:
+    rows = answer.of_pair(ends)
+    camera, target = (_side(answer, way, answer.times[rows]) for way in answer.ways(ends, root))
+    places = _array(_turned(answer.places, root, answer))
+    there, seen = camera.at(places), target.at(places)
+    turn = np.kron(np.eye(2), there[:, :3, :3])
+    weights = turn @ answer.weights[rows] @ np.swapaxes(turn, 1, 2)
+    measured = _measured(invert(there) @ seen, answer.errors[rows])
+    return Sightings(replace(camera, c=camera.c @ measured), target, weights, answer.freedoms[rows])
+
+
+def _side(answer: Answer, way: Sequence[Step], times: Indices) -> Side:
+    """Return a way as one side of sightings: of two unknown places at most."""
+    index = {name: i for i, name in enumerate(answer.places)}
+    still = np.tile(np.eye(4), (len(times), 1, 1))
+    known, unknown = [still], list[int]()
+    for step in way:
+        if step.name in index:
+            unknown.append(index[step.name])
+            known.append(still)
+        else:
+            known[-1] = known[-1] @ answer.place(step, times)
+    # The last is after the last unknown; what is not there is none of them, and nothing between.
+    lacking = 2 - len(unknown)
+    (u, v), (a, b, c) = [len(index)] * lacking + unknown, [still] * lacking + known
+    return Side(a, np.full(len(times), u), b, np.full(len(times), v), c)
+
+
+def _measured(predicted: Floats, errors: Floats) -> Floats:
+    """Return (M, 4, 4) what was measured; of a circle the turn about its z is as predicted."""
+    out = predicted.copy()
+    out[:, :3, :3] = rotation_exp(errors[:, :3]) @ predicted[:, :3, :3]
+    out[:, :3, 3] += errors[:, 3:]
+    return out

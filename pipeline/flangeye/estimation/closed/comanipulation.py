@@ -1,0 +1,140 @@
+"""AXB = YCZ, two arms: Kronecker products, alternation, and the paper's decomposition (6).
+
+``A`` is the first arm's flange in its base, ``B`` the target in the camera, ``C`` the second
+arm's flange in its base; ``X`` the camera in the first flange, ``Y`` the second base in the first,
+``Z`` the target in the second flange.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.errors import CalibrationRefused
+from flangeye.estimation.closed.motions import motions_of, place_of
+from flangeye.estimation.closed.separable import park_martin
+from flangeye.maths.geometry import (
+    invert,
+    nearest_rotation,
+    rigid,
+    rotation_from_quaternion,
+    stack_rows,
+)
+from flangeye.types import Floats
+
+Triple = tuple[Floats, Floats, Floats]
+
+FEWEST_KRONECKER = 12
+"""Poses from which the 90 products of the rotations' entries follow."""
+ROUNDS, SETTLED = 3000, 1e-10
+REST = 1e-4
+"""An arm rested between two poses that differ by less [rad, m]."""
+
+
+def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
+    """Return X, Y, Z (4, 4) linearly, each (N, 4, 4) given; N is 12 at least.
+
+    ``A X B`` is linear in the 9 entries of X, ``Y C Z`` in the 81 products of those of Y and Z
+    (as in Wang, Wu, Meng & Ren, IROS 2014, there with quaternions). The null vector holds both;
+    the products are then split by their largest singular vectors, and made rotations.
+    """
+    rotations = [m[:, :3, :3] for m in (a, b, c)]
+    n, identity = len(a), np.eye(3)
+    of_x = np.einsum("nik,nlj->nijkl", rotations[0], rotations[1]).reshape(n, 9, 9)
+    of_yz = np.einsum("nkl,ia,jb->nijaklb", rotations[2], identity, identity).reshape(n, 9, 81)
+    rows = stack_rows(np.concatenate([of_x, -of_yz], axis=2))
+    null = np.linalg.eigh(rows.T @ rows)[1][:, 0]
+    u, _, vt = np.linalg.svd(null[9:].reshape(9, 9))
+    x, y, z = (
+        nearest_rotation(r * np.sign(np.linalg.det(r)))
+        for r in (null[:9].reshape(3, 3), u[:, 0].reshape(3, 3), vt[0].reshape(3, 3))
+    )
+    return with_translations((a, b, c), (x, y, z))
+
+
+def alternate(given: Triple, start: Triple, rounds: int = ROUNDS) -> tuple[Triple, float]:
+    """Return rotations X, Y, Z (3, 3) from any start, and their error [rad rms].
+
+    Each in turn is the rotation that fits best given the other two (Procrustes); the sum of
+    squared Frobenius distances falls in every step.
+
+    Args:
+        given: Rotations of A, B, C, each (N, 3, 3).
+        start: Rotations to begin with.
+        rounds: Steps at most.
+    """
+    (a, b, c), (x, y, z), before = given, start, -np.inf
+    at, bt, ct = (np.swapaxes(m, 1, 2) for m in (a, b, c))
+    for _ in range(rounds):
+        x = nearest_rotation((at @ (y @ c @ z) @ bt).sum(axis=0))
+        left = a @ x @ b
+        y = nearest_rotation((left @ z.T @ ct).sum(axis=0))
+        moved = (ct @ y.T @ left).sum(axis=0)
+        z = nearest_rotation(moved)
+        agreement = float((moved * z).sum())
+        if agreement - before < SETTLED * len(a):
+            break
+        before = agreement
+    # |R - 1|^2 = 2 * angle^2 for small angles, and 6 - 2 trace(R) in general.
+    return (x, y, z), float(np.sqrt(max(3.0 - agreement / len(a), 0.0)))
+
+
+def random_rotations(rng: np.random.Generator) -> Triple:
+    """Return three rotations drawn evenly from all there are."""
+    x, y, z = (rotation_from_quaternion(q) for q in rng.standard_normal((3, 4)))
+    return x, y, z
+
+
+def with_translations(given: Triple, rotations: Triple) -> Triple:
+    """Return X, Y, Z (4, 4): the translations fit the rotations by linear least squares.
+
+    ``R_A t_X - R_Y R_C t_Z - t_Y = R_Y t_C - t_A - R_A R_X t_B`` for every pose.
+
+    Args:
+        given: A, B, C, each (N, 4, 4).
+        rotations: Rotations of X, Y, Z, each (3, 3).
+    """
+    (a, b, c), (x, y, z) = given, rotations
+    rows = np.zeros((len(a), 3, 9))
+    rows[:, :, :3], rows[:, :, 3:6] = a[:, :3, :3], -np.eye(3)
+    rows[:, :, 6:] = -y @ c[:, :3, :3]
+    seen = np.einsum("nij,jk,nk->ni", a[:, :3, :3], x, b[:, :3, 3])
+    right = c[:, :3, 3] @ y.T - a[:, :3, 3] - seen
+    found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
+    return rigid(x, found[:3]), rigid(y, found[3:6]), rigid(z, found[6:])
+
+
+def two_steps(a: Floats, b: Floats, c: Floats) -> Triple:
+    """Return X, Y, Z (4, 4) by the paper's (6), each (N, 4, 4) given.
+
+    (a) The poses at which the second arm rests are eye-in-hand for the first; (b) those at which
+    the first rests are eye-on-base for the second; (c) chains the two.
+
+    Raises:
+        CalibrationRefused: Fewer than three poses share a place of either arm.
+    """
+    first, second = _resting(c), _resting(a)
+    _require_rest(len(first), "second", "first")
+    _require_rest(len(second), "first", "second")
+    x = park_martin(motions_of(a[first], b[first]))
+    eyes = invert(b[second])
+    z = park_martin(motions_of(c[second], eyes))
+    base2_T_camera = place_of(c[second], z, eyes)
+    y = a[second[0]] @ x @ invert(base2_T_camera)
+    return x, y, z
+
+
+def _resting(poses: Floats) -> NDArray[np.intp]:
+    """Return the indices of the largest group of equal poses."""
+    apart = np.abs(poses[:, None] - poses[None]).max(axis=(2, 3))
+    together = apart < REST
+    return np.flatnonzero(together[int(np.argmax(together.sum(axis=1)))])
+
+
+def _require_rest(count: int, resting: str, moving: str) -> None:
+    if count < 3:
+        raise CalibrationRefused(
+            f"the {resting} arm stands still at {count} poses at most, and 3 are needed at which "
+            f"only the {moving} moves: record such poses, or use solve.robust, which "
+            "needs none"
+        )

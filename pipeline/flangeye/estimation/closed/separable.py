@@ -1,0 +1,91 @@
+"""AX = XB, rotation first: Tsai & Lenz, Park & Martin, Horaud & Dornaika, Andreff et al."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.estimation.closed.motions import Motions, translation_of
+from flangeye.maths.geometry import (
+    hat,
+    nearest_rotation,
+    rigid,
+    rotation_exp,
+    rotation_from_quaternion,
+    stack_rows,
+)
+from flangeye.types import Floats
+
+HALF_TURNS = np.stack([np.eye(3), *(np.diag(d) for d in np.eye(3) * 2.0 - 1.0)])
+"""No turn, and half a turn about each axis."""
+
+
+def tsai_lenz(motions: Motions) -> Floats:
+    """Return X (4, 4): Tsai & Lenz, IEEE Trans. Robotics and Automation 5(3), 1989, eq. (10)-(15).
+
+    Their vector ``2 sin(angle / 2) axis`` cannot express half a turn. X is therefore looked for
+    with the camera turned beforehand by nothing and by half a turn about each of its axes; the
+    best conditioned of the four systems is the one whose X turns least.
+    """
+    a, b = _half_sines(motions.alpha), _half_sines(motions.beta)
+    turned = np.einsum("kij,nj->kni", HALF_TURNS, b)
+    systems = hat(a + turned).reshape(4, -1, 3)
+    best = int(np.argmax(np.linalg.svd(systems, compute_uv=False)[:, -1]))
+    tangent = np.linalg.lstsq(systems[best], (turned[best] - a).ravel(), rcond=None)[0]
+    length = np.linalg.norm(tangent)
+    angle = 2.0 * np.arctan(length) / max(float(length), 1e-300)
+    rotation = rotation_exp(angle * tangent) @ HALF_TURNS[best]
+    return rigid(rotation, translation_of(rotation, motions))
+
+
+def _half_sines(vectors: Floats) -> Floats:
+    """Return ``2 sin(angle / 2) axis`` of (K, 3) rotation vectors."""
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors * np.sinc(angles / (2.0 * np.pi)))
+
+
+def park_martin(motions: Motions) -> Floats:
+    """Return X (4, 4): Park & Martin, IEEE Trans. Robotics and Automation 10(5), 1994.
+
+    The rotation that takes the camera's rotation vectors to the carrier's by least squares, here
+    by the singular value decomposition, which keeps it proper where the axes lie in a plane.
+    """
+    rotation = nearest_rotation(motions.alpha.T @ motions.beta)
+    return rigid(rotation, translation_of(rotation, motions))
+
+
+def horaud_dornaika(motions: Motions) -> Floats:
+    """Return X (4, 4): Horaud & Dornaika, Int. J. Robotics Research 14(3), 1995, section 3.
+
+    The unit quaternion q that minimises the sum of ``|a q - q b|^2``, an eigenvector.
+    """
+    a, b = 0.5 * _half_sines(motions.alpha), 0.5 * _half_sines(motions.beta)
+    rows = _commutators(a, b)
+    values = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
+    rotation = rotation_from_quaternion(values[1][:, 0])
+    return rigid(rotation, translation_of(rotation, motions))
+
+
+def _commutators(a: Floats, b: Floats) -> Floats:
+    """Return the (N, 4, 4) matrices C with ``C q = a q - q b`` for pure a, b; q is xyzw."""
+    rows = np.zeros((len(a), 4, 4))
+    rows[:, :3, :3], rows[:, :3, 3], rows[:, 3, :3] = hat(a + b), a - b, b - a
+    return rows
+
+
+def andreff(motions: Motions) -> Floats:
+    """Return X (4, 4): Andreff, Horaud & Espiau, 3DIM 1999: linear in the rotation's entries.
+
+    ``(R_A x 1 - 1 x R_B^T) vec(R_X) = 0`` with Kronecker products, and ``R_X t_B + t_X - R_A t_X =
+    t_A``, together; the rotation is made orthonormal, and the translation fitted to it again.
+    """
+    n, identity = len(motions.a), np.eye(3)
+    turns_a, turns_b = motions.a[:, :3, :3], motions.b[:, :3, :3]
+    rows = np.zeros((n, 12, 12))
+    rows[:, :9, :9] = np.einsum("nij,kl->nikjl", turns_a, identity).reshape(n, 9, 9)
+    rows[:, :9, :9] -= np.einsum("ij,nlk->nikjl", identity, turns_b).reshape(n, 9, 9)
+    rows[:, 9:, :9] = np.einsum("ij,nl->nijl", identity, motions.b[:, :3, 3]).reshape(n, 3, 9)
+    rows[:, 9:, 9:] = identity - turns_a
+    right = np.concatenate([np.zeros((n, 9)), motions.a[:, :3, 3]], axis=1)
+    found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
+    rotation = nearest_rotation(np.asarray(found[:9].reshape(3, 3), dtype=np.float64))
+    return rigid(rotation, translation_of(rotation, motions))

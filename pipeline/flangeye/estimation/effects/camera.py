@@ -1,0 +1,66 @@
+"""Errors that all features of one camera share: of its intrinsics, and of a marker's size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.graph import Linear, Problem
+from flangeye.types import Floats
+
+CERTAIN = 1.05
+"""By how many times a stated deviation may be more or less, one sigma: views told it."""
+SIZE = 1e-3
+"""Typical share by which a printed marker is larger or smaller than was said: a tenth of a
+millimetre of 100 mm, what a ruler shows."""
+UNKNOWN_SIZE = 0.1
+"""The same where the size is to be found."""
+TIMES = 2.0
+"""By how many times that may be more or less, one sigma."""
+
+
+def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]:
+    """Return what the features share of each camera's intrinsics, and the size of each target."""
+    s, effects = problem.seen, []
+    if s.shared.any():
+        for camera in dict.fromkeys(camera for camera, _ in problem.ends):
+            name = f"intrinsics of {camera}"
+            effects.append(Effect(name, _shared(camera), 1.0, CERTAIN, kind="shared"))
+    size = UNKNOWN_SIZE if size_unknown else SIZE
+    whole = {int(k) for k in s.pairs[s.ranks == 6]}
+    pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
+    for target in dict.fromkeys(target for _, target in pairs):
+        effects.append(Effect(f"size of {target}", _size(target), size, TIMES, kind="size"))
+    for camera in dict.fromkeys(camera for camera, _ in pairs):
+        name = f"focal length of {camera}"
+        effects.append(Effect(name, _focal(camera), SIZE, TIMES, kind="focal"))
+    return effects
+
+
+def _shared(camera: str) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s = problem.seen
+        whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
+        return np.asarray(np.where(whose[:, None, None], s.shared, 0.0))
+
+    return block
+
+
+def _size(target: str) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s, out = problem.seen, np.zeros((len(problem.seen), 6, 1))
+        whose = np.array([problem.ends[k][1] == target for k in s.pairs]) & (s.ranks == 6)
+        out[whose, 3:, 0] = -s.centres[whose]
+        return out
+
+    return block
+
+
+def _focal(camera: str) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s, out = problem.seen, np.zeros((len(problem.seen), 6, 1))
+        whose = np.array([problem.ends[k][0] == camera for k in s.pairs]) & (s.ranks == 6)
+        out[whose, 5, 0] = -s.centres[whose, 2]
+        return out
+
+    return block

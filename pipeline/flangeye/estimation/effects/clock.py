@@ -1,0 +1,71 @@
+"""The time between a camera's clock and the arms', where these moved when the camera saw them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.graph import Linear, Problem
+from flangeye.maths.streams import joints_at, later, pose_at
+from flangeye.models.cell import Cell
+from flangeye.types import FLANGE, Floats, Observation
+
+DELAY = 20e-3
+"""Typical time between two clocks that nobody set [s]: an exposure, a buffer, a network's delay."""
+TIMES = 4.0
+"""By how many times it may be more or less, one sigma."""
+
+
+def clock_effects(problem: Problem) -> list[Effect]:
+    """Return the delay of each camera [s]: by how much its sightings are later than their poses."""
+    if not problem.carriers or any(c.rates is None for c in problem.carriers):
+        return []
+    cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
+    return [
+        Effect(f"clock of {camera}", _delay(camera), DELAY, TIMES, kind="clock", lasting=False)
+        for camera in cameras
+    ]
+
+
+def _delay(camera: str) -> Block:
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s, out = problem.seen, np.zeros((len(problem.seen), 6))
+        for carrier in problem.carriers:
+            if carrier.rates is not None:
+                turned = linear.blocks[carrier.frame] @ carrier.rates[s.times][..., None]
+                out += turned[..., 0]
+        whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
+        return np.asarray(np.where(whose[:, None], out, 0.0)[..., None])
+
+    return block
+
+
+def delayed(
+    observations: Sequence[Observation], cell: Cell, delays: Mapping[str, float]
+) -> list[Observation] | None:
+    """Return observations with all that moves where it was so much later; None beyond the record.
+
+    Args:
+        observations: With how everything passed.
+        cell: What stands on what.
+        delays: By camera [s].
+    """
+    moved = []
+    for o in observations:
+        passed = o.motion and later(cell.passing(o.motion), delays.get(o.camera, 0.0))
+        if passed is None:
+            return None
+        at = {
+            name: replace(pose, matrix=pose_at(passed, 0.0, name))
+            for name, pose in o.poses.items()
+            if name in passed.others
+        }
+        told = {n: q for n in o.arm_joints if (q := joints_at(passed, 0.0, n)) is not None}
+        own = joints_at(passed, 0.0, FLANGE)
+        moved.append(
+            replace(o, poses={**o.poses, **at}, joints=own, arm_joints=told, motion=passed)
+        )
+    return moved

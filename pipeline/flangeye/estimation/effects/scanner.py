@@ -1,0 +1,163 @@
+r"""Errors of a depth scanner that are the same at every pose: a smooth distortion, rounded edges.
+
+Poses held out do not show them, for they err alike; only the size is known, by the scanner's model.
+The distortion is a field of :mod:`flangeye.maths.smooth_field` over the view (right, down, depth,
+each from -1 to 1), without the rigid motion nearest to it over the whole volume: that part is where
+the camera is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from flangeye.estimation.effects.effect import Effect
+from flangeye.estimation.graph import Linear, Problem, Sightings
+from flangeye.maths.geometry import hat, stack_rows
+from flangeye.maths.smooth_field import features
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import Floats
+
+POWERS = tuple(p for p in product(range(4), repeat=3) if sum(p) <= 3)
+"""A calibrated scanner bends its volume once or twice, and has no ripples."""
+GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), axis=-1).reshape(-1, 3)
+"""The view, evenly."""
+RADIUS = 30e-3
+"""A target is turned by how the field changes over so much to each side [m]: a flange's radius."""
+NEGLIGIBLE = 0.05
+"""Combinations of weights that move a session's targets by less than this share of the largest
+are left out."""
+LEVER = 0.3
+"""A turn counts like what it does so far away [m]."""
+TIMES = 1.1
+"""By how many times the file's calibration error may be more or less, one sigma: data sheets state
+it for every device of the type. Were it free, it would take what the arm does wrong."""
+LEAST_TILT = 1e-3
+"""Circles that all face the camera to this [rad] are seen alike."""
+
+
+def scanner_effects(problem: Problem, scanner: ScannerModel | None) -> list[Effect]:
+    """Return the scanner's distortion, and how it rounds the edges of circles."""
+    seen = problem.seen
+    effects = []
+    if scanner is not None and seen.by_depth.any():
+        effects.append(_distortion(scanner, seen))
+    placed = all(problem.frames[target].place is not None for _, target in problem.ends)
+    size = 0.0 if placed else _edge_size(seen)
+    if size > 0:
+        effects.append(Effect("rounded edges", _edges, size, TIMES, kind="scanner"))
+    return effects
+
+
+def _distortion(scanner: ScannerModel, seen: Sightings) -> Effect:
+    field = _Field(scanner)
+    moves = field.moves(seen) * seen.by_depth[:, None, None]
+    scaled = moves * np.repeat([LEVER, 1.0], 3)[:, None]
+    _, sizes, ways = np.linalg.svd(stack_rows(scaled), full_matrices=False)
+    kept = ways[sizes > NEGLIGIBLE * sizes[0]].T
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        s = problem.seen
+        return np.asarray((field.moves(s) * s.by_depth[:, None, None]) @ kept)
+
+    return Effect("scanner distortion", block, 1.0, TIMES, kind="scanner")
+
+
+def _edges(problem: Problem, linear: Linear) -> Floats:
+    """Return (N, 6, 1): by how much centres move towards the camera's side of a tilted face.
+
+    Where the wall behind an edge is in view a scanner rounds the edge off; on the other side it
+    breaks off. So a centre lies too far from the camera's side, by the more the more the face is
+    tilted. Tilting also is what tells how far away a circle of unknown place is.
+    """
+    s = problem.seen
+    out = np.zeros((len(s), 6, 1))
+    out[:, 3:, 0] = _along(s) * (s.by_depth & (s.ranks == 5))[:, None]
+    return out
+
+
+def _along(s: Sightings) -> Floats:
+    """Return (N, 3) the direction to the camera, in the face, as long as the face is tilted."""
+    normals = s.rotations[:, :, 2]
+    to_camera = -s.centres / np.linalg.norm(s.centres, axis=1)[:, None]
+    return np.asarray(to_camera - (to_camera * normals).sum(axis=1)[:, None] * normals)
+
+
+def _edge_size(s: Sightings) -> float:
+    """Return what the fits state of their centres in the face, as if all of it were this [m]."""
+    rows = s.by_depth & (s.ranks == 5)
+    tilts = (_along(s)[rows] ** 2).sum()
+    if not rows.any() or tilts <= LEAST_TILT**2 * rows.sum():
+        return 0.0
+    own, normals = s.covariances[rows, 3:, 3:], s.rotations[rows, :, 2]
+    across = np.einsum("na,nab,nb->n", normals, own, normals)
+    return float(np.sqrt((np.trace(own, axis1=1, axis2=2) - across).sum() / tilts))
+
+
+@dataclass(frozen=True)
+class _Field:
+    """A field of the scanner's size, linear in weights of unit variance."""
+
+    scanner: ScannerModel
+
+    @property
+    def _depths(self) -> tuple[float, float]:
+        """Middle of the range, and half of it [m]."""
+        near, far = self.scanner.range
+        return (near + far) / 2, (far - near) / 2
+
+    @property
+    def _slopes(self) -> Floats:
+        return np.tan(np.array(self.scanner.field_of_view) / 2)
+
+    @cached_property
+    def _over_volume(self) -> tuple[Floats, float]:
+        """Return the rigid motions (6, K) nearest to each weight's, and the scale to the size."""
+        middle, half = self._depths
+        depths = middle + half * GRID[:, 2:]
+        points = np.concatenate([GRID[:, :2] * self._slopes * depths, depths], axis=1)
+        raw, motions = self._raw(points), self._motions(points)
+        rigid = np.linalg.lstsq(stack_rows(motions), stack_rows(raw), rcond=None)[0]
+        bent = raw - motions @ rigid
+        rms = float(np.sqrt((bent**2).sum(axis=(1, 2)).mean()))
+        return np.asarray(rigid), self.scanner.calibration_error / rms
+
+    def moves(self, s: Sightings) -> Floats:
+        """Return (N, 6, K): how each weight turns and moves a target, in ``camera``."""
+        across, along, normals = (s.rotations[:, :, i] for i in range(3))
+        bent = [(self._at(s.centres + RADIUS * t) - self._at(s.centres - RADIUS * t))
+                / (2 * RADIUS) for t in (across, along)]  # fmt: skip
+        rising = [np.einsum("ni,nik->nk", normals, each)[:, None] for each in bent]
+        turning = np.einsum("ni,nik->nk", along, bent[0]) - np.einsum("ni,nik->nk", across, bent[1])
+        turned = (
+            across[..., None] * rising[1]
+            - along[..., None] * rising[0]
+            + normals[..., None] * turning[:, None] / 2
+        )
+        return np.concatenate([turned, self._at(s.centres)], axis=1)
+
+    def _at(self, points: Floats) -> Floats:
+        """Return (N, 3, K) by how much each weight moves points (N, 3) of the view [m]."""
+        rigid, scale = self._over_volume
+        return np.asarray(scale * (self._raw(points) - self._motions(points) @ rigid))
+
+    def _raw(self, points: Floats) -> Floats:
+        middle, half = self._depths
+        rays = points / points[:, 2:]
+        view = np.concatenate([rays[:, :2] / self._slopes, (points[:, 2:] - middle) / half], axis=1)
+        # Where two rays cross that are equally uncertain, what is across them is better known than
+        # what is along, in the ratio of the baseline to the root of two squared distances.
+        across = np.eye(3)[:, :2] * min(self.scanner.baseline / middle / np.sqrt(2), 1.0)
+        ways = np.concatenate(
+            [rays[..., None], np.broadcast_to(across, (len(points), 3, 2))], axis=2
+        )
+        columns = features(view, POWERS)[:, None, :, None] * ways[:, :, None, :]
+        return np.asarray(columns.reshape(len(points), 3, -1))
+
+    def _motions(self, points: Floats) -> Floats:
+        about = points - np.array([0.0, 0.0, self._depths[0]])
+        still = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+        return np.concatenate([-hat(about), still], axis=2)

@@ -1,0 +1,606 @@
+"""Whether the motion determines every unknown; if not, which motion is missing. Arrays only.
+
+One analysis for all: the moves of the unknowns that the information leaves less well known than
+their limits (:func:`weak_moves`). What is refused because of them says which motion would help.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from flangeye.errors import CalibrationRefused, StageError
+from flangeye.estimation.graph import Places, Problem
+from flangeye.maths.frame_graph import chain
+from flangeye.maths.geometry import hat, invert, kabsch, rotation_exp, rotation_log, stack_rows
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.types import CAMERA, TARGET, Floats
+
+FINEST_NOISE = 1e-5
+"""No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""
+MISTAKE = 5e-3
+"""Noise of a centre beyond which something is not as the recipe says [m]."""
+STILL = np.radians(0.5), 1e-3
+"""An arm that turns and moves by less than this stands still [rad, m]."""
+PARALLEL = 0.03
+"""Axes of rotation are parallel when they spread by less [rad]."""
+LEAST = 1e-4, 2e-5
+"""Noise of the best camera and arm [rad, m]: exact inputs must not seem observable."""
+TELLS, UNKNOWN = 2.0, 1e3
+"""What shows a weak move makes it known so many times better, at least; of one that is known worse
+than so many times its limit nothing is known."""
+
+SURE = 3.0
+"""Motions that are named are to make everything known so many times better than its limit."""
+USUAL, TIED = (0.5e-3, 0.2e-3), 30.0
+"""Noise that further sightings will have [rad, m]; what they leave known to so many times
+its limit is no matter of another tie, but of more of them."""
+IN_LINE = 0.1
+"""Points lie on a line when they are no further from it than this share of its length."""
+NAMED = 0.1
+"""A frame of which a weak move has this share, or more, is one that it leaves unknown."""
+FURTHER = np.repeat([np.radians(20), 0.1], 3)
+"""By how much what moves is turned [rad] or moved [m] to find out what that would show."""
+
+Motion = TypeVar("Motion")
+Move = tuple[str, tuple[float, ...]]
+"""What is moved, and its unit twist in its parent: a turn or a shift."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeakMoves:
+    """Moves of the unknowns that are known less well than they have to be, the weakest first.
+
+    Attributes:
+        moves: (P, k), each as long as its limit.
+        excess: (k,) how many times their limit their standard deviation is; at least 1.
+    """
+
+    moves: Floats
+    excess: Floats
+
+    def __bool__(self) -> bool:
+        return bool(self.moves.size)
+
+
+def weak_moves(information: Floats, limits: Floats) -> WeakMoves:
+    """Return the moves of P unknowns whose standard deviation is beyond its limit.
+
+    Args:
+        information: (P, P) Fisher information.
+        limits: (P,) largest standard deviation of each unknown [rad, m].
+    """
+    values, vectors = np.linalg.eigh(information * np.outer(limits, limits))
+    weak = values < 1.0
+    excess = 1.0 / np.sqrt(np.maximum(values[weak], 1e-12))
+    return WeakMoves(limits[:, None] * vectors[:, weak], excess)
+
+
+def telling(
+    information: Floats, limits: Floats, further: Mapping[Motion, Floats]
+) -> tuple[list[Motion], WeakMoves]:
+    """Return the motions that would show the weak moves, as few as do, and what stays weak.
+
+    Greedy: each time the motion that makes the weak moves known best.
+
+    Args:
+        information: (P, P) so far.
+        limits: (P,) largest standard deviation of each unknown [rad, m].
+        further: (P, P) that each motion would add.
+    """
+    chosen: list[Motion] = []
+    weak = weak_moves(information, limits)
+    while weak:
+        left = {m: weak_moves(information + more, limits) for m, more in further.items()}
+        best = min(left, key=lambda motion: _weakness(left[motion]), default=None)
+        if best is None or _weakness(left[best]) > _weakness(weak) - np.log(TELLS):
+            break
+        chosen.append(best)
+        information, weak = information + further[best], left[best]
+    return chosen, weak
+
+
+def _weakness(weak: WeakMoves) -> float:
+    return float(np.log(np.minimum(weak.excess, UNKNOWN)).sum())
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How a set of points is spread along its longest axis and about it.
+
+    Attributes:
+        axis: (3,) unit direction of the longest extent, its largest component positive.
+        length: Root of the summed squares along the axis [m].
+        width: Root of the summed squares of the distances from the axis [m].
+        farthest: Largest distance from the axis [m].
+        radius: Largest distance from the centroid [m].
+    """
+
+    axis: Floats
+    length: float
+    width: float
+    farthest: float
+    radius: float
+
+
+def spread_of(points: Floats) -> Spread:
+    """Measure (N, 3) points."""
+    centred = points - points.mean(axis=0)
+    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    along = centred @ axis
+    off = np.linalg.norm(centred - np.outer(along, axis), axis=1)
+    return Spread(
+        axis=axis,
+        length=float(np.linalg.norm(along)),
+        width=float(np.linalg.norm(off)),
+        farthest=float(off.max()),
+        radius=float(np.linalg.norm(centred, axis=1).max()),
+    )
+
+
+def require_poses(count: int, needed: int = 3) -> None:
+    """Refuse fewer than ``needed`` poses.
+
+    Raises:
+        StageError: Says how many there are.
+    """
+    if count < needed:
+        raise StageError(
+            f"{needed} poses needed, {count} given: add poses, or see why captures were set aside"
+        )
+
+
+def require_several_places(tcps: Floats) -> None:
+    """Refuse (N, 3) TCPs [m] that are all the same to within 1 mm.
+
+    Raises:
+        StageError: Says where they are.
+    """
+    radius = spread_of(tcps).radius
+    if radius < 1e-3:
+        raise StageError(
+            f"all {len(tcps)} poses are at one place, {in_base(tcps.mean(axis=0))} m "
+            f"within {radius * 1e3:.1f} mm: move the arm between captures"
+        )
+
+
+def require_same_units(centres: Floats, tcps: Floats) -> None:
+    """Refuse centres that are not as far apart as the TCPs are, both (N, 3).
+
+    Medians of all pairwise distances are compared: neither the camera's place nor a few wrong
+    centres matter.
+
+    Raises:
+        StageError: Says the ratio.
+    """
+    ratio = _median_distance(centres) / _median_distance(tcps)
+    if not 0.5 < ratio < 2.0:
+        raise StageError(
+            f"the circle centres are {ratio:.4g} times as far apart as the robot's poses: "
+            "both must be in metres, and each scan must belong to its pose"
+        )
+
+
+def require_right_handed(centres: Floats, tcps: Floats) -> None:
+    """Refuse centres that only fit the TCPs in a mirror, both (N, 3).
+
+    Raises:
+        StageError: Gives both residuals.
+    """
+    straight = _fit_rms(centres, tcps)
+    mirrored = _fit_rms(centres * [1.0, 1.0, -1.0], tcps)
+    if straight > 1e-3 and mirrored < 0.1 * straight:
+        raise StageError(
+            f"the centres fit the poses only when mirrored ({mirrored * 1e3:.1f} mm rms instead "
+            f"of {straight * 1e3:.1f} mm): flip one axis of the scanner's or the robot's frame"
+        )
+
+
+def require_observable(
+    tcps: Floats, axes: Floats, information: Floats, noise: float, limit: float
+) -> None:
+    """Refuse poses that leave rotation about some axis unknown.
+
+    Args:
+        tcps: (N, 3) flange centres in ``base`` [m].
+        axes: (M, 3) flange axes in ``base``, of the poses whose normal was measured.
+        information: (6 + k, 6 + k) Fisher information: rotation, translation, nuisances.
+        noise: Standard deviation of each coordinate of a centre [m].
+        limit: Largest standard deviation of rotation about any axis [rad].
+
+    Raises:
+        CalibrationRefused: Names the axis and the motion that is missing.
+    """
+    rest = np.linalg.pinv(information[3:, 3:], hermitian=True)
+    of_rotation = information[:3, :3] - information[:3, 3:] @ rest @ information[3:, :3]
+    weak = weak_moves(of_rotation, np.full(3, limit))
+    if not weak:
+        return
+    spread = spread_of(tcps)
+    if spread.width < 0.1 * spread.length:
+        parallel = " and the flange's axis is nearly parallel to it" if len(axes) else ""
+        raise CalibrationRefused(
+            f"the {len(tcps)} flange centres lie on a line along base {in_base(spread.axis, 2)} "
+            f"within {spread.farthest * 1e3:.1f} mm{parallel}: rotation about that line is not "
+            "observable; move the arm across it"
+        )
+    axis = weak.moves[:, 0] / limit
+    cure = (
+        "spread the poses further, and check that each scan belongs to its robot pose"
+        if noise < MISTAKE
+        else "no scanner or arm is so noisy: check that each scan belongs to its robot pose, and "
+        "that the target is where the recipe has it (configuration: {place: unknown} finds it)"
+    )
+    raise CalibrationRefused(
+        f"rotation about base {in_base(axis, 2)} is known to "
+        f"{np.degrees(weak.excess[0] * limit):.1f} deg only "
+        f"(limit {np.degrees(limit):g} deg) with {noise * 1e3:.1f} mm of noise per axis: {cure}"
+    )
+
+
+def information_of_centres(tcps: Floats, noise: float) -> Floats:
+    """Return the (6, 6) Fisher information of (N, 3) centres with equal isotropic noise [m]."""
+    n = len(tcps)
+    levers = -hat(tcps - tcps.mean(axis=0))
+    jacobian = np.concatenate([levers, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
+    return np.asarray(np.einsum("nai,naj->ij", jacobian, jacobian) / noise**2)
+
+
+def robust_sigma(residuals: Floats) -> float:
+    """Return the noise of one coordinate [m] by the median of (N, 3) residuals of a rigid fit."""
+    n = len(residuals)
+    median = float(np.median(np.linalg.norm(residuals, axis=1)))
+    unbiased = np.sqrt(3 * n / max(3 * n - 6, 1))
+    return float(unbiased * median / np.sqrt(chi2_quantile(0.5, 3)))
+
+
+def in_base(vector: Floats, digits: int = 3) -> str:
+    """Return ``(0.020, 0.990, 0.010)``, without negative zeros."""
+    return "(" + ", ".join(f"{v:.{digits}f}" for v in np.round(vector, digits) + 0.0) + ")"
+
+
+def _median_distance(points: Floats) -> float:
+    first, second = np.triu_indices(len(points), k=1)
+    return float(np.median(np.linalg.norm(points[first] - points[second], axis=1)))
+
+
+def _fit_rms(source: Floats, target: Floats) -> float:
+    rotation, translation = kabsch(source, target)
+    errors = source @ rotation.T + translation - target
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def require_enough(problem: Problem, needed: int) -> None:
+    """Refuse fewer sightings than the unknowns need, or sightings that are all the same.
+
+    Raises:
+        StageError: Says how many there are, or that nothing moved.
+    """
+    if len(problem.seen) < needed:
+        raise StageError(
+            f"{needed} poses needed for what this configuration leaves unknown, "
+            f"{len(problem.seen)} given: add poses, or see why captures were set aside"
+        )
+    moved = [np.asarray(problem.frames[name].place) for name in problem.moving]
+    if moved and all(_stands_still(poses) for poses in moved):
+        raise StageError(
+            f"all {len(problem.seen)} poses are the same: move the arm between captures"
+        )
+
+
+def fewest(problem: Problem) -> int:
+    """Return how many sightings of one camera and one target tell what is unknown."""
+    ranks, count = problem.seen.ranks, len(problem.unknown)
+    if (ranks == 6).all():
+        return {1: 3, 2: 3}.get(count, 6)
+    if count == 1:
+        return 3
+    placed = problem.frames[problem.ends[0][1]].place is not None
+    normals = bool((ranks >= 5).all())
+    return (5 if normals else 8) if placed else (4 if normals else 6)
+
+
+def meaningless(problem: Problem) -> Floats:
+    """Return (P, k) unit moves that no sighting of the kind could tell: turns of round targets.
+
+    Of a target that was seen as a circle its turn about its own axis; as a centre, every turn.
+    """
+    columns = []
+    for i, name in enumerate(problem.unknown):
+        pairs = [k for k, (_, target) in enumerate(problem.ends) if target == name]
+        ranks = problem.seen.ranks[np.isin(problem.seen.pairs, pairs)]
+        if not len(ranks) or ranks.max() == 6:
+            continue
+        axes = [2] if ranks.max() == 5 else [0, 1, 2]
+        for axis in axes:
+            column = np.zeros(6 * len(problem.unknown))
+            column[6 * i + axis] = 1.0
+            columns.append(column)
+    return np.array(columns).reshape(len(columns), 6 * len(problem.unknown)).T
+
+
+def unobservable(
+    problem: Problem,
+    places: Places,
+    information: Floats,
+    limits: tuple[float, float],
+    mark: bool,
+    freedoms: Mapping[str, Floats] | None = None,
+) -> Floats:
+    """Return (P, k) unit moves of the unknowns that the sightings tell nothing of.
+
+    Args:
+        problem: The sightings that agree.
+        places: (4, 4) of each unknown.
+        information: (P, P) of the places, the effects left to themselves.
+        limits: Largest standard deviations of a rotation [rad] and of a translation [m].
+        mark: Whether translations that are not known are marked instead of refused.
+        freedoms: (6, k) unit twists that what moves can do, by frame.
+
+    Raises:
+        CalibrationRefused: There are some, and they are not translations that may be marked; names
+            the motion that is missing.
+    """
+    scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
+    basis = _told(problem, places)
+    weak = weak_moves(
+        basis.T @ (information * np.outer(scale, scale)) @ basis, np.ones(basis.shape[1])
+    )
+    if not weak:
+        return np.zeros((len(scale), 0))
+    moves = scale[:, None] * (basis @ weak.moves)
+    directions = np.asarray(np.linalg.qr(moves)[0])
+    turns = directions.reshape(len(problem.unknown), 2, 3, -1)[:, 0]
+    if mark and np.abs(turns).max() < 0.05:
+        return directions
+    if _is_configuration(problem):
+        raise CalibrationRefused(
+            f"{_of_what(problem, directions)}: {missing_motion(problem, places)}"
+        )
+    raise CalibrationRefused(
+        _untold(problem, places, (information, scale), WeakMoves(moves, weak.excess), freedoms)
+    )
+
+
+def _told(problem: Problem, places: Places) -> Floats:
+    """Return (P, m) an orthonormal basis of all moves but the meaningless ones."""
+    nothing = _turned(problem, places, meaningless(problem))
+    if not nothing.shape[1]:
+        return np.eye(len(nothing))
+    return np.asarray(np.linalg.svd(nothing, full_matrices=True)[0][:, nothing.shape[1] :])
+
+
+def _turned(problem: Problem, places: Places, moves: Floats) -> Floats:
+    """Return moves given in the unknowns' own axes in those of their parents."""
+    out = np.zeros_like(moves)
+    for i, name in enumerate(problem.unknown):
+        at = slice(6 * i, 6 * i + 3)
+        out[at] = places[name][:3, :3] @ moves[at]
+    return out
+
+
+def _of_what(problem: Problem, weak: Floats) -> str:
+    names = {name: _called(problem, name) for name in problem.unknown}
+    shares = {
+        (name, kind): float(np.linalg.norm(weak[6 * i + at : 6 * i + at + 3]))
+        for i, name in enumerate(problem.unknown)
+        for at, kind in ((0, "rotation"), (3, "translation"))
+    }
+    camera = problem.ends[0][0]
+    of_camera = [kind for (name, kind), size in shares.items() if size > NAMED and name == camera]
+    named = camera if of_camera else max(shares, key=lambda key: shares[key])[0]
+    what = " and ".join(of_camera) if of_camera else "part"
+    return f"{what} of {names[named]} cannot be told from these poses"
+
+
+def _called(problem: Problem, name: str) -> str:
+    camera, target = problem.ends[0]
+    known = {camera: "the camera's pose", target: "the target's place"}
+    return known.get(name, "the second base's pose")
+
+
+def missing_motion(problem: Problem, places: Places) -> str:
+    """Return what the arms did not do, in words."""
+    camera, _ = problem.ends[0]
+    if problem.unknown == [camera] and not (problem.seen.ranks == 6).all():
+        return _line_of(problem, places)
+    for name, poses in _arms(problem):
+        if fault := _fault_of(poses):
+            return f"{name} {fault}"
+    return "the poses are too much alike; spread them, by 20 deg or more about two axes"
+
+
+def _line_of(problem: Problem, places: Places) -> str:
+    s = problem.seen
+    points = s.centres @ places[problem.unknown[0]][:3, :3].T
+    spread = spread_of(points)
+    if spread.width < IN_LINE * spread.length:
+        return (
+            f"the {len(points)} centres lie on a line along base {in_base(spread.axis, 2)} within "
+            f"{spread.farthest * 1e3:.1f} mm: rotation about that line is not observable; move the "
+            "arm across it"
+        )
+    return (
+        "the poses are too close together for their noise: spread the poses further, and check "
+        "that each scan belongs to its robot pose, and that the target is where the recipe has it "
+        "(configuration: {place: unknown} finds it)"
+    )
+
+
+def require_turns(problem: Problem) -> None:
+    """Refuse arms that stood still or never turned, before any start is looked for.
+
+    Raises:
+        CalibrationRefused: Names the arm.
+    """
+    if not _is_configuration(problem) or len(problem.unknown) < 2:
+        return
+    for name, poses in _arms(problem):
+        if not _turns(poses):
+            raise CalibrationRefused(
+                f"the camera's pose cannot be told from these poses: {name} {_fault_of(poses)}"
+            )
+
+
+def _is_configuration(problem: Problem) -> bool:
+    """Whether it is one camera and one target of a configuration, and no cell of own names."""
+    return list(problem.ends) == [(CAMERA, TARGET)]
+
+
+def _arms(problem: Problem) -> list[tuple[str, Floats]]:
+    """Return each arm's name and (N, 4, 4) poses: one of camera and target against each other."""
+    camera, target = (
+        [n for n in chain(problem.frames, end) if n in problem.moving] for end in problem.ends[0]
+    )
+    still = np.tile(np.eye(4), (len(problem.seen), 1, 1))
+
+    def poses(names: list[str]) -> Floats:
+        out = still
+        for name in names:
+            out = out @ np.asarray(problem.frames[name].place)[problem.seen.times]
+        return out
+
+    if len(problem.unknown) == 3:
+        return [("the first arm", poses(camera)), ("the second arm", poses(target))]
+    return [("the arm", invert(poses(target)) @ poses(camera))]
+
+
+def _untold(
+    problem: Problem,
+    places: Places,
+    known: tuple[Floats, Floats],
+    weak: WeakMoves,
+    freedoms: Mapping[str, Floats] | None,
+) -> str:
+    """Return which frames of a cell stay unknown, and which motions or sightings would tell."""
+    information, scale = known
+    named = _named(problem, weak, scale)
+    share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))
+    motions, left = telling(information, scale / SURE, _seen_again(problem, places, freedoms))
+    untied = left and left.excess[0] > TIED
+    cures = _asked(problem, motions)
+    cures += [_tie(problem, _named(problem, left, scale))] if untied else []
+    return (
+        f"the sightings do not tell where {' and '.join(named)} "
+        f"{'are' if len(named) > 1 else 'is'}: a common "
+        f"{'turn' if share[0] > share[1] else 'shift'} hardly changes them; {'; '.join(cures)}"
+    )
+
+
+def _named(problem: Problem, weak: WeakMoves, scale: Floats) -> list[str]:
+    share = np.abs(weak.moves / scale[:, None]).reshape(len(problem.unknown), -1).max(axis=1)
+    return [name for name, most in zip(problem.unknown, share, strict=True) if most > NAMED]
+
+
+def _asked(problem: Problem, motions: Sequence[Move]) -> list[str]:
+    """Return what to move: the turns of each thing, and its shifts."""
+    axes: dict[tuple[str, bool], list[str]] = {}
+    for name, twist in motions:
+        turns = any(twist[:3])
+        axis = in_base(np.array(twist[:3] if turns else twist[3:]), 2)
+        axes.setdefault((name, turns), []).append(axis)
+    return [
+        f"{'turn' if turns else 'move'} {name} {'about' if turns else 'along'} "
+        f"{' and '.join(told)} of {problem.frames[name].parent} by "
+        f"{'20 deg' if turns else '0.1 m'} or more, and see it again"
+        for (name, turns), told in axes.items()
+    ]
+
+
+def _tie(problem: Problem, named: Sequence[str]) -> str:
+    """Return what would tell what no motion does: a sighting that ties two parts."""
+    seen = [problem.ends[k] for k in dict.fromkeys(problem.seen.pairs.tolist())]
+    ends = dict.fromkeys(end for pair in seen for end in pair)
+    moved = [end for end in ends if {*chain(problem.frames, end)} & {*named}]
+    still = [end for end in ends if end not in moved]
+    if not moved:
+        return (
+            f"no sighting that agrees with others has {' or '.join(named)} in it: let a camera "
+            "see it, or it a target, and check what it saw"
+        )
+    if not still or any((camera in moved) != (target in moved) for camera, target in seen):
+        return (
+            f"no motion shows where {' and '.join(named)} "
+            f"stand{'' if len(named) > 1 else 's'}: say it of {named[0]} (place: in the recipe)"
+        )
+    return (
+        f"no sighting ties {' and '.join(moved)} to {' and '.join(still)}: let a camera of the "
+        "one see a target of the other"
+    )
+
+
+def _seen_again(
+    problem: Problem, places: Places, freedoms: Mapping[str, Floats] | None
+) -> dict[Move, Floats]:
+    """Return the (P, P) that all would tell with one thing moved, by its frame and twist."""
+    again: dict[Move, Floats] = {}
+    every = freedoms or {name: np.eye(6) for name in problem.moving}
+    for name, twists in every.items():
+        for twist in np.transpose(twists):
+            told = [_moved_tells(problem, places, name, x) for x in (twist, -twist)]
+            again[name, tuple(map(float, twist))] = np.sum(told, axis=0)
+    return again
+
+
+def _moved_tells(problem: Problem, places: Places, name: str, twist: Floats) -> Floats:
+    turn, shift = np.split(twist * FURTHER, 2)
+    place = np.array(problem.frames[name].place)
+    place[..., :3, :3] = rotation_exp(turn) @ place[..., :3, :3]
+    place[..., :3, 3] += shift
+    frame = replace(problem.frames[name], place=place)
+    moved = replace(problem, frames={**problem.frames, name: frame})
+    linear, before, s = moved.linearised(places), problem.linearised(places), problem.seen
+    rows = np.concatenate([linear.blocks[n] for n in problem.unknown], axis=2)
+    # What is not measured of a circle turns with it.
+    back = np.kron(np.eye(2), before.turns @ np.swapaxes(linear.turns, 1, 2))
+    rows = s.projectors @ back @ rows
+    noise = s.covariances + np.diag(np.repeat(np.square(USUAL), 3))
+    q = s.projectors
+    weights = q @ np.linalg.inv(q @ noise @ q + (np.eye(6) - q)) @ q
+    return np.asarray(np.einsum("nai,nab,nbj->ij", rows, weights, rows, optimize=True))
+
+
+def _turns(poses: Floats) -> bool:
+    return bool(np.linalg.norm(_turns_of(poses), axis=1).max() >= STILL[0])
+
+
+def _fault_of(poses: Floats) -> str | None:
+    turns = _turns_of(poses)
+    if _stands_still(poses):
+        return "stood still; move it too"
+    if not _turns(poses):
+        return "moved without turning; turn it by 20 deg or more about two axes"
+    _, sizes, axes = np.linalg.svd(turns, full_matrices=False)
+    if sizes[1] > PARALLEL * sizes[0]:
+        return None
+    axis = axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))])
+    named = in_base(axis, 2)
+    if _about_one_line(poses):
+        return f"turned only its last joint, about {named}; tilt it about another axis too"
+    return (
+        f"turned about one axis only, {named}, so that translation along it does not show; tilt "
+        "it about another axis too, or, where it has four joints, set unobservable: mark"
+    )
+
+
+def _about_one_line(poses: Floats) -> bool:
+    """Return whether all poses turn about one fixed line."""
+    rotations = poses[:, :3, :3] @ poses[0, :3, :3].T
+    shifts = poses[:, :3, 3] - (rotations @ poses[0, :3, 3])
+    rows = stack_rows(np.eye(3) - rotations)
+    centre = np.linalg.lstsq(rows, shifts.ravel(), rcond=None)[0]
+    return bool(np.abs(rows @ centre - shifts.ravel()).max() < STILL[1])
+
+
+def _stands_still(poses: Floats) -> bool:
+    shifts = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    return not _turns(poses) and bool(shifts.max() < STILL[1])
+
+
+def _turns_of(poses: Floats) -> Floats:
+    """Return the (N, 3) rotation vectors from the first of (N, 4, 4) poses [rad]."""
+    return rotation_log(poses[:, :3, :3] @ poses[0, :3, :3].T)

@@ -1,0 +1,153 @@
+"""Which sighting of a cell tells most, and when enough were seen: by the whole graph's covariance.
+
+A sighting of one target by one camera tells of every frame between them, and by what those share
+of all others. So a candidate counts by how much it is expected to shrink the error at the work of
+all that is to be found, in closed form: with J its rows, whitened, and C the covariance of all,
+
+    C' = C - C J^T (1 + J C J^T)^-1 J C
+
+(greedy A-optimal design, Pukelsheim 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from flangeye.errors import FlangeyeError
+from flangeye.estimation.estimate import model_at
+from flangeye.estimation.mixed import fit
+from flangeye.estimation.rough import Rough, rough
+from flangeye.estimation.sightings import problem_of
+from flangeye.maths.frame_graph import composed
+from flangeye.maths.geometry import hat, invert, stack_rows
+from flangeye.maths.statistics import largest_error_quantile
+from flangeye.models.cell import Cell
+from flangeye.types import (
+    CAMERA,
+    TARGET,
+    Feature,
+    Floats,
+    Observation,
+    PoseFeature,
+    Transform,
+)
+
+REACH = 0.1
+"""About the origin of what is no camera, errors count so far off [m]."""
+
+
+def so_far(observations: Sequence[Observation], cell: Cell) -> Rough | None:
+    """Return what sightings tell; None as long as something stays unknown."""
+    with suppress(FlangeyeError, np.linalg.LinAlgError):
+        return rough(problem_of(observations, cell), cell.freedoms)
+    return None
+
+
+def errors_at_work(found: Rough, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
+    """Return, by unknown frame, what it is off by at most at its work, 95 % of the time [m]."""
+    work = work_of_frames(found, cell, seen)
+    return {
+        name: largest_error_quantile(covariance, found.places[name][:3, 3], points)
+        for (name, points), covariance in zip(work.items(), _blocks(found), strict=True)
+    }
+
+
+def _blocks(found: Rough) -> list[Floats]:
+    """Return the (6, 6) covariance of each place."""
+    covariance = found.covariance
+    return [covariance[i : i + 6, i : i + 6] for i in range(0, len(covariance), 6)]
+
+
+def work_of_frames(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
+    """Return (k, 3) where each unknown frame has to be right, in its parent [m].
+
+    A camera where it saw something; what else there is about its origin.
+    """
+    corners = REACH * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    work = {}
+    for name, place in found.places.items():
+        points = np.array([o.feature.centre for o in seen if o.camera == name]).reshape(-1, 3)
+        points = points if len(points) else corners
+        work[name] = points @ place[:3, :3].T + place[:3, 3]
+    return work
+
+
+def most_telling(
+    candidates: Sequence[Observation], found: Rough, cell: Cell, seen: Sequence[Observation]
+) -> int:
+    """Return which candidate is expected to shrink the error at the work most.
+
+    Args:
+        candidates: M sightings as they would be, by what is known so far.
+        found: What is known so far, from ``seen``.
+        cell: What stands on what.
+        seen: The sightings so far.
+    """
+    rows, _ = _rows(candidates, found, cell)
+    gain = found.fit.covariance @ np.swapaxes(rows, 1, 2)
+    inner = np.linalg.inv(rows @ gain + np.eye(6))
+    moved = _levers(found, cell, seen) @ gain
+    worth = np.einsum("mai,mij,maj->m", moved, inner, moved)
+    return int(np.argmax(worth))
+
+
+def foreseen(moments: Sequence[Observation], found: Rough, cell: Cell) -> list[Observation]:
+    """Return M sightings of one target by one camera as they would be, by what is known so far.
+
+    Args:
+        moments: Where the controllers would have what moves, the camera, the target, and by a
+            feature anywhere what such a sighting measures, and how well.
+        found: What is known so far.
+        cell: What stands on what.
+    """
+    poses = foreseen_poses(moments, found, cell)
+    return [
+        replace(moment, feature=_moved(moment.feature, pose))
+        for moment, pose in zip(moments, poses, strict=True)
+    ]
+
+
+def foreseen_poses(moments: Sequence[Observation], found: Rough, cell: Cell) -> Floats:
+    """Return (M, 4, 4) camera_T_target at such moments, by what is known so far."""
+    frames = {
+        name: replace(frame, place=found.places.get(name, frame.place))
+        for name, frame in cell.graph(moments).items()
+    }
+    camera, target = (composed(frames, end) for end in (moments[0].camera, moments[0].target))
+    return np.broadcast_to(invert(camera) @ target, (len(moments), 4, 4))
+
+
+def _moved(like: Feature, pose: Floats) -> Feature:
+    """Return what is measured of a target at another pose (4, 4)."""
+    if isinstance(like, PoseFeature):
+        return replace(like, camera_T_target=Transform(CAMERA, TARGET, pose))
+    if like.normal is None or like.normal_covariance is None:
+        return replace(like, centre=pose[:3, 3])
+    axis, size = pose[:3, 2], np.trace(like.normal_covariance) / 2
+    across = size * (np.eye(3) - np.outer(axis, axis))
+    return replace(like, centre=pose[:3, 3], normal=axis, normal_covariance=across)
+
+
+def _rows(sightings: Sequence[Observation], found: Rough, cell: Cell) -> tuple[Floats, Floats]:
+    """Return (M, 6, P + K) rows of sightings, and (M, 6) their errors, of unit covariance."""
+    problem = problem_of(sightings, cell)
+    model = model_at(problem, found.places, found.effects, np.ones(len(sightings)))
+    weights = fit(model, found.fit.sizes).weights
+    values, vectors = np.linalg.eigh(weights)
+    roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
+
+
+def _levers(found: Rough, cell: Cell, seen: Sequence[Observation]) -> Floats:
+    """Return (A, P + K): how the work of all frames moves with all of them, each counting alike."""
+    blocks, work = [], work_of_frames(found, cell, seen)
+    for i, (name, points) in enumerate(work.items()):
+        block = np.zeros((len(points), 3, len(found.fit.mean)))
+        block[:, :, 6 * i : 6 * i + 3] = -hat(points - found.places[name][:3, 3])
+        block[:, :, 6 * i + 3 : 6 * i + 6] = np.eye(3)
+        blocks.append(stack_rows(block) / np.sqrt(len(points)))
+    return np.concatenate(blocks)

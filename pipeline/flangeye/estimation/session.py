@@ -1,0 +1,435 @@
+"""From what was observed to one posterior: where to begin, what may be wrong, and what agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flangeye.errors import CalibrationRefused, StageError
+from flangeye.estimation.effects.arm import arm_effects
+from flangeye.estimation.effects.camera import camera_effects
+from flangeye.estimation.effects.clock import clock_effects, delayed
+from flangeye.estimation.effects.drift import drift_effects
+from flangeye.estimation.effects.effect import Effect
+from flangeye.estimation.effects.scanner import scanner_effects
+from flangeye.estimation.effects.target import target_effects, wrong_offset
+from flangeye.estimation.estimate import Estimate, estimate, model_at
+from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.mixed import fit
+from flangeye.estimation.observability import (
+    IN_LINE,
+    fewest,
+    require_enough,
+    require_turns,
+    spread_of,
+)
+from flangeye.estimation.sightings import branches_of, problem_of
+from flangeye.estimation.start import agreeing, begin, distances, size_of
+from flangeye.maths.geometry import rigid
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.models.cell import Cell
+from flangeye.models.scanners import ScannerModel
+from flangeye.types import Floats, Mask, Note, Observation, PoseFeature
+
+CLOCK_STEPS, EXACT_DELAY = 6, 1e-5
+"""Steps to find the time between two clocks, and how small the last one is [s]."""
+SIZE_STEPS, EXACT_SIZE, LOOSEST_SIZE = 6, 1e-6, 0.05
+"""Steps to find a target's size, the share by which the last one changes it, and the largest
+standard deviation of what is taken for found: half the prior's."""
+CERTAIN = 1 - 1e-6
+"""Probability with which a mistake that is named is not noise's doing."""
+LARGEST_NOISE = 0.02, np.radians(5.0)
+"""Sightings that agree no better than this [m, rad], nor than a share of their extent, belong to
+other poses."""
+LARGEST_SHARE = 0.4
+"""Of their extent: scans that belong to other poses show noise as large as it."""
+MIRROR = 0.1
+"""A mirrored fit with this share of the residuals or less is the right one."""
+LARGEST_TILT = np.radians(10.0)
+"""Normals further than this from the target's axis, at the median, belong to another frame."""
+CONFIGURED = (
+    "that the recipe's configuration is the cell's (place: unknown, where nobody has measured "
+    "where the target is mounted)"
+)
+"""What to look at, where poses agree with no one answer."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a solver is asked for.
+
+    Attributes:
+        normals: Whether circles' normals count.
+        size_unknown: Whether the sizes of markers are found from the arm's motion.
+        size_limit: Share by which a marker may be of another size than was said.
+    """
+
+    normals: bool = True
+    size_unknown: bool = False
+    size_limit: float = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What was observed, and what it tells.
+
+    Attributes:
+        observations: As they are when clocks and sizes that were found are put right.
+        cell: What stands on what.
+        scanner: The scanner's model, where it is known.
+        asked: What is to be found.
+        found: The posterior.
+        notes: For the person.
+        tool_offset: (3,) of the seen circle in the frame that carries it, where it is mounted or
+            the tool frame is set elsewhere than was said [m].
+    """
+
+    observations: Sequence[Observation]
+    cell: Cell
+    scanner: ScannerModel | None
+    asked: Asked
+    found: Estimate
+    notes: tuple[Note, ...] = ()
+    tool_offset: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def noted(self, *notes: Note) -> Session:
+        """Return it with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def again(self, observations: Sequence[Observation]) -> Session:
+        """Return what changed observations tell, begun at what is known."""
+        joints = {c.frame: c.joints for c in self.found.problem.carriers}
+        problem = problem_of(observations, self.cell, self.asked.normals)
+        carriers = [
+            replace(c, joints=joints[c.frame] if c.joints is None else c.joints)
+            for c in problem.carriers
+        ]
+        problem = replace(problem, carriers=carriers)
+        found = estimate(problem, self.found.places, self.found.effects, self.found.inliers)
+        return replace(self, observations=observations, found=found)
+
+
+def session_of(
+    observations: Sequence[Observation], cell: Cell, scanner: ScannerModel | None, asked: Asked
+) -> Session:
+    """Return what observations of a cell tell.
+
+    Raises:
+        StageError: Too few sightings, all the same, those of a mirrored camera, or the pose of
+            something that moves is missing.
+        CalibrationRefused: Fewer than half of them agree, nothing gives a start, or a marker has
+            another size than was said.
+    """
+    problem = problem_of(observations, cell, asked.normals)
+    if len(problem.ends) == 1:
+        require_enough(problem, fewest(problem))
+    require_turns(problem)
+    factor = 1.0
+    if asked.size_unknown and len(problem.ends) == 1:
+        factor = size_of(problem)
+        observations = _resized(observations, factor)
+        problem = problem_of(observations, cell, asked.normals)
+    problem, places, agree, notes = _begun(problem)
+    problem, branch_notes = _on_branches(problem, places, agree)
+    effects = effects_of(problem, scanner, asked)
+    found = estimate(problem, places, effects, agree)
+    session = Session(observations, cell, scanner, asked, found, (*notes, *branch_notes))
+    session = _with_bad_normals_left_out(session)
+    _require_majority(session.found)
+    return _with_offset(_with_size(_on_one_clock(session), factor))
+
+
+def effects_of(problem: Problem, scanner: ScannerModel | None, asked: Asked) -> list[Effect]:
+    """Return all that may be wrong with a cell."""
+    arms = dict.fromkeys(carrier.arm for carrier in problem.carriers)
+    return [
+        *(effect for arm in arms for effect in arm_effects(problem, arm)),
+        *target_effects(problem),
+        *scanner_effects(problem, scanner),
+        *camera_effects(problem, asked.size_unknown),
+        *clock_effects(problem),
+        *drift_effects(problem),
+    ]
+
+
+# --- where to begin ------------------------------------------------------------------------------
+
+
+def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
+    """Return places that most sightings agree on, and which do, less normals of another frame."""
+    placed = all(problem.frames[target].place is not None for _, target in problem.ends)
+    circles = problem.seen.ranks == 5
+    in_line = (
+        spread_of(problem.seen.centres).width < IN_LINE * spread_of(problem.seen.centres).length
+    )
+    bare = problem.without_normals(circles) if placed and not in_line else problem
+    places, squares = begin(bare)
+    _require_agreement(bare, places, agreeing(bare, squares))
+    if not (placed and circles.any()) or in_line:
+        return problem, places, agreeing(problem, squares), ()
+    turns = problem.linearised(places).residuals[:, :3]
+    tilt = float(np.median(np.linalg.norm(turns[circles & agreeing(bare, squares)], axis=1)))
+    if not tilt > LARGEST_TILT:
+        return problem, places, agreeing(bare, squares), ()
+    if tilt < np.pi - LARGEST_TILT:  # a flange whose z points inwards is no mistake of its poses
+        raise CalibrationRefused(
+            f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis: "
+            "the orientations of the poses are wrong, or belong to another tool frame; 'flangeye "
+            "doctor' tries the orders of quaternions and angles"
+        )
+    note = (
+        f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis, so "
+        "they are left out: check the orientation of the poses, and the tool frame they are in"
+    )
+    return bare, places, agreeing(bare, squares), (note,)
+
+
+def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
+    """Refuse sightings that agree no better than scans would that belong to other poses."""
+    shift, turn = _spread(problem, places, agree)
+    if _plausible(problem, shift, turn):
+        return
+    if len(problem.ends) == 1:
+        _require_right_handed(problem, places)
+        raise CalibrationRefused(
+            f"the poses agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
+            "deg only: check that each scan belongs to its robot pose, and " + CONFIGURED
+        )
+    sizes = [np.median(distances(problem.of_pair(k), places)) for k in range(len(problem.ends))]
+    camera, target = problem.ends[int(np.argmax(sizes))]
+    raise CalibrationRefused(
+        f"the sightings agree with one answer to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
+        f"deg only, those of {target} by {camera} least: check that each belongs to the poses "
+        f"beside it (join: clock_offset, where the clock of {camera} is another), and that the "
+        "cell stands as the recipe says"
+    )
+
+
+def _spread(problem: Problem, places: Places, agree: Mask) -> tuple[float, float]:
+    """Return how well the sightings agree: [m] and [rad], rms over those that do."""
+    r = problem.residuals(places)[agree]
+    shift, turn = (np.sqrt((r[:, at] ** 2).sum(axis=1).mean()) for at in (slice(3, 6), slice(3)))
+    return float(shift), float(turn)
+
+
+def _plausible(problem: Problem, shift: float, turn: float) -> bool:
+    s = problem.seen
+    extent = float(np.sqrt(s.centres.var(axis=0).sum()))
+    axes = s.rotations[s.ranks >= 5, :, 2]
+    turned = float(np.sqrt(axes.var(axis=0).sum())) if len(axes) else 0.0
+    return shift < max(LARGEST_NOISE[0], LARGEST_SHARE * extent) and turn < max(
+        LARGEST_NOISE[1], LARGEST_SHARE * turned
+    )
+
+
+def _require_right_handed(problem: Problem, places: Places) -> None:
+    """Refuse sightings that agree far better in a mirror.
+
+    Raises:
+        StageError: Gives both residuals.
+    """
+    flip, s = np.array([1.0, 1.0, -1.0]), problem.seen
+    mirrored = replace(
+        problem,
+        seen=replace(s, centres=s.centres * flip, rotations=s.rotations * np.outer(flip, flip)),
+    )
+    try:
+        there, _ = begin(mirrored)
+    except CalibrationRefused:
+        return
+    ours = float(np.median(distances(problem, places)))
+    theirs = float(np.median(distances(mirrored, there)))
+    if theirs < MIRROR**2 * ours:
+        raise StageError(
+            "what the camera saw fits the poses only when mirrored "
+            f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm): flip one "
+            "axis of the scanner's or the robot's frame"
+        )
+
+
+def _require_majority(found: Estimate) -> None:
+    agree, given = int(found.inliers.sum()), len(found.inliers)
+    if agree < max(3, given / 2):
+        raise CalibrationRefused(
+            f"only {agree} of {given} poses agree with one answer: check that each scan belongs "
+            "to its robot pose, and " + CONFIGURED
+        )
+
+
+# --- the joints of arms that did not tell them ---------------------------------------------------
+
+
+def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem, tuple[Note, ...]]:
+    """Return the problem with the joints of every arm, on the branch that makes it likeliest.
+
+    Where an arm's model does not reach its poses, its joints are not known.
+    """
+    notes: list[Note] = []
+    for carrier in problem.carriers:
+        if carrier.kinematics is None or carrier.link is not None:
+            continue
+        tried = list(_tried(problem, carrier.frame))
+        if not tried:
+            notes.append(
+                f"the model of {carrier.arm} misses the reported poses: errors of its joints are "
+                "not considered"
+            )
+            problem = _with_joints(problem, carrier.arm, None)
+            continue
+        problem = min(tried, key=lambda p: _cost(p, places, agree)) if tried[1:] else tried[0]
+    return problem, tuple(notes)
+
+
+def _tried(problem: Problem, frame: str) -> Iterator[Problem]:
+    carrier = next(c for c in problem.carriers if c.frame == frame)
+    for joints in branches_of(problem, carrier):
+        yield _with_joints(problem, carrier.arm, joints)
+
+
+def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
+    carriers = [replace(c, joints=joints) if c.arm == arm else c for c in problem.carriers]
+    return replace(problem, carriers=carriers)
+
+
+def _cost(problem: Problem, places: Places, agree: Mask) -> float:
+    """Return -2 log of the restricted likelihood at the sizes that are expected beforehand."""
+    effects = effects_of(problem, None, Asked())
+    model = model_at(problem, places, effects, agree.astype(float))
+    return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])), with_gradient=False).cost
+
+
+# --- mistakes that are put right -----------------------------------------------------------------
+
+
+def _with_bad_normals_left_out(session: Session) -> Session:
+    """Return the session with the centres of circles whose normals alone disagree."""
+    found = session.found
+    out = ~found.inliers & (found.problem.seen.ranks == 5)
+    if not out.any():
+        return session
+    problem = found.problem.without_normals(out)
+    again = estimate(problem, found.places, found.effects, found.inliers)
+    kept = int((out & again.inliers).sum())
+    if not kept:
+        return session
+    note = f"normals left out, for they disagree with the others: {kept}"
+    return replace(session, found=again).noted(note)
+
+
+def _on_one_clock(session: Session) -> Session:
+    """Return the session with the arms where they were when cameras saw them."""
+    total: dict[str, float] = {}
+    moved = session
+    for _ in range(CLOCK_STEPS):
+        left = {
+            e.name.removeprefix("clock of "): float(mean[0])
+            for e, mean, _ in moved.found.numbers("clock")
+        }
+        if max(map(abs, left.values()), default=0.0) < EXACT_DELAY:
+            break
+        total = {camera: total.get(camera, 0.0) + x for camera, x in left.items()}
+        later = delayed(session.observations, session.cell, total)
+        if later is None:
+            far = ", ".join(f"{x * 1e3:.1f} ms" for x in total.values())
+            return session.noted(f"clocks seem {far} apart, and no pose was recorded so far away")
+        moved = replace(moved.again(later), notes=session.notes)
+    sigmas = [float(np.sqrt(cov[0, 0])) for _, _, cov in moved.found.numbers("clock")]
+    told = [
+        f"{abs(x) * 1e3:.1f} +- {sigma * 1e3:.1f} ms {'after' if x > 0 else 'before'} the times "
+        f"that {camera} gives"
+        for (camera, x), sigma in zip(total.items(), sigmas, strict=False)
+    ]
+    return moved.noted(f"the arms were at the poses {', '.join(told)}") if told else moved
+
+
+def _with_size(session: Session, factor: float) -> Session:
+    """Return the session with markers as large as the arm's motion shows, or refuse others."""
+    if not session.asked.size_unknown:
+        _require_size(session)
+        return session
+    for _ in range(SIZE_STEPS):
+        shares = [float(mean[0]) for _, mean, _ in session.found.numbers("size")]
+        if max(map(abs, shares), default=0.0) < EXACT_SIZE:
+            break
+        factor *= 1 + shares[0]
+        session = session.again(_resized(session.observations, 1 + shares[0]))
+    known = float(np.sqrt(session.found.numbers("size")[0][2][0, 0]))
+    if known > LOOSEST_SIZE:
+        raise CalibrationRefused(
+            f"the target's size is told to {known:.1%} only: move the arm further between poses, "
+            "or say target_size: known"
+        )
+    sigma = known * factor
+    digits = max(4, 1 - int(np.floor(np.log10(max(sigma, 1e-9)))))
+    return session.noted(
+        f"by the arm's own motion the target is {factor:.{digits}f} +- {sigma:.{digits}f} times as "
+        "large as was said where it was fitted, and is taken to be"
+    )
+
+
+def _resized(observations: Sequence[Observation], factor: float) -> list[Observation]:
+    """Return observations with all poses of targets so many times as far from the camera."""
+    scale, out = np.repeat([1.0, factor], 3), []
+    for o in observations:
+        if isinstance(o.feature, PoseFeature):
+            seen = o.feature.camera_T_target
+            pose = rigid(seen.rotation, factor * seen.translation)
+            moved = replace(
+                o.feature,
+                camera_T_target=replace(seen, matrix=pose),
+                covariance=o.feature.covariance * np.outer(scale, scale),
+            )
+            o = replace(o, feature=moved)
+        out.append(o)
+    return out
+
+
+def _require_size(session: Session) -> None:
+    """Refuse a marker of another size than was said, or a camera of another focal length.
+
+    Raises:
+        CalibrationRefused: Says how large the one, or how long the other is; the surer of both.
+    """
+    told = [
+        (float(mean[0]), float(np.sqrt(covariance[0, 0])), kind)
+        for kind in ("size", "focal")
+        for _, mean, covariance in session.found.numbers(kind)
+    ]
+    if not told:
+        return
+    share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
+    if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(CERTAIN, 1):
+        return
+    factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
+    if kind == "size":
+        raise CalibrationRefused(
+            f"by the arm's own motion the target is {factor} large as was said where it was "
+            "fitted: measure the print; or the camera's focal length is off by as much "
+            "(size_limit allows more, target_size: unknown finds it)"
+        )
+    raise CalibrationRefused(
+        f"by the arm's own motion the camera's focal length is {factor} long as was said, for "
+        "distances along its axis are off and those across it are not: calibrate the camera "
+        "(acquire.images does from its views of a board; size_limit allows more)"
+    )
+
+
+def _with_offset(session: Session) -> Session:
+    """Return the session with the circle where the poses show it, if it is not where was said.
+
+    The tool frame of the controller, or what the circle is mounted on, is then another than the
+    recipe says: a mistake of millimetres, not the offset that every circle has a little of.
+    """
+    found = session.found
+    wrong = wrong_offset(found.problem, found.effects)
+    if wrong is None or not found.outgrown("offset"):
+        return session
+    again = estimate(found.problem, found.places, wrong, found.inliers)
+    _, mean, covariance = again.numbers("offset")[0]
+    if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(CERTAIN, 3):
+        return session
+    listed = ", ".join(f"{value * 1e3:.3f}" for value in mean)
+    what = f"the seen circle is ({listed}) mm from the origin of the flange frame, in it"
+    return replace(session, found=again, tool_offset=mean).noted(what)

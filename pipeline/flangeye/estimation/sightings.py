@@ -1,0 +1,134 @@
+"""From observations of a cell to the arrays of a problem: what was seen, and what moved it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from flangeye.errors import StageError
+from flangeye.estimation.graph import Carrier, Problem, Sightings
+from flangeye.maths.arm_correction import follow
+from flangeye.maths.frame_graph import Frame, chain
+from flangeye.maths.geometry import basis_of_plane, hat
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.streams import rates_of
+from flangeye.models.cell import Axis, Cell
+from flangeye.models.robots import RobotModel
+from flangeye.types import Feature, Floats, Motion, Observation, PoseFeature
+
+REACHED = 5e-3
+"""Further from the controller's poses than this [m], the catalogue's arm is another one."""
+STARTS = 48
+"""Of the search for the branches of an arm that has no closed form of them."""
+
+
+def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
+    """Return N observations as a problem of N sightings, each at a time of its own.
+
+    Where an arm's joints were not recorded they are unknown here; see ``branches_of``.
+
+    Args:
+        observations: What was measured.
+        cell: What stands on what.
+        normals: Whether the normals of circles count.
+
+    Raises:
+        StageError: There is none, or one lacks the pose of what moves.
+    """
+    if not observations:
+        raise StageError("no pose to solve with: every capture was set aside, each for its reason")
+    ends = list(dict.fromkeys((o.camera, o.target) for o in observations))
+    each = [_measured(o.feature, normals) for o in observations]
+    rotations, covariances, projectors = (np.array(column) for column in zip(*each, strict=True))
+    seen = Sightings(
+        times=np.arange(len(observations)),
+        pairs=np.array([ends.index((o.camera, o.target)) for o in observations], dtype=np.intp),
+        rotations=rotations,
+        centres=np.array([o.feature.centre for o in observations]),
+        covariances=covariances,
+        projectors=projectors,
+        offsets=np.array([o.centre_in_mount for o in observations]),
+        by_depth=np.array([_by_depth(o.feature) for o in observations]),
+        shared=_shared(observations),
+    )
+    frames = cell.graph(observations)
+    return Problem(frames, ends, seen, _carriers(observations, cell, frames))
+
+
+def _measured(feature: Feature, normals: bool) -> tuple[Floats, Floats, Floats]:
+    """Return (3, 3) rotation, (6, 6) covariance and (6, 6) projector of one feature."""
+    if isinstance(feature, PoseFeature):
+        return feature.camera_T_target.rotation, feature.covariance, np.eye(6)
+    covariance, projector = np.zeros((6, 6)), np.zeros((6, 6))
+    covariance[3:, 3:], projector[3:, 3:] = feature.covariance, np.eye(3)
+    if feature.normal is None or feature.normal_covariance is None or not normals:
+        return np.eye(3), covariance, projector
+    turn = hat(feature.normal)
+    covariance[:3, :3] = turn @ feature.normal_covariance @ turn.T
+    projector[:3, :3] = np.eye(3) - np.outer(feature.normal, feature.normal)
+    return basis_of_plane(feature.normal).T, covariance, projector
+
+
+def _by_depth(feature: Feature) -> bool:
+    return not (isinstance(feature, PoseFeature) and len(feature.corners))
+
+
+def _shared(observations: Sequence[Observation]) -> Floats:
+    """Return (N, 6, k) how each of k errors that all share moves what was seen, in ``camera``."""
+    each = [
+        o.feature.shared if isinstance(o.feature, PoseFeature) else np.zeros((6, 0))
+        for o in observations
+    ]
+    most = max(moved.shape[1] for moved in each)
+    return np.array([np.pad(moved, ((0, 0), (0, most - moved.shape[1]))) for moved in each])
+
+
+def _carriers(
+    observations: Sequence[Observation], cell: Cell, frames: Mapping[str, Frame]
+) -> list[Carrier]:
+    """Return what moves a camera or a target."""
+    ends = {end for o in observations for end in (o.camera, o.target)}
+    used = {frame for end in ends for frame in chain(frames, end)}
+    joints, motions = cell.joints(observations), _motions(observations, cell)
+    return [
+        _carrier(frame, cell, joints, rates_of(motions, frame) if motions else None)
+        for frame in cell.measured
+        if frame in used
+    ]
+
+
+def _carrier(frame: str, cell: Cell, joints: Mapping[str, Floats], rates: Floats | None) -> Carrier:
+    link = cell.links.get(frame)
+    arm, number = (link.arm, link.number) if link else (frame, None)
+    mover = cell.movers.get(arm)
+    if not isinstance(mover, RobotModel):
+        return Carrier(frame, arm, rates=rates, axis=isinstance(mover, Axis))
+    return Carrier(frame, arm, Arm(mover), joints.get(arm), mover.joint_accuracy, number, rates)
+
+
+def _motions(observations: Sequence[Observation], cell: Cell) -> list[Motion] | None:
+    """Return how all that moves passed every capture; None where nobody recorded it."""
+    motions = [cell.passing(o.motion) for o in observations if o.motion is not None]
+    told = [m for m in motions if {*cell.measured} <= {*m.others}]
+    return told if len(told) == len(observations) else None
+
+
+def branches_of(problem: Problem, carrier: Carrier) -> Iterator[Floats]:
+    """Give the (T, n) joints that an arm may have had at its poses, branch by branch [rad].
+
+    Those recorded are the only ones, if they reach the poses. Nothing where the model is another
+    arm's, or unknown.
+    """
+    arm, poses = carrier.kinematics, np.asarray(problem.frames[carrier.frame].place)
+    if arm is None:
+        return
+    if carrier.joints is not None:
+        reached = arm.pose(carrier.joints, carrier.link)
+        if np.linalg.norm((reached - poses)[:, :3, 3], axis=1).max() < REACHED:
+            yield carrier.joints
+        return
+    for first in arm.inverse(poses[0], STARTS):
+        with suppress(ValueError):  # this branch does not reach all poses
+            yield follow(arm, poses, first)

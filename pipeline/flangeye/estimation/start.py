@@ -1,0 +1,500 @@
+r"""Where to begin: places that most sightings agree on, found without a guess, outliers among them.
+
+The loop of one camera and one target is a circle of unknown places U and of what is known K:
+
+.. math:: U_1 K_1 U_2 K_2 \cdots = 1
+
+Up to three unknowns have closed forms. A loop is solved from all its sightings and from small sets
+of them drawn at random; that answer is taken which explains the better half of the sightings best
+(least median of squares, Rousseeuw 1984). What one loop tells is known in the next. Where no loop
+leads on, descents begin at random places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from flangeye.errors import CalibrationRefused
+from flangeye.estimation.closed.comanipulation import alternate, random_rotations, with_translations
+from flangeye.estimation.closed.motions import motions_of, place_of
+from flangeye.estimation.closed.separable import park_martin
+from flangeye.estimation.graph import Places, Problem, Sightings
+from flangeye.maths.frame_graph import chain
+from flangeye.maths.geometry import (
+    basis_of_plane,
+    each_applied,
+    invert,
+    kabsch,
+    nearest_rotation,
+    rigid,
+    rotation_exp,
+    stack_rows,
+)
+from flangeye.types import Floats, Indices, Mask
+
+MOST = 40
+"""Sightings that one closed form takes: beyond, more cost time and change the start little."""
+FIRST, SETS = 10, 80
+"""Small sets drawn where all sightings agree, and where they do not: 40 % of them wrong, four of
+five in a set right once in eight draws."""
+ENOUGH = 1.5
+"""All sightings agree where no small set leaves a median so many times smaller."""
+LEVER = 0.3
+"""A turn counts like what it does so far away [m]: the distance of a target."""
+NOISE = 0.2e-3, 0.1e-3
+"""Noise of an arm's poses beyond the features' own while nothing is known of it: [rad] and [m]."""
+DRAWS, PATIENCE, AGREE = 60, 12, 1e-3
+"""Random starts at most; so many in turn that find nothing lower end the search, and so do two
+whose costs differ by this share: they ended in one valley."""
+STEPS, SETTLED = 40, 1e-6
+"""Steps of a descent at most, and the share by which the last one lowers the cost."""
+WIDTH = 4.0
+"""Sightings beyond so many times the median square of their pair hardly count."""
+GOOD = 25.0
+"""Times the median square within which a sighting may agree with the start: all that is plausible,
+for the estimate judges again."""
+SIZE_ROWS, LARGEST_SIZE = 8, 100.0
+"""Poses of a set that a target's size is told from, and the largest factor on it."""
+TWO_ARMS = 20, 200, np.radians(1.0)
+"""Searches for the rotations of two arms, steps of each, and how well one has to agree [rad]."""
+
+
+def begin(problem: Problem) -> tuple[Places, Floats]:
+    """Return (4, 4) of each unknown, and (N,) squared distances there in units of the noise.
+
+    Raises:
+        CalibrationRefused: Nothing gives a start.
+    """
+    rng = np.random.default_rng(0)
+    places = _grown(problem, rng)
+    if places is not None:
+        found = _descended(problem, places)
+        if len(problem.ends) == 1 or _plausible(problem, found[1]):
+            return found
+    elsewhere = _anywhere(problem, rng)
+    if places is None or _cost(problem, elsewhere[1]) < _cost(problem, found[1]):
+        return elsewhere
+    return found
+
+
+def agreeing(problem: Problem, squares: Floats) -> Mask:
+    """Return (N,) which sightings may agree with a start, by their squared distances there."""
+    return np.asarray(squares <= GOOD * np.maximum(_middles(problem, squares), 1.0))
+
+
+def _plausible(problem: Problem, squares: Floats) -> bool:
+    """Whether the better half of every pair agrees to what no two frames mixed up would: 1 %."""
+    middles = _middles(problem, squares) * NOISE[1] ** 2
+    extent = problem.seen.centres.var(axis=0).sum()
+    return bool(middles.max() < 0.01 * max(extent, 1e-4))
+
+
+def size_of(problem: Problem) -> float:
+    """Return how many times as large as was said the target of whole poses is, about; else 1.
+
+    Rotations do not depend on it, and once they are known the loop's translations are linear in the
+    places and the size (Andreff et al. 2001). Of small sets of poses that is taken which explains
+    the better half of all poses best. Of loops of two unknown places.
+    """
+    names, (seen, carried) = circle_of(problem)[0], circle_of(problem)[1][:2]
+    rng, n, least, size = np.random.default_rng(0), len(problem.seen), np.inf, 1.0
+    if len(names) != 2:
+        return size
+    for _ in range(SETS):
+        rows = rng.choice(n, min(SIZE_ROWS, n), replace=False)
+        with suppress(np.linalg.LinAlgError, CalibrationRefused):
+            turn = park_martin(motions_of(carried[rows], seen[rows]))[:3, :3]
+            left, right = _sized_translations(carried, seen, turn)
+            found = _least(stack_rows(left[rows]), right[rows].ravel())
+            median = float(np.median(np.linalg.norm(left @ found - right, axis=1)))
+            if median < least and 1 / LARGEST_SIZE < found[-1] < LARGEST_SIZE:
+                least, size = median, float(found[-1])
+    return size
+
+
+def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Return (N, 3, 7) equations of the two unknown shifts and the size, and (N, 3) their sides.
+
+    Of the loop ``G X M = Z``, whose M has its translation so many times as long.
+    """
+    turns, still = carried[:, :3, :3], np.broadcast_to(-np.eye(3), (len(seen), 3, 3))
+    sized = turns @ (seen[:, :3, 3] @ turn.T)[..., None]
+    return np.concatenate([turns, still, sized], axis=2), -carried[:, :3, 3]
+
+
+# --- from loop to loop ---------------------------------------------------------------------------
+
+
+def _grown(problem: Problem, rng: np.random.Generator) -> dict[str, Floats] | None:
+    """Return the places, loop by loop, those of fewest unknowns first; None where none leads on."""
+    known: dict[str, Floats] = {}
+    left = set(range(len(problem.ends)))
+    while len(known) < len(problem.unknown):
+        each = {k: loop for k in left if (loop := _loop_of(problem, k, known)).unknown}
+        if not each:  # the others are on no way: nothing ties them
+            return known | {n: np.eye(4) for n in problem.unknown if n not in known}
+        order = sorted(each, key=lambda k: (len(each[k].unknown), -len(each[k].seen)))
+        for k in order:
+            found = _solved(each[k], rng)
+            if found is not None:
+                known |= found
+                left.discard(k)
+                break
+        else:
+            return None
+    return known
+
+
+class _Loop(NamedTuple):
+    """What one camera saw of one target.
+
+    Attributes:
+        problem: Of these sightings alone, all other places known.
+        seen: They.
+        camera: Known (N, 4, 4) and unknown names, in turn, from the root to the camera.
+        target: Likewise to the target.
+    """
+
+    problem: Problem
+    seen: Sightings
+    camera: Sequence[Floats | str]
+    target: Sequence[Floats | str]
+
+    @property
+    def unknown(self) -> list[str]:
+        """Names of what is unknown on both ways."""
+        return [x for x in (*self.camera, *self.target) if isinstance(x, str)]
+
+
+def _loop_of(problem: Problem, k: int, known: Places) -> _Loop:
+    part = problem.where(np.flatnonzero(problem.seen.pairs == k)).placed(known)
+    ends = problem.ends[k]
+    shared = _shared_way(part, *ends)
+    on_way = {name for end in ends for name in chain(part.frames, end)[shared:]}
+    part = part.placed({n: np.eye(4) for n in part.unknown if n not in on_way})
+    return _Loop(part, part.seen, *(_way(part, end, shared) for end in ends))
+
+
+def _shared_way(problem: Problem, camera: str, target: str) -> int:
+    ways = chain(problem.frames, camera), chain(problem.frames, target)
+    return sum(1 for a, b in zip(*ways, strict=False) if a == b)
+
+
+def _way(problem: Problem, end: str, shared: int) -> list[Floats | str]:
+    count = len(problem.seen)
+    still = np.tile(np.eye(4), (count, 1, 1))
+    out: list[Floats | str] = [still]
+    for name in chain(problem.frames, end)[shared:]:
+        place = problem.frames[name].place
+        if place is None:
+            out += [name, still]
+            continue
+        each = np.asarray(place)
+        each = each[problem.seen.times] if each.ndim == 3 else each
+        out[-1] = np.asarray(out[-1]) @ each
+    return out
+
+
+def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
+    """Return the places that explain the better half of a loop's sightings best."""
+    form = _form_of(loop)
+    if form is None or len(loop.seen) < form.fewest:
+        return None
+    n = len(loop.seen)
+    everyone = np.arange(n) if n <= MOST else rng.choice(n, MOST, replace=False)
+    best, least, of_all = None, np.inf, np.inf
+    size = min(form.fewest + (1 if n > form.fewest else 0), n)
+    for draw in range(-1, SETS):
+        if draw == FIRST and of_all <= ENOUGH * least:
+            break
+        chosen = everyone if draw < 0 else rng.choice(n, size, replace=False)
+        with suppress(np.linalg.LinAlgError, CalibrationRefused):
+            places = form.solve(chosen, rng, draw < 0)
+            median = float(np.median(distances(loop.problem, places)))
+            if median < least:
+                best, least = places, median
+        if draw < 0:
+            of_all = least
+    return best
+
+
+def distances(problem: Problem, places: Places) -> Floats:
+    """Return (N,) squared residuals, turns by what they do at the lever [m^2]."""
+    r = problem.residuals(places)
+    return np.asarray((LEVER**2 * r[:, :3] ** 2).sum(axis=1) + (r[:, 3:] ** 2).sum(axis=1))
+
+
+class _Form(NamedTuple):
+    """A closed form: how many sightings it needs, and the places by some of them."""
+
+    fewest: int
+    solve: Callable[[Indices, np.random.Generator, bool], dict[str, Floats]]
+
+
+def _form_of(loop: _Loop) -> _Form | None:
+    """Return the closed form of a loop; None where there is none."""
+    whole, count = bool((loop.seen.ranks == 6).all()), len(loop.unknown)
+    if whole and count <= 3:
+        return _Form({1: 1, 2: 3, 3: 6}[count], lambda rows, rng, _: _of_poses(loop, rows, rng))
+    if count == 1:
+        of_point = loop.unknown[0] == loop.target[-2] if len(loop.target) > 1 else False
+        return _Form(1 if of_point else 3, lambda rows, rng, _: _of_points(loop, rows))
+    if count == 2 and len(loop.camera) == len(loop.target) == 3:
+        fewest = 5 if (loop.seen.ranks >= 5).all() else 8
+        return _Form(fewest, lambda rows, rng, _: _linear(loop, rows))
+    return None
+
+
+def circle_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
+    """Return the unknowns round the loop of one camera and one target, and what lies between.
+
+    Each name with whether its inverse stands there, and the (N, 4, 4) that follow each.
+    """
+    return _circle(_loop_of(problem, 0, {}))
+
+
+def start_of_circles(problem: Problem) -> dict[str, Floats]:
+    """Return the unknowns of one camera and one circle by the closed form of all sightings.
+
+    Raises:
+        CalibrationRefused: There is no closed form of them.
+    """
+    loop = _loop_of(problem, 0, {})
+    form = _form_of(loop)
+    if form is None:
+        raise CalibrationRefused(
+            "two arms and a circle whose place is not known cannot be solved: give its place, "
+            "which for the flange's own circle is known, or use a marker"
+        )
+    rows = np.arange(len(loop.seen))
+    return form.solve(rows, np.random.default_rng(0), True)
+
+
+# --- closed forms of a loop ----------------------------------------------------------------------
+
+
+def _of_poses(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str, Floats]:
+    """Return the unknowns of whole poses: round the circle, each with what is known after it."""
+    names, known = _circle(loop)
+    k = [each[rows] for each in known]
+    if len(names) == 1:
+        found = [_mean(invert(k[0]))]
+    elif len(names) == 2:
+        x = park_martin(motions_of(k[1], k[0]))
+        found = [x, invert(place_of(k[1], x, k[0]))]
+    else:
+        x, y, z = _of_two_arms((k[2], k[0], invert(k[1])), rng)
+        found = [x, invert(z), invert(y)]
+    return {
+        name: invert(place) if back else place
+        for (name, back), place in zip(names, found, strict=True)
+    }
+
+
+def _circle(loop: _Loop) -> tuple[list[tuple[str, bool]], list[Floats]]:
+    """Return the unknowns round the loop, and whether inverted, and what is known after each."""
+    back = [x if isinstance(x, str) else invert(x) for x in reversed(loop.target)]
+    names: list[tuple[str, bool]] = [(x, False) for x in loop.camera if isinstance(x, str)]
+    names += [(x, True) for x in back if isinstance(x, str)]
+    known = [np.asarray(x) for x in loop.camera if not isinstance(x, str)]
+    behind = [np.asarray(x) for x in back if not isinstance(x, str)]
+    known = [*known[:-1], known[-1] @ loop.seen.poses @ behind[0], *behind[1:]]
+    # The last leads on into the first: they are one.
+    return names, [*known[1:-1], known[-1] @ known[0]]
+
+
+def _mean(poses: Floats) -> Floats:
+    return rigid(
+        nearest_rotation(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0)
+    )
+
+
+def _of_two_arms(
+    given: tuple[Floats, Floats, Floats], rng: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    """Return X, Y, Z of A X M = Y B Z: rotations by alternation from random starts."""
+    rotations = given[0][:, :3, :3], given[1][:, :3, :3], given[2][:, :3, :3]
+    restarts, rounds, enough = TWO_ARMS
+    best, error = alternate(rotations, random_rotations(rng))
+    for _ in range(restarts):
+        if error < enough:
+            break
+        again, its = alternate(rotations, random_rotations(rng), rounds=rounds)
+        if its < error:
+            best, error = again, its
+    return with_translations(given, best)
+
+
+def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
+    """Return the one unknown of circles or centres: it takes points onto where they are seen."""
+    name, s = loop.unknown[0], loop.seen
+    on_camera = len(loop.camera) > 1
+    moved, other = (loop.camera, loop.target) if on_camera else (loop.target, loop.camera)
+    own, across = (s.centres, s.offsets) if on_camera else (s.offsets, s.centres)
+    before, after = (np.asarray(moved[i])[rows] for i in (0, 2))
+    there = each_applied(np.asarray(other[0])[rows], across[rows])
+    points, seen = each_applied(after, own[rows]), each_applied(invert(before), there)
+    if (s.ranks[rows] >= 5).all():  # axes are as good as points so far out on them
+        far = LEVER * np.array([0.0, 0.0, 1.0])
+        tips = own[rows] + s.rotations[rows] @ far if on_camera else own[rows] + far
+        ends = across[rows] + far if on_camera else across[rows] + s.rotations[rows] @ far
+        ends = each_applied(invert(before), each_applied(np.asarray(other[0])[rows], ends))
+        points, seen = np.vstack([points, each_applied(after, tips)]), np.vstack([seen, ends])
+    if np.abs(points - points[0]).max() > 1e-6:
+        return {name: rigid(*kabsch(points, seen))}
+    turn = np.eye(3)
+    if (s.ranks[rows] == 5).all():
+        axes = (np.asarray(other[0])[rows, :3, :3] @ s.rotations[rows, :, 2, None])[..., 0]
+        axes = (np.swapaxes(before[:, :3, :3], 1, 2) @ axes[..., None])[..., 0]
+        turn = _facing(axes.mean(axis=0))
+    return {name: rigid(turn, np.median(seen, axis=0) - turn @ points[0])}
+
+
+def _linear(loop: _Loop, rows: Indices) -> dict[str, Floats]:
+    """Return camera and another place from centres, and normals where all have one.
+
+    ``A (R_X c + t_X)`` is the target's centre, or where the second base has it: linear in the
+    entries of R_X, t_X, and of the centre and axis in the target's carrier, or of R_Y, t_Y. The
+    rotations are then made orthonormal and the translations fitted again.
+    """
+    s = loop.seen.where(rows)
+    a = invert(np.asarray(loop.target[0])[rows]) @ np.asarray(loop.camera[0])[rows]
+    b, c = np.asarray(loop.target[2])[rows], np.asarray(loop.camera[2])[rows]
+    own, points = each_applied(c, s.centres), each_applied(b, s.offsets)
+    n, of_place = len(s), np.abs(points - points[0]).max() < 1e-6
+    equations = np.zeros((n, 3, 24))
+    equations[:, :, :9] = np.einsum("nij,nk->nijk", a[:, :3, :3], own).reshape(n, 3, 9)
+    equations[:, :, 9:12] = a[:, :3, :3]
+    equations[:, :, 21:] = -np.eye(3)
+    if not of_place:
+        equations[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), points).reshape(n, 3, 9)
+    right = -a[:, :3, 3]
+    normals = c[:, :3, :3] @ s.rotations[:, :, 2, None]
+    has_normals = bool((s.ranks == 5).all())
+    every, sides = [stack_rows(equations)], [right.ravel()]
+    if has_normals:
+        more = np.zeros((n, 3, 24))
+        more[:, :, :9] = np.einsum("nij,nk->nijk", a[:, :3, :3], normals[..., 0]).reshape(n, 3, 9)
+        axes = b[:, :3, 2] if not of_place else np.zeros((n, 3))
+        if of_place:
+            more[:, :, 15:18] = -np.eye(3)  # the axis, in the place of entries that are not used
+        else:
+            more[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), axes).reshape(n, 3, 9)
+        every.append(stack_rows(more))
+        sides.append(np.zeros(3 * n))
+    found = _least(np.vstack(every), np.concatenate(sides))
+    x = nearest_rotation(found[:9].reshape(3, 3))
+    y = np.eye(3) if of_place else nearest_rotation(found[12:21].reshape(3, 3))
+    if of_place and has_normals:
+        y = _facing(found[15:18])
+    turned = np.zeros(24)
+    turned[:9] = x.ravel()
+    if not of_place:
+        turned[12:21] = y.ravel()
+    shifts = [9, 10, 11, 21, 22, 23]
+    moved = _least(
+        stack_rows(equations[:, :, shifts]), right.ravel() - stack_rows(equations) @ turned
+    )
+    centre = moved[3:] - (y @ points[0] if of_place else 0.0)
+    return {str(loop.camera[1]): rigid(x, moved[:3]), str(loop.target[1]): rigid(y, centre)}
+
+
+def _least(rows: Floats, right: Floats) -> Floats:
+    return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0], dtype=np.float64)
+
+
+def _facing(axis: Floats) -> Floats:
+    """Return a rotation (3, 3) whose z is along an axis."""
+    return basis_of_plane(axis / np.linalg.norm(axis)).T
+
+
+# --- descents ------------------------------------------------------------------------------------
+
+
+def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Floats]:
+    """Return the lowest of descents from random places: the rotations first, then all."""
+    best: tuple[Places, Floats] | None = None
+    least, since = np.inf, 0
+    for _ in range(DRAWS):
+        places: Places = {name: _drawn(rng) for name in problem.unknown}
+        with suppress(np.linalg.LinAlgError):
+            places, _ = _descended(problem, places, turns_alone=True)
+            found = _descended(problem, places)
+            cost = _cost(problem, found[1])
+            if best is not None and abs(cost - least) <= AGREE * cost + 1e-12:
+                return best
+            since += 1
+            if cost < least:
+                best, least, since = found, cost, 0
+        if since >= PATIENCE:
+            break
+    if best is None:
+        raise CalibrationRefused(
+            "no closed form gives a start for these poses: spread them, and turn the arm about two "
+            "axes at least"
+        )
+    return best
+
+
+def _drawn(rng: np.random.Generator) -> Floats:
+    axis = rng.standard_normal(3)
+    turn = rotation_exp(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis))
+    return rigid(turn, rng.uniform(-0.5, 0.5, 3))
+
+
+def _descended(
+    problem: Problem, places: Places, turns_alone: bool = False
+) -> tuple[Places, Floats]:
+    """Return where a start leads, and the squares there; the far hardly count.
+
+    Weights of Geman & McClure (1987), as wide as each pair's median, so that they narrow as the fit
+    improves; steps of Levenberg & Marquardt.
+    """
+    s, q = problem.seen, problem.seen.projectors.copy()
+    if turns_alone:
+        q[:, 3:, 3:] = 0.0
+    further = np.diag(np.repeat(np.square(NOISE), 3))
+    weights = q @ np.linalg.inv(q @ (s.covariances + further) @ q + (np.eye(6) - q)) @ q
+    damping, before = 1e-6, np.inf
+    linear = problem.linearised(places)
+    for _ in range(STEPS):
+        squares = np.einsum("na,nab,nb->n", linear.residuals, weights, linear.residuals)
+        widths = WIDTH * np.maximum(_middles(problem, squares), 1.0)
+        shares = (1 + squares / widths) ** -2.0
+        g = np.concatenate([linear.blocks[name] for name in problem.unknown], axis=2)
+        weighted = (shares[:, None, None] * weights) @ g
+        information = np.einsum("nai,naj->ij", g, weighted)
+        right = np.einsum("nai,na->i", weighted, linear.residuals)
+        cost = float((squares / (1 + squares / widths)).sum())
+        if abs(before - cost) <= SETTLED * cost:
+            break
+        before = cost
+        for _ in range(8):
+            scale = np.diag(information) + 1e-12 * np.trace(information) + 1e-12
+            step = np.linalg.solve(information + damping * np.diag(scale), right)
+            moved = problem.moved(places, step)
+            after = problem.linearised(moved)
+            there = np.einsum("na,nab,nb->n", after.residuals, weights, after.residuals)
+            if (there / (1 + there / widths)).sum() <= cost:
+                places, linear, damping = moved, after, max(damping / 10, 1e-9)
+                break
+            damping *= 10
+    squares = np.einsum("na,nab,nb->n", linear.residuals, weights, linear.residuals)
+    return places, squares / np.maximum(s.ranks, 1)
+
+
+def _middles(problem: Problem, squares: Floats) -> Floats:
+    """Return (N,) the median over the sightings of the same pair: each pair has outliers alone."""
+    out, pairs = np.zeros(len(squares)), problem.seen.pairs
+    for k in range(len(problem.ends)):
+        if (pairs == k).any():
+            out[pairs == k] = np.median(squares[pairs == k])
+    return out
+
+
+def _cost(problem: Problem, squares: Floats) -> float:
+    return float(_middles(problem, squares).sum())

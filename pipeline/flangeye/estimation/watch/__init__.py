@@ -1,0 +1,1 @@
+"""Whether a calibration still holds: drift tests on later sightings. Arrays only."""

@@ -1,0 +1,112 @@
+"""Which part of a cell has changed: scanner, flange or arm. Arrays only.
+
+A scanner, an arm's zeros and a tool explain residuals by different patterns. The marginal
+likelihoods of the three are compared, each with a Gaussian prior of its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flangeye.estimation.watch.drift import MISFIT, Information, Sightings, allowance
+from flangeye.maths.geometry import adjoint_shift, stack_rows
+from flangeye.maths.statistics import chi2_quantile
+from flangeye.types import Floats
+
+LARGEST = 1e-3
+"""Standard deviation of what a part may do: [rad] or [m]."""
+FARTHEST = 0.1
+"""The same of what it may do at all."""
+
+
+def blame(
+    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+) -> Mapping[str, float]:
+    """Return the probability that each part explains what is seen after a change, likeliest first.
+
+    The scanner turned, shifted or both, the flange replaced (so that the circle is elsewhere on
+    it), and, where the arm's kinematics are known, one joint or the arm re-mastered.
+
+    Args:
+        before: What was known of the camera before, with the calibration.
+        after: The sightings since.
+        about: (3,) where motions are taken [m].
+        scanner: (3,) where the scanner stands [m]: it turns about itself.
+        daily: See :class:`DriftTest`.
+    """
+    residuals = after.residuals + after.effects @ before.mean
+    designs = _designs(after, about, scanner)
+    noise = _noise(before, after, daily)
+    scores = {part: _evidence(residuals.ravel(), noise, *d) for part, d in designs.items()}
+    best = max(scores.values())
+    weights = {part: float(np.exp(score - best)) for part, score in scores.items()}
+    total = sum(weights.values())
+    return {part: w / total for part, w in sorted(weights.items(), key=lambda x: -x[1])}
+
+
+def explained(
+    before: Information, after: Sightings, about: Floats, scanner: Floats, daily: float
+) -> bool:
+    """Return whether the scanner, the flange or the arm alone can have moved as sightings say.
+
+    Args:
+        before: As in :func:`blame`.
+        after: The sightings.
+        about: As in :func:`blame`.
+        scanner: As in :func:`blame`.
+        daily: As in :func:`blame`.
+    """
+    residuals = (after.residuals + after.effects @ before.mean).ravel()
+    noise = _noise(before, after, daily)
+    limit = chi2_quantile(1 - MISFIT, len(residuals))
+    totals = (noise + FARTHEST**2 * d @ d.T for d, _ in _designs(after, about, scanner).values())
+    return any(residuals @ np.linalg.solve(total, residuals) < limit for total in totals)
+
+
+def suspects(parts: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Return (scanner, flange or arm, its probability), likeliest first."""
+    of = {"scanner": 0.0, "flange": 0.0, "arm": 0.0}
+    for part, probability in parts.items():
+        of[part.split()[0].replace("joint", "arm")] += probability
+    return sorted(of.items(), key=lambda x: -x[1])
+
+
+def _designs(after: Sightings, about: Floats, scanner: Floats) -> dict[str, tuple[Floats, Floats]]:
+    n = len(after.residuals)
+    at_scanner = -after.effects[..., :6] @ adjoint_shift(about - scanner)
+    tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
+    moved = stack_rows(at_scanner)
+    found = {
+        "scanner turned": (moved[:, :3], np.full(3, LARGEST)),
+        "scanner shifted": (moved[:, 3:], np.full(3, LARGEST)),
+        "scanner moved": (moved, np.full(6, LARGEST)),
+        "flange replaced": (stack_rows(tool), np.full(3, LARGEST)),
+    }
+    if after.joints is None:
+        return found
+    k = after.joints.shape[2]
+    columns = stack_rows(after.joints)
+    # The first joint turns the base as the scanner would, so it is no suspect of its own.
+    scale = np.full(k - 1, LARGEST)
+    one = {f"joint {j + 1} re-mastered": (columns[:, [j]], scale[:1]) for j in range(1, k)}
+    return found | one | {"arm re-mastered": (columns[:, 1:], scale)}
+
+
+def _noise(before: Information, after: Sightings, daily: float) -> Floats:
+    """Return the (5N, 5N) covariance of the residuals without a change."""
+    stacked = stack_rows(after.effects)
+    out = stacked @ before.covariance @ stacked.T
+    same = np.repeat(after.check, 5)[:, None] == np.repeat(after.check, 5)
+    out += same * (stacked[:, :6] @ allowance(daily) @ stacked[:, :6].T)
+    for i, own in enumerate(after.covariances):
+        out[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] += own
+    return np.asarray(out)
+
+
+def _evidence(residuals: Floats, noise: Floats, design: Floats, prior: Floats) -> float:
+    """Return the log of the marginal likelihood of residuals under a linear cause."""
+    total = noise + (design * prior**2) @ design.T
+    _, volume = np.linalg.slogdet(total)
+    return float(-0.5 * (residuals @ np.linalg.solve(total, residuals) + volume))

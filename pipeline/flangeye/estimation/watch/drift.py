@@ -1,0 +1,392 @@
+r"""Whether a calibration still holds: a sequential likelihood-ratio test. Arrays only.
+
+A camera that was at :math:`T` and is now at :math:`\exp(\xi) T` leaves, at a target that the arm
+carries to :math:`b` and the camera sees at :math:`c`, the residual
+:math:`r = T c - b = -J \xi + \varepsilon`. Each *check* is one to a few such sightings, reduced to
+an information matrix :math:`H` and a vector :math:`g = -\sum J^\top W r`. What the cell does with
+the hours of the day is one more unknown of each check, with a known variance, and marginalised.
+What the arm does wrong alike at every visit (``pose_error``) is one unknown of all checks and of
+the calibration: its weights stand behind :math:`\xi` in one vector :math:`z`.
+
+**Steps.** The last :math:`w` checks, with :math:`H` and :math:`g`, are held against those before,
+which start from the calibration's own sightings and tell :math:`z = m` with information
+:math:`B`. A motion of the camera between them has the information and the score
+
+.. math:: I = P^\top (H - H (H + B)^{-1} H) P, \quad s = P^\top (1 - H (H + B)^{-1}) (g - H m)
+
+where :math:`P` takes the motion's six, and :math:`s^\top I^{+} s` is the generalised likelihood
+ratio of a step (Willsky & Jones 1976), largest over a window (Lai 1995). Its threshold is the
+quantile of an F distribution, for the scatter is learned from the checks before, at the false-alarm
+rate divided by the number of windows: by Bonferroni's inequality no more false alarms come a check.
+
+**Slow drift.** The mean of the last checks is held against the calibration with the first checks;
+what counts is how far it surely moves a point of the work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flangeye.maths.geometry import hat
+from flangeye.maths.statistics import chi2_quantile, f_quantile
+from flangeye.types import Floats
+
+NO_NORMAL = 1.0
+"""Variance [rad^2] of a tilt that was not measured: it tells nothing."""
+MISFIT = 1e-6
+"""How unlikely one sighting is that is a misfit, while nothing moved."""
+SURE = 1.64
+"""Standard deviations: a drift counts when it is larger than its limit with 95 %."""
+LEVER = 0.5
+"""What moves the work by a length turns it by the length over this [m]."""
+
+
+State = Literal["OK", "DEGRADED", "MOVED"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N sightings of the target, against the stored calibration.
+
+    Attributes:
+        residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
+        effects: (N, 5, 6 + K) their derivative by a motion of the camera about ``about``, then by
+            K weights of the arm's error, which are the same at every check.
+        covariances: (N, 5, 5) with nothing moved, the scan's and the arm's beyond those weights.
+        flanges: (N, 3, 3) base_R_flange.
+        joints: (N, 5, n) their derivative by the arm's joints; None where those are not known.
+        check: (N,) which check each belongs to, from 0, in order.
+    """
+
+    residuals: Floats
+    effects: Floats
+    covariances: Floats
+    flanges: Floats
+    joints: Floats | None
+    check: NDArray[np.intp]
+
+    def of(self, first: int, last: int) -> Sightings:
+        """Return those of the checks from ``first`` up to, not with, ``last``."""
+        kept = (self.check >= first) & (self.check < last)
+        joints = None if self.joints is None else self.joints[kept]
+        return Sightings(
+            self.residuals[kept], self.effects[kept], self.covariances[kept], self.flanges[kept],
+            joints, self.check[kept],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DriftTest:
+    """How the test is set.
+
+    Attributes:
+        false_alarms: Probability of a false alarm at one check.
+        daily: Standard deviation of what the cell does within days, at the work [m].
+        seasonal: Standard deviation of what it does within a year [m].
+        window: Largest number of checks in which a step is looked for.
+        reference: How many checks before them it is held against.
+        settled: Checks of which a mean is taken for slow drift.
+        limit: Slow drift of the work that counts as moved [m]; half of it, as degraded.
+    """
+
+    false_alarms: float = 2e-4
+    daily: float = 0.03e-3
+    seasonal: float = 0.1e-3
+    window: int = 4
+    reference: int = 30
+    settled: int = 9
+    limit: float = 0.4e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What the last check says.
+
+    Attributes:
+        state: OK, DEGRADED or MOVED.
+        motion: (6,) of the camera since, about ``about`` (rotation [rad], translation [m]).
+        covariance: (6, 6) of it.
+        shift: How far the motion moves the point of the work it moves most [m].
+        since: Index of the first check after the change; None while there is none.
+        statistic: The test's, over its threshold: above one something moved.
+    """
+
+    state: State
+    motion: Floats
+    covariance: Floats
+    shift: float
+    since: int | None
+    statistic: float
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What checks tell of the camera's motion and of the arm, in information form.
+
+    Attributes:
+        matrix: (..., 6 + K, 6 + K).
+        vector: (..., 6 + K).
+    """
+
+    matrix: Floats
+    vector: Floats
+
+    @classmethod
+    def of_covariance(cls, covariance: Floats, mean: Floats | float = 0.0) -> Information:
+        """Return what a mean (D,) known with a (D, D) covariance tells."""
+        matrix = np.asarray(np.linalg.inv(covariance))
+        return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
+
+    def loosened(self, deviation: float) -> Information:
+        """Return the same after a motion of the camera by ``deviation`` [m]; see ``allowance``."""
+        covariance = self.covariance
+        covariance[:6, :6] += allowance(deviation)
+        return Information.of_covariance(covariance, self.mean)
+
+    def summed(self, first: int, last: int | None) -> Information:
+        """Return what the checks from ``first`` up to ``last``, or to the end, tell together."""
+        return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
+
+    def plus(self, other: Information) -> Information:
+        """Return both together."""
+        return Information(self.matrix + other.matrix, self.vector + other.vector)
+
+    @property
+    def covariance(self) -> Floats:
+        """(6 + K, 6 + K)."""
+        return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
+
+    @property
+    def mean(self) -> Floats:
+        """(6 + K,) the motion, and the weights."""
+        return np.asarray(self.covariance @ self.vector)
+
+
+def allowance(deviation: float) -> Floats:
+    """Return the (6, 6) covariance of a motion that moves the work by ``deviation`` [m] an axis."""
+    return np.diag([(deviation / LEVER) ** 2] * 3 + [deviation**2] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the first check.
+
+    Attributes:
+        told: By the calibration, of the camera's motion since and of the arm's error.
+        freedom: Degrees of freedom from which the size of the arm's error is known.
+    """
+
+    told: Information
+    freedom: float = np.inf
+
+
+def information_of(sightings: Sightings, daily: float) -> Information:
+    """Return what each check tells, its share of the day's motion marginalised."""
+    told = _unmarginalised(sightings)
+    motions = told.matrix[:, :, :6]
+    taken = motions @ np.linalg.inv(motions[:, :6] + np.linalg.inv(allowance(daily)))
+    matrix = told.matrix - taken @ told.matrix[:, :6]
+    return Information(matrix, told.vector - (taken @ told.vector[:, :6, None])[..., 0])
+
+
+def _unmarginalised(sightings: Sightings) -> Information:
+    weights = np.linalg.inv(sightings.covariances)
+    weighted = sightings.effects.transpose(0, 2, 1) @ weights
+    matrices, vectors = weighted @ sightings.effects, -(weighted @ sightings.residuals[..., None])
+    count = int(sightings.check.max()) + 1 if len(sightings.check) else 0
+    matrix, vector = np.zeros((count, *matrices.shape[1:])), np.zeros((count, *vectors.shape[1:]))
+    np.add.at(matrix, sightings.check, matrices)
+    np.add.at(vector, sightings.check, vectors)
+    return Information(matrix, vector[..., 0])
+
+
+def prior_of(sightings: Sightings, variances: Floats) -> Prior:
+    """Return what a calibration's own sightings tell, all of one check.
+
+    Args:
+        sightings: With the calibration's scans and the arm's noise in their covariances.
+        variances: (6 + K,) before them, of the camera's motion and of the arm's weights.
+    """
+    told = _unmarginalised(sightings).summed(0, 1)
+    start = Information.of_covariance(np.diag(variances))
+    tilts = np.count_nonzero(sightings.covariances[:, 3, 3] < NO_NORMAL)
+    return Prior(start.plus(told), max(3.0 * len(sightings.check) + 2.0 * tilts - 6.0, 1.0))
+
+
+def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest) -> Verdict:
+    """Judge the last of the checks; every change found is its first.
+
+    Args:
+        checks: The n checks in order.
+        prior: What the calibration tells.
+        corners: (8, 3) of the work, from ``about`` [m].
+        test: How it is set.
+    """
+    n = len(checks.matrix)
+    start = Prior(prior.told.loosened(test.seasonal), prior.freedom)
+    found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
+    if found[0] > 1.0:
+        return moved_since(checks, prior, corners, test, found[1], found[0])
+    motion, covariance = _slow(checks, prior, test)
+    shift = largest_shift(motion, corners)
+    surely = shift - SURE * _deviation(motion, covariance, corners)
+    drifted: State = "MOVED" if surely > test.limit else "DEGRADED"
+    state = drifted if surely > test.limit / 2 else "OK"
+    since = None if state == "OK" else _began(checks, corners, prior, test)
+    return Verdict(state, motion, covariance, shift, since, found[0])
+
+
+def moved_since(
+    checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
+) -> Verdict:
+    """Return how far the camera is from where it was before check ``since``."""
+    start = prior.told.loosened(test.seasonal)
+    before = start.plus(checks.summed(max(since - test.reference, 0), since))
+    change = _change(checks.summed(since, len(checks.matrix)), before)
+    shift = largest_shift(change.mean, corners)
+    return Verdict("MOVED", change.mean, change.covariance, shift, since, ratio)
+
+
+def misfits(sightings: Sightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
+    """Return which of N sightings (N,) cannot be, by themselves, while nothing moved."""
+    effects = sightings.effects
+    spread = effects @ before.covariance @ effects.transpose(0, 2, 1) + sightings.covariances
+    motions = effects[..., :6]
+    spread += motions @ allowance(test.daily) @ motions.transpose(0, 2, 1)
+    left = sightings.residuals + effects @ before.mean
+    squares = np.einsum("ni,ni->n", left, np.linalg.solve(spread, left[..., None])[..., 0])
+    return np.asarray(squares > chi2_quantile(1 - MISFIT, 5))
+
+
+def largest_shift(motion: Floats, corners: Floats) -> float:
+    """Return how far a motion (6,) moves the corner that it moves most [m]."""
+    return float(np.linalg.norm(np.cross(motion[:3], corners) + motion[3:], axis=1).max())
+
+
+def _deviation(motion: Floats, covariance: Floats, corners: Floats) -> float:
+    """Return the standard deviation of :func:`largest_shift`, along that shift [m]."""
+    shifts = np.cross(motion[:3], corners) + motion[3:]
+    lengths = np.linalg.norm(shifts, axis=1)
+    worst = int(lengths.argmax())
+    rows = np.concatenate([-hat(corners[worst]), np.eye(3)], axis=1)
+    along = shifts[worst] / max(lengths[worst], 1e-12) @ rows
+    return float(np.sqrt(along @ covariance @ along))
+
+
+def _windows(n: int, test: DriftTest) -> range:
+    return range(1, min(test.window, n) + 1)
+
+
+def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tuple[float, int]:
+    """Return the likelihood ratio of a step at check ``first``, over its threshold; and it."""
+    low = max(first - test.reference, 0)
+    before = start.told.plus(checks.summed(low, first))
+    after = checks.summed(first, len(checks.matrix))
+    statistic, rank = (x.item() for x in _surprise(_change(after, before)))
+    scale, freedom = _scatter(checks, before, (low, first), start.freedom)
+    rate = test.false_alarms / test.window
+    limit = rank * scale * f_quantile(1 - rate, int(rank), freedom) if rank else np.inf
+    return statistic / limit, first
+
+
+def _change(after: Information, before: Information) -> Information:
+    """Return what is told of a motion (..., 6) between what came before and what came after."""
+    taken = after.matrix @ np.linalg.inv(after.matrix + before.matrix)
+    left = after.vector - after.matrix @ before.mean
+    score = left - (taken @ left[..., None])[..., 0]
+    told = after.matrix - taken @ after.matrix
+    return Information(told[..., :6, :6], score[..., :6])
+
+
+def _surprise(change: Information) -> tuple[Floats, Floats]:
+    """Return the squared distances (...) of a motion from none, and ranks."""
+    values, axes = np.linalg.eigh(change.matrix)
+    seen = values > 1e-9 * values[..., -1:]
+    along = (np.swapaxes(axes, -1, -2) @ change.vector[..., None])[..., 0]
+    squares = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0)
+    return squares.sum(-1), seen.sum(-1)
+
+
+def _scatter(
+    checks: Information,
+    before: Information,
+    span: tuple[int, int],
+    freedom: float,
+    fewest: int = 10,
+) -> tuple[float, float]:
+    """Return by what factor checks scatter more than they say, and its degrees of freedom.
+
+    The median, so that one bad check does not hide the next; never below a quarter. Of few checks
+    nobody knows it, and the freedom is the calibration's.
+    """
+    n = span[1] - span[0]
+    if n < fewest:
+        return 1.0, freedom
+    own = Information(checks.matrix[slice(*span)], checks.vector[slice(*span)])
+    squares, ranks = _surprise(_change(own, before))
+    typical = [chi2_quantile(0.5, int(rank)) for rank in ranks]
+    return max(float(np.median(squares / typical)), 0.25), 0.4 * float(ranks.mean()) * n
+
+
+def _slow(checks: Information, prior: Prior, test: DriftTest) -> tuple[Floats, Floats]:
+    """Return the motion from the calibration and the first checks to the last ones."""
+    n = len(checks.matrix)
+    if n < test.settled:
+        return np.zeros(6), prior.told.covariance[:6, :6]
+    first = prior.told.plus(checks.summed(0, min(test.settled, n - test.settled)))
+    change = _change(checks.summed(n - test.settled, n), first)
+    return change.mean, change.covariance
+
+
+def _began(checks: Information, corners: Floats, prior: Prior, test: DriftTest) -> int:
+    """Return the check at which a slow drift had gone a quarter of its limit, for good."""
+    shifts = []
+    for n in range(test.settled, len(checks.matrix) + 1):
+        motion, _ = _slow(Information(checks.matrix[:n], checks.vector[:n]), prior, test)
+        shifts.append(largest_shift(motion, corners) > test.limit / 4)
+    below = [i for i, above in enumerate(shifts) if not above]
+    return min((below[-1] + 1 if below else 0) + test.settled - 1, len(checks.matrix) - 1)
+
+
+def sightings_of(  # noqa: PLR0913  one argument a measured quantity
+    pose: Floats,
+    about: Floats,
+    centres: Floats,
+    normals: Floats,
+    covariances: Floats,
+    expected: Floats,
+    jacobians: Floats | None,
+    check: NDArray[np.intp],
+) -> Sightings:
+    """Linearise N sightings of a circle at the stored calibration.
+
+    Args:
+        pose: (4, 4) base_T_camera.
+        about: (3,) where motions are taken [m].
+        centres: (N, 3) in camera [m].
+        normals: (N, 3) in camera; NaN where none was measured.
+        covariances: (N, 5, 5) in base, tilts across the flange's axis last.
+        expected: (N, 4, 4) the frame of the circle in base, where the arm is believed to have it.
+        jacobians: (N, 6, n) of the circle's centre (rotation, translation), or None.
+        check: (N,) which check each belongs to.
+    """
+    turn, axes = pose[:3, :3], expected[:, :3, 2]
+    across = expected[:, :3, :2].transpose(0, 2, 1)
+    mapped, seen = centres @ turn.T + pose[:3, 3], np.nan_to_num(normals) @ turn.T
+    has = np.asarray(np.isfinite(normals).all(axis=1))
+    tilts = np.where(has[:, None], np.einsum("nai,ni->na", across, seen - axes), 0.0)
+    effects = np.zeros((len(centres), 5, 6))
+    effects[:, :3, :3], effects[:, :3, 3:] = -hat(mapped - about), np.eye(3)
+    effects[:, 3:, :3] = -across @ hat(seen) * has[:, None, None]
+    own = np.array(covariances)
+    own[~has, 3:, 3:] = NO_NORMAL * np.eye(2)
+    joints = None
+    if jacobians is not None:
+        turned = across @ -hat(axes) @ jacobians[:, :3] * has[:, None, None]
+        joints = np.concatenate([jacobians[:, 3:], turned], axis=1)
+    residuals = np.concatenate([mapped - expected[:, :3, 3], tilts], axis=1)
+    return Sightings(residuals, effects, own, expected[:, :3, :3], joints, np.asarray(check))
