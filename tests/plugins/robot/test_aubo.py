@@ -182,7 +182,6 @@ def test_a_controller_that_is_lost_is_an_error_in_time(
         controller.control.reset()
 
 
-@pytest.mark.slow  # its limit of 0.1 s to read needs an idle machine
 def test_what_the_arm_cannot_do_is_a_protective_stop(robot: Any) -> None:
     far = moved(robot.state().base_T_flange, x=2.0)
     state = arrived(robot, lambda: robot.move_linear(far, 0.2, 1.0))

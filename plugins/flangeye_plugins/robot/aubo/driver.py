@@ -143,8 +143,16 @@ class AuboRobot(Device):
                 f"{self.name}: reading it took {took:.2f} s, at most {STALE} s are allowed: the "
                 "network is slow"
             )
-        if self._ride is not None:
+        if self._ride is None:
+            return state
+        try:
             self._go_on(self._ride, state)
+        except DeviceError:
+            # The arm may have stopped after it was read: that is its state then, not an error.
+            self._ride = None
+            state, _ = self._read()
+            if not state.message:
+                raise
         return state
 
     def _read(self) -> tuple[RobotState, float]:
@@ -183,7 +191,7 @@ class AuboRobot(Device):
         self._rest = _in_joints(np.asarray(joints))
         self._ride = Ride(
             speed, acceleration,
-            lambda speeds: self._command(
+            lambda speeds: self._client.command(
                 "speed", lambda: motion.speedJoint(speeds.tolist(), acceleration, GRACE)
             ),
             self._brake,
@@ -199,7 +207,7 @@ class AuboRobot(Device):
         self._rest = self._in_space(base_T_goal)
         self._ride = Ride(
             speed, acceleration,
-            lambda twist: self._command(
+            lambda twist: self._client.command(
                 "speed", lambda: motion.speedLine(twist.tolist(), acceleration, GRACE)
             ),
             self._brake,
@@ -265,15 +273,7 @@ class AuboRobot(Device):
     def _arrive(self, move: Callable[[], int]) -> None:
         """Let the controller make the last bit, and expect it to begin."""
         self._begins = time.monotonic() + BEGUN
-        self._command("move", move)
-
-    def _command(self, what: str, order: Callable[[], int]) -> None:
-        """Give a command in the middle of a move; say why a controller that has stopped refuses."""
-        try:
-            self._client.command(what, order)
-        except DeviceError:
-            self._require_able()
-            raise
+        self._client.command("move", move)
 
     def _in_space(self, base_T_goal: Floats) -> Callable[[RobotState], tuple[Floats, float]]:
         def rest(state: RobotState) -> tuple[Floats, float]:
