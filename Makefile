@@ -20,7 +20,7 @@ help:
 	@echo "make demo   install what is missing and calibrate a simulated UR5 + PhoXi M cell"
 	@echo "make test   run the tests"
 	@echo "make test-all   the same with the long studies"
-	@echo "make check  formatting, lint, types, imports"
+	@echo "make check  formatting, lint, types, imports; size of each room"
 	@echo "make docs   build the documentation into site/, strictly"
 	@echo "make bench  what each stage costs, beside its yardstick and what it was"
 	@echo "make flame  a flame graph of RECIPE=…, flame.svg"
@@ -43,6 +43,7 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tools.count
 
 docs: $(VENV)/.dev
 	$(BIN)/python -m mkdocs build --strict --quiet
