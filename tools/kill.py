@@ -1,8 +1,8 @@
 """Kill runs at random moments: python -m tools.kill [COUNT] [--seed N] [--kind NAME …].
 
-Each run is killed (-9), alone or with its process group, at a random moment of its duration.
-Afterwards: what was finished before is in the log and can be read; the run is gone on with
-(``--resume``, ``--from``, or the batch's own command); and of the killed one no process, no
+Each run is killed (-9), alone or with its process group, at a random moment after its log is there
+(of a monitor: after its history's lock is). Afterwards: what was finished before is in the log and can be read; the run is gone on with
+(``--resume``, ``--from``, or the batch's or monitor's own command); and of the killed one no process, no
 temporary file and no shared memory is left, and so no port.
 """
 
@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from flangeye.batch.scratch import PREFIX
+from flangeye.doctor.monitor import History, stored_calibration
 from flangeye.errors import FlangeyeError
 from flangeye.files.children import python_command
 from flangeye.log.read import read_run
+from tests.doctor.monitor.cell import part_of_sample
 
 MARK = "FLANGEYE_KILLED"
 """In the environment of a run and of all that it starts."""
@@ -44,10 +46,14 @@ FEWER = ("--set", "acquire.live.poses={next_best: {count: 6, candidates: 60}}")
 
 
 class Kind(NamedTuple):
-    """A kind of run: its command without ``--out``, and the one that goes on from a folder."""
+    """A kind of run: its command, the one that goes on from a folder, and what it writes first.
+
+    ``OUT`` in a command is its folder, ``PARENT`` that one's; a run is given it by ``--out``.
+    """
 
     command: tuple[str, ...]
     goes_on: Callable[[Path], tuple[str, ...] | None]
+    writes: str = "run.mcap"
 
 
 def _solved_again(recipe: str) -> Callable[[Path], tuple[str, ...] | None]:
@@ -70,6 +76,25 @@ def _recorded(recipe: str, *options: str) -> Kind:
     return Kind(("run", recipe, *options), _solved_again(recipe))
 
 
+def _checked_again(out: Path) -> tuple[str, ...] | None:
+    """Return the same check, where its history does not have it yet; the history can be read."""
+    stored = stored_calibration(out.parent / "calibration")
+    checks = History.read(out / "h.jsonl", stored.key).checks
+    return None if checks else MONITOR
+
+
+def _calibrated(folder: Path) -> None:
+    """Calibrate from six of the sample's scans, and lay the others aside for a check."""
+    part_of_sample(folder / "scans", range(6))
+    part_of_sample(folder / "later", range(6, 8))
+    words = ("run", "ur5_phoxi-m_sample", "--archive", f"{folder}/scans")
+    command = python_command("-m", "flangeye.cli", *words, "--out", f"{folder}/calibration")
+    subprocess.run(command, check=True, capture_output=True)
+
+
+MONITOR = (
+    "monitor", "PARENT/calibration", "--archive", "PARENT/later", "--history", "OUT/h.jsonl",
+)  # fmt: skip
 BATCH = ("batch", "ur5_phoxi-m_simulated", "--repeat", "3", "--workers", "2", "--no-report", *SMALL)
 KINDS = {
     "archive": _recorded("ur5_phoxi-m_sample"),
@@ -77,6 +102,7 @@ KINDS = {
     "live": Kind(("run", "ur5e_phoxi-m_loopback", "--move", *FEWER), _resumed),
     "weld": _recorded("ur10e_phoxi-m_weld_simulated", *SMALL),
     "batch": Kind(BATCH, lambda out: (*BATCH, "--out", str(out))),
+    "monitor": Kind(MONITOR, _checked_again, ".h.jsonl.lock"),
 }
 
 
@@ -91,6 +117,8 @@ def main() -> None:
     print("kind       kills  within  logs  captures  gone on  faults", flush=True)
     for name in asked.kind:
         with tempfile.TemporaryDirectory() as folder:
+            if name == "monitor":
+                _calibrated(Path(folder))
             trial = Trial(KINDS[name], Path(folder), random.Random(f"{name} {asked.seed}"))
             trial.kill(each)
         print(trial.row(name, each), *trial.faults, sep="\n  ", flush=True)
@@ -115,8 +143,8 @@ class Trial:
             raise SystemExit(f"{self._kind.command} ends with {whole.returncode}")
         self._duration = time.monotonic() - began
         for number in range(count):
-            after = self._chance.uniform(0, self._duration)
-            self.faults += [f"{after:.1f} s: {fault}" for fault in self._killed(number, after)]
+            share = self._chance.random()
+            self.faults += [f"at {share:.2f}: {fault}" for fault in self._killed(number, share)]
 
     def row(self, name: str, count: int) -> str:
         """Return the line of the table."""
@@ -125,11 +153,15 @@ class Trial:
             f"{self._gone_on:8} {len(self.faults):7}"
         )
 
-    def _killed(self, number: int, after: float) -> Iterator[str]:
+    def _killed(self, number: int, share: float) -> Iterator[str]:
         out = self._folder / str(number)
-        run = self._start((*self._kind.command, "--out", str(out)), out)
+        began = time.monotonic()
+        run = self._start(self._kind.command, out)
+        while run.poll() is None and not any(out.rglob(self._kind.writes)):
+            time.sleep(0.005)
+        left = max(self._duration - (time.monotonic() - began), 0.0)
         with suppress(subprocess.TimeoutExpired):
-            run.wait(after)
+            run.wait(share * left)
         before = {log: set(_finished(log)) for log in out.rglob("run.mcap")}
         shared = _shared(str(out))
         kill = os.killpg if self._chance.random() < 0.5 else os.kill
@@ -169,8 +201,10 @@ class Trial:
     def _stuck(self, out: Path) -> Iterator[str]:
         """Go on, and yield why it did not."""
         try:
-            command = self._kind.goes_on(out) if any(out.rglob("run.mcap")) else None
-        except FlangeyeError:
+            command = self._kind.goes_on(out) if any(out.rglob(self._kind.writes)) else None
+        except FlangeyeError as error:
+            if self._kind.writes != "run.mcap":
+                yield str(error)
             return  # the log was killed before its first message, which is no loss
         if command is None:
             return
@@ -187,7 +221,9 @@ class Trial:
         """Start a command; what it starts has the folder's name in its environment."""
         _temporary(out).mkdir(exist_ok=True)
         environment = {**os.environ, MARK: str(out), "TMPDIR": str(_temporary(out))}
-        words = command if "--out" in command else (*command, "--out", str(out))
+        words = [w.replace("OUT", str(out)).replace("PARENT", str(out.parent)) for w in command]
+        if "--out" not in words and command[0] != "monitor":
+            words += ["--out", str(out)]
         return subprocess.Popen(
             python_command("-m", "flangeye.cli", *words),
             env=environment, start_new_session=True, stdin=subprocess.DEVNULL,

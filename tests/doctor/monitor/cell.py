@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,17 @@ def check(
     return folder
 
 
+def part_of_sample(folder: Path, ids: range) -> Path:
+    """Copy some of the sample's scans and their poses."""
+    sample = Path(__file__).parents[3] / "data" / "samples" / "ur5_phoxi-m"
+    head, *rows = (sample / "poses.csv").read_text().splitlines()
+    folder.mkdir()
+    (folder / "poses.csv").write_text("\n".join([head, *(rows[i] for i in ids)]))
+    for i in ids:
+        shutil.copy(sample / f"{i:04}.pcd", folder)
+    return folder
+
+
 def _circle(seen: t.Transform, rng: np.random.Generator, noise: float) -> t.CircleFeature:
     normal = rotation_exp(rng.normal(0, 3e-4, 3)) @ seen.rotation[:, 2]
     across = np.eye(3) - np.outer(normal, normal)
@@ -61,4 +73,4 @@ def _circle(seen: t.Transform, rng: np.random.Generator, noise: float) -> t.Circ
     )  # fmt: skip
 
 
-__all__ = ["STATIONS", "TRUTH", "WORKSPACE", "calibrate", "check"]
+__all__ = ["STATIONS", "TRUTH", "WORKSPACE", "calibrate", "check", "part_of_sample"]

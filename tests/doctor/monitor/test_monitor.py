@@ -27,7 +27,7 @@ from flangeye.doctor.monitor.opcua import write_state
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.watch.drift import DriftTest
 from flangeye_plugins.reader.folder import FolderParams, folder
-from tests.doctor.monitor.cell import calibrate, check
+from tests.doctor.monitor.cell import calibrate, check, part_of_sample
 from tests.doctor.sessions import clean
 from tests.fuzz.damage import spoilt
 
@@ -364,17 +364,6 @@ def test_live_needs_a_calibration_that_was_live(cell: Path) -> None:
 
     with pytest.raises(StageError, match=r"was not calibrated live"):
         from_arm(stored_calibration(cell / "calibration"), load_registry(), 3, move=False)
-
-
-def part_of_sample(folder: Path, ids: range) -> Path:
-    """Copy some of the sample's scans and their poses."""
-    sample = Path(__file__).parents[3] / "data" / "samples" / "ur5_phoxi-m"
-    head, *rows = (sample / "poses.csv").read_text().splitlines()
-    folder.mkdir()
-    (folder / "poses.csv").write_text("\n".join([head, *(rows[i] for i in ids)]))
-    for i in ids:
-        shutil.copy(sample / f"{i:04}.pcd", folder)
-    return folder
 
 
 def calibrated_from_six(scans: Path, out: Path, *more: str) -> None:
