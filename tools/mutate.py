@@ -39,6 +39,10 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),
+    "log": ("pipeline/flangeye/log", "tests/log"),
+    "monitor": ("pipeline/flangeye/doctor/monitor", "tests/doctor/monitor"),
+    "export": ("plugins/flangeye_plugins/export", "tests/plugins/export", "tests/cli"),
+    "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot"),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
     "run": (
         "pipeline/flangeye/run", "tests/run", "tests/plugins/reader/test_cell.py",
