@@ -56,10 +56,14 @@ RECIPE ?= ur5_phoxi-m_simulated
 flame: $(VENV)/.dev
 	$(BIN)/py-spy record --rate 200 --output flame.svg -- $(BIN)/python -m flangeye.cli run $(RECIPE)
 
-$(VENV)/.run: pyproject.toml .ci/system-packages
+# The versions of requirements.lock, where it was made for this machine; else what pip finds.
+LOCKED := $(VENV)/locked.txt
+$(VENV)/.run: pyproject.toml requirements.lock .ci/system-packages
 	PYTHON=$(PYTHON) ./.ci/system-packages run
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable .
+	$(BIN)/python -c 'import platform as p, sys; sys.exit((sys.version_info[:2], p.system(), p.machine()) != ((3, 11), "Linux", "x86_64"))' \
+		&& sed -nE 's/^([A-Za-z0-9._-]+==[^ ;]+).*/\1/p' requirements.lock >$(LOCKED) || : >$(LOCKED)
+	$(PIP) --constraint $(LOCKED) --editable .
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.run plugins/flangeye_paper/pyproject.toml
