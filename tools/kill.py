@@ -1,9 +1,10 @@
 """Kill runs at random moments: python -m tools.kill [COUNT] [--seed N] [--kind NAME …].
 
 Each run is killed (-9), alone or with its process group, at a random moment after its log is there
-(of a monitor: after its history's lock is). Afterwards: what was finished before is in the log and can be read; the run is gone on with
-(``--resume``, ``--from``, or the batch's or monitor's own command); and of the killed one no process, no
-temporary file and no shared memory is left, and so no port.
+(of a monitor: after its history's lock is). Afterwards: what was finished before is in the log and
+can be read; the run is gone on with (``--resume``, ``--from``, or the batch's or monitor's own
+command); and of the killed one no process, no temporary file and no shared memory is left, and so no
+port.
 """
 
 from __future__ import annotations

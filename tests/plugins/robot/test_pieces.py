@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ class Driven:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.at, self.velocity, self.done = 100.0, 0.0, 0.0, list[str]()
-        monkeypatch.setattr(pieces.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
         self.ride = Ride(SPEED, ACCELERATION, self._go, self._stop, self._arrive)
 
     def look(self, after: float = TICK, fastest: float | None = None) -> None:
@@ -96,10 +97,10 @@ def test_the_controllers_own_end_of_a_move_is_no_longer_than_a_piece() -> None:
 
 
 def test_it_heads_straight_for_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    gone = []
+    gone: list[Any] = []
     ride = Ride(SPEED, ACCELERATION, gone.append, lambda: None, lambda: None)
-    later = pieces.time.monotonic() + 0.1
-    monkeypatch.setattr(pieces.time, "monotonic", lambda: later)
+    later = time.monotonic() + 0.1
+    monkeypatch.setattr(time, "monotonic", lambda: later)
     ride.renew(np.array([0.3, -0.4]), 0.5, 0.0)
     (velocity,) = gone
     np.testing.assert_allclose(velocity / np.linalg.norm(velocity), [0.6, -0.8])
