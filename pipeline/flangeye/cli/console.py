@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
-from contextlib import nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -14,8 +14,7 @@ from flangeye.files.children import keep_current_folder_out
 from flangeye.files.printable import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from contextlib import AbstractContextManager
+    from collections.abc import Callable, Iterator, Sequence
 
     from rich.console import Console
 
@@ -42,13 +41,30 @@ def say_notes(notes: Sequence[str]) -> None:
             say(as_line(note), err=True)
 
 
-def at_work(what: str) -> AbstractContextManager[object]:
-    """Say in a terminal what takes its time, while it does."""
-    if not sys.stderr.isatty():
-        return nullcontext()
-    from rich.console import Console
+@contextmanager
+def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
+    """Show in a terminal what takes its time, with a bar and the time left if steps are known.
 
-    return Console(stderr=True).status(what)
+    Yields what is called after each step; after the last one a further round begins.
+    """
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as TimeLeft
+
+    parts = TextColumn("{task.description}"), BarColumn(bar_width=12), TimeElapsedColumn()
+    bar = Progress(*parts, TimeLeft(compact=True), console=Console(stderr=True), transient=True)
+    task = bar.add_task(what, total=steps)
+
+    def step() -> None:
+        if bar.finished:
+            bar.reset(task, total=steps)
+        bar.advance(task)
+
+    with bar:
+        yield step
 
 
 def end_in_words(command: Callable[[], object]) -> None:

@@ -217,12 +217,15 @@ def doctor(
     if checked is not None and recipe == str(archive):
         archive = _archive_of(checked)
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
-    with of_foreign(archive, "it cannot be examined"), at_work("looking for mistakes"):
+    with (
+        of_foreign(archive, "it cannot be examined"),
+        at_work("looking for mistakes", len(checks)) as step,
+    ):
         cell = open_cell(archive, registry, checked)
         if cell is None:
             session = open_session(archive, registry, checked)
             say_notes(session.damage)
-        diagnosis = examine_cell(*cell) if cell else examine(session, checks)
+        diagnosis = examine_cell(*cell) if cell else examine(session, checks, step)
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
     if diagnosis.findings or diagnosis.session.damage:
         raise typer.Exit(1)

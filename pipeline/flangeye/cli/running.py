@@ -187,9 +187,14 @@ def _first_finding(log: Path, registry: Registry) -> Finding | None:
 
     checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
-        with of_foreign(log, "it cannot be examined"), at_work("looking for the mistake"):
-            cell = open_cell(log, registry)
-            found = examine_cell(*cell) if cell else examine(open_session(log, registry), checks)
+        with (
+            of_foreign(log, "it cannot be examined"),
+            at_work("looking for the mistake", len(checks)) as checked,
+        ):
+            if cell := open_cell(log, registry):
+                found = examine_cell(*cell)
+            else:
+                found = examine(open_session(log, registry), checks, checked)
     except FlangeyeError:
         return None  # the doctor needs more than this log has, and says so when it is asked
     return next(iter(found.findings), None)

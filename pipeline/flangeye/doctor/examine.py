@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from flangeye.doctor.diagnosis import FEWEST, Finding, NotApplicable, RecordedSession
@@ -34,11 +34,18 @@ class Diagnosis:
     idle: Mapping[str, str]
 
 
-def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
+def examine(
+    session: RecordedSession, checks: Iterable[Part], checked: Callable[[], None] = lambda: None
+) -> Diagnosis:
     """Look for mistakes, the most telling first.
 
     Each check has counted the alternatives it tried; here the checks are counted (Bonferroni), so
     that a session without a mistake gives any finding with :data:`FALSE_ALARM` at most.
+
+    Args:
+        session: The recordings.
+        checks: The checks to run.
+        checked: Called after each check; each correction is followed by another round of all.
 
     Raises:
         StageError: There are too few samples to tell anything.
@@ -47,7 +54,7 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
     found, current = [r for r in session.remarks if not r.note], session
     known = tuple(remark for remark in session.remarks if remark.note)
     require_enough(session)
-    offered, idle = _offered(current, bound)
+    offered, idle = _offered(current, bound, checked)
     if made_up := [f for f in offered if f.hopeless]:
         # What else these samples seem to show is made up like them.
         return Diagnosis(session, (*found, made_up[0]), known, _names(bound), idle)
@@ -57,7 +64,7 @@ def examine(session: RecordedSession, checks: Iterable[Part]) -> Diagnosis:
         offered = []
         if len(found) == MOST_MISTAKES or current.seen.sum() < FEWEST:
             break
-        offered, _ = _offered(current, bound)
+        offered, _ = _offered(current, bound, checked)
         # What all samples share is read once: the same mistake again would be of the first mending.
         named = {f.name for f in found if not f.samples}
         offered = [f for f in offered if f.samples or f.name not in named]
@@ -71,7 +78,7 @@ def _names(checks: Sequence[BoundPart]) -> tuple[str, ...]:
 
 
 def _offered(
-    session: RecordedSession, checks: Sequence[BoundPart]
+    session: RecordedSession, checks: Sequence[BoundPart], checked: Callable[[], None]
 ) -> tuple[list[Finding], dict[str, str]]:
     """Return the findings that hold against the number of checks, and which do not apply."""
     found: list[Finding] = []
@@ -82,6 +89,8 @@ def _offered(
         except NotApplicable as why:
             idle[check.part.name] = str(why)
             continue
+        finally:
+            checked()
         found += [f for f in findings if f.probability * len(checks) < FALSE_ALARM]
     return found, idle
 
