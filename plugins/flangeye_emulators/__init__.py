@@ -35,9 +35,6 @@ PARTS = {
     "arc.simulated": "flangeye_emulators.arc.simulated:arc_simulated",
     "profiler.simulated": "flangeye_emulators.finger.profiler:profiler_simulated",
     "sensor.simulated_finger": "flangeye_emulators.finger.sensor:sensor_simulated_finger",
-    # Their former names.
-    "scanner.loopback": "scanner.emulator",
-    "robot.loopback": "robot.emulator",
 }
 
 

@@ -23,7 +23,7 @@ from flangeye.batch.request import BatchError, Request
 from flangeye.batch.software import Software, software_of
 from flangeye.batch.work import READY, STARTS, WORKER_DIED, Job
 
-SLURM = Path(cluster.__file__).with_name("slurm_cluster.py")
+SLURM = Path(__file__).parents[2] / "docs/examples/slurm_cluster.py"
 PATIENCE = 120
 """Seconds after which a process is taken to hang; it answers in a few."""
 

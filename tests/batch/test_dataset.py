@@ -78,13 +78,6 @@ def test_parts_that_are_torn_or_of_other_columns_count_for_nothing(
     assert files(tmp_path) == []
 
 
-def test_the_file_of_a_former_version_makes_way(rows: Dataset, tmp_path: Path) -> None:
-    (tmp_path / "sessions.parquet").write_bytes(b"PAR1")
-    assert not rows.finished(Ledger([session(0)]), report=False).any()
-    rows.write_part(0, "a", [row(0)])
-    assert files(tmp_path) == ["000000-a.parquet"]
-
-
 def test_a_ledger_knows_where_each_session_stands() -> None:
     ledger = Ledger(map(session, [5, 3, 2**64 - 1]))
     ids = [session(i).id for i in (3, 2**64 - 1, 4, 5)]

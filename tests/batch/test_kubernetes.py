@@ -14,10 +14,9 @@ from typing import Any
 import pytest
 import yaml
 
-from flangeye.batch import cluster
 from tests.batch.test_batch import PATIENCE, running
 
-MANIFESTS = Path(cluster.__file__).with_name("kubernetes.yaml")
+MANIFESTS = Path(__file__).parents[2] / "docs/examples/kubernetes.yaml"
 DOCUMENTS: list[dict[str, Any]] = list(yaml.safe_load_all(MANIFESTS.read_text()))
 PROGRAMS = {
     "dask": [sys.executable, "-m", "dask"],

@@ -332,17 +332,9 @@ def help_text() -> tuple[Work, Work]:
 
 
 def check() -> tuple[Work, Work]:
-    """Checking a recipe that was checked before, beside importing numpy."""
-    words = ("-m", "flangeye.cli", "check", "ur5_phoxi-m_simulated")
-    again = _command(*words, XDG_CACHE_HOME=tempfile.mkdtemp())
-    return Work(again, "flangeye check, again"), help_text()[1]
-
-
-def first_check() -> tuple[Work, Work]:
-    """Checking a recipe for the first time, beside importing numpy."""
-    words = ("-m", "flangeye.cli", "check", "ur5_phoxi-m_simulated")
-    first = _command(*words, XDG_CACHE_HOME=os.devnull)  # nothing can be kept
-    return Work(first, "flangeye check, the first time"), help_text()[1]
+    """Checking a recipe, a whole process, beside importing numpy."""
+    words = ("check", "ur5_phoxi-m_simulated")
+    return Work(_flangeye(*words), "flangeye check"), help_text()[1]
 
 
 PUBLISHED = Path(__file__).parents[3] / "shared" / "data" / "ancorasir"
@@ -396,7 +388,6 @@ CASES = {
     "read_cloud": read,
     "log": record,
     "flangeye check": check,
-    "flangeye check, first": first_check,
     "flangeye --help": help_text,
     "finger": finger,
     "cycle": cycle,

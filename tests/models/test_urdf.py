@@ -20,8 +20,8 @@ from flangeye.models.urdf import robot_from_urdf
 from flangeye.models.urdf_meshes import vertices
 from flangeye.motion.clearance import ArmVolume
 from flangeye.plugin.registry import load_registry
+from flangeye.recipe.check import describe_recipe
 from flangeye.recipe.load import load_recipe
-from flangeye.recipe.verdict import verdict
 from flangeye.types import Warn
 
 ORIGINS = [  # of a KUKA KR 6 R900 sixx: its maker's table
@@ -198,12 +198,12 @@ def test_an_arm_of_five_joints_is_sent_nowhere(kuka: Path, tmp_path: Path) -> No
     steps = "segment.flange, fit.rim, solve.robust]\n"
     recipe.write_text(f"{head}steps: [acquire.archive, {steps}")
     registry = load_registry()
-    said = verdict(recipe, "", registry)
+    said = describe_recipe(recipe, registry)
     assert f"note: {kuka}: base 'base', flange 'tool0'" in said
     view = "{view: {guess: {position: [620 mm, 0 mm, 980 mm]}}}"
     recipe.write_text(f"{head}steps: [acquire.live: {view}, {steps}")
     with pytest.raises(RecipeError, match="kr6_r900 has 5 joints, .* robot: {flange: ISO 9409"):
-        verdict(recipe, "", registry)
+        describe_recipe(recipe, registry)
 
 
 def test_a_rail_and_a_base_of_ones_own(kuka: Path) -> None:

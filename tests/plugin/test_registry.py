@@ -139,14 +139,6 @@ def test_a_stage_says_which_configurations_it_serves() -> None:
     )
 
 
-def test_a_former_name_still_works_and_is_said() -> None:
-    registry = load_registry()
-    assert registry.part("robot.loopback") is registry.part("robot.emulator")
-    assert registry.notes() == [
-        "robot.loopback is now called robot.emulator; the old name works in this version only"
-    ]
-
-
 def offering(**places):
     module = python_types.ModuleType("acme")
     named = {f"solve.{n}": at for n, at in places.items()}
@@ -175,8 +167,6 @@ def test_every_name_of_ours_is_where_it_is_said_to_be() -> None:
     assert registry.broken == {}
     assert set(offered) == set(registry.stages) | set(registry.parts)
     assert all(plugin.name == name for name, plugin in offered.items())
-    former = {old: name for name, plugin in offered.items() for old in plugin.formerly}
-    assert former == registry.renamed
 
 
 def test_finding_plugins_imports_none_of_their_modules() -> None:

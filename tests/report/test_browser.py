@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flangeye.batch import page as batch_page
 from flangeye.log.read import RunLog
-from flangeye.report import page as report_page
 from flangeye.report import write_report
-from flangeye.report.plotly_js import packed_plotly
 from tests.chromium import chromium
 
 PAINTED = """[...document.querySelectorAll(".gl-container canvas")].map(from => {
@@ -25,19 +20,6 @@ PAINTED = """[...document.querySelectorAll(".gl-container canvas")].map(from => 
   return pixels.filter((value, i) => i % 4 === 3 && value > 0).length;
 })"""
 """How many pixels of each 3D canvas are not empty."""
-
-DRAW = """async kind => {
-  const div = document.body.appendChild(document.createElement("div"));
-  const axes = {x: [1, 2, 3], y: [2, 1, 3], z: [1, 3, 2]};
-  const shapes = [{type: "rect", xref: "x", yref: "paper", x0: 1, x1: 2, y0: 0, y1: 1}];
-  const modes = kind === "bar" ? [undefined] : ["lines", "markers", "text", "lines+markers"];
-  const data = modes.map(mode => ({type: kind, mode, ...axes, text: ["a", "b", "c"]}));
-  await Plotly.newPlot(div, data, {shapes, legend: {orientation: "h"}});
-  await Plotly.relayout(div, {template: {layout: {paper_bgcolor: "#222"}}});
-  const shown = div.querySelector("svg.main-svg, canvas");
-  return {type: div._fullData[0].type, bounds: shown && shown.getBoundingClientRect().width};
-}"""
-"""Draw a kind of trace in every mode; what plotly.js made of it."""
 
 
 @pytest.fixture(scope="module")
@@ -115,22 +97,3 @@ def test_a_telephone_scrolls_down_only(
     page.goto(path.as_uri())
     page.wait_for_selector("html[data-drawn]", timeout=60_000)
     assert page.evaluate("document.documentElement.scrollWidth") == 420
-
-
-@pytest.mark.parametrize("traces", [report_page.DRAWN, batch_page.DRAWN], ids=["report", "batch"])
-def test_the_part_of_plotly_that_a_page_holds_draws_each_of_its_kinds(
-    browser: Any, traces: frozenset[str]
-) -> None:
-    library = gzip.decompress(base64.b64decode(packed_plotly(traces))).decode()
-    page = browser.new_page()
-    problems: list[str] = []
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("console", lambda line: problems.append(line.text) if line.type == "error" else None)
-    page.set_content("<body></body>")
-    page.add_script_tag(content=library)
-    for kind in sorted(traces):
-        drawn = page.evaluate(DRAW, kind)
-        assert drawn["type"] == kind
-        assert drawn["bounds"] is not None
-    assert problems == []
-    page.close()

@@ -117,8 +117,6 @@ class Dataset:
             report: Whether each must have a report.
         """
         done = np.zeros(len(ledger.numbers), dtype=bool)
-        if self._place.read(FOLDER) is not None:  # a file of a former version
-            self._place.remove(FOLDER)
         for block, parts in self._parts().items():
             _, at = self._settled(block, parts, ledger, FINISHED, report)
             done[at] = True

@@ -15,7 +15,7 @@ from flangeye.batch.tally import Tally
 from flangeye.files.bundled import VERSION
 from flangeye.files.place import Place
 from flangeye.report.look import css
-from flangeye.report.plotly_js import packed_plotly
+from flangeye.report.page import packed_plotly
 from flangeye.report.units import degrees, duration, millimetres
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 _HERE = Path(__file__).parent
 _REPORT = Path(run_report.__file__).parent
-DRAWN = frozenset({"scatter", "scattergl"})
-"""The kinds of traces in a summary."""
 
 _HEADINGS: Mapping[str, str] = {
     "session": "Session",
@@ -87,7 +85,7 @@ def render(tally: Tally) -> str:
         varied=tally.by(),
         drawings=drawings,
         seconds=duration(tally.seconds),
-        plotly_js=packed_plotly(DRAWN) if drawings else "",
+        plotly_js=packed_plotly() if drawings else "",
         version=VERSION,
     )  # fmt: skip
 

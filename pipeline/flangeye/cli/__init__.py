@@ -1,14 +1,11 @@
 """The ``flangeye`` command: parse, delegate, say what happened. No logic of the field is here.
 
-Modules are imported inside the commands, so that ``--help`` answers at once; ``check RECIPE``,
-``report LOG`` and ``stages`` need no parser.
+Modules are imported inside the commands, so that ``--help`` answers at once.
 """
 
 import os
-import sys
 
 from flangeye.cli.console import end_in_words
-from flangeye.files.collector import collector_paused
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Captures are worked on side by side and matrices are small: more threads in one product only
@@ -23,11 +20,6 @@ def main() -> None:
 
 
 def _command() -> None:
-    from flangeye.cli.fast_path import answered
+    from flangeye.cli.commands import app
 
-    words = sys.argv[1:]
-    with collector_paused(keep=True):
-        if answered(words):
-            return
-        from flangeye.cli.commands import app, named_in
-    (named_in(words) if words else app)()  # a shell that completes a line gives no words
+    app()

@@ -10,7 +10,6 @@ from typer.core import TyperGroup
 
 from flangeye.cli.console import say, say_notes
 from flangeye.errors import FlangeyeError
-from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -107,10 +106,9 @@ def _options(
 
 def load_plugins() -> Registry:
     """Find every installed plugin."""
-    with collector_paused(keep=True):
-        from flangeye.plugin.registry import load_registry
+    from flangeye.plugin.registry import load_registry
 
-        return load_registry()
+    return load_registry()
 
 
 def open_graph(registry: Registry, name: str = "ros2") -> Graph:
@@ -126,13 +124,12 @@ def open_graph(registry: Registry, name: str = "ros2") -> Graph:
 
 
 def read_recipe(name: str, registry: Registry, overrides: Sequence[str] | None = None) -> Recipe:
-    """Return a checked recipe by path or name; say which names in it are outdated."""
-    with collector_paused(keep=True):
-        from flangeye.recipe.find import find_recipe
-        from flangeye.recipe.load import load_recipe
+    """Return a checked recipe by path or name; print its notes."""
+    from flangeye.recipe.find import find_recipe
+    from flangeye.recipe.load import load_recipe
 
-        recipe = load_recipe(find_recipe(name), registry, overrides or ())
-    say_notes([*registry.notes(), *recipe.notes])
+    recipe = load_recipe(find_recipe(name), registry, overrides or ())
+    say_notes(recipe.notes)
     return recipe
 
 

@@ -9,10 +9,8 @@ import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
 from flangeye.cli.console import at_work, say, say_notes
-from flangeye.cli.fast_path import say_report
 from flangeye.cli.foreign import name_damage, of_foreign, require_gathered
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.files.collector import collector_paused
 
 if TYPE_CHECKING:
     from flangeye.log.read import RunLog
@@ -96,8 +94,16 @@ def report(
     ] = None,
 ) -> None:
     """Write the HTML report of a run from its log."""
-    with collector_paused(keep=True):
-        say_report(log, out)
+    from flangeye.log.read import read_run
+    from flangeye.report import write_report
+
+    read = read_run(log)
+    path = out or read.path.parent / "report.html"
+    require_gathered(read)
+    with of_foreign(read.path, "no report can be made of it"):
+        write_report(read, path)
+    say(path)
+    name_damage(read)
 
 
 @app.command()

@@ -17,9 +17,10 @@ def check(recipe: RecipeName, overrides: Overrides = None) -> None:
 
     Prints every mistake with its line, or the transforms that will be estimated.
     """
-    from flangeye.cli.fast_path import say_verdict
+    from flangeye.recipe.check import describe_recipe
+    from flangeye.recipe.find import find_recipe
 
-    say_verdict(recipe, overrides or ())
+    say(describe_recipe(find_recipe(recipe), load_plugins(), overrides or ()))
 
 
 @app.command()
@@ -44,14 +45,10 @@ def stages(
 
     NAME may be a kind (reader, solve, …) or one stage or part.
     """
-    if name is None:
-        from flangeye.plugin.stage_list import list_stages
+    from flangeye.plugin.describe import describe_all, describe_one
 
-        say(list_stages())
-        return
-    from flangeye.plugin.describe import describe_one
-
-    say(describe_one(load_plugins(), name))
+    registry = load_plugins()
+    say(describe_all(registry) if name is None else describe_one(registry, name))
 
 
 @app.command()

@@ -28,7 +28,6 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from flangeye.estimation.lifted import Family, Sightings, Squares, squares_of
 from flangeye.maths.geometry import nearest_rotation, rotation_exp
@@ -172,6 +171,7 @@ class _Dual(NamedTuple):
             tries: Steps at most.
             start: Multipliers to begin with; without them none.
         """
+        from scipy.optimize import minimize
 
         def apart(multipliers: Floats) -> tuple[float, Floats]:
             matrix = self.at(multipliers)

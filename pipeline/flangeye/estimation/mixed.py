@@ -21,8 +21,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import minimize
-from scipy.stats import qmc
 
 from flangeye.types import Floats, Mask
 
@@ -251,6 +249,8 @@ class Posterior:
 
 def mode_of(model: Model, start: Floats | None = None, steps: int = 60) -> Floats:
     """Return (Z,) the most likely sizes, as standard normal numbers, by L-BFGS."""
+    from scipy.optimize import minimize
+
     prior, model = model.sizes, model.telling()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
 
@@ -301,6 +301,7 @@ def _laplace(model: Model, z: Floats) -> Floats:
 def _draws(count: int, samples: int) -> Floats:
     """Return (samples, count) multivariate t numbers, low in discrepancy, in mirrored pairs."""
     from scipy.special import gammaincinv, ndtri
+    from scipy.stats import qmc
 
     points = qmc.Sobol(count + 1, scramble=True, seed=0).random(samples // 2)
     normal = ndtri(np.clip(points[:, :-1], 1e-6, 1 - 1e-6))

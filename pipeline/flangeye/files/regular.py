@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,20 +19,6 @@ _FLAGS = os.O_RDONLY | sum(
 """Not every system has all of them."""
 
 
-_noted: ContextVar[list[Path] | None] = ContextVar("_noted", default=None)
-
-
-@contextmanager
-def noting_opened() -> Iterator[list[Path]]:
-    """Collect which files are asked for while the context lasts, as they were named."""
-    opened: list[Path] = []
-    before = _noted.set(opened)
-    try:
-        yield opened
-    finally:
-        _noted.reset(before)
-
-
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
     """Open a regular file, or a link to one, for reading; never waits, as a FIFO would make one.
 
@@ -47,9 +30,6 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
         FlangeyeError: Of the given sort: it does not exist, cannot be read, or is a folder, a
             device, a FIFO or a socket.
     """
-    noted = _noted.get()
-    if noted is not None:
-        noted.append(path)
     try:
         number = os.open(path, _FLAGS)
     except (OSError, ValueError) as failure:
@@ -65,9 +45,11 @@ def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryI
 def read_regular(
     path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = StageError
 ) -> bytes:
-    """Return what a regular file holds; raises as :func:`open_regular`, and where it is longer
-    than ``limit`` [bytes].
-    """  # noqa: D205
+    """Return what a regular file holds.
+
+    Raises:
+        FlangeyeError: As :func:`open_regular`, or the file is longer than ``limit`` [bytes].
+    """
     with open_regular(path, error) as file:
         try:
             raw = file.read(limit + 1)
@@ -81,9 +63,11 @@ def read_regular(
 
 
 def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = StageError) -> str:
-    """Return a regular file's UTF-8 text, without a byte-order mark; raises as
-    :func:`read_regular`, and where it is no UTF-8.
-    """  # noqa: D205
+    """Return a regular file's UTF-8 text, without a byte-order mark.
+
+    Raises:
+        FlangeyeError: As :func:`read_regular`, or it is no UTF-8.
+    """
     try:
         return read_regular(path, limit, error).decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -26,8 +26,7 @@ def flangeye_stages() -> Iterable[Stage] | Mapping[str, str]:  # type: ignore[em
     """Return the stages this plugin offers to recipes.
 
     Or where they are, ``{"fit.hull": "acme.hull:fit_hull"}``: a module is then imported when a
-    recipe uses what is in it, and no other command waits for it. A former name has the present
-    one in that place.
+    recipe uses what is in it, and no other command waits for it.
     """
 
 

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import pluggy
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.collector import collector_paused
 from flangeye.files.near import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
@@ -72,8 +71,7 @@ class Offered(MutableMapping[str, Kind]):
     def _imported(self, name: str, place: str) -> Kind:
         module, _, attribute = place.partition(":")
         try:
-            with collector_paused():
-                found = getattr(importlib.import_module(module), attribute)
+            found = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a vendor's import may fail in any way
             raise PluginNotFoundError(
                 f"'{name}' cannot be imported from {place} ({type(error).__name__}: {error})"
@@ -96,9 +94,6 @@ class Registry:
         broken: Entry point name -> why it could not be loaded.
         owners: Stage or part name -> entry point that offers it.
         installed: Entry point name -> the package it comes from, None where nobody knows.
-        renamed: Former name -> present name of stages and parts.
-        outdated: The former names that were asked for.
-        asked: The present names that were asked for.
     """
 
     hooks: pluggy.PluginManager
@@ -107,9 +102,6 @@ class Registry:
     broken: dict[str, Exception] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
     installed: dict[str, Distribution | None] = field(default_factory=dict)
-    renamed: dict[str, str] = field(default_factory=dict)
-    outdated: set[str] = field(default_factory=set)
-    asked: set[str] = field(default_factory=set)
 
     def stage(self, name: str) -> Stage:
         """Return the stage ``name``.
@@ -117,7 +109,6 @@ class Registry:
         Raises:
             PluginNotFoundError: Names the nearest stages, and the plugins that failed to load.
         """
-        name = self._present(name)
         if name not in self.stages:
             raise self._missing("stage", name)
         return self.stages[name]
@@ -128,7 +119,6 @@ class Registry:
         Raises:
             PluginNotFoundError: Names the nearest parts, and the plugins that failed to load.
         """
-        name = self._present(name)
         if name not in self.parts:
             raise self._missing("part", name)
         return self.parts[name]
@@ -148,20 +138,6 @@ class Registry:
             for name in sorted(self.parts)
             if name.startswith(f"{part.kind}.") and name != part.name
         }
-
-    def notes(self) -> list[str]:
-        """Return a line for each former name that was asked for."""
-        return [
-            f"{old} is now called {self.renamed[old]}; the old name works in this version only"
-            for old in sorted(self.outdated)
-        ]
-
-    def _present(self, name: str) -> str:
-        if name in self.renamed:
-            self.outdated.add(name)
-        present = self.renamed.get(name, name)
-        self.asked.add(present)
-        return present
 
     def versions(self) -> dict[str, str]:
         """Return each loaded plugin's entry point and the version of what installed it."""
@@ -218,15 +194,11 @@ class Registry:
     def _add(self, owner: str, offers: Any, places: Offered[Any]) -> None:
         if isinstance(offers, Mapping):
             for name, place in offers.items():
-                if ":" not in place:
-                    self.renamed[name] = place
-                    continue
                 self._own(owner, name)
                 places.put(name, place)
             return
         for offered in offers:
             self._own(owner, offered.name)
-            self.renamed.update(dict.fromkeys(offered.formerly, offered.name))
             (self.stages if isinstance(offered, Stage) else self.parts)[offered.name] = offered
 
 
@@ -256,9 +228,8 @@ def load_registry() -> Registry:
     hooks = pluggy.PluginManager(hookspecs.NAME)
     hooks.add_hookspecs(hookspecs)
     registry = Registry(hooks)
-    with collector_paused():
-        for entry_point in sorted(installed_plugins(), key=_builtin_first):
-            _load(registry, entry_point)
+    for entry_point in sorted(installed_plugins(), key=_builtin_first):
+        _load(registry, entry_point)
     return registry
 
 

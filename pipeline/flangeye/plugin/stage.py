@@ -16,7 +16,7 @@ import types as python_types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, Union, get_args, get_origin
+from typing import Any, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import (
     BaseModel,
@@ -31,7 +31,6 @@ from flangeye import types as t
 from flangeye.files.validation import EXPLAINED, sentence
 from flangeye.models.configuration import CELL, EVERY
 from flangeye.models.robots import RobotModel
-from flangeye.plugin.hints import Hints
 
 
 class Params(BaseModel):
@@ -176,7 +175,6 @@ class Plugin:
         params: Its parameter model, or None when it takes none.
         needs: Argument name -> type, the parameters aside.
         gives: Types it may return.
-        formerly: Names it had, which recipes may still use for one version.
     """
 
     name: str
@@ -184,7 +182,6 @@ class Plugin:
     params: type[Params] | None
     needs: Mapping[str, Any]
     gives: tuple[Any, ...]
-    formerly: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -377,9 +374,7 @@ def _below(key: str, error: ValidationError, model: type[Params]) -> ValidationE
     )
 
 
-def stage(
-    name: str, serves: Iterable[str] = (), formerly: Iterable[str] = ()
-) -> Callable[[Callable[..., Any]], Stage]:
+def stage(name: str, serves: Iterable[str] = ()) -> Callable[[Callable[..., Any]], Stage]:
     """Declare a function as the step ``name``, for example ``solve.svd``.
 
     Args:
@@ -387,7 +382,6 @@ def stage(
         serves: Configurations it can work in besides the default, by name;
             :data:`flangeye.models.configuration.EVERY` for all,
             and ``CELL`` for cells.
-        formerly: Names it had, which recipes may still use for one version.
 
     Raises:
         TypeError: The signature breaks the contract of the stage's kind, or a configuration is
@@ -401,9 +395,7 @@ def stage(
         )
 
     def declare(function: Callable[..., Any]) -> Stage:
-        declared = _read_signature(Stage, name, function)
-        needs = dict(declared.needs)
-        declared = replace(declared, needs=needs, serves=tuple(serves), formerly=tuple(formerly))
+        declared = replace(_read_signature(Stage, name, function), serves=tuple(serves))
         _check_contract(declared)
         return declared
 
@@ -412,7 +404,6 @@ def stage(
 
 def part(
     name: str,
-    formerly: Iterable[str] = (),
     *,
     simulated: bool = False,
     interactive: bool = False,
@@ -423,7 +414,6 @@ def part(
 
     Args:
         name: ``kind.name``.
-        formerly: Names it had, which recipes may still use for one version.
         simulated: For a robot: its arm moves nothing, and its time is not this computer's.
         interactive: For a robot: it talks to a person at the terminal.
         passive: For a robot: it commands nothing, others move the arm.
@@ -436,7 +426,6 @@ def part(
     def declare(function: Callable[..., Any]) -> Part:
         declared = replace(
             _read_signature(Part, name, function),
-            formerly=tuple(formerly),
             simulated=simulated,
             interactive=interactive,
             passive=passive,
@@ -454,9 +443,9 @@ AnyPlugin = TypeVar("AnyPlugin", bound=Plugin)
 
 
 def _read_signature(cls: type[AnyPlugin], name: str, function: Callable[..., Any]) -> AnyPlugin:
-    hints = Hints(function)
-    params = hints.pop("params") if "params" in hints else None
-    gives = _alternatives(hints.pop("return"))
+    hints = get_type_hints(function)
+    params = hints.pop("params", None)
+    gives = _alternatives(hints.pop("return", type(None)))
     if params is not None and not (isinstance(params, type) and issubclass(params, Params)):
         raise TypeError(f"'{name}': its params must be a subclass of flangeye.Params")
     if not inspect.getdoc(function):
@@ -488,8 +477,8 @@ def _check_contract(declared: Stage) -> None:
 def _check_call(declared: Part, kind: PartKind) -> None:
     """Hold a part's signature against the Protocol of its kind; untyped arguments pass."""
     contract = _at(*kind.contract.split(":"))
-    wanted = Hints(contract.__call__)
-    gives = _alternatives(wanted.pop("return"))
+    wanted = get_type_hints(contract.__call__)
+    gives = _alternatives(wanted.pop("return", type(None)))
     where = f"part '{declared.name}'"
     asked = [n for n in inspect.signature(declared.function).parameters if n not in _GIVEN]
     if asked != list(wanted):
@@ -497,11 +486,10 @@ def _check_call(declared: Part, kind: PartKind) -> None:
             f"{where}: a '{declared.kind}' part is called with {', '.join(wanted)}, "
             f"and has {', '.join(asked) or 'no arguments'}"
         )
-    said = Hints(declared.function)
-    for name in [n for n in declared.needs if n in wanted and not said.says_as(wanted, n)]:
-        if not _fits(wanted[name], said[name]):
+    for name, taken in declared.needs.items():
+        if name in wanted and not _fits(wanted[name], taken):
             raise TypeError(
-                f"{where}: its {name} is a {_called(wanted[name])}, not a {_called(said[name])}"
+                f"{where}: its {name} is a {_called(wanted[name])}, not a {_called(taken)}"
             )
     foreign = [g for g in declared.gives if not any(_fits(g, given) for given in gives)]
     if foreign:

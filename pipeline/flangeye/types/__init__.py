@@ -55,7 +55,7 @@ from flangeye.types.frames import (
     by_frame,
 )
 from flangeye.types.notes import Note, Warn, records_of, warnings_of
-from flangeye.types.running import ArchivePath, Journal, Progress, Resumed, Seed, StageLog
+from flangeye.types.running import ArchivePath, Progress, Resumed, Seed, StageLog
 from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
 from flangeye.types.streams import Captures, Look, Observations, Source, Stream, Truth, Views
 from flangeye.types.welding import Seam, WeldReport
@@ -87,7 +87,6 @@ __all__ = [
     "HandEye",
     "Image",
     "Indices",
-    "Journal",
     "Look",
     "Mask",
     "Motion",

@@ -27,10 +27,6 @@ class StageLog(Protocol):
         ...
 
 
-Journal = StageLog
-"""Its former name, which goes with version 0.3."""
-
-
 @dataclass(frozen=True)
 class Progress:
     """What a solver knows while it still takes poses.

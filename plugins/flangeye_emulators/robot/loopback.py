@@ -45,7 +45,7 @@ class LoopbackParams(Params):
     )
 
 
-@part("robot.emulator", formerly=("robot.loopback",))
+@part("robot.emulator")
 def robot_loopback(model: RobotModel, params: LoopbackParams, reads_only: bool = False) -> Robot:
     """Start a controller on loopback and open it with the arm's own driver.
 

@@ -61,7 +61,7 @@ class LoopbackParams(Params):
     )
 
 
-@part("scanner.emulator", formerly=("scanner.loopback",))
+@part("scanner.emulator")
 def scanner_loopback(model: ScannerModel | None, params: LoopbackParams) -> Scanner:
     """Scan the simulated cell around a controller on loopback.
 
